@@ -1,18 +1,19 @@
-"""Class evidence of the voxels of a semantic map, including the background, and its update by a frame.
+"""Class evidence of the voxels of a semantic map, including the background, and its update from a frame.
 
-After SemanticFusion (McCormac et al. 2017), eq. 2, which is eq. [7] with one distribution per pixel:
+The update follows SemanticFusion (McCormac et al. 2017, eq. 2). It is eq. (7) with one distribution per pixel:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t),   c = background or a class
 
-In log space the update is a sum, from a uniform start. Only ratios matter, so a voxel stores the log ratio of each
-class to the background. The background wins if no class is above 0.
+In log space, the update is a sum that starts from a uniform distribution. Only ratios matter, so a voxel stores the
+log ratio of each class to the background. If no log ratio is above 0, the voxel is background.
 
-A pixel under a mask has the distribution of the mask. All pixels outside the masks are equal evidence for the
-background, so a voxel only counts these frames. Mask evidence is stored in rows of 512 voxels, only for blocks that
-were under a mask. A voxel of a row takes 14 bytes and 5 bytes per class slot, so at most 94 bytes.
+A voxel is *under a mask* if it projects to a pixel of the mask. It then gets the class distribution of the mask. All
+pixels outside the masks are equal evidence for the background, so a voxel only counts the frames in which it is
+outside. Mask evidence is stored in rows of 512 voxels, one row for each block that was under a mask. A voxel in a row
+takes 14 bytes plus 5 bytes per class slot, at most 94 bytes.
 
-A voxel stores the CLASS_SLOTS most likely classes and evicts the least likely class when another class is named. The
-unnamed classes share one sum, `rest`. A newly named class starts with this sum.
+Each mask *names* its most likely classes. A voxel stores the CLASS_SLOTS most likely named classes; a newly named class
+replaces the least likely one. The unnamed classes share one sum, `rest`, with which a newly named class starts.
 """
 
 from __future__ import annotations
@@ -33,19 +34,19 @@ from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-MAX_EXPONENT = 700.0  # maximum log of a ratio in float64
+MAX_EXPONENT = 700.0  # maximum log ratio; float64 can represent exp(700)
 
 
 class ClassEvidence(NamedTuple):
     """Class evidence of all voxels. The best class of a voxel is in slot 0."""
 
-    unmasked: UInt16  # (B, 512) number of frames with the voxel outside all masks; B as in the grid
+    unmasked: UInt16  # (B, 512) number of frames in which the voxel was outside all masks; B as in Grid
     class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
-    log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames with the voxel under a mask
-    rest: Float32  # (R, 512) log_ratio of each unnamed class
-    masked: UInt16  # (R, 512) number of frames with the voxel under a mask
-    first_frame: Int32  # (R, 512) first frame with the voxel under a mask, -1 = none
-    last_frame: Int32  # (R, 512) last frame with the voxel under a mask, -1 = none
+    log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames counted by `masked`
+    rest: Float32  # (R, 512) log_ratio of each unnamed class of the voxel
+    masked: UInt16  # (R, 512) number of frames in which the voxel was under a mask
+    first_frame: Int32  # (R, 512) first frame in which the voxel was under a mask, -1 = none
+    last_frame: Int32  # (R, 512) last frame in which the voxel was under a mask, -1 = none
 
 
 ROW_ARRAYS = ClassEvidence._fields[1:]
@@ -55,16 +56,19 @@ NO_EVIDENCE = (NO_CLASS, 0, 0, 0, -1, -1)  # values of ROW_ARRAYS in a new row
 class MaskClasses(NamedTuple):
     """Evidence of one frame's N masks for C classes."""
 
-    cluster: Int32  # (H * W,) cluster with the best score over each pixel, -1 = none
+    cluster: Int32  # (H * W,) cluster with the highest score at each pixel, -1 = none
     log_ratio: Float32  # (N, C) log P(class) / P(background)
     unnamed: Float32  # (N,) log ratio of the mean P(unnamed class) of each cluster to P(background)
-    named_classes: UInt8  # (N, NEW_CLASSES) best classes of each cluster
-    named_bit: UInt8  # (N, NO_CLASS + 1) bit m of a cluster's m-th named class, 0 = unnamed
+    named_classes: UInt8  # (N, NEW_CLASSES) most likely classes of each cluster
+    named_bit: UInt8  # (N, NO_CLASS + 1) 2^m for the m-th named class of a cluster, 0 = unnamed
     frame: int  # index of the frame
 
 
 def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists, frame: int) -> MaskClasses:
-    """Return the evidence of a frame's clusters from their `log_ratio` (N, C), log P(class) / P(background)."""
+    """Return the evidence of a frame's clusters from their `log_ratio` (N, C), log P(class) / P(background).
+
+    `points` lists the clusters at each pixel.
+    """
     relative, named, bits = named_classes(log_ratio, logarithmic=True)
     best = best_clusters(points.offsets, points.clusters, clusters.scores)
     return MaskClasses(
@@ -78,7 +82,7 @@ def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists
 
 
 class ClassRows:
-    """Owner of the growing class evidence of a grid. The kernels work on `self.evidence`."""
+    """Class evidence of a growing voxel grid. The kernels modify `self.evidence`."""
 
     def __init__(self, voxels: VoxelGrid) -> None:
         self.voxels = voxels
@@ -103,7 +107,7 @@ class ClassRows:
         self.evidence = _free_rows(min(classes, CLASS_SLOTS))
 
     def update(self, seen: SeenBlocks, masks: MaskClasses | None) -> None:
-        """Update the voxels near the measured surface in the seen blocks; `masks` = None: the detector did not run."""
+        """Update the voxels near the measured surface; `masks` = None: no update, because the detector did not run."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.evidence.unmasked) < capacity:
             self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, zeros=True))
@@ -117,12 +121,12 @@ class ClassRows:
         self.evicted += int(evicted.sum())
 
     def saved(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the arrays in use by name."""
+        """Return the used part of each array, by name."""
         rows = {name: getattr(self.evidence, name)[: self.row_count] for name in ROW_ARRAYS}
         return {"unmasked": self.evidence.unmasked[: self.voxels.block_count], **rows}
 
     def fill(self, arrays: dict[str, npt.NDArray[Any]], classes: int) -> None:
-        """Adopt the arrays of a saved map with `classes` classes. Raises DataError if they are invalid."""
+        """Load the arrays of a saved map with `classes` classes. Raises DataError if they are invalid."""
         free = self.evidence._asdict()
         check_like(arrays, {"unmasked": free.pop("unmasked")}, self.voxels.block_count)
         check_like(arrays, free, len(arrays["rest"]))
@@ -156,7 +160,7 @@ def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: i
     wrong = ratios[..., 0] < best
     if wrong.any():
         raise DataError(
-            f"log_ratio: expected the maximum of each voxel, {best[wrong][0]:g}, in slot 0, got {ratios[wrong][0, 0]:g}"
+            f"log_ratio: expected the maximum of the voxel, {best[wrong][0]:g}, in slot 0, got {ratios[wrong][0, 0]:g}"
         )
     excess = np.where(named.sum(axis=-1) == classes, rest - np.maximum(best, 0), np.float32(-np.inf))
     if (excess > MAX_EXPONENT).any():
@@ -167,7 +171,7 @@ def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: i
 
 
 def _free_rows(class_slots: int) -> ClassEvidence:
-    """Return evidence without rows."""
+    """Return evidence without rows, with `class_slots` slots per voxel."""
     voxels = (0, BLOCK_VOXELS)
     return ClassEvidence(
         unmasked=np.empty(voxels, np.uint16),

@@ -9,12 +9,15 @@ from framework.mapping.labels.class_slots import ALL_NAMED, NEW_CLASSES, NO_CLAS
 from framework.mapping.labels.label_evidence_kernels import best_first
 from framework.mapping.voxels.voxel_grid_kernels import device
 
-MAX_FRAMES = np.uint16(65535)  # largest frame count of a voxel
+MAX_FRAMES = np.uint16(65535)  # maximum frame count of a voxel
 
 
 @njit(cache=True, nogil=True)
 def best_clusters(offsets, clusters, scores):
-    """Return the clusters (L,) with the best score in each of the lists, -1 = none; ties go to the first."""
+    """Return the cluster (L,) with the highest score in each list of clusters, -1 = empty list.
+
+    List i is clusters[offsets[i] : offsets[i + 1]]. Ties go to the smallest cluster index.
+    """
     best = np.full(offsets.shape[0] - 1, -1, np.int32)
     for i in range(best.shape[0]):
         for entry in range(offsets[i], offsets[i + 1]):
@@ -28,7 +31,7 @@ def best_clusters(offsets, clusters, scores):
 def best_class(grid, evidence, log_missed, block, n):
     """Return the most likely class of a voxel, -1 = background; ties go to the background.
 
-    `log_missed` is the log ratio of every class to the background for a frame with the voxel outside all masks.
+    `log_missed` is the log ratio of every class to the background for a frame in which the voxel is outside all masks.
     """
     row = grid.label_row[block]
     if row < 0 or evidence.class_ids[row, n, 0] == NO_CLASS:
@@ -39,7 +42,10 @@ def best_class(grid, evidence, log_missed, block, n):
 
 @device
 def _add_class(labels, sums, label, total):
-    """Give a class a free slot or the slot of the least likely class. Returns 1 if a class was evicted."""
+    """Store a class in a free slot, or in the slot of the least likely class if the new class is more likely.
+
+    Returns 1 if no slot was free, so that a class was evicted or not stored.
+    """
     least = 0
     for s in range(len(labels)):
         if labels[s] == NO_CLASS:
@@ -56,7 +62,7 @@ def _add_class(labels, sums, label, total):
 
 @device
 def observe_mask(evidence, row, n, masks, k):
-    """Apply the recursive update to a voxel seen under cluster k. Returns the number of evictions."""
+    """Apply the recursive update to a voxel under the mask of cluster k. Returns the number of evictions."""
     labels, sums = evidence.class_ids[row, n], evidence.log_ratio[row, n]
     known = 0  # bits of the named classes with a slot
     for s in range(len(labels)):
@@ -83,7 +89,7 @@ def observe_mask(evidence, row, n, masks, k):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_blocks_under_masks(grid, seen, cluster, wants_row):
-    """Set wants_row (A,) to True for blocks that have a voxel under a mask but no row."""
+    """Set wants_row (A,) to True for each seen block that has a voxel under a mask but no row, else to False."""
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
         start = seen.near_start[a]
@@ -96,7 +102,10 @@ def find_blocks_under_masks(grid, seen, cluster, wants_row):
 
 @njit(cache=True, nogil=True, parallel=True)
 def update_classes(grid, seen, evidence, masks, evicted):
-    """Update the near voxels of the seen blocks; evicted (A,) gets the number of evictions of each block."""
+    """Update the voxels near the measured surface in the seen blocks.
+
+    Sets evicted (A,) to the number of evictions in each block.
+    """
     unmasked = evidence.unmasked  # numba 0.68 drops assignments to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):
         evicted[a] = 0

@@ -2,7 +2,7 @@
 
 Fusion++ (McCormac et al. 2018) represents an object by 64^3 voxels, which are resampled as the object grows. It
 integrates every frame that shows the object, corrects object poses by loop closures, and tracks against a coarse
-background. MaskFusion (Runz et al. 2018) has surfels under the masks only, and tracks moving objects.
+background. MaskFusion (Runz et al. 2018) stores surfels under the masks only, and tracks moving objects.
 
 Here, all volumes have voxels of the same size, objects are static, and a volume changes only in frames in which its
 object is detected.
@@ -49,7 +49,7 @@ Part = tuple[Float32, Int32, UInt8, Int32]
 
 
 class ObjectMap(InstanceTableMap):
-    """The background, the volume of each object by id, and the instance table.
+    """A map with a background volume, one volume per object, and an instance table.
 
     The class distribution of an object is the mean over its detections.
     """
@@ -85,15 +85,15 @@ class ObjectMap(InstanceTableMap):
         return ObjectVolume(self.background.voxel_size, self.background.sensor, self.background.voxels.max_blocks)
 
     def remove(self, instance_id: int) -> None:
-        """Remove an object."""
+        """Remove an object and its volume."""
         del self.table.records[instance_id], self.volumes[instance_id]
         self.background.changed(NO_BLOCKS)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, masks: Mapping[int, Bool], band: float) -> None:
-        """Integrate `frame` into the background and into the volumes of the objects with `masks` (H, W) by id.
+        """Integrate `frame` into the background and into the volumes of the objects in `masks`.
 
-        Voxels within `band` m of the measured surface count their observations under and outside the object's mask.
-        Raises MapFullError if the block budget is reached.
+        `masks` maps object ids to masks (H, W). Voxels within `band` m of the measured surface count their
+        observations under and outside the object's mask. Raises MapFullError if the block budget is reached.
         """
         self.background.integrate(frame, T_world_camera, band)
         for instance_id, mask in masks.items():
@@ -108,7 +108,7 @@ class ObjectMap(InstanceTableMap):
     def _integrate_object(
         self, volume: ObjectVolume, frame: Frame, T_world_camera: Float64, mask: Bool, band: float
     ) -> None:
-        """Integrate the image window around the object's volume and mask."""
+        """Integrate the image region that contains the object's mask and the projection of its volume."""
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         u0, v0, u1, v1 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
         if volume.block_count:
@@ -124,9 +124,10 @@ class ObjectMap(InstanceTableMap):
         return boxes_in_view(camera, T_world_camera, low, high, float(self.background.sensor.min_depth))
 
     def instances_seen(self, camera: Camera, T_world_camera: Float64, depth: Float32, stride: int) -> Int32:
-        """Return the object ids (ceil(H / stride), ceil(W / stride)) at the readings of the subsampled depth, 0 = none.
+        """Return the object ids (ceil(H / stride), ceil(W / stride)) at the measured surface, 0 = none.
 
-        `depth` is (H, W) m. A reading in several volumes belongs to the object with the highest foreground probability.
+        Samples every stride-th depth reading of every stride-th row of `depth` (H, W), m. A reading in several volumes
+        belongs to the object with the highest foreground probability.
         """
         shape = tuple(-(-side // stride) for side in depth.shape)
         instance_ids, best = np.zeros(shape, np.int32), np.full(shape, np.float32(FOREGROUND))
@@ -224,8 +225,12 @@ class ObjectMap(InstanceTableMap):
                 )
             counts = {int(key): objects.whole(key) for key in objects.values}
             check_like(arrays, scene._empty_volume().arrays(), sum(counts.values()), OBJECT)
-            if (arrays[OBJECT + "foreground"] > arrays[OBJECT + "observed"]).any():
-                raise DataError(f"{OBJECT}foreground: expected at most {OBJECT}observed, got a larger count")
+            foreground, observed = (arrays[OBJECT + name] for name in ("foreground", "observed"))
+            if (wrong := foreground > observed).any():
+                raise DataError(
+                    f"{OBJECT}foreground: expected at most the value in {OBJECT}observed, {observed[wrong][0]}, got "
+                    f"{foreground[wrong][0]}"
+                )
             start = 0
             for key, blocks in counts.items():
                 volume = scene.volumes[key] = scene._empty_volume()
@@ -235,7 +240,7 @@ class ObjectMap(InstanceTableMap):
 
 
 def _part(surface: UnlabeledMesh, voxels: VoxelGrid, chosen: Bool, instance_ids: Int32) -> Part:
-    """Return the chosen (V,) vertices of a surface and the triangles between them."""
+    """Return the vertices marked in `chosen` (V,), with their `instance_ids` (V,), and the triangles between them."""
     new_index = np.cumsum(chosen, dtype=np.int32) - np.int32(1)
     triangles = surface.triangles[chosen[surface.triangles].all(axis=1)]
     nearest = surface.voxels[chosen]
@@ -245,7 +250,7 @@ def _part(surface: UnlabeledMesh, voxels: VoxelGrid, chosen: Bool, instance_ids:
 
 
 def _cropped(frame: Frame, u0: int, v0: int, u1: int, v1: int) -> Frame:
-    """Return the part of a frame from pixel (u0, v0) to (u1, v1), exclusive."""
+    """Return the part of a frame from pixel (u0, v0) to pixel (u1, v1), exclusive."""
     camera = frame.camera
     part = replace(camera, width=u1 - u0, height=v1 - v0, cx=camera.cx - u0, cy=camera.cy - v0)
     return Frame(

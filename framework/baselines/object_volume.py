@@ -1,6 +1,6 @@
-"""Volume of one object: a TSDF that grows under the object's masks, and mask counts of its voxels.
+"""Volume of one object: a TSDF that grows under the object's masks, and a mask count for each voxel.
 
-After Fusion++ (McCormac et al. 2018), a voxel counts its observations under a mask of the object, and all of its
+As in Fusion++ (McCormac et al. 2018), a voxel counts its observations under a mask of the object, and all of its
 observations. Its foreground probability is the mean of Beta(1 + foreground, 1 + background). The object's surface is
 the part with a probability above 1/2. Therefore, occasional mask errors are outvoted, but systematic errors are not.
 
@@ -35,7 +35,7 @@ class ObjectVolume:
         self.volume = TsdfVolume(voxel_size, sensor, max_blocks)
         self.voxels = self.volume.voxels
         self.counts = MaskCounts(np.zeros((0, BLOCK_VOXELS), np.uint16), np.zeros((0, BLOCK_VOXELS), np.uint16))
-        self.low = np.full(3, np.inf)  # corners of the bounding box of the blocks, m
+        self.low = np.full(3, np.inf)  # corners of the bounding box of the blocks, world frame, m
         self.high = np.full(3, -np.inf)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -75,17 +75,17 @@ class ObjectVolume:
             self.low, self.high = coords.min(axis=0) * side, (coords.max(axis=0) + 1) * side
 
     def encloses(self, points_world: Float32) -> Bool:
-        """Return an array (P,), True for points (P, 3) m in the bounding box of the blocks."""
+        """Return an array (P,), True for each point (P, 3), m, inside the bounding box of the blocks."""
         return np.asarray(((points_world >= self.low) & (points_world <= self.high)).all(axis=1))
 
     def foreground_at(self, points_world: Float32) -> Float32:
-        """Return the foreground probability (P,) of surface points (P, 3) m."""
+        """Return the foreground probability (P,) at surface points (P, 3), m, in the world frame."""
         probability = np.empty(len(points_world), np.float32)
         foreground_at(self.voxels.grid, self.counts, points_world, probability)
         return probability
 
     def arrays(self) -> dict[str, Array]:
-        """Return the arrays to save."""
+        """Return the arrays to save, by name."""
         arrays = self.volume.saved()[1] | {n: counts[: self.block_count] for n, counts in self.counts._asdict().items()}
         return {name: arrays[name] for name in VOLUME_ARRAYS}
 

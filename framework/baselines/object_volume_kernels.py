@@ -16,7 +16,7 @@ from framework.mapping.voxels.voxel_grid_kernels import NO_LOOK_UP, device
 
 
 class MaskCounts(NamedTuple):
-    """Counts of the observations of each voxel in frames with a mask of the object."""
+    """Numbers of observations of each voxel in frames in which the object is detected."""
 
     foreground: UInt16  # (B, 512) number of observations under a mask
     observed: UInt16  # (B, 512) number of all observations, at most 65535
@@ -31,7 +31,7 @@ def _probability(foreground, observed):
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_masks(seen, mask, counts):
-    """Count observations of the near voxels of the seen blocks, in total and under `mask` (H, W)."""
+    """Count the observations of the voxels near the measured surface, in total and under `mask` (H, W)."""
     foreground, observed = counts
     largest = np.uint16(65535)
     inside = mask.ravel()
@@ -57,10 +57,11 @@ def look_up_object(
     instance_ids: Int32,
     best: Float32,
 ) -> None:
-    """Set instance_ids (h, w) and `best` (h, w) where the object is more probable than `best` at a reading's voxel.
+    """Assign readings to an object if its foreground probability is higher than `best` (h, w).
 
-    Reads every stride-th depth reading of every stride-th row of `depth` (H, W) m. `window` holds the first row and
-    column of (h, w), and the exclusive last row and column. `view` holds T_world_camera.
+    Updates instance_ids (h, w) and `best`. Samples every stride-th depth reading of every stride-th row of `depth`
+    (H, W), m. Only samples inside `window` are updated: first row, first column, last row and last column in (h, w),
+    the last ones exclusive. `view` contains T_world_camera.
     """
     top, left, bottom, right = window
     for row in prange(top, bottom):
@@ -78,7 +79,7 @@ def look_up_object(
 
 @njit(cache=True, nogil=True, parallel=True)
 def foreground_at(grid, counts, points, probability):
-    """Fill probability (P,) with the interpolated foreground probability at points (P, 3) m."""
+    """Fill probability (P,) with the interpolated foreground probability at points (P, 3), m, in the world frame."""
     for chunk in prange(-(-len(points) // CHUNK)):
         blocks, voxels = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
         weights = np.empty(CORNERS, np.float32)

@@ -45,7 +45,7 @@ CPU = o3d.core.Device("CPU:0")
 
 @dataclass(frozen=True)
 class BlockGridSettings:
-    """The parameters of a grid."""
+    """Parameters of a BlockGrid."""
 
     voxel_size: float  # side of a voxel, m
     block_resolution: int  # number of voxels per side of a block
@@ -73,7 +73,7 @@ class BlockGridSettings:
 
 
 class BlockGrid:
-    """Blocks of voxels with a signed distance, a color and labels. Voxel indices refer to `flat`."""
+    """Voxel blocks with signed distances, colors and instance votes. Voxel indices refer to the arrays of `flat`."""
 
     def __init__(self, settings: BlockGridSettings) -> None:
         self.settings = settings
@@ -110,7 +110,7 @@ class BlockGrid:
 
     @property
     def byte_count(self) -> int:
-        """Bytes of the blocks in use; Open3D's hash map has up to twice this capacity."""
+        """Size of the blocks in use, bytes. Open3D's hash map may allocate up to twice as much."""
         return self.voxel_count * sum(dtype.byte_size() * channels for dtype, channels in ATTRIBUTES.values())
 
     @property
@@ -137,7 +137,7 @@ class BlockGrid:
         return np.where((depth >= s.min_depth) & (depth <= s.max_depth), depth, np.float32(0))
 
     def _touched(self, depth: Float32, camera: Camera, T_world_camera: Float64, band: float) -> Tensor:
-        """Return the blocks (B, 3) along the rays within `band` voxels of the readings of `depth` (H, W).
+        """Return the coordinates (B, 3) of the blocks within `band` voxels of the readings of `depth` (H, W), m.
 
         Open3D samples every 4th pixel of every 4th row. If the samples are more than half a block apart, the image is
         enlarged to avoid holes in the map.
@@ -154,7 +154,10 @@ class BlockGrid:
         return self.blocks.compute_unique_block_coordinates(_image(depth), *view, METERS, s.max_depth, band)
 
     def _make_room(self, blocks: Tensor) -> None:
-        """Grow the hash map for `blocks` (B, 3) up to the block budget. Open3D has no budget."""
+        """Grow the hash map to fit the block coordinates `blocks` (B, 3).
+
+        Raises MapFullError if the block budget, which Open3D lacks, is exceeded.
+        """
         hashmap = self.blocks.hashmap()
         new = blocks.shape[0]
         if hashmap.size():
@@ -170,9 +173,10 @@ class BlockGrid:
             hashmap.reserve(min(max(needed, 2 * hashmap.capacity()), self.settings.max_blocks))
 
     def voxels_seen(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> tuple[Int64, Int64]:
-        """Return the voxels within `band` voxels of the reading at their pixel, and their pixels, as flat indices (V,).
+        """Return the flat indices (V,) of voxels near the measured surface, and the flat indices (V,) of their pixels.
 
-        Only pixels in `mask` (H, W) are used. The method is from integrate_custom.py of Open3D's examples.
+        A voxel is near if its depth is within `band` voxels of the reading at its pixel. Only pixels in `mask` (H, W)
+        are used. The method is from integrate_custom.py of Open3D's examples.
         """
         camera = frame.camera
         usable = self._usable(frame.depth)
@@ -195,7 +199,7 @@ class BlockGrid:
         return voxels.numpy().ravel()[inside[near]], pixels[near]
 
     def voxels_at(self, points_world: Float32) -> Int64:
-        """Return the flat indices (P,) of the voxels nearest to the points (P, 3) m, -1 = none."""
+        """Return the flat indices (P,) of the voxels nearest to the points (P, 3), m; -1 outside all blocks."""
         if not len(points_world) or not self.block_count:
             return np.full(len(points_world), -1)
         r = self.settings.block_resolution
@@ -206,7 +210,7 @@ class BlockGrid:
         return np.where(known, indices.astype(np.int64) * r**3 + (z * r + y) * r + x, -1)  # x varies fastest
 
     def flat(self, attribute: str) -> npt.NDArray[Any]:
-        """Return a writable view of one attribute (block capacity * voxels per block,) of all voxels."""
+        """Return a writable, flat view of one attribute of all voxels, including the unused blocks of the hash map."""
         return np.asarray(self.blocks.attribute(attribute).numpy()).reshape(-1)
 
     def ray_cast(self, camera: Camera, T_world_camera: Float64) -> SurfaceView:
@@ -266,7 +270,7 @@ class BlockGrid:
         T_camera_world = inverse(T_world_camera)
         x, y, z = T_camera_world[:3, :3] @ ((coords + 0.5) * side).T + T_camera_world[:3, 3:]
         seen = z > -radius
-        # distance of the center from each side of the view frustum, inwards
+        # a block is in view if its center is at most `radius` outside each side of the view frustum
         for sideways, focal, center, size in (
             (x, camera.fx, camera.cx, camera.width),
             (y, camera.fy, camera.cy, camera.height),
@@ -285,9 +289,9 @@ class BlockGrid:
         return np.asarray(hashmap.key_tensor().numpy()[hashmap.active_buf_indices().numpy()], np.int32)
 
     def extract(self) -> tuple[Float32, Int32, UInt8]:
-        """Return vertices (V, 3) m, triangles (F, 3) and colors (V, 3) of marching cubes in a deterministic order."""
+        """Return vertices (V, 3), m, triangles (F, 3) and colors (V, 3) of the mesh, in a deterministic order."""
         if self.block_count:
-            # weights are integers; marching cubes needs weights above the threshold, ray-casting at or above it
+            # weights are integers; the threshold is exclusive in marching cubes and inclusive in ray casting
             mesh = self.blocks.extract_triangle_mesh(self.min_weight - 0.5)
             if mesh.triangle.indices.shape[0]:
                 colors = np.rint(255 * mesh.vertex.colors.numpy()).astype(np.uint8)
@@ -334,13 +338,13 @@ def _image(pixels: Float32) -> o3d.t.geometry.Image:
 
 
 def _blank(camera: Camera) -> tuple[Float32, Float32, UInt8]:
-    """Return empty depth, normals and color."""
+    """Return depth (H, W), normals (H, W, 3) and color (H, W, 3), all 0."""
     shape = camera.shape
     return np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.uint8)
 
 
 def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
-    """Return the world-frame rays (H, W, 3) of the pixels, m per m of depth."""
+    """Return the ray (H, W, 3) of each pixel in the world frame, scaled to a depth of 1 m."""
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
     x, y = (u - np.float32(camera.cx)) / np.float32(camera.fx), (v - np.float32(camera.cy)) / np.float32(camera.fy)
     R = T_world_camera[:3, :3].astype(np.float32)
@@ -348,7 +352,7 @@ def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
 
 
 def points_of(surface: SurfaceView) -> Float32:
-    """Return the points (H, W, 3), m, of a surface in the world frame."""
+    """Return the surface point (H, W, 3), m, of each pixel in the world frame; the camera center without a surface."""
     points = _rays(surface.camera, surface.T_world_camera)
     points *= surface.depth[..., None]
     points += surface.T_world_camera[:3, 3].astype(np.float32)
@@ -356,7 +360,7 @@ def points_of(surface: SurfaceView) -> Float32:
 
 
 def _towards(camera: Camera, T_world_camera: Float64, normals_camera: Float32) -> Float32:
-    """Return Open3D's camera-frame normals (H, W, 3) in the world frame, towards the camera."""
+    """Transform Open3D's camera-frame normals (H, W, 3) to the world frame, and flip them towards the camera."""
     normals = normals_camera @ T_world_camera[:3, :3].T.astype(np.float32)
     away = np.einsum("hwi,hwi->hw", normals, _rays(camera, T_world_camera)) > 0
     normals[away] *= -1

@@ -30,7 +30,7 @@ FORMAT = "open3d_vbg 5"  # format of the map file; increment it when the meaning
 
 
 class Open3DMap(InstanceTableMap):
-    """Open3D's voxel blocks and an instance table. All voxels of an instance have the class of its record."""
+    """Open3D's voxel blocks and an instance table. All voxels of an instance have the class stored in the table."""
 
     def __init__(self, settings: BlockGridSettings, confirmation: Confirmation) -> None:
         self.classes: tuple[str, ...] = ()
@@ -56,7 +56,7 @@ class Open3DMap(InstanceTableMap):
     def vote(self, frame: Frame, T_world_camera: Float64, instance_ids: Int32, band: float) -> None:
         """Vote for instance_ids (H, W), 0 = no vote, in the voxels within `band` voxels of the measured depth.
 
-        A voxel stores one candidate and one counter. They find the majority if one exists (Boyer and Moore, "MJRTY - a
+        A voxel stores one candidate and one counter. If a majority exists, it is found (Boyer and Moore, "MJRTY - a
         fast majority vote algorithm", 1981).
         """
         voxels, pixels = self.grid.voxels_seen(frame, T_world_camera, instance_ids > 0, band)
@@ -77,16 +77,16 @@ class Open3DMap(InstanceTableMap):
         self.changed()
 
     def changed(self) -> None:
-        """Invalidate derived data after writing the map."""
+        """Discard the cached mesh after a change of the map."""
         self.__dict__.pop("_mesh", None)
 
     def instances_at(self, points_world: Float32) -> Int32:
-        """Return the instance ids (P,) of the voxels nearest to the points (P, 3) m, 0 = none."""
+        """Return the instance ids (P,) of the voxels nearest to the points (P, 3), m, 0 = none."""
         voxels = self.grid.voxels_at(points_world)
         return np.where(voxels >= 0, self.grid.flat("instance")[voxels], 0).astype(np.int32)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """Return the instance ids at every stride-th depth reading in both directions; see `LabeledMap`."""
+        """Return the instance ids (ceil(H / stride), ceil(W / stride)) of a frame; see `LabeledMap.instances_seen`."""
         v, u = np.nonzero(frame.depth[::stride, ::stride])
         pixels = np.stack([u * stride, v * stride], axis=1).astype(np.int32)
         points_camera = back_project(frame.camera, pixels, frame.depth[pixels[:, 1], pixels[:, 0]])
@@ -104,7 +104,7 @@ class Open3DMap(InstanceTableMap):
     def render_near(
         self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
     ) -> SurfaceView:
-        """Return the surface without labels; Open3D cannot use `depth` and `sensor`."""
+        """Return the surface without labels. `depth` and `sensor` are ignored, because Open3D cannot use them."""
         return self.grid.ray_cast(camera, T_world_camera)
 
     def mesh(self) -> InstanceMesh:

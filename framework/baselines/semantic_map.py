@@ -33,7 +33,7 @@ FORMAT = "semantic 4"  # format of the map file; increment it when the meaning o
 
 
 class Elections(NamedTuple):
-    """Parameters that determine classes and instances from the evidence."""
+    """Parameters for deriving classes and instances from the evidence."""
 
     missed: float  # likelihood ratio P(no mask | any class) / P(no mask | background)
     min_area: float  # minimum surface area of an instance, m^2
@@ -41,12 +41,12 @@ class Elections(NamedTuple):
 
 
 class ComponentStatistics(NamedTuple):
-    """Statistics of K components by id, over the nearest voxel of each of their vertices; entry 0 is unused."""
+    """Statistics of K instances by id, over the voxels nearest to the vertices of each; entry 0 is unused."""
 
     probability_sums: Float64  # (K + 1, C) sums of P(class) over the vertices; the remainder is P(background)
-    masked: Int32  # (K + 1,) maximum number of frames with a voxel under a mask
-    first_frame: Int32  # (K + 1,) first frame with any voxel under a mask, -1 = none
-    last_frame: Int32  # (K + 1,) last frame with any voxel under a mask, -1 = none
+    masked: Int32  # (K + 1,) maximum, over the voxels, of the number of frames under a mask
+    first_frame: Int32  # (K + 1,) first frame in which any of the voxels was under a mask, -1 = none
+    last_frame: Int32  # (K + 1,) last frame in which any of the voxels was under a mask, -1 = none
 
 
 class SemanticMap(SceneMap):
@@ -62,7 +62,7 @@ class SemanticMap(SceneMap):
         self.labels = ClassRows(volume.voxels)
 
     def begin(self, classes: tuple[str, ...]) -> None:
-        """Adopt the label space of the first frame. Raises DataError if a later frame has a different label space."""
+        """Set the label space in the first frame. Raises DataError if a later frame has a different label space."""
         if not self.classes:
             self.labels.begin(len(classes))
         self.classes = agreed_classes(self.classes, classes)
@@ -100,7 +100,7 @@ class SemanticMap(SceneMap):
         return self.volume.mesh(self._labeled)
 
     def _labeled(self, surface: UnlabeledMesh) -> InstanceMesh:
-        """Return the surface with instances and classes by the majority rule of InstanceMap."""
+        """Return the surface with instances and classes. A majority vote determines the class of a vertex."""
         colors, class_ids = np.empty((len(surface.voxels), 3), np.uint8), np.empty(len(surface.voxels), np.int32)
         label_classes(self.volume.voxels.grid, self.labels.evidence, self._log_missed, surface, colors, class_ids)
         if self.elections.smoothness > 0:
@@ -113,7 +113,7 @@ class SemanticMap(SceneMap):
     def _smooth(self, surface: UnlabeledMesh, class_ids: Int32) -> None:
         """Regularize the classes (V,) in place by a Potts model over the edges of the mesh.
 
-        The unary term is the class evidence of the nearest voxel to the vertex. Iterated conditional modes (Besag 1986)
+        The unary term is the class evidence of the voxel nearest to the vertex. Iterated conditional modes (Besag 1986)
         minimize the energy.
         """
         starts, neighbors = vertex_neighbors(surface.triangles, len(class_ids))
@@ -128,9 +128,9 @@ class SemanticMap(SceneMap):
     def instances(self) -> Mapping[int, Instance]:
         """Return the components of the mesh.
 
-        The class distribution is the mean over the nearest voxels of the vertices, without the background. The
-        confidence is the mean probability of the class, with the background. The number of observations is the maximum
-        number of frames with one of these voxels under a mask.
+        The class distribution is the mean over the voxels nearest to the vertices, without the background. The
+        confidence is the mean probability of the class, including the background. The number of observations is the
+        largest number of frames in which one of these voxels was under a mask.
         """
         mesh, up, instances = self.mesh(), self.gravity().up, {}
         found = self._sum_components(self.volume.surface().voxels, mesh.instance_ids)
@@ -185,10 +185,10 @@ class SemanticMap(SceneMap):
 
 
 def connected_components(triangles: Int32, class_ids: Int32, min_vertices: int) -> Int32:
-    """Return the component (V,) of each vertex, numbered from 1 in the order of their first vertices.
+    """Return the component (V,) of each vertex. Components are numbered from 1 in the order of their first vertices.
 
-    Components are connected by edges of the triangles (F, 3) within one class. 0 = no class or fewer vertices than
-    `min_vertices`.
+    Components are connected by edges of the triangles (F, 3) within one class. 0 = no class, or a component with fewer
+    than `min_vertices` vertices.
     """
     components = np.empty(len(class_ids), np.int32)
     connect_vertices(triangles, class_ids, components)
@@ -197,7 +197,10 @@ def connected_components(triangles: Int32, class_ids: Int32, min_vertices: int) 
 
 
 def vertex_neighbors(triangles: Int32, count: int) -> tuple[Int32, Int32]:
-    """Return the neighbors of V = `count` vertices along edges of triangles (F, 3) as starts (V + 1,) and indices."""
+    """Return the neighbors of V = `count` vertices along edges of triangles (F, 3), as starts (V + 1,) and indices.
+
+    The neighbors of vertex v are indices[starts[v] : starts[v + 1]].
+    """
     a, b = (triangles[:, sides].ravel() for sides in ([0, 1, 2], [1, 2, 0]))
     both = np.concatenate([a, b]), np.concatenate([b, a])
     edges = coo_array((np.ones(len(both[0]), np.bool_), both), (count, count)).tocsr()

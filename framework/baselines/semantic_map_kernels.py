@@ -15,7 +15,7 @@ from framework.refinement.segmentation.union_find import root, unite
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_view(grid, evidence, log_missed, view, depth, class_ids):
-    """Fill class_ids (H, W) with the classes of the voxels nearest to the surface at `depth` (H, W) m, -1 = none."""
+    """Fill class_ids (H, W) with the classes of the voxels nearest to the surface at `depth` (H, W), m, -1 = none."""
     for v in prange(depth.shape[0]):
         key, region = NO_LOOK_UP
         for u in range(depth.shape[1]):
@@ -28,7 +28,7 @@ def label_view(grid, evidence, log_missed, view, depth, class_ids):
 
 @device
 def _elect(grid, evidence, log_missed, blocks, voxels, weights, labels):
-    """Return the majority class of the voxels around a vertex, -1 without a majority."""
+    """Return the majority class of the voxels around a vertex, -1 = background or no majority."""
     keep_near(grid, blocks, voxels, weights)
     for c in range(CORNERS):
         labels[c] = 1 + best_class(grid, evidence, log_missed, blocks[c], voxels[c]) if weights[c] > 0 else 0
@@ -67,10 +67,11 @@ def _log_ratio(grid, evidence, log_missed, block, n, label):
 
 @njit(cache=True, nogil=True)
 def smooth_classes(grid, evidence, log_missed, voxels, starts, neighbors, smoothness, class_ids):
-    """Set each vertex in order to the class with the best sum of evidence and agreeing neighbors.
+    """Set each vertex, in order, to the class with the highest score.
 
-    Candidates are the background, the best class of the nearest voxel and the classes of the neighbors. Ties go to the
-    current class. Returns the number of changes.
+    The score is the log ratio of the class to the background, plus `smoothness` for each neighbor of this class.
+    Candidates are the background, the most likely class of the nearest voxel and the classes of the neighbors. Ties go
+    to the current class. Returns the number of changes.
     """
     changes = 0
     for v in range(len(class_ids)):
@@ -112,7 +113,7 @@ def connect_vertices(triangles, class_ids, components):
 
 @njit(cache=True, nogil=True)
 def sum_components(grid, evidence, log_missed, voxels, instance_ids, found):
-    """Sum the evidence of the nearest voxel to each vertex, by component, in the zeroed ComponentStatistics `found`."""
+    """Add the evidence of the voxel nearest to each vertex to the ComponentStatistics `found`, initially zero."""
     sums, masked, first_frame, last_frame = found.probability_sums, found.masked, found.first_frame, found.last_frame
     classes = sums.shape[1]
     unnamed_sums = np.zeros(len(sums))

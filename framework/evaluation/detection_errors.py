@@ -20,9 +20,9 @@ MIN_PIXELS = 64  # px, minimum area of an evaluated appearance
 FOUND_IOU = 0.3  # minimum IoU of a found appearance, regardless of class
 SIDES = (32.0, 96.0)  # px, square roots of areas: COCO's bounds between small, medium and large
 MIN_APPEARANCES = 5  # minimum number of appearances of an object for its detection rate
-RARE_FRACTION, FREQUENT_FRACTION = 0.25, 0.75  # fractions of an object's appearances
-PART_INSIDE, PART_COVERS = 0.6, 0.05  # minimum fractions of the detection and of the object, for a part of an object
-ON_ONE = 0.6  # minimum fraction of a false detection on one object of unknown class
+RARE_FRACTION, FREQUENT_FRACTION = 0.25, 0.75  # bounds of the found fraction of an object's appearances
+PART_INSIDE, PART_COVERS = 0.6, 0.05  # minimum shared pixels, as fractions of a detection and of an object (`parts`)
+ON_ONE = 0.6  # minimum fraction of a false detection's pixels on one object of unknown class (`on_thing`)
 
 
 class Appearance(NamedTuple):
@@ -32,15 +32,15 @@ class Appearance(NamedTuple):
     side: float  # px, square root of the area
     parts: int  # number of detections mostly on the object
     iou: float = 0.0
-    inside: float = 0.0  # fraction of the detection on the object
-    covered: float = 0.0  # fraction of the object under the detection
+    inside: float = 0.0  # fraction of the detection's pixels on the object
+    covered: float = 0.0  # fraction of the object's pixels in the detection
     score: float = 0.0
     class_name: str = ""
     is_right: bool = False
 
 
 class FalseDetection(NamedTuple):
-    """A detection with at most half of its pixels on objects of known classes."""
+    """A detection that is best for no object, with at most half of its pixels on objects of known classes."""
 
     score: float
     side: float  # px, square root of the area
@@ -49,7 +49,7 @@ class FalseDetection(NamedTuple):
 
 @dataclass
 class DetectionErrors:
-    """The errors of all frames added so far."""
+    """Detection errors, accumulated over frames."""
 
     frames: int = 0
     appearances: list[Appearance] = field(default_factory=list)
@@ -91,7 +91,7 @@ class DetectionErrors:
                 )
 
     def table(self) -> dict[str, float]:
-        """Return all statistics by name, in the order of the model cards of the presets; NaN without data."""
+        """Return all statistics by name, in the order of the presets' model cards; NaN = no data."""
         hits = [one for one in self.appearances if one.iou >= FOUND_IOU]
         scores = [one.score for one in hits]
         of_objects = _by_object(self.appearances)
@@ -132,7 +132,10 @@ def _by_object(appearances: Iterable[Appearance]) -> list[list[Appearance]]:
 
 
 def overlaps(truth: FrameTruth, masks: Bool) -> tuple[Int64, Int64]:
-    """Return the ids (M,) in a frame, and their pixel counts (1 + N, M): in the frame and in each mask (N, H, W)."""
+    """Return the instance ids (M,) in a frame, and their pixel counts (1 + N, M).
+
+    Row 0 counts the pixels in the frame, and row 1 + k counts the pixels in mask k of `masks` (N, H, W).
+    """
     ids, index = np.unique(truth.instance_ids.ravel(), return_inverse=True)
     counts = [np.bincount(index, minlength=len(ids))]
     counts += [np.bincount(index[mask.ravel()], minlength=len(ids)) for mask in masks]

@@ -8,11 +8,11 @@ A ground-truth instance is evaluated if its class is known and it has at least `
 ground-truth instances are *ignored*. A prediction without a match is ignored (neither right nor wrong) if
 
 1. its best overlap with an ignored instance reaches the IoU threshold, or
-2. more than half of its points lie on ignored instances, or
+2. more than half of its points are on ignored instances, or
 3. its class was not annotated (`SceneTruth.classes`).
 
-Every other prediction without a match is wrong. This includes predictions on points of instance 0 (no instance) and far
-from the ground truth.
+Every other prediction without a match is wrong. This includes predictions on points of instance 0 (no instance) and
+predictions far from the ground truth.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class PredictedInstances:
     def on_mesh(
         cls, mesh: InstanceMesh, ids: Sequence[int], confidences: Sequence[float], class_names: Sequence[str]
     ) -> PredictedInstances:
-        """Return the instances `ids`. Vertices of all other (tentative) instances get the id 0."""
+        """Return the instances `ids` of a mesh. Vertices of all other (tentative) instances get the id 0."""
         listed = np.array(ids, np.int64)
         return cls(
             points_world=mesh.vertices,
@@ -124,7 +124,7 @@ class Judgment:
     outcome: Outcome
     truth_id: int  # matched ground-truth instance, otherwise the instance with the largest overlap; 0 = none
     truth_class: str | None  # None = unknown
-    iou: float  # with this ground-truth instance
+    iou: float  # IoU with this ground-truth instance
 
 
 @dataclass(frozen=True)
@@ -133,12 +133,12 @@ class InstanceEvaluation:
 
     by_class: Mapping[float, Mapping[str, Score]]  # IoU threshold -> class with a ground-truth instance -> score
     agnostic: Mapping[float, Score]  # IoU threshold -> class-agnostic score
-    overall: Score | None  # at IoU 0.5 over all classes; matches agree in class
-    best_ious: Mapping[int, float]  # evaluated ground-truth instance -> best overlap with a prediction
-    best_ids: Mapping[int, int]  # evaluated ground-truth instance -> prediction with the best overlap, 0 = none
+    overall: Score | None  # at IoU 0.5, over all classes; matches have the same class
+    best_ious: Mapping[int, float]  # evaluated ground-truth instance -> best IoU with a prediction
+    best_ids: Mapping[int, int]  # evaluated ground-truth instance -> prediction with the best IoU, 0 = none
 
     def ap(self, threshold: float) -> float:
-        """Return the class-averaged AP at one IoU threshold, `nan` without ground truth."""
+        """Return the class-averaged AP at one IoU threshold, NaN without ground truth."""
         scores = self.by_class.get(threshold, {})
         return float(np.mean([score.ap for score in scores.values()])) if scores else float("nan")
 
@@ -148,10 +148,10 @@ class InstanceEvaluation:
         - `instances.ap50`, `ap25`: AP at IoU 0.5 and 0.25; `ap`: the mean over IOU_THRESHOLDS. Also for each class with
           a ground-truth instance, as `instances.ap50.<class>`.
         - `ap50_agnostic`, `ap25_agnostic`: class-agnostic AP.
-        - `mean_iou`: mean over the ground-truth instances of the best overlap with a prediction of any class.
+        - `mean_iou`: mean, over the ground-truth instances, of the best IoU with a prediction of any class.
         - `precision50`, `recall50`, `f1_50`: at IoU 0.5, over all predictions and ground-truth instances.
         - `pq50`: panoptic quality at IoU 0.5, averaged over classes.
-        - `true_count`: number of evaluated ground-truth instances, also by class.
+        - `true_count`: number of evaluated ground-truth instances, also for each class.
         - `ignored_count`: number of ignored predictions at IoU 0.5.
         """
         if self.overall is None:
@@ -210,9 +210,9 @@ def evaluate(
 def judge(
     predictions: PredictedInstances, truth: SceneTruth, threshold: float = 0.5
 ) -> tuple[list[Judgment], dict[int, str]]:
-    """Return the outcome of each prediction, best first, and the class of each missed ground-truth instance.
+    """Return the outcome of each prediction, and the class of each missed ground-truth instance by id.
 
-    Predictions are matched as for `InstanceEvaluation.overall`.
+    Predictions are in order of decreasing confidence. They are matched as for `InstanceEvaluation.overall`.
     """
     overlaps = _Overlaps.between(predictions, truth, Transfer.TO_TRUTH, MAX_DISTANCE, MIN_POINTS)
     everything = np.ones(len(overlaps.predicted_ids), np.bool_)
@@ -224,12 +224,12 @@ def judge(
     return judged, {key: name for key, name, counts in counted if counts and key not in found}
 
 
-IGNORED, NO_MATCH = -2, -1  # values in place of the column of a ground-truth instance
+IGNORED, NO_MATCH = -2, -1  # results of a prediction that is not matched with a column of `_Overlaps.iou`
 
 
 @dataclass(frozen=True)
 class _Overlaps:
-    """The overlaps of K predictions, best first, with T ground-truth instances."""
+    """The overlaps of K predictions, in order of decreasing confidence, with T ground-truth instances."""
 
     iou: Float64  # (K, T)
     ignorable: Bool  # (K,) more than half of the points on ignored instances, or class not annotated
@@ -271,9 +271,12 @@ class _Overlaps:
         )
 
     def score(self, threshold: float, predicted: Bool, truths: Bool, allowed: Bool) -> Score:
-        """Return the score of the `predicted` (K,) instances, matched with `allowed` (K, T) ground-truth instances."""
+        """Return the score of the predictions in `predicted` (K,) for the ground-truth instances in `truths` (T,).
+
+        `allowed` (K, T) is True for the pairs that may match.
+        """
         matches = self.matches(threshold, predicted, allowed)
-        hits = [match >= 0 for _, match in matches if match != IGNORED]  # evaluated predictions, best first
+        hits = [match >= 0 for _, match in matches if match != IGNORED]  # evaluated predictions
         count = int((truths & self.evaluated).sum())
         return Score(
             ap=average_precision(np.array(hits, np.bool_), count),
@@ -285,7 +288,10 @@ class _Overlaps:
         )
 
     def matches(self, threshold: float, predicted: Bool, allowed: Bool) -> list[tuple[int, int]]:
-        """Return (prediction, match) pairs, best first; a match is a column of `allowed`, NO_MATCH or IGNORED."""
+        """Return (prediction, match) pairs in order of decreasing confidence.
+
+        A match is a column of `allowed`, NO_MATCH or IGNORED.
+        """
         ignored_iou = self.iou[:, ~self.evaluated].max(axis=1, initial=0.0)
         unknown = self.ignorable | (ignored_iou >= threshold)
         free = np.ones(len(self.truth_ids), np.bool_)
@@ -301,7 +307,7 @@ class _Overlaps:
         return found
 
     def judgment(self, k: int, match: int, threshold: float) -> Judgment:
-        """Return the judgment of prediction k, given its result of `matches`."""
+        """Return the judgment of prediction k, given its match from `matches`."""
         t = match if match >= 0 else int(self.iou[k].argmax()) if len(self.truth_ids) else -1
         iou = float(self.iou[k, t]) if t >= 0 else 0.0
         truth_id, truth_class = (int(self.truth_ids[t]), self.truth_classes[t]) if iou > 0 else (0, None)
@@ -311,7 +317,7 @@ class _Overlaps:
         return Judgment(int(self.predicted_ids[k]), outcome, truth_id, truth_class, iou)
 
     def best(self) -> tuple[dict[int, float], dict[int, int]]:
-        """Return the best overlap of each evaluated ground-truth instance and its prediction, regardless of class."""
+        """Return the best IoU of each evaluated ground-truth instance and the prediction with it, for any class."""
         columns = {int(self.truth_ids[t]): self.iou[:, t] for t in np.flatnonzero(self.evaluated)}
         ious = {key: float(column.max(initial=0.0)) for key, column in columns.items()}
         ids = {key: int(self.predicted_ids[columns[key].argmax()]) if iou > 0 else 0 for key, iou in ious.items()}
@@ -321,8 +327,8 @@ class _Overlaps:
 def average_precision(hits: Bool, truths: int) -> float:
     """Return the area under the precision-recall curve of ranked predictions `hits` (K,), True = right.
 
-    Uses all-point interpolation: the sum, over the hits, of the largest precision at the same or a lower rank, divided
-    by `truths`.
+    `truths` is the number of ground-truth instances. All-point interpolation: each hit contributes the maximum
+    precision at its own or a later position in the ranking, divided by `truths`.
     """
     if truths == 0:
         raise ValueError("average precision: expected at least one ground-truth instance, got none")
@@ -332,7 +338,7 @@ def average_precision(hits: Bool, truths: int) -> float:
 
 
 def transfer_labels(points: Float32, labels: Int32, targets: Float32, max_distance: float) -> Int32:
-    """Return the labels (T,) of the points (P, 3) m nearest to targets (T, 3) m, 0 = none within `max_distance` m."""
+    """Return the label (T,) of the point (P, 3) nearest to each target (T, 3), m; 0 = none within `max_distance`, m."""
     if not len(points) or not len(targets):
         return np.zeros(len(targets), np.int32)
     import numba  # imported here to keep commands that only read metrics fast
@@ -348,14 +354,14 @@ def transfer_labels(points: Float32, labels: Int32, targets: Float32, max_distan
 
 
 def _contingency(predicted: Int32, true: Int32, predicted_ids: Int64, truth_ids: Array) -> Int64:
-    """Return the point counts (1 + K, 1 + T) of each pair of labels; row and column 0 mean no instance."""
+    """Return the number of points (1 + K, 1 + T) with each pair of labels; row and column 0 are for no instance."""
     rows, columns = _positions(predicted, predicted_ids), _positions(true, truth_ids)
     shape = 1 + len(predicted_ids), 1 + len(truth_ids)
     return np.bincount(rows * shape[1] + columns, minlength=shape[0] * shape[1]).reshape(shape)
 
 
 def _positions(labels: Int32, ids: Array) -> Int64:
-    """Return 1 + the index in `ids` of each label, 0 for label 0."""
+    """Return 1 + the index of each label in `ids`, 0 for label 0."""
     values, inverse = np.unique(labels, return_inverse=True)
     index = {value: k for k, value in enumerate(ids.tolist(), start=1)}
     return np.array([index.get(value, 0) for value in values.tolist()], np.int64)[inverse]

@@ -1,4 +1,4 @@
-"""COCO mask AP (Lin et al. 2014) by its reference implementation pycocotools: all areas, at most 100 detections."""
+"""COCO mask AP (Lin et al. 2014), computed by pycocotools for all areas and at most 100 detections per image."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pycocotools.cocoeval import COCOeval
 
 from framework.data import Bool, Detections
 
-UNDEFINED = -1.0  # pycocotools' precision of a class without an object
+UNDEFINED = -1.0  # precision of a class without objects in pycocotools
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,15 @@ class MaskAp:
 def mask_ap(
     pictures: Iterable[tuple[Bool, Sequence[str | None], Detections]], classes: Sequence[str], min_pixels: int = 1
 ) -> MaskAp:
-    """Return the AP over images, given as ground-truth masks (N, H, W), class names (N,) and detections.
+    """Return the AP over images and the given classes.
 
-    A detection has its most likely class. Objects of unknown class (name None) and objects with fewer than `min_pixels`
+    The class of a detection is its most likely class. Objects of unknown class and objects with fewer than `min_pixels`
     pixels count neither for nor against a detection (COCO's `iscrowd`).
+
+    Args:
+        pictures: Ground-truth masks (N, H, W), their class names (N,), None = unknown, and detections of each image.
+        classes: Names of the evaluated classes. Objects and detections of other classes are omitted.
+        min_pixels: Minimum area of an evaluated object, px.
     """
     category = {name: k for k, name in enumerate(classes, start=1)}
     images: list[dict[str, int]] = []

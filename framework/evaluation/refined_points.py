@@ -15,7 +15,7 @@ from framework.interfaces import ClusterRefiner
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 
-TIMED_CALLS = 5  # number of timed calls for the median; the call before them may compile kernels
+TIMED_CALLS = 5  # number of timed calls for the median; an untimed call before them compiles the kernels
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,13 @@ class Refinement:
     frame: Frame
     before: PointClusters
     after: PointClusters
-    milliseconds: float  # median run time of the refiner
+    milliseconds: float  # median run time of the refiner, ms
 
     @classmethod
     def of(cls, refiner: ClusterRefiner, detections: Detections, frame: Frame) -> Refinement:
-        """Return the clusters of detections, lifted at the frame's ground-truth pose, before and after refinement.
+        """Return the clusters of detections before and after refinement.
 
-        Without a ground-truth pose, they are lifted in the camera frame.
+        The points are in the world frame, or in the camera frame if the frame has no ground-truth pose.
         """
         pose = Pose(np.eye(4) if frame.T_world_camera is None else frame.T_world_camera)
         before = lift(detections, frame, pose)
@@ -45,10 +45,11 @@ class Refinement:
 
     @cached_property
     def origin(self) -> Int32:
-        """Original cluster (M,) of each refined cluster, -1 = none.
+        """Index (M,) of the original cluster of each refined cluster, -1 = none.
 
-        If the number of clusters is unchanged, their order is unchanged, too. Otherwise, a refined cluster is assigned
-        to the original cluster with which it shares the most pixels. Ties go to the first.
+        If the refiner does not change the number of clusters, refined cluster k comes from original cluster k.
+        Otherwise, a refined cluster is assigned to the original cluster with which it shares the most pixels. Ties go
+        to the smallest index.
         """
         n, m = len(self.before), len(self.after)
         if n == m or n == 0:
@@ -58,7 +59,7 @@ class Refinement:
 
     @cached_property
     def main_part(self) -> Int32:
-        """Largest refined cluster (N,) of each original cluster, -1 = none."""
+        """Index (N,) of the largest refined cluster of each original cluster, -1 = none."""
         sizes = point_counts(self.after)
         largest_last = np.argsort(sizes, kind="stable")
         main = np.full(len(self.before), -1, np.int32)
@@ -73,7 +74,7 @@ class Refinement:
 
     @cached_property
     def points_after(self) -> Int32:
-        """Remaining point count (N,) of each original cluster."""
+        """Point count (N,) of each original cluster after refinement, summed over its refined clusters."""
         known = self.origin >= 0
         sums = np.bincount(self.origin[known], point_counts(self.after)[known], minlength=len(self.before))
         return sums.astype(np.int32)
@@ -90,13 +91,13 @@ class Refinement:
 
     @cached_property
     def judged_before(self) -> Bool:
-        """Mask (N,) of the clusters that are not on an object of unknown class; all False without ground truth."""
+        """Array (N,), True for clusters that are not on an object of unknown class; all False without ground truth."""
         fit = self.fit_before
         return np.zeros(len(self.before), np.bool_) if fit is None else ~fit.unknown
 
     @cached_property
     def judged_after(self) -> Bool:
-        """Mask (M,) of the refined clusters whose original cluster is evaluated."""
+        """Array (M,), True for refined clusters whose original cluster is evaluated; all False without ground truth."""
         fit = self.fit_after
         if fit is None:
             return np.zeros(len(self.after), np.bool_)
@@ -109,7 +110,7 @@ class TrueFit:
 
     iou: Float64  # (N,) intersection over union with the object; 0 for an empty cluster
     points_inside: Int32  # (N,) number of the cluster's points on the object
-    unknown: Bool  # (N,) True: an object of unknown class fits better; not evaluated
+    unknown: Bool  # (N,) True: not evaluated, because an object of unknown class fits better
 
 
 def point_counts(clusters: PointClusters) -> Int32:
@@ -130,9 +131,9 @@ def _membership(clusters: PointClusters, frame: Frame) -> csr_array:
 
 
 def true_fit(clusters: PointClusters, frame: Frame, truth: FrameTruth) -> TrueFit:
-    """Return the fit of clusters to the ground-truth objects over the pixels with a depth reading.
+    """Return the fit of clusters to the ground-truth objects.
 
-    Clusters contain no other pixels.
+    Only pixels with a depth reading are compared, because clusters contain no other pixels.
     """
     ids = np.where(frame.depth > 0, truth.instance_ids, 0).ravel()
     objects, of_pixel, areas = np.unique(ids, return_inverse=True, return_counts=True)

@@ -1,13 +1,13 @@
-"""Trajectory errors ATE and RPE, in the notation of evo and with the same results.
+"""Trajectory errors ATE and RPE, in the notation of evo and with the same results as evo.
 
 Q_i and P_i are the ground-truth and the estimated T_world_camera of frame i.
 
-- ATE (absolute trajectory error, Sturm et al. 2012): the RMSE of |trans E_i| with E_i = Q_i^-1 S P_i, where the rigid S
-  aligns the positions in the least squares sense (Umeyama 1991, without scale).
+- ATE (absolute trajectory error, Sturm et al. 2012): the RMSE of |trans E_i| with E_i = Q_i^-1 S P_i, where the rigid
+  transform S aligns the positions in the least-squares sense (Umeyama 1991, without scale).
 - RPE (relative pose error) with delta = 1 frame: the RMSE of |trans E_i| and of the angle of rot E_i with
   E_i = (Q_i^-1 Q_{i+1})^-1 (P_i^-1 P_{i+1}).
 
-Frames with a lost pose or an unknown ground-truth pose are omitted, and so are pairs with such a frame for the RPE.
+Frames with a lost pose or an unknown ground-truth pose are omitted. The RPE also omits pairs that contain such a frame.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from framework.errors import DataError
 
 @dataclass(frozen=True)
 class TrajectoryError:
-    """Errors of one trajectory; `nan` without a frame (ATE) or a pair of frames (RPE)."""
+    """Errors of one trajectory. The ATE is NaN without evaluated frames, the RPE without evaluated frame pairs."""
 
     ate_rmse_m: float
     rpe_rmse_m: float
@@ -32,7 +32,7 @@ class TrajectoryError:
     pairs: int  # number of frame pairs in the RPE
 
     def metrics(self) -> dict[str, float]:
-        """Return the defined errors by their names in metrics.json."""
+        """Return the errors that are not NaN, by their names in metrics.json."""
         flat: dict[str, float] = {}
         if self.frames:
             flat["trajectory.ate_rmse_m"] = self.ate_rmse_m
@@ -43,7 +43,7 @@ class TrajectoryError:
 
 
 def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> TrajectoryError:
-    """Return the errors of estimated poses; both sequences are T_world_camera (4, 4) by frame, None = unknown.
+    """Return the errors of estimated poses. `reference` lists T_world_camera (4, 4) of each frame, None = unknown.
 
     Raises DataError if the numbers of poses differ.
     """
@@ -75,7 +75,7 @@ def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> 
 def umeyama(x: Float64, y: Float64) -> tuple[Float64, Float64]:
     """Return the R (3, 3) and t (3,) that minimize sum |y_i - (R x_i + t)|^2: Umeyama 1991, eqs. (40) to (43).
 
-    The points are (n, 3). With fewer than three points or points on a line, R is one of several solutions.
+    The points are (n, 3). For fewer than three points, or points on a line, R is one of several solutions.
     """
     mu_x, mu_y = x.mean(axis=0), y.mean(axis=0)
     U, _, Vt = np.linalg.svd((y - mu_y).T @ (x - mu_x) / len(x))

@@ -28,7 +28,7 @@ CHOSEN, OTHER = "#1a7f37", "#b0b6be"
 
 
 def write_check(path: Path, check: RecordingCheck) -> None:
-    """Write the figure as a PNG, atomically."""
+    """Write the figure of a recording check as a PNG."""
     figure = Figure(SIZE_IN, facecolor="white")
     grid = figure.add_gridspec(
         3, 4, height_ratios=(1, 1, 0.75), left=0.02, right=0.98, top=0.9, bottom=0.01, wspace=0.16
@@ -72,7 +72,7 @@ def _edges_on_color(frame: Frame) -> UInt8:
 
 
 def _warped(axes: Axes, title: str, pair: MatchedPair | None, fit: PoseFit | None) -> None:
-    """Draw a frame in red and a second frame, warped to the first, in cyan: aligned pixels are gray."""
+    """Draw a frame in red, and a second frame, warped onto the first, in cyan. Aligned pixels are gray."""
     if pair is None:
         _say(axes, "no pair of frames with enough overlap")
         return
@@ -80,7 +80,7 @@ def _warped(axes: Axes, title: str, pair: MatchedPair | None, fit: PoseFit | Non
         T_second_first, factor, title = pair.T_second_first, 1.0, "from image matches"
     else:
         T_second_first, factor = motion_of(pair, fit.reading), fit.depth_factor
-    title = f"{title}: frame {pair.first.index} red,\nframe {pair.second.index}, warped, cyan; gray = aligned"
+    title = f"{title}: frame {pair.first.index} (red),\nframe {pair.second.index} warped (cyan); gray: aligned"
     _image(axes, title, _moved(pair, T_second_first, factor))
 
 

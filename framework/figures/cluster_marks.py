@@ -1,4 +1,4 @@
-"""Colors of a frame's clusters in the refinement figure, with the pixels dropped and added by the refiner."""
+"""Colors of a frame's clusters in the refinement figure, and the pixels that the refiner drops or adds."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class ClusterMarks:
     heading: str
     clusters: PointClusters
     colors: UInt8  # (K, 3) RGB
-    owner: Int32  # (H, W) smallest cluster with this pixel, -1 = none
-    dropped: Bool  # (H, W) True: in a cluster only before refinement
-    added: Bool  # (H, W) True: not in the original cluster of the owner
+    owner: Int32  # (H, W) smallest cluster that contains the pixel, -1 = none
+    dropped: Bool  # (H, W) True: pixel in a cluster only before refinement
+    added: Bool  # (H, W) True: pixel not in the original cluster of the owner
 
     @classmethod
     def before(cls, refinement: Refinement) -> ClusterMarks:
@@ -53,7 +53,7 @@ class ClusterMarks:
         return mask
 
     def by_size(self) -> list[int]:
-        """Return the nonempty clusters, largest first."""
+        """Return the indices of the nonempty clusters, largest first."""
         sizes = point_counts(self.clusters)
         return [k for k in np.argsort(-sizes, kind="stable").tolist() if sizes[k]]
 
@@ -86,7 +86,10 @@ def _owner(clusters: PointClusters, frame: Frame) -> Int32:
 
 
 def _painted(clusters: PointClusters, frame: Frame, values: Array, nothing: int) -> Array:
-    """Return the values (P,) of the points as an image (H, W), with small clusters in front of large ones."""
+    """Return the values (P,) of the points as an image (H, W), with small clusters in front of large ones.
+
+    Pixels outside all clusters have the value `nothing`.
+    """
     held = np.flatnonzero(clusters.cluster >= 0)
     held = held[np.argsort(-point_counts(clusters)[clusters.cluster[held]], kind="stable")]
     image = np.full(frame.depth.size, nothing, values.dtype)

@@ -46,7 +46,7 @@ def write_figure(directory: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class Pictured:
-    """The runs of a figure."""
+    """The runs shown in a figure."""
 
     choice: FigureChoice
     rows: Mapping[str, RunRow | None]  # by display name; None = no complete run
@@ -54,15 +54,15 @@ class Pictured:
 
     @classmethod
     def below(cls, directory: Path) -> Pictured:
-        """Read the runs in and below `directory`, according to the sweep's config.
+        """Read the runs in and below `directory`, as defined by the sweep's config.
 
-        Raises DataError for a sweep without a figure or complete runs, and ConfigError for an invalid figure.
+        Raises DataError if the sweep has no figure or no complete run, and ConfigError if its figure block is invalid.
         """
         if not directory.is_dir():
             raise DataError(f"{directory}: expected a folder of runs, got no folder")
         if not (directory / SWEEP).exists():
             raise DataError(
-                f"{directory}: expected the folder of an experiment with {SWEEP}, got a folder without it; run an "
+                f"{directory}: expected the folder of an experiment, got a folder without {SWEEP}; run an "
                 "experiment such as experiment=figure4_progress"
             )
         sweep = read_yaml(directory / SWEEP)
@@ -156,7 +156,7 @@ def _maps(pictured: Pictured) -> Page:
     if not lines:
         raise DataError("maps: expected a readable map, got none; the log lists the reasons")
     note = (
-        "An object has the same color in all images of a line. Dark: no match with a ground-truth object. "
+        "An object has the same color in all images of a row. Dark: no match with a ground-truth object. "
         "Beige: ground-truth object of unknown class, not evaluated."
     )
     if any(record.annotation for record in pictured.records):

@@ -26,13 +26,13 @@ PNG_DPI = 200
 PDF_DPI = 300  # resolution of raster images in a PDF
 NOTE_LINE_MM = 2.35  # line spacing of the note
 MARGIN_MM = 1.0
-HINTED = 1.03  # maximum ratio of hinted text width in a PNG to the width of the outlines
+HINTED = 1.03  # maximum ratio of the width of hinted text in a PNG to the width of its outlines
 
 logging.getLogger("fontTools").setLevel(logging.WARNING)  # fontTools logs a hundred lines about each font in a PDF
 
 
 class Page:
-    """A white page with a note at the bottom. Coordinates: mm from the lower left corner of the area above the note."""
+    """A white page with a note at the bottom. Coordinates are in mm from the lower left corner above the note."""
 
     def __init__(self, width: float, height: float, note: str) -> None:
         lines = _wrapped(note, (width - 2 * MARGIN_MM) / HINTED)
@@ -53,7 +53,7 @@ class Page:
         self.figure.text(*self._fraction(x, y), text, **style)
 
     def write(self, path: Path) -> list[Path]:
-        """Write `path`.png and `path`.pdf and return their paths. The bytes are deterministic."""
+        """Write `path`.png and `path`.pdf, and return their paths. The files are byte-identical in repeated calls."""
         png, pdf = path.with_suffix(".png"), path.with_suffix(".pdf")
         with atomic_write(png) as temporary:
             self.figure.savefig(temporary, dpi=PNG_DPI)
@@ -66,13 +66,13 @@ class Page:
 
 
 def text_width(text: str, size: float) -> float:
-    """Return the printed width, mm, of a text of this size, pt."""
+    """Return the printed width, mm, of a text in the font size `size`, pt."""
     width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)
     return float(width) / 72 * INCH_MM
 
 
 def _wrapped(text: str, width: float) -> list[str]:
-    """Return the note as lines of at most `width` mm."""
+    """Return the text as lines that are at most `width` mm wide."""
     lines: list[str] = []
     for word in text.split():
         longer = f"{lines[-1]} {word}" if lines else word
@@ -84,7 +84,7 @@ def _wrapped(text: str, width: float) -> list[str]:
 
 
 def draw_names(axes: Axes, ids: Int32, names: Mapping[int, str], size: float, width_mm: float) -> None:
-    """Write names on the objects of an image, or next to small objects with a line.
+    """Write names on the objects of an image, or next to small objects with a leader line.
 
     Args:
         axes: Axes of the image, in pixels.

@@ -46,7 +46,7 @@ class CaptionedLine:
 
 
 def panel_size(columns: int) -> tuple[int, int]:
-    """Return the width and height of a panel, px."""
+    """Return the width and height of a panel, px, in a figure with this number of columns."""
     width = _panel_mm(columns)
     return round(width * PDF_DPI / INCH_MM), round(width * ASPECT * PDF_DPI / INCH_MM)
 
@@ -107,7 +107,7 @@ def _draw(axes: Axes, panel: Panel | None, otherwise: str) -> None:
 
 
 def _draw_path(axes: Axes, path: ProjectedPath) -> None:
-    """Draw the path; occluded segments are thin."""
+    """Draw the camera path; occluded segments are thin."""
     shades = path.shades() / 255.0
     segments = [path.pixels[k : k + 2] for k in range(len(path.pixels) - 1)]
     widths = [0.4 if hidden else 0.9 for hidden in path.hidden[:-1]]

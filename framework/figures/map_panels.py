@@ -17,7 +17,7 @@ from framework.rendering.viewpoint import best_view, fitted
 from framework.runs.stored_map import StoredMap
 
 ZOOM = 2.5  # magnification of the window with the largest differences
-FRAMING_SCALE = 0.1  # scale of the small image for framing a view
+FRAMING_SCALE = 0.1  # scale of the image that is rendered to frame a view
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Panel:
     """An image of one map."""
 
     image: UInt8  # (H, W, 3) RGB
-    objects: Int32  # (H, W) objects of the pixels, 0 = none
+    objects: Int32  # (H, W) object of each pixel, 0 = none
     names: Mapping[int, str]  # class name by object
     path: ProjectedPath | None = None  # camera path; None = not drawn
 
@@ -53,7 +53,7 @@ class Window:
 
 @dataclass(frozen=True)
 class PanelLine:
-    """The maps of one scene."""
+    """Panels of one scene: its maps and its ground truth."""
 
     maps: Sequence[Panel | None]  # by column; None = no map
     truth: Panel | None  # None = no ground truth
@@ -65,10 +65,10 @@ class PanelLine:
 def panel_line(
     maps: Sequence[StoredMap | None], truth: SceneTruth | None, size: tuple[int, int], zoom: bool
 ) -> PanelLine:
-    """Return the images of one scene's maps. The last map determines the viewpoint and the ground-truth surface.
+    """Return the panels of one scene's maps. The last map determines the viewpoint and the ground-truth surface.
 
     Args:
-        maps: Maps; at least one is not None.
+        maps: Map of each column, None = no map; at least one map is required.
         truth: Ground truth; None = the last map is used as the reference.
         size: Width and height of a panel, px.
         zoom: True: also draw the window with the largest differences.
@@ -104,7 +104,7 @@ class _Column:
 
     surface: Surface
     colors: UInt8  # (V, 3) RGB
-    objects: Int32  # (V,) objects of the vertices, 0 = none
+    objects: Int32  # (V,) object of each vertex, 0 = none
     names: Mapping[int, str]  # class name by object
     poses: Float64  # (F, 4, 4) T_world_camera
 
@@ -142,7 +142,7 @@ def _surface(stored: StoredMap) -> Surface:
 
 
 def _most_different(images: Sequence[Int32], colors: ObjectColors) -> Window | None:
-    """Return the window with the most differing pixels of object images (H, W), None if they are equal.
+    """Return the window with the most pixels that differ between object images (H, W); None if the images are equal.
 
     A pixel counts if at least one image shows a ground-truth object.
     """

@@ -27,7 +27,7 @@ def write_raycast(path: Path, view: View, names: Mapping[int, str], centers: Map
         path: PNG file.
         view: Ray-cast view.
         names: Class of each object, by id; all other ids are gray.
-        centers: Center (3,) m of each object, by id; determines the color.
+        centers: Center (3,), m, of each object, by id; it determines the color of the object.
         note: Note at the bottom of the page.
     """
     page = raycast_page(view, names, centers, note)
@@ -82,13 +82,13 @@ def normal_colors(view: View) -> UInt8:
 
 
 def position_colors(positions: Float64, low: Float64, high: Float64) -> UInt8:
-    """Return RGB colors (H, W, 3) of positions (H, W, 3) m, from black at `low` (3,) to white at `high` (3,)."""
+    """Return RGB colors (H, W, 3) of positions (H, W, 3), m, from black at `low` (3,) to white at `high` (3,)."""
     scaled = (positions - low) / np.maximum(high - low, 1e-9)
     return np.asarray(np.rint(255 * np.clip(scaled, 0, 1)), np.uint8)
 
 
 def index_colors(ids: Int32, centers: Mapping[int, Float64]) -> UInt8:
-    """Return RGB colors (H, W, 3) of object indices (H, W), 0 = none; `centers` (3,) m are given by index."""
+    """Return RGB colors (H, W, 3) of object indices (H, W), 0 = none. `centers` maps each index to a point (3,), m."""
     image = np.empty((*ids.shape, 3), np.uint8)
     image[...] = WITHOUT_OBJECT
     for key, color in object_colors(centers, set(centers)).items():

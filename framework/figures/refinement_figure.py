@@ -83,7 +83,7 @@ def refinement_figure(refinement: Refinement, title: str, refiner: str) -> Figur
 
 
 def draw_image(axes: Axes, frame: Frame, marks: ClusterMarks, width_in: float) -> None:
-    """Draw the image with tinted, outlined and named clusters; dropped and added pixels are hatched."""
+    """Draw the image with tinted, outlined and named clusters. Dropped and added pixels are hatched."""
     axes.imshow(tinted(frame, marks), interpolation="antialiased", aspect="auto")
     axes.axis("off")
     for k in marks.by_size():
@@ -112,7 +112,7 @@ def draw_image(axes: Axes, frame: Frame, marks: ClusterMarks, width_in: float) -
 
 
 def tinted(frame: Frame, marks: ClusterMarks) -> UInt8:
-    """Return the pale image (H, W, 3) with the clusters in their colors."""
+    """Return the RGB image (H, W, 3), desaturated, with the clusters in their colors."""
     gray = frame.color.mean(axis=2, keepdims=True)
     image = 0.55 * frame.color + 0.28 * gray + 38.0
     for k in marks.by_size():
@@ -122,7 +122,7 @@ def tinted(frame: Frame, marks: ClusterMarks) -> UInt8:
 
 
 def _region(mask: Array) -> tuple[Array, Array, Array]:
-    """Return x, y and values of a mask (H, W) with a border that closes its contours."""
+    """Return the x coordinates, y coordinates and values of a mask (H, W), padded with 0 to close its contours."""
     height, width = mask.shape
     return np.arange(-1, width + 1), np.arange(-1, height + 1), np.pad(mask.astype(float), 1)
 
@@ -148,7 +148,7 @@ def _summary(refinement: Refinement) -> str:
 
 
 def _draw_table(axes: Axes, refinement: Refinement, marks: ClusterMarks, rows: int) -> None:
-    """Draw the change of each cluster, in the order of the detections, one unit of y per row."""
+    """Draw a table with the change of each cluster, in the order of the detections. A row is one unit of y high."""
     n, places = len(refinement.before), TABLE_COLUMNS * MAX_ROWS
     shown = n if n <= places else places - 1
     was, now = refinement.fit_before, refinement.fit_after

@@ -16,7 +16,7 @@ from framework.rendering.lit_view import NOTHING
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import looking, upward
 
-AZIMUTH_RAD, ELEVATION_RAD = np.deg2rad(75), np.deg2rad(14)  # at 90 degrees, planes would become lines
+AZIMUTH_RAD, ELEVATION_RAD = np.deg2rad(75), np.deg2rad(14)  # side view; at 90 degrees, planes would become lines
 MARGIN = 0.09  # margin around the clusters, relative to the size of the view
 MIN_HEIGHT_M = 0.4  # minimum height of the view
 CELLS = 300  # number of grid cells across the view for counting visible points
@@ -40,11 +40,13 @@ class SideView:
     spacing: Float32  # (P,) m, distance between neighboring readings
     center: Float64  # (2,) m, x and y of the center of the view
     size: Float64  # (2,) m, width and height of the view
-    forward: float  # x component of the viewing direction of the frame's camera
+    forward: float  # x component of the camera's viewing direction, in the frame of the view
 
     @classmethod
     def of(cls, frame: Frame, before: ClusterMarks, after: ClusterMarks, aspect: float) -> SideView | None:
-        """Return the view, from the left or the right, that shows more changed points; None = no depth readings.
+        """Return the view from the left or from the right, whichever shows more changed points.
+
+        Returns None if the frame has no depth readings.
 
         Args:
             frame: Frame with depth.
@@ -79,7 +81,7 @@ class SideView:
 
 
 def draw_side(axes: Axes, frame: Frame, marks: ClusterMarks, side: SideView | None, height_in: float) -> None:
-    """Draw the readings as points with a scale bar; the colored clusters are in front."""
+    """Draw the readings as points, with a scale bar. Clusters are colored and drawn in front of all other readings."""
     axes.set_facecolor(np.array(NOTHING) / 255)
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
@@ -136,7 +138,7 @@ def _up(frame: Frame) -> Float64:
 
 
 def _turned(up: Float64, azimuth: float) -> Float64:
-    """Return R_camera_view (3, 3), rotated by `azimuth` about the up direction, with a slight downward pitch."""
+    """Return R_camera_view (3, 3): a rotation by `azimuth`, rad, about `up` (3,), and a slight downward pitch."""
     forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
     if np.linalg.norm(forward) < 0.1:  # the camera looks straight down or up
         forward = np.array([0.0, -1.0, 0.0]) + up[1] * up

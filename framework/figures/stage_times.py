@@ -24,13 +24,13 @@ COLUMNS = {
     "GMM": ("refinement",),
     "map integration": ("update", "integration"),
 }
-"""Stages by line, with the names of the paper; the assignment of stages to names is our interpretation."""
-COLORS = dict(zip(COLUMNS, ("#0072b2", "#8c6bb1", "#d55e00", "#b5830a"), strict=True))  # for color-blind readers
+"""Stages of each line, by its name in the paper. The assignment of stages to names is our interpretation."""
+COLORS = dict(zip(COLUMNS, ("#0072b2", "#8c6bb1", "#d55e00", "#b5830a"), strict=True))  # color-blind safe
 RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # names of the reference lines, by ms per frame
 PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights of a diagram, its heading and its axis labels
 LEFT_MM, RIGHT_MM = 9.5, 25.5  # margins of the diagram
 PLOT_WIDTH_MM = COLUMN_MM - LEFT_MM - RIGHT_MM
-LABEL_PLACES_MM = (2.2, 2.8, 12.5)  # distance to the right of the diagram: line end, name and median, growth
+LABEL_PLACES_MM = (2.2, 2.8, 12.5)  # distances from the right edge of the diagram: line end, name and median, growth
 LABEL_MM, LABEL_LINE_MM = 6.4, 2.6  # spacing of the labels and of their two lines
 LOWEST_MS = 0.1  # lower limit of drawn times
 
@@ -41,8 +41,8 @@ class MeanTimes:
 
     frames: Int64  # (G,) frame numbers
     mean: Mapping[str, Float64]  # by name in COLUMNS: (G,) ms, NaN = unknown
-    lowest: Mapping[str, Float64]  # (G,) ms, of the fastest sequence at each frame
-    highest: Mapping[str, Float64]  # (G,) ms, of the slowest sequence at each frame
+    lowest: Mapping[str, Float64]  # by name: (G,) ms, of the fastest sequence at each frame
+    highest: Mapping[str, Float64]  # by name: (G,) ms, of the slowest sequence at each frame
     count: int  # number of sequences
     longest: int  # last frame number of the longest sequence
 
@@ -70,7 +70,7 @@ class MeanTimes:
         return [name for name, values in self.mean.items() if np.isfinite(values).any()]
 
     def growth(self, name: str) -> float:
-        """Return the ratio of the medians over the last and the first third of the frames, NaN if unknown."""
+        """Return the median over the last third of the frames, divided by the median over the first; NaN if unknown."""
         third = max(1, len(self.frames) // 3)
         first, last = self.mean[name][:third], self.mean[name][-third:]
         if not np.isfinite(first).any() or not np.isfinite(last).any():
@@ -79,7 +79,10 @@ class MeanTimes:
 
 
 def running_median(values: Float64, window: int) -> Float64:
-    """Return the running median (F,) over `window` (odd) values, or fewer at the ends. NaN values stay NaN."""
+    """Return the running median (F,) over `window` values, or fewer at both ends. NaN values stay NaN.
+
+    `window` is odd.
+    """
     half = window // 2
     around = np.lib.stride_tricks.sliding_window_view(np.pad(values, half, constant_values=np.nan), window)
     with warnings.catch_warnings():

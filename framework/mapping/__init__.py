@@ -1,1 +1,1 @@
-"""The voxel-hashed map: storage, integration, evidence, association, ray-casting, meshing."""
+"""The voxel-hashed map: storage, integration, evidence, association, ray casting, meshing."""

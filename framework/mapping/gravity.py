@@ -1,8 +1,8 @@
 """Direction of gravity and height of the floor.
 
-If the sensor measures the direction of gravity, the mean over all frames is used. Otherwise the direction is estimated
-from the surface: up is perpendicular or parallel to most of the surface. Floors are distinguished from walls by two
-cues: the mean direction of the upper edges of the images, and the surfaces that face up.
+If the sensor measures the direction of gravity, the mean over all frames is used. Otherwise, the direction is estimated
+from the surface: most of the surface is perpendicular or parallel to the up direction. Two cues distinguish floors from
+walls: the mean direction of the upper edges of the images, and the surfaces that face up.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from framework.interfaces import Gravity
 from framework.mapping.storage.map_header import MapHeader
 
 MAX_FRAMES = 1e9  # maximum number of frames of a map
-AGREED = 0.95  # minimum length of the mean of the sensor's unit vectors; 0.95 = all are 18 degrees from the mean
+AGREED = 0.95  # minimum length of the mean of the sensor's unit vectors; 0.95 if all are 18 degrees from the mean
 DIGITS = 6  # number of decimals of a frame's contribution; the last digits of float64 depend on the memory layout
 SAMPLED = 20_000  # number of triangles that refine a direction; every VOTING-th of them votes for candidates
 VOTING = 5
-DIRECTIONS = 3000  # number of candidate directions on a half-sphere, about 2.6 degrees apart
+DIRECTIONS = 3000  # number of candidate directions on a hemisphere, about 2.6 degrees apart
 SPREAD = np.radians(4.0)  # standard deviation of the normals of level and upright surfaces, rad
 NEAR = np.radians(10.0)  # maximum deviation from level or upright of surfaces that refine the direction, rad
 HELD_WITHIN = np.radians(50.0)  # maximum angle between up and the mean upper edge of the images, rad
-FACING_UP = 2.0  # weight of surfaces that face up; without it, the three axes of a box-shaped room have equal votes
+FACING_UP = 2.0  # weight of surfaces that face up; with weight 1, the axes of a box-shaped room would get equal votes
 MIN_FRACTION = 0.15  # minimum fraction of the surface that is level or upright; a heap of objects has less
 LEVEL = np.cos(np.radians(18.0))  # minimum dot product of up and the normal of a floor
 STEP = 0.05  # bin size of heights, m
@@ -41,7 +41,7 @@ class GravityEstimator:
     """Accumulator of camera orientations and of the sensor's gravity directions over frames."""
 
     def __init__(self) -> None:
-        self.camera_up: Float64 = np.zeros(3)  # (3,) sum of unit vectors to the upper edges of images, world frame
+        self.camera_up: Float64 = np.zeros(3)  # (3,) sum of unit vectors towards upper image edges, world frame
         self.sensed_up: Float64 = np.zeros(3)  # (3,) sum of the sensor's unit vectors against gravity, world frame
         self.sensed_frames = 0  # number of frames with a gravity direction from the sensor
         self._warned = False
@@ -57,7 +57,7 @@ class GravityEstimator:
             self.sensed_frames += 1
 
     def saved(self) -> dict[str, Any]:
-        """Return the entries for the header of a map."""
+        """Return the entries for the header of the map file."""
         return {
             "camera_up": self.camera_up.tolist(),
             "sensed_up": self.sensed_up.tolist(),
@@ -66,7 +66,7 @@ class GravityEstimator:
 
     @classmethod
     def of(cls, header: MapHeader) -> GravityEstimator:
-        """Return the estimator saved in a map's header. Raises DataError if the entries are invalid."""
+        """Return the estimator saved in the header of a map file. Raises DataError if the entries are invalid."""
         found = cls()
         found.camera_up = _vector(header, "camera_up")
         found.sensed_up = _vector(header, "sensed_up")
@@ -80,7 +80,7 @@ class GravityEstimator:
         return found
 
     def sensed(self) -> Float64 | None:
-        """Return the sensor's up vector (3,) in the world frame, None without a sensor or if frames disagree."""
+        """Return the sensor's up vector (3,) in the world frame; None without a sensor, or if the frames disagree."""
         length = float(np.linalg.norm(self.sensed_up))
         if not self.sensed_frames:
             return None
@@ -131,7 +131,7 @@ def _vector(header: MapHeader, key: str) -> Float64:
 
 
 def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float64]:
-    """Return the unit normals (T, 3), areas (T,) m^2 and centers (T, 3) m of the triangles with nonzero area."""
+    """Return the unit normals (N, 3), areas (N,), m^2, and centers (N, 3), m, of the triangles with nonzero area."""
     a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
@@ -140,7 +140,7 @@ def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float6
 
 
 def half_sphere(count: int) -> Float64:
-    """Return unit vectors (count, 3) evenly spread over a half-sphere, in a golden-angle spiral."""
+    """Return unit vectors (count, 3) evenly distributed over the hemisphere z > 0, on a golden-angle spiral."""
     k = np.arange(count) + 0.5
     z = 1 - k / count
     turn, radius = np.pi * (1 + np.sqrt(5)) * k, np.sqrt(1 - z * z)
@@ -148,9 +148,10 @@ def half_sphere(count: int) -> Float64:
 
 
 def level_or_upright(normals: Float64, areas: Float64, directions: Float64, facing_up: float = 1.0) -> Float64:
-    """Return the fraction (D,) of the surface that is level or upright, for each candidate up direction.
+    """Return the fraction (D,) of the surface that is level or upright, for each candidate in `directions` (D, 3).
 
-    Surfaces that face the direction have the weight `facing_up`.
+    Level surfaces that face the direction have the weight `facing_up`. The surface is given by the unit normals (N, 3)
+    and areas (N,) of its triangles.
     """
     signed = normals.astype(np.float32) @ directions.T.astype(np.float32)
     cosines = np.abs(signed)
@@ -161,7 +162,7 @@ def level_or_upright(normals: Float64, areas: Float64, directions: Float64, faci
 
 
 def _refined(up: Float64, normals: Float64, areas: Float64) -> Float64:
-    """Return the direction that best fits the normals of level surfaces and of walls."""
+    """Return the up direction (3,) near `up` that best fits the normals of level surfaces and of walls."""
     for _ in range(5):
         cosines = normals @ up
         level, upright = np.abs(cosines) > np.cos(NEAR), np.abs(cosines) < np.sin(NEAR)
@@ -183,7 +184,7 @@ def floor_height(vertices: Float32, triangles: Int32, up: Float64) -> float | No
         return None
     edges = np.arange(heights[level].min(), heights[level].max() + 2 * STEP, STEP)
     area, _ = np.histogram(heights[level], edges, weights=areas[level])
-    wide = area + np.append(area[1:], 0)  # a floor may lie on the edge between two steps
+    wide = area + np.append(area[1:], 0)  # a floor may be at the edge between two bins
     lowest = int(np.argmax(wide >= FLOOR_FRACTION * area.sum()))
     within = level & (heights >= edges[lowest]) & (heights < edges[lowest] + 2 * STEP)
     height = float(np.average(heights[within], weights=areas[within]))

@@ -35,7 +35,7 @@ from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVo
 from framework.sensors.noise_models import SensorKind
 
 FORMAT = 8  # format of the map file; increment it when the meaning of the contents changes
-LARGEST_SCALE = 2**40  # largest scale of quantized class scores
+LARGEST_SCALE = 2**40  # maximum scale of quantized class scores
 
 
 class InstanceMap(InstanceTableMap):

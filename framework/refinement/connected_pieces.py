@@ -1,6 +1,6 @@
 """Connected components of a cluster, in the image and in depth.
 
-A custom kernel is used, because OpenCV and SciPy label binary images: they ignore depth and connect only adjacent
+A custom kernel is used, because OpenCV and SciPy label binary images. They ignore depth and connect only adjacent
 pixels. A graph over all pairs of nearby pixels would have 12 edges per point.
 """
 
@@ -26,7 +26,7 @@ def in_largest_piece(clusters: PointClusters, frame: Frame, connection: Connecti
 def in_near_pieces(
     clusters: PointClusters, frame: Frame, connection: Connection, min_ratio: float, max_slope: float
 ) -> Bool:
-    """Return an array (P,), True for points in the largest component of their cluster or a component at similar depth.
+    """Return an array (P,), True for points in their cluster's largest component, or in one at a similar depth.
 
     Candidates are components with at least `min_ratio` times the points of the largest component, largest first. A
     candidate is kept if most of its points agree in depth with the nearest kept point. The allowed difference is the

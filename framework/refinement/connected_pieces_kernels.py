@@ -28,7 +28,7 @@ def find_pieces(
     pixels: Int32, firsts: Int64, depth: Float32, connection: Connection, min_ratio: np.float32, max_slope: np.float32,
     schedule: ThreadSchedule, stays: Bool,
 ) -> None:  # fmt: skip
-    """Set `stays` (M,) to True for the points that `in_near_pieces` keeps; `max_slope` is its slope over fx, 1/px."""
+    """Set `stays` (M,) to True for the points that `in_near_pieces` keeps; `max_slope` is divided by fx, 1 / px."""
     for thread in prange(len(schedule.starts) - 1):
         for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:
             if firsts[k + 1] > firsts[k]:
@@ -42,8 +42,8 @@ def _find_pieces_of(
 ) -> None:
     """Find the components of one cluster by union-find over runs of connected pixels in each row.
 
-    Cells are in flat arrays, row by row, with empty cells at the end of each row. So offsets to neighbors are constant
-    and no run continues in the next row.
+    Cells are in flat arrays, row by row, with empty cells at the end of each row. Therefore, offsets to neighbors are
+    constant, and no run continues in the next row.
     """
     u0, v0, u1, v1 = bounding_box(pixels)
     reach = connection.radius
@@ -84,7 +84,7 @@ def _keep_near(
     pixels: Int32, piece: Int32, sizes: Int32, largest: int, min_ratio: np.float32, depth: Float32,
     connection: Connection, max_slope: np.float32, stays: Bool,
 ) -> None:  # fmt: skip
-    """Mark each component whose depth is similar to that of the kept components, largest first."""
+    """Set `stays` to True for each component at a similar depth to the kept components, largest component first."""
     least = min_ratio * np.float32(sizes[largest])
     candidates, waiting, count = np.empty(len(sizes), np.int64), np.zeros(len(sizes), np.bool_), 0
     for other in range(len(sizes)):
@@ -133,7 +133,7 @@ def _sample(pixels: Int32, piece: Int32, wanted: int, most: int, samples: Int32)
 
 @njit(cache=True, nogil=True)
 def _is_near(samples: Int32, kept: Int32, depth: Float32, connection: Connection, max_slope: np.float32) -> bool:
-    """Return True if most samples agree in depth with the nearest kept pixel, up to the maximum slope of a surface."""
+    """Return True if most samples agree in depth with the nearest kept pixel, within the gap and the maximum slope."""
     near = 0
     for k in range(len(samples)):
         u, v = samples[k, 0], samples[k, 1]
@@ -156,7 +156,7 @@ def _name_by_roots(parents: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _find_runs(readings: Float32, connection: Connection, runs: Int32, parents: Int32, sizes: Int32) -> int:
-    """Label each run as a separate component from 1 on, and empty cells as 0; return the number of labels with 0."""
+    """Label each run as a component, from 1 on, and empty cells as 0; return the number of labels, including 0."""
     run, begin = 0, 0
     parents[0], sizes[0] = 0, 0
     previous = np.float32(np.nan)
@@ -181,7 +181,7 @@ def _connected(a: np.float32, b: np.float32, connection: Connection) -> bool:
 def _unite_near(
     readings: Float32, runs: Int32, cells: int, offset: int, connection: Connection, parents: Int32
 ) -> None:
-    """Unite the runs of each cell and the cell `offset` cells after it, if they are connected in depth."""
+    """Unite the run of each cell with the run `offset` cells after it if both cells are connected in depth."""
     for begin in range(0, cells, CHUNK):
         end = min(begin + CHUNK, cells)
         here, there = slice(begin, end), slice(begin + offset, end + offset)

@@ -1,4 +1,4 @@
-"""Lifting of detected masks to 3D point clusters (equation [5] of docs/method.md)."""
+"""Lifting of detected masks to 3D point clusters (eq. (5) of docs/method.md)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from framework.refinement.lifting_kernels import count_readings, gather_readings
 def lift(detections: Detections, frame: Frame, pose: Pose, color_pixels: Int32 | None = None) -> PointClusters:
     """Return the depth readings in each mask as points, m, in the world frame.
 
-    `color_pixels` (H, W) has the flat index of the color pixel for each depth reading, -1 = none. With None, color and
-    depth have the same pixels. `color_pixels` is not applied to exact masks of the depth image.
+    `color_pixels` (H, W) is the flat index of the color pixel of each depth reading, -1 = none. None = color and depth
+    have the same pixels. `color_pixels` is not applied to exact masks of the depth image.
 
-    Masks may overlap. A mask without depth readings gives an empty cluster, so that cluster k is detection k. Raises
-    DataError if the mask size differs from the frame size or if `detections` has another type.
+    Masks may overlap. A mask without depth readings becomes an empty cluster, so that cluster k is always detection k.
+    Raises DataError if the mask size differs from the frame size or if `detections` has another type.
     """
     if not isinstance(cast(object, detections), Detections):
         raise DataError(f"frame {frame.index}: expected Detections from the detector, got {type(detections).__name__}")

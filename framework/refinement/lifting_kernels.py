@@ -36,7 +36,7 @@ def gather_readings(
     masks: Bool, depth: Float32, camera: tuple[float, float, float, float], T: Float64, starts: Int64,
     points_world: Float32, pixels: Int32, cluster: Int32,
 ) -> None:  # fmt: skip
-    """Set points_world (P, 3) m, pixels (P, 2) (u, v) and cluster (P,) by row of each mask; T is T_world_camera."""
+    """Set points_world (P, 3), m, pixels (P, 2) and cluster (P,), row by row of each mask; T is T_world_camera."""
     height = depth.shape[0]
     fx, fy, cx, cy = camera
     for row in prange(masks.shape[0] * height):

@@ -1,4 +1,4 @@
-"""Points of each mask and of a ring around it, which shows the object's surroundings.
+"""Points of each mask and of a ring around it, which contains the object's surroundings.
 
 A custom kernel computes the distances to a mask's border. OpenCV's distance transform would need two passes over each
 mask, one for the inside and one for the outside.
@@ -25,7 +25,7 @@ from framework.refinement.neighborhood_kernels import (
     signed_distances,
 )
 
-MAX_RING_WIDTH = 80  # px; wider rings add no information about the object
+MAX_RING_WIDTH = 80  # maximum width of a ring, px; wider rings add no information about the object
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Neighborhoods:
 
     points_camera: Float32  # (S, 3) m
     depth_in_mask: Float32  # (S,) distance to the mask's border, px, positive in the mask, negative in the ring
-    starts: Int64  # (N + 1,)
-    mask_counts: Int64  # (N,)
-    ring_widths: Int64  # (N,) px
+    starts: Int64  # (N + 1,) start of each neighborhood
+    mask_counts: Int64  # (N,) number of points of each mask
+    ring_widths: Int64  # (N,) width of each ring, px
     mask_radii: Float32  # (N,) largest `depth_in_mask` of the mask, px; 0 for an empty cluster
 
     def __len__(self) -> int:
@@ -57,11 +57,11 @@ class Neighborhoods:
         return np.repeat(np.arange(len(parts)) % 2 == 1, parts)
 
     def mask_log_odds(self, largest: float, expected_bleed: float) -> Float32:
-        """Return the log-odds (S,) of each point for the object: `largest` deep in the mask, -`largest` far outside.
+        """Return the log-odds (S,) of a point being on the object: `largest` deep in the mask, -`largest` far outside.
 
-        The linear ramp in between is 0 at `expected_bleed` ring widths inside the mask's border. It ends 1 - 2
-        `expected_bleed` ring widths outside the border. A thin mask gets a shorter ramp, so that its center gets
-        `largest`.
+        The linear ramp in between is 0 at a distance of `expected_bleed` ring widths inside the mask's border. It ends
+        (1 - 2 * `expected_bleed`) ring widths outside the border. A thin mask gets a shorter ramp, so that its center
+        gets `largest`.
         """
         reach = np.maximum(np.minimum(self.ring_widths, self.mask_radii), 1).astype(np.float32)
         log_odds, widths = np.empty_like(self.depth_in_mask), reach * np.float32(1 - expected_bleed)
@@ -78,9 +78,9 @@ class Surroundings:
     order: slice | Int64  # indices of the M points of all clusters, cluster by cluster
     windows: Windows
     steps: Int16  # (cells,) signed distance in thirds of a pixel: above 0 in the mask, below 0 in the ring, otherwise 0
-    ring_counts: Int64  # (N,) depth readings in each ring
-    ring_widths: Int64  # (N,) px
-    mask_radii: Float32  # (N,) px
+    ring_counts: Int64  # (N,) number of depth readings in each ring
+    ring_widths: Int64  # (N,) width of each ring, px
+    mask_radii: Float32  # (N,) maximum distance to the border in each mask, px
 
     @property
     def mask_counts(self) -> Int64:
@@ -88,7 +88,7 @@ class Surroundings:
         return np.diff(self.windows.firsts)
 
     def of_at_least(self, min_points: int) -> Bool:
-        """Return an array (N,), True for clusters with `min_points` or more points in the mask and in any ring."""
+        """Return an array (N,), True for clusters with at least `min_points` points in the mask and any ring."""
         return np.asarray(
             (self.mask_counts >= min_points) & ((self.ring_counts >= min_points) | (self.ring_widths == 0))
         )
@@ -100,7 +100,7 @@ class Surroundings:
         return self._gathered(-(-counts // nth), -(-self.mask_counts // nth), nth)
 
     def own(self) -> Neighborhoods:
-        """Return the M points of the clusters without the rings."""
+        """Return the M points of the clusters, without the rings."""
         return self._gathered(self.mask_counts, self.mask_counts, np.ones_like(self.ring_counts))
 
     def kept(self, good: Bool, judged: Bool) -> Bool:
@@ -148,8 +148,8 @@ def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundi
 
     A ring contains the pixels with a depth reading around the cluster. Its width is `ring_fraction` * sqrt(points in
     the cluster) px, clipped to [`min_ring`, `max_ring`] px. With `ring_fraction=0` the ring is empty. A ring may
-    contain pixels of other clusters. Pixels of known structure count as pixels without a reading, because they are
-    already separated from the object.
+    contain pixels of other clusters. Pixels of known structure, such as floors, count as pixels without a reading,
+    because they are already separated from the object.
     """
     order, firsts = members(clusters)
     pixels, areas = clusters.pixels[order], np.diff(firsts)
@@ -180,9 +180,9 @@ def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
 
 
 def thread_schedule(costs: Int64) -> ThreadSchedule:
-    """Return the clusters of each thread, assigned costliest first to the thread with the least work (Graham 1969).
+    """Return the clusters of each thread, assigned by decreasing cost to the least busy thread (Graham 1969).
 
-    Numba splits a parallel loop into parts of equal length, but a few large clusters contain most of the points.
+    Numba divides a parallel loop into parts of equal length, but a few large clusters contain most of the points.
     """
     longest_first = np.argsort(-costs, kind="stable")
     return ThreadSchedule(*share_among_threads(costs, longest_first, numba.get_num_threads()))

@@ -23,7 +23,7 @@ class Windows(NamedTuple):
 
     pixels: Int32  # (M, 2) (u, v), cluster by cluster
     firsts: Int64  # (N + 1,) start of each cluster in `pixels`
-    bounds: Int64  # (N, 4) v0 u0 v1 u1 (half open)
+    bounds: Int64  # (N, 4) v0, u0, v1, u1; v1 and u1 are exclusive
     cells: Int64  # (N + 1,) start of each window in flat arrays of all windows
 
 
@@ -57,7 +57,7 @@ def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
 
 @njit(cache=True, nogil=True)
 def share_among_threads(costs: Int64, longest_first: Int64, threads: int) -> tuple[Int64, Int64]:
-    """Return the clusters in thread order, assigned by cost, and the start of each thread."""
+    """Return the clusters (N,) in the order of their threads, and the start (threads + 1,) of each thread."""
     loads, owners, starts = np.zeros(threads, np.int64), np.empty(len(costs), np.int64), np.zeros(threads + 1, np.int64)
     for k in longest_first:
         least = 0
@@ -78,7 +78,7 @@ def share_among_threads(costs: Int64, longest_first: Int64, threads: int) -> tup
 
 @njit(cache=True, nogil=True)
 def bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, bounds: Int64) -> None:
-    """Set bounds (N, 4) v0 u0 v1 u1 (half open) to the bounding box of each cluster and its ring in the image."""
+    """Set bounds (N, 4), v0, u0, v1, u1, to the bounding box of each cluster and its ring; v1 and u1 are exclusive."""
     for k in range(len(widths)):
         if firsts[k] < firsts[k + 1]:
             u0, v0, u1, v1 = bounding_box(pixels[firsts[k] : firsts[k + 1]])
@@ -88,7 +88,7 @@ def bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, 
 
 @njit(cache=True, nogil=True)
 def bounding_box(pixels: Int32) -> tuple[int, int, int, int]:
-    """Return the lowest u and v and the highest u and v of one or more pixels."""
+    """Return the minimum u and v and the maximum u and v of one or more pixels."""
     u0, v0 = pixels[0, 0], pixels[0, 1]
     u1, v1 = u0, v0
     for i in range(len(pixels)):
@@ -127,9 +127,9 @@ def _signed_distances_of(
 ) -> tuple[int, np.float32]:
     """Return the number of readings in the ring and the mask's radius, px.
 
-    One grid holds the distances to the mask and to the rest side by side, each surrounded by FAR cells. A shortest path
-    may take its horizontal steps first, in the row of its source. So each row is first filled with the distances along
-    the row. Two vectorized sweeps, down and up, then add the vertical and diagonal steps.
+    One grid holds the distances to the mask and to the readings outside it side by side, each surrounded by FAR cells.
+    A shortest path may take its horizontal steps first, in the row of its source. Therefore, each row is first filled
+    with the distances along the row. Two vectorized sweeps, down and up, then add the vertical and diagonal steps.
     """
     v0, u0 = bounds[0], bounds[1]
     rows, columns = bounds[2] - v0, bounds[3] - u0
@@ -235,7 +235,7 @@ def gather(
     windows: Windows, steps: Int16, depth: Float32, pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64,
     schedule: ThreadSchedule, points: Float32, depth_in_mask: Float32,
 ) -> None:  # fmt: skip
-    """Set the points (S, 3), m, as in geometry.back_project, and their `depth_in_mask` (S,), px."""
+    """Set the camera-frame points (S, 3), m, as in geometry.back_project, and their `depth_in_mask` (S,), px."""
     firsts, cells = windows.firsts, windows.cells
     for thread in prange(len(schedule.starts) - 1):
         for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:
@@ -246,7 +246,8 @@ def gather(
                 points[starts[k] : middle], depth_in_mask[starts[k] : middle],
             )  # fmt: skip
             if middle < end:
-                skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])  # n-th points of mask and ring together
+                # every n-th point of mask and ring together
+                skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])
                 _gather_ring(
                     bounds, own_steps, depth, pinhole, skipped, nth[k], points[middle:end], depth_in_mask[middle:end]
                 )

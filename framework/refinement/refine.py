@@ -17,9 +17,9 @@ from framework.refinement.refine_kernels import compress, part_starts
 def refine(refiner: ClusterRefiner, clusters: PointClusters, frame: Frame) -> PointClusters:
     """Return the refined clusters.
 
-    Exact clusters from ground-truth masks and clusters of frames without detection stay unchanged. Raises DataError if
-    the refiner does not return PointClusters or returns pixels outside the image. Later stages index the frame with
-    these pixels without another check.
+    Exact clusters from ground-truth masks, and clusters of frames without a detector run, remain unchanged. Raises
+    DataError if the refiner does not return PointClusters or returns pixels outside the image. Later stages index the
+    frame with these pixels without another check.
     """
     if clusters.exact or not clusters.detected:
         return clusters
@@ -31,7 +31,7 @@ def refine(refiner: ClusterRefiner, clusters: PointClusters, frame: Frame) -> Po
 
 
 def keep_points(clusters: PointClusters, kept: Bool) -> PointClusters:
-    """Return the clusters without the points with `kept` (P,) False.
+    """Return the clusters with only the points for which `kept` (P,) is True.
 
     Clusters keep their index, scores and classes, so that cluster k is detection k even without points.
     """

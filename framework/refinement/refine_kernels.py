@@ -7,7 +7,7 @@ from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32, Int64
 
-PART = 8192  # rows that a thread processes at once
+PART = 8192  # number of rows that a thread processes at once
 
 
 @njit(cache=True, nogil=True)
@@ -28,7 +28,7 @@ def compress(
     points: Float32, pixels: Int32, cluster: Int32, kept: Bool, starts: Int64, kept_points: Float32,
     kept_pixels: Int32, kept_cluster: Int32,
 ) -> None:  # fmt: skip
-    """Copy the kept rows, which is faster than boolean indexing of three arrays."""
+    """Copy the kept rows of three arrays. This is faster than Boolean indexing."""
     for part in prange(len(starts) - 1):
         k = starts[part]
         for i in range(part * PART, min((part + 1) * PART, len(kept))):

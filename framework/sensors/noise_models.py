@@ -1,4 +1,4 @@
-"""Noise models of depth sensors: the standard deviation (m) of a depth reading at depth z (m).
+"""Noise models of depth sensors: the standard deviation, m, of a depth reading at depth z, m.
 
 For a surface at the angle theta to the image plane:
 
@@ -37,14 +37,14 @@ FLOOR = 0.001  # m, the usual step of stored depth; no reading is more accurate
 
 
 class DepthNoise(NamedTuple):
-    """The coefficients of a noise model, flat for kernels."""
+    """Coefficients of a noise model, in a flat tuple, as kernels require."""
 
     least: float  # m, standard deviation at `near`
     near: float  # m, depth of the smallest standard deviation
     growth: float  # 1 / m, quadratic growth with depth
     slant: float = 0.0  # m^1.5, growth on slanted surfaces
     far_slant: float = 0.0  # m^-0.5, growth on slanted surfaces at larger depths
-    full_weight_depth: float = 0.0  # m, nearly constant noise up to this depth; 0 = noise grows with depth squared
+    full_weight_depth: float = 0.0  # m, depth up to which noise is nearly constant; 0 = noise grows with depth squared
 
 
 class SensorKind(Enum):
@@ -66,7 +66,7 @@ class SensorKind(Enum):
         return self.value
 
     def sigma(self, z: float | NDArray[np.float32]) -> NDArray[np.floating]:
-        """Return the standard deviation (m), of the shape of `z` (m), for surfaces that face the camera."""
+        """Return the standard deviation, m, with the shape of `z`, m, for surfaces that face the camera."""
         least, near, growth = self.noise[:3]
         return np.maximum(FLOOR, least + growth * (z - near) ** 2)
 
@@ -87,7 +87,7 @@ class SensorChoice(Enum):
     PHONE_LIDAR = "LiDAR of an iPhone or iPad"
 
     def kind(self, stored: SensorKind) -> SensorKind:
-        """Return the chosen kind; AUTO = `stored`."""
+        """Return the chosen kind of sensor; for AUTO, the `stored` kind."""
         return stored if self is SensorChoice.AUTO else SensorKind[self.name]
 
 

@@ -1,7 +1,7 @@
 """Kernels of noise_models.py.
 
 They accept a `DepthNoise`, or another named tuple with the fields `least`, `near` and `growth`, as an argument. Do not
-change the order of multiplications: results would differ in the last digit, and maps would no longer be byte-identical.
+change the order of multiplications. Otherwise, results differ in the last digit, and maps are no longer byte-identical.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from numba import njit
 
 from framework.sensors.noise_models import FLOOR, DepthNoise, SensorKind
 
-LARGEST_THETA = np.float32(np.deg2rad(80))  # limit of the fits; the models diverge at larger angles
+LARGEST_THETA = np.float32(np.deg2rad(80))  # maximum angle of the fits, rad; the models diverge at larger angles
 
 _KINECT_V1 = SensorKind.KINECT_V1.noise
 
@@ -21,20 +21,20 @@ device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fas
 
 @device
 def axial_sigma(z: float, noise: DepthNoise) -> float:
-    """Return sigma(z, 0) in m, in double precision."""
+    """Return sigma(z, 0), m, in double precision."""
     return max(FLOOR, noise.least + noise.growth * (z - noise.near) ** 2)
 
 
 @device
 def axial_sigma_single(z: np.float32, noise: DepthNoise) -> np.float32:
-    """Return sigma(z, 0) in m, in single precision."""
+    """Return sigma(z, 0), m, in single precision."""
     beyond = z - np.float32(noise.near)
     return max(np.float32(FLOOR), np.float32(noise.least) + np.float32(noise.growth) * beyond * beyond)
 
 
 @device
 def axial_sigma_at_angle(z: np.float32, theta: np.float32, noise: DepthNoise) -> np.float32:
-    """Return sigma(z, theta) in m, in single precision, with theta in rad."""
+    """Return sigma(z, theta), m, in single precision; theta in rad."""
     theta = min(theta, LARGEST_THETA)
     beyond = z - np.float32(noise.near)
     upright = np.float32(np.pi / 2) - theta
@@ -47,5 +47,5 @@ def axial_sigma_at_angle(z: np.float32, theta: np.float32, noise: DepthNoise) ->
 
 @device
 def noise_ratio(z: float, noise: DepthNoise) -> float:
-    """Return the ratio of sigma(z, 0) to that of KINECT_V1, for limits that were tuned for KINECT_V1."""
+    """Return the ratio of sigma(z, 0) to sigma(z, 0) of KINECT_V1, to scale limits that were tuned for KINECT_V1."""
     return float(axial_sigma(z, noise) / axial_sigma(z, _KINECT_V1))

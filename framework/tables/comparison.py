@@ -47,9 +47,8 @@ class TableChoice:
     columns_by: str | None = None  # config key with one column per value; None = one column per metric
     group_by: str | None = None  # config key with one group of lines per value; None = one line per row
     baseline: str | None = None  # row for comparisons; None = the first row
-    columns: list[str] = field(
-        default_factory=list
-    )  # keys of metrics.json, at least one; with `columns_by`, exactly one
+    # keys of metrics.json, at least one; with `columns_by`, exactly one
+    columns: list[str] = field(default_factory=list)
     names: dict[str, str] = field(default_factory=dict)  # display names by row
     published: str | None = None  # section of published.yaml, if all runs use the original SceneNN data; None = none
 
@@ -99,18 +98,18 @@ class ComparisonTable:
     title: str
     choice: TableChoice
     rows: list[RunRow]  # each with at least one run
-    overrides: Mapping[str, Sequence[str]]  # by row of the experiment, also for rows without runs
-    requested: list[Run]  # requested runs of the last sweep for every row, also if not started
+    overrides: Mapping[str, Sequence[str]]  # by row of the experiment, including rows without runs
+    requested: list[Run]  # runs of the last sweep for every row, including runs that have not started
     incomplete: list[Incomplete]
     superseded: int  # number of older records of the same runs
     root: Path  # base of relative run names
-    left_out: Sequence[str] = ()  # omitted columns of PLAIN, without values in all runs
+    left_out: Sequence[str] = ()  # columns of PLAIN that are omitted, because no run has a value
 
     @classmethod
     def below(cls, directory: Path) -> ComparisonTable:
-        """Return the table of the runs in and below `directory`, as set by its experiment or with the columns PLAIN.
+        """Return the table of the runs in and below `directory`, as set by its experiment, or with the columns PLAIN.
 
-        Raises DataError if no run is complete or the experiment's config cannot be read.
+        Raises DataError if no run is complete, or if the experiment's config cannot be read.
         """
         if not directory.is_dir():
             raise DataError(f"{directory}: expected a folder of runs, got no folder")
@@ -136,7 +135,7 @@ class ComparisonTable:
 
     @property
     def judged(self) -> bool:
-        """True if a metric depends on ground-truth instances, which may have several annotation releases."""
+        """True if a metric of the table depends on ground-truth instances, whose annotation release must be stated."""
         annotated = self.choice.split_key or any(record.annotation for record in self.records)
         return bool(annotated) and any(map(is_evaluation, self.choice.columns))
 
@@ -150,11 +149,11 @@ class ComparisonTable:
 
     @property
     def noun(self) -> str:
-        """Last component of the split key: `scene` for dataset.scene."""
+        """Last component of the split key, such as `scene` for dataset.scene."""
         return (self.choice.split_key or "").rpartition(".")[2]
 
     def base_of(self, row: RunRow) -> RunRow | None:
-        """Return the baseline of `row`; None for the baseline itself and if the variant has no baseline."""
+        """Return the baseline of `row`; None for the baseline itself, and for a variant without a baseline."""
         named = [other for other in self.rows if other.name == self.base_name]
         bases = named or [r for r in self.rows if r.system == self.base_name and r.variant == row.variant]
         return bases[0] if bases and bases[0] is not row else None
@@ -206,7 +205,7 @@ class ComparisonTable:
 
     @cached_property
     def sequences(self) -> list[str]:
-        """Values of the split key: those of the published table, followed by those of the runs."""
+        """Values of the split key: those of the published table, then those of the runs."""
         found = {run[-1] for run in self._runs} if self.choice.split_key else set()
         order = sorted(found, key=lambda value: natural((value,)))
         return list(dict.fromkeys([*self.published.sequences, *order]))
@@ -252,7 +251,7 @@ def mean_by_sequence(values: Mapping[Run, float]) -> dict[str, Mean]:
 
 
 def mean_over_sequences(values: Mapping[Run, float]) -> SequenceMean:
-    """Return the mean of the sequences, with equal weights."""
+    """Return the mean over the sequences, with equal weights."""
     means = mean_by_sequence(values)
     seeds: dict[Run, list[float]] = {}
     for run, value in values.items():
@@ -263,5 +262,5 @@ def mean_over_sequences(values: Mapping[Run, float]) -> SequenceMean:
 
 
 def mean_difference(differences: Mapping[Run, float]) -> Mean:
-    """Return the mean of paired differences, with its standard error over sequences, as seeds are not independent."""
+    """Return the mean of paired differences; its standard error is over sequences, as seeds are not independent."""
     return Mean.of(mean.value for mean in mean_by_sequence(differences).values())

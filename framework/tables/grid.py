@@ -19,19 +19,19 @@ class TextTable:
 
 
 def decimals(values: Iterable[float]) -> int:
-    """Return the number of decimals for about three digits of the largest value; NaN is ignored."""
+    """Return the number of decimals for about three significant digits of the largest value; NaN is ignored."""
     largest = max((abs(value) for value in values if not math.isnan(value)), default=0.0)
     return next((3 - k for k, limit in enumerate((2, 20, 200)) if largest < limit), 0)
 
 
 def figure(value: float, spread: float, digits: int, signed: bool = False) -> str:
     """Return the text `value ± spread`; a NaN spread is omitted."""
-    text = f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # + 0.0: no -0.000
+    text = f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # + 0.0 avoids -0.000
     return text if math.isnan(spread) else f"{text} ± {spread:.{digits}f}"
 
 
 def markdown_grid(grid: TextTable) -> str:
-    """Return the table as Markdown, padded for terminals."""
+    """Return the table as Markdown, with columns padded for terminals."""
     cells = [[" ".join(cell.replace("|", "\\|").split()) for cell in line] for line in (grid.heads, *grid.body)]
     for line, column in grid.bold:
         cells[line + 1][column] = f"**{cells[line + 1][column]}**"
@@ -72,5 +72,5 @@ def _escaped(cell: str) -> str:
 
 def _latex_line(cells: Iterable[str]) -> str:
     line = " & ".join(cells) + " \\\\"
-    # Without {}, the previous line's command would take the mark as its argument.
+    # Without {}, the command of the previous line would interpret the mark as its argument.
     return f"{{}}{line}" if line.startswith(("*", "[")) else line

@@ -53,7 +53,7 @@ def head(key: str) -> str:
 
 
 def row_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a table with the mean and deviation of each row, and the published rows below."""
+    """Return a table with the mean and standard deviation of each row, followed by the published rows."""
     keys = comparison.choice.columns
     means = {key: [row.mean(key) for row in comparison.rows] for key in keys}
     digits = {key: decimals(mean.value for mean in of_key) for key, of_key in means.items()}
@@ -109,7 +109,7 @@ class _SequenceFigures:
         return {sequence for of_row in self.means.values() for sequence in of_row}
 
     def cell(self, row: RunRow, sequence: str, digits: int) -> _Cell:
-        """Return mean ± deviation over seeds, with the number of seeds if values are missing."""
+        """Return the mean ± standard deviation over seeds, with the number of seeds if values are missing."""
         if not any(run[-1] == sequence for run in row.records):
             return MISSING, math.nan
         mean = self.means[row.name].get(sequence, Mean.of(()))
@@ -118,7 +118,7 @@ class _SequenceFigures:
         return _mean_cell(mean, digits, self._seeds), mean.value if mean.count == most else math.nan
 
     def mean_cell(self, row: RunRow, expected: int, digits: int) -> _Cell:
-        """Return mean ± deviation over seeds, with the number of sequences or runs if some are missing."""
+        """Return the mean ± standard deviation over seeds, with the number of sequences or runs if some are missing."""
         mean = self._overall[row.name]
         others = [self._overall[other.name] for other in self._rows if other.variant == row.variant]
         competes = (mean.count, mean.runs) == max((other.count, other.runs) for other in others)
@@ -129,7 +129,7 @@ class _SequenceFigures:
 
 
 def across_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a table with a column per sequence, which contains each row's mean over seeds, and a column of means."""
+    """Return a table of each row's means over seeds: one column per sequence, and a column with their mean."""
     [key] = comparison.choice.columns
     figures, sequences = _SequenceFigures(comparison, key), comparison.sequences
     digits = _decimals([figures])
@@ -147,7 +147,7 @@ def across_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def by_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a table with a group of lines per sequence, one line per row; the last group contains the means."""
+    """Return a table with a group of lines per sequence, and one line per row. The last group contains the means."""
     keys = comparison.choice.columns
     rows = [row for rows in _by_variant(comparison.rows) for row in rows]
     figures = [_SequenceFigures(comparison, key) for key in keys]
@@ -174,7 +174,7 @@ def by_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def difference_across_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a table of the baseline minus each other row: by sequence, and the mean with its standard error."""
+    """Return a table of the baseline minus each other row, by sequence, and their mean with its standard error."""
     [key] = comparison.choice.columns
     differences = {row.name: base.differences(row, key) for row, base in comparison.compared}
     paired = {run[-1] for runs in differences.values() for run in runs}
@@ -207,7 +207,7 @@ def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], digits: int) ->
 
 
 def _highest(section: Sequence[_Line], digits: int) -> Iterator[tuple[int, int]]:
-    """Yield the (line, column) of the highest printed values among the lines of each variant."""
+    """Yield the (line, column) of each highest printed value among the lines of a variant."""
     for k, line in enumerate(section):
         competing = [other.cells for other in section if other.variant == line.variant]
         for column, (_, value) in enumerate(line.cells):
@@ -249,7 +249,7 @@ def published_name(published: PublishedRow) -> str:
 
 
 def published_cell(published: PublishedRow, key: Key, digits: int) -> str:
-    """Return a published number as text: NOT_KNOWN if not looked up, NOTHING if missing in the source."""
+    """Return a published number as text; NOT_KNOWN = not looked up, NOTHING = not in the source."""
     value = (published.values or {}).get(key, math.nan)
     if value is None:
         return NOT_KNOWN
@@ -267,7 +267,7 @@ def _difference(mean: Mean, digits: int) -> str:
 
 
 def _of(text: str, count: int, expected: int) -> str:
-    """Return the text, with the count if it differs from the expected count."""
+    """Return the text, with the count appended if it differs from the expected count."""
     if not count:
         return NOTHING
     return text if count == expected else f"{text} ({count} of {expected})"

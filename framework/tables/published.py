@@ -15,7 +15,7 @@ from framework.errors import ConfigError
 FILE = Path(__file__).with_suffix(".yaml")
 DATASET = "scenenn"  # dataset of the published results
 SYNTHETIC = "synthetic"  # first word of the annotation release of scenes written by `instancemap synthesize`
-NOT_KNOWN = "not known"  # printed for numbers that were not looked up
+NOT_KNOWN = "not known"  # text in place of numbers that were not looked up
 
 Key = tuple[str, ...]  # ("fps",), ("011",) or ("011", "instances.ap50.bed"), depending on the layout
 
@@ -30,14 +30,14 @@ class PublishedRow:
     poses: str  # source of the poses
     annotation: str  # release of the annotation
     decimals: int  # number of known decimals of the values
-    values: Mapping[Key, float | None] | None  # in the project's unit; None = not looked up
+    values: Mapping[Key, float | None] | None  # in the unit of metrics.json; None = not looked up
 
     def knows(self, keys: Iterable[Key]) -> bool:
-        """Return True if a number of any key is known."""
+        """Return True if the number for at least one of the keys is known."""
         return any((self.values or {}).get(key) is not None for key in keys)
 
     def leaves_open(self, keys: Iterable[Key]) -> bool:
-        """Return True if a number of any key was not looked up."""
+        """Return True if the number for at least one of the keys was not looked up."""
         return self.values is None or any(key in self.values and self.values[key] is None for key in keys)
 
 

@@ -80,7 +80,7 @@ def _with_needs(columns: Sequence[str]) -> str:
 
 
 def _winners(comparison: ComparisonTable) -> Iterator[str]:
-    """Yield, for each row, the numbers of sequences in which the baseline is better and worse."""
+    """Yield, for each row, the numbers of sequences in which the baseline has a higher and a lower value."""
     if not comparison.choice.columns_by:
         return
     [key] = comparison.choice.columns
@@ -148,7 +148,7 @@ def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
 
 
 def _same(records: Sequence[Record]) -> str:
-    """Return the common options of all runs, by stage."""
+    """Return the options that all runs have in common, by stage."""
     chosen = {stage: {record.metrics.get(f"{CHOICE}{stage}") for record in records} for stage in STAGES}
     agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}
     return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
@@ -173,7 +173,7 @@ def machine(record: Record) -> str:
 
 
 def counted(words: Iterable[str]) -> str:
-    """Return the distinct words; if there are several, each with its number of runs."""
+    """Return the distinct words, each with its number of runs if there are several words."""
     counts = Counter(words).most_common()
     if len(counts) == 1:
         return counts[0][0]

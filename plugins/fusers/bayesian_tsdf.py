@@ -15,7 +15,7 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.label_rule import DetectionEvidence, LabeledVoxels, LabelRule, floored_log
 
 RULE = LabelRule(Combine.SUM, logarithmic=True)
-MIN_LIKELIHOOD = 1e-3  # minimum likelihood of an instance, so that no single score decides
+MIN_LIKELIHOOD = 1e-3  # minimum likelihood of an instance, so that no single score determines the result
 
 
 @dataclass
@@ -23,14 +23,16 @@ class BayesianTsdf(MapFuser):
     """Two independent Bayesian recursions per voxel, eqs. (7) and (8), as sums of log-likelihoods.
 
     The likelihood of the matched instance in eq. (8) is the score of the detection (our interpretation). The paper does
-    not state the likelihood of other instances. Here it is `instance_floor`. With `instance_floor=0`, 1 - score is
+    not state the likelihood of other instances. Here, it is `instance_floor`. With `instance_floor=0`, 1 - score is
     divided equally among all other instances and "no instance".
     """
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
     association: Association = field(default_factory=Association)
     class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
-    instance_floor: float = 0.05  # likelihood of each other instance, in [0, 1); 0 = equal parts of 1 - score
+    # likelihood of each other instance, in [0, 1); 0 = (1 - score) divided equally among the other instances and
+    # "no instance"
+    instance_floor: float = 0.05
     absence_likelihood: float = 0.7  # P(outside the mask | matched instance), in (0, 1]; 1 = no evidence of absence
 
     def __post_init__(self) -> None:
@@ -52,18 +54,18 @@ class BayesianTsdf(MapFuser):
         with timer("update"):
             evidence = self.evidence(clusters, len(self.scene.table.records))
             measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULE)
-            self.scene.labels.update(seen, measurement)  # the sums of eqs. [7] and [8]
+            self.scene.labels.update(seen, measurement)  # the sums of eqs. (7) and (8)
             self.association.observe(self.scene.table, matches, evidence.classes)
         with timer("association"):
             self.association.merge(self.scene, matches)
 
     def evidence(self, clusters: PointClusters, instances: int) -> DetectionEvidence:
-        """Return log P(O_u | I_t) of eqs. (7) and (8), for the matched instance relative to any other instance."""
-        if self.instance_floor > 0:  # scores count as at least twice the floor, so that no match lowers the log-odds
+        """Return log P(O_u | I_t) of eqs. (7) and (8); for the matched instance, relative to any other instance."""
+        if self.instance_floor > 0:  # a score counts as at least twice the floor, so that no match lowers the log-odds
             log_odds = np.log(np.maximum(clusters.scores, 2 * self.instance_floor) / self.instance_floor)
         else:
             scores = np.clip(clusters.scores, MIN_LIKELIHOOD, 1 - MIN_LIKELIHOOD)
-            # 1 - score has `instances` equal parts, for the other instances and for "no instance"
+            # 1 - score is divided into `instances` equal parts, for the other instances and for "no instance"
             log_odds = np.log(scores * max(instances, 1) / (1 - scores))
         return DetectionEvidence(
             instances=np.asarray(log_odds, np.float32),

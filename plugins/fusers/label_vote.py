@@ -19,7 +19,7 @@ class Vote(Enum):
     """Rule for combining the votes for a voxel's labels."""
 
     COUNT = "count"  # number of detections (Voxblox++, Grinvald et al. 2019)
-    LAST = "last"  # last detection only; for overlapping masks, the later mask
+    LAST = "last"  # last detection only; among overlapping masks, the last mask
     MAX_SCORE = "max_score"  # detection with the highest score
 
 
@@ -56,7 +56,7 @@ class LabelVote(MapFuser):
         with timer("update"):
             weights = np.ones(len(clusters), np.float32)
             if self.vote is Vote.MAX_SCORE:
-                weights = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # a score of 0 would be no evidence
+                weights = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # a score of 0 would not be evidence
             evidence = vote_for_best(clusters, weights)
             measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULES[self.vote])
             self.scene.labels.update(seen, measurement)

@@ -27,10 +27,10 @@ def existence(record: InstanceRecord) -> float:
 class ObjectVolumes(MapFuser):
     """A TSDF with foreground probabilities for each object, and a TSDF of the whole scene.
 
-    A detection belongs to the object with the largest overlap. Several detections may belong to one object, with the
-    union of their masks. The defaults are the rule of Fusion++. Set `overlap_rule=CLUSTER min_overlap=0.05
-    require_same_class=true` for the rule of MaskFusion. `framework/baselines/object_map.py` lists differences from the
-    original systems.
+    A detection belongs to the object with the largest overlap. If several detections belong to one object, the union of
+    their masks is used. The defaults are the rule of Fusion++. Set `overlap_rule=CLUSTER min_overlap=0.05
+    require_same_class=true` for the rule of MaskFusion. `framework/baselines/object_map.py` lists the differences from
+    the original systems.
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
@@ -80,7 +80,7 @@ class ObjectVolumes(MapFuser):
         return count_overlaps(points, seen, stride)
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Matches:
-        """Return the matches: the object with the largest overlap, or a new object if score and size suffice."""
+        """Return the matches: the object with the largest overlap, or a new object if score and size are sufficient."""
         ratios = overlaps.by(self.overlap_rule, self.create_points)
         ratios[~self._agree(clusters, overlaps.instance_ids)] = 0
         instance_ids = np.zeros(len(clusters), np.int32)
@@ -100,14 +100,14 @@ class ObjectVolumes(MapFuser):
         return np.asarray(clusters.class_probabilities.argmax(axis=1)[:, None] == known[None, :])
 
     def _remove_empty(self, instance_ids: Int32) -> None:
-        """Remove new objects without readings in range, because objects without voxels are never seen again."""
+        """Remove new objects without readings in range, because objects without voxels can never be matched."""
         for instance_id in set(instance_ids[instance_ids > 0].tolist()):
             if not self.scene.volumes[instance_id].block_count:
                 self.scene.remove(instance_id)
                 instance_ids[instance_ids == instance_id] = 0
 
     def _remove_unlikely(self) -> None:
-        """Remove the objects with a low existence probability."""
+        """Remove the objects with an existence probability below `min_existence`."""
         for record in list(self.scene.table.records.values()):
             if existence(record) < self.min_existence:
                 self.scene.remove(record.id)

@@ -1,1 +1,1 @@
-"""Cluster refiners, which clean the point clusters of one frame."""
+"""Cluster refiners, which clean, split or merge the point clusters of one frame."""

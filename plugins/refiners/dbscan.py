@@ -23,8 +23,8 @@ class Dbscan(ClusterRefiner):
     these core points, even if the points border other components. A cluster without core points stays unchanged.
 
     With a `stride` above 1, only the pixels of every `stride`-th row and column are searched for core points, and
-    `min_points` counts these pixels. If more than `max_points` of a cluster remain, the stride increases, and each
-    point is weighted by the number of points that it represents.
+    `min_points` counts these pixels. If more than `max_points` pixels of a cluster remain, the stride is increased, and
+    each point is weighted by the number of points that it represents.
     """
 
     eps: float = 0.04  # neighborhood radius at depth 0, m, >= 0.001
@@ -74,7 +74,7 @@ class Dbscan(ClusterRefiner):
         core = found.core_sample_indices_
         if len(core) == 0:
             return np.ones(len(points), np.bool_)
-        pieces = found.labels_[core]  # in the order of their first points, so that ties go to the first
+        pieces = found.labels_[core]  # numbered in the order of their first points, so that ties go to the first
         largest = sampled[core[pieces == np.bincount(pieces).argmax()]]
         distances, _ = KDTree(largest).query(points, distance_upper_bound=np.nextafter(eps, np.inf))
         return np.asarray(distances <= eps)

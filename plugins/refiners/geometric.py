@@ -18,15 +18,16 @@ class Geometric(ClusterRefiner):
     """Clusters as unions of the convex depth segments covered by a mask.
 
     Voxblox++ (Grinvald et al., RA-L 2019) cuts the depth image at depth jumps and concave creases. It assigns each
-    segment to the mask with the largest overlap, if the mask covers more than `min_overlap` of the segment. A cluster
-    loses its points outside its segments. With `grow_to_segments` it also gains the segments' pixels outside the mask,
-    if the cluster points determine the camera pose. A mask without a segment loses all points.
+    segment to the mask with the largest overlap, if the mask covers more than `min_overlap` of the segment. Points of a
+    cluster outside its segments are removed. With `grow_to_segments`, the segments' pixels outside the mask are added,
+    if the cluster points determine the camera pose. All points of a mask without a segment are removed.
     """
 
     cell_size: int = 2  # side of the cells of averaged readings, px, >= 1
     window_radius: int = 3  # radius of the square windows for plane fits, in cells, >= 1
     noise_factor: float = 3.0  # noise threshold of depth, in standard deviations of the sensor, >= 0.1
-    min_noise: float = 0.0  # minimum standard deviation of depth, m, >= 0; half the step of rounded readings
+    # minimum standard deviation of depth, m, >= 0; half of the rounding step for rounded readings
+    min_noise: float = 0.0
     max_slope: float = 4.0  # maximum slope of a surface, m per m, >= 0.1; steeper = depth jump (4 = 76 degrees)
     max_angle: float = 15.0  # maximum concave angle within a segment, beyond noise, degrees, in (0, 90)
     closing_radius: int = 1  # radius of the morphological closing of edges, in cells, >= 0

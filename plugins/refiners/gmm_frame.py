@@ -32,9 +32,9 @@ class GmmFrame(ClusterRefiner):
     """Assignment of the points of a frame's masks to the most probable mask, by hierarchical EM.
 
     The refiner applies eqs. (1) to (4) to the points of all masks (section 3.2.2). A pixel in several masks is one
-    point of the mask with the best score. There is no background, and the masks only initialize the mixture. So
-    clusters lose points only to other clusters. The paper does not specify the hierarchy. Levels, children and
-    initialization are our choice (J = 8 after Eckart et al., CVPR 2016).
+    point of the mask with the best score. There is no background, and the masks only initialize the mixture. Therefore,
+    a point leaves its cluster only if it fits another cluster better. The paper does not specify the hierarchy. Levels,
+    children and initialization are our choice (J = 8 after Eckart et al., CVPR 2016).
     """
 
     levels: int = 2  # number of levels of hierarchical EM, >= 1; 1 = flat
@@ -45,7 +45,8 @@ class GmmFrame(ClusterRefiner):
     max_iterations: int = 10  # maximum number of EM iterations in a node, >= 1
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
     std_floor: float = 0.005  # minimum standard deviation of a Gaussian along any axis, m
-    min_support: float = 1e-4  # minimum fraction of the frame's points in a Gaussian, in [0, 1); others are dropped
+    # minimum fraction of the frame's points in a Gaussian, in [0, 1); smaller ones are dropped
+    min_support: float = 1e-4
     min_points: int = 30  # minimum number of points of a refined cluster, >= 1; smaller clusters are dropped
     max_points: int = 20_000  # maximum number of points of a frame for the fit, >= 100; all points are assigned
 
@@ -82,7 +83,7 @@ class GmmFrame(ClusterRefiner):
 
 
 def best_of_pixels(clusters: PointClusters, shape: tuple[int, int]) -> Bool:
-    """Return an array (P,), True for points of the best-scored cluster at their pixel; ties go to the first."""
+    """Return an array (P,), True for points of the highest-scored cluster at their pixel; ties go to the first."""
     rank = np.empty(len(clusters), np.int32)
     rank[np.argsort(-clusters.scores, kind="stable")] = np.arange(len(clusters), dtype=np.int32)
     kept = np.empty(len(clusters.cluster), np.bool_)

@@ -23,11 +23,11 @@ class GmmTree(ClusterRefiner):
     surface patches. They do not depend on the mask, because a wrong assignment at the first level could not be
     corrected at later levels.
 
-    The mask enters as evidence. Points have the log-odds of `gmm_em`. A node's object fraction maximizes the likelihood
-    of its points' evidence, with the parent's fraction as a prior (our choice). A point stays if its leaves and its own
-    evidence give the object a posterior above `min_posterior`. Outliers at the root do not belong to the object.
-    Outliers below a node have the node's fraction. Clusters with fewer than `min_points` points in the mask or the ring
-    stay unchanged.
+    The mask is used as evidence. Points have the log-odds of `gmm_em`. A node's object fraction maximizes the
+    likelihood of its points' evidence, with the parent's fraction as a prior (our choice). A point stays if its leaves
+    and its own evidence give the object a posterior above `min_posterior`. Outliers at the root do not belong to the
+    object. Outliers below a node have the object fraction of this node. Clusters with fewer than `min_points` points in
+    the mask or the ring stay unchanged.
     """
 
     levels: int = 2  # number of levels of the tree, >= 1
@@ -63,7 +63,7 @@ class GmmTree(ClusterRefiner):
         odds = sample.mask_log_odds(self.mask_log_odds, self.expected_bleed)
         ratios = object_ratios(tree, sample, odds, self.parent_points)
         judged = around.of_at_least(self.ring.min_points)
-        judged &= np.diff(tree.levels[0].firsts) > 0  # a tree without nodes is no evidence against its mask
+        judged &= np.diff(tree.levels[0].firsts) > 0  # a tree without nodes is not evidence against its mask
         own = around.own()
         own_odds = own.mask_log_odds(self.mask_log_odds, self.expected_bleed)
         return keep_points(clusters, around.kept(claimed(tree, ratios, own, own_odds, self.min_posterior), judged))

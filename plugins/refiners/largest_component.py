@@ -19,7 +19,8 @@ class LargestComponent(ClusterRefiner):
     """Selection of the largest 3D-connected component of each cluster; ties go to the first in the image.
 
     Points are connected if they are at most `connection_radius` pixels apart and their depths differ by less than
-    `max_gap` + `gap_per_depth` * depth of the nearer point. The spacing and the noise of readings grow with depth.
+    `max_gap` + `gap_per_depth` * depth of the nearer point, because the spacing and the noise of readings grow with
+    depth.
     """
 
     max_gap: float = 0.03  # maximum depth step between connected pixels at depth 0, m, >= 0

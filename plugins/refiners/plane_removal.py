@@ -1,4 +1,4 @@
-"""Cluster refinement by structure. Floors and walls are not part of an object."""
+"""Cluster refinement by removal of structure. Floors and walls are not part of an object."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class PlaneRemoval(ClusterRefiner):
 
     Planes are found in the depth of the whole frame, without the gravity direction. A plane is structure if it is large
     (`min_area`, `min_frame_fraction`) and the frame has few readings behind it (`max_behind_ratio`). Table tops and
-    screens have more readings behind them. A cluster keeps a plane if it contains more than `max_cluster_fraction` of
-    the plane's points, for example a table that fills the image. The refined clusters pass the planes to later refiners
-    as `structure`.
+    screens have more readings behind them. A cluster keeps its points on a plane if they are more than
+    `max_cluster_fraction` of the plane's points, for example for a table that fills the image. The refined clusters
+    pass the planes to later refiners as `structure`.
     """
 
     plane_distance: float = 0.01  # maximum distance to a plane, m, >= 0, in addition to 3 standard deviations of noise

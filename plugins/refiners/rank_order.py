@@ -29,8 +29,8 @@ class RankOrder(ClusterRefiner):
     Two points are linked if D is at most `threshold` and one point is among the k nearest of the other. Groups are
     connected components. A cluster of at most k points stays unchanged.
 
-    Only the first point of each block of s x s px is compared, with the smallest s that leaves at most `max_points`.
-    Each other point joins the group of the nearest compared point.
+    Only the first point of each block of s x s px is compared, with the smallest s that leaves at most `max_points`
+    points. Each other point joins the group of the nearest compared point.
     """
 
     neighbors: int = 16  # number of nearest neighbors k, >= 2
@@ -38,7 +38,7 @@ class RankOrder(ClusterRefiner):
     max_points: int = 500  # maximum number of compared points of a cluster, >= 10
 
     def __post_init__(self) -> None:
-        # ranks are bytes, in a square table
+        # a square table stores ranks as bytes
         check_bounds(self, neighbors=(2, 254), threshold=(0.0, np.inf), max_points=(10, 5000))
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
@@ -71,7 +71,7 @@ def _firsts_of_blocks(pixels: Int32, max_points: int) -> Int64:
 
 
 def rank_order_groups(points: Float32, neighbors: int, threshold: float) -> Int32:
-    """Return the group (P,) of each point (P, 3); groups are numbered by their first points."""
+    """Return the group (P,) of each point (P, 3), m; groups are numbered in the order of their first points."""
     n, k = len(points), neighbors
     if n <= k:  # all points have the same neighbors
         return np.zeros(n, np.int32)

@@ -1,9 +1,9 @@
 """Data association of a frame's clusters with the instances of the map.
 
-The pixels of a cluster vote for the instances of the map at their positions. The instances come from the voxels at the
+The pixels of a cluster vote for the instances of the map at these pixels. The instances come from the voxels at the
 measured surface or from the ray-cast view. The ray-cast view is our interpretation of section 3.3 of the paper.
 
-A cluster and an instance may match if their overlap is large enough. By default the overlap is relative to the smaller
+A cluster and an instance may match if their overlap is large enough. By default, the overlap is relative to the smaller
 of the two, so that a part of an object matches the whole. Matching is one to one, best IoU first, so that a table does
 not match the book on it. An unmatched cluster creates a new instance.
 """
@@ -29,7 +29,7 @@ from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
-VOTES_ACROSS = 320  # number of voting pixels per image row; more pixels take time without a benefit
+VOTES_ACROSS = 320  # number of voting pixels per image row; more pixels take longer without improving the result
 
 
 class InstanceSource(Enum):
@@ -42,8 +42,8 @@ class InstanceSource(Enum):
 class OverlapRule(Enum):
     """The denominator of an overlap."""
 
-    SMALLER = "size of the cluster or the instance, the smaller one, so that a part of an object matches the whole"
-    IOU = "number of pixels in the cluster or the instance"
+    SMALLER = "size of the smaller of cluster and instance, so that a part of an object matches the whole"
+    IOU = "number of pixels in the union of cluster and instance"
     CLUSTER = "size of the cluster, so that a small part of an object matches it, but not always the reverse"
 
 
@@ -55,8 +55,8 @@ class Overlaps:
     visible: Int32  # (M,) number of pixels of each visible instance
     sizes: Int32  # (N,) number of pixels of each cluster
     votes: Int32  # (N, M) number of pixels shared by a cluster and an instance
-    seen: Int32  # (h, w) instance at every `stride`-th pixel of every `stride`-th row, 0 = none
-    stride: int  # px
+    seen: Int32  # (h, w) instance at every stride-th pixel of every stride-th row, 0 = none
+    stride: int  # distance between the samples in `seen`, px
 
     def by(self, rule: OverlapRule, min_pixels: int) -> npt.NDArray[np.float64]:
         """Return the overlaps (N, M) in [0, 1] by a rule; see `over_smaller` for `min_pixels`."""
@@ -72,14 +72,17 @@ class Overlaps:
     def over_smaller(self, min_pixels: int) -> npt.NDArray[np.float64]:
         """Return the shared pixels (N, M) divided by the smaller of cluster and visible instance, in [0, 1].
 
-        The divisor is at least `min_pixels`. Otherwise a few stray voxels under a cluster would overlap it completely,
-        and match it instead of its own instance.
+        The divisor is at least `min_pixels`. Otherwise, an instance with a few stray voxels under a cluster would
+        overlap it completely, and match it instead of the correct instance.
         """
         return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), min_pixels)
 
 
 def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> Overlaps:
-    """Return the overlaps with `instance_ids` (h, w) at every stride-th pixel; each pixel counts stride^2 times."""
+    """Return the overlaps of clusters with `instance_ids` (h, w), 0 = none, sampled at every stride-th pixel.
+
+    Each sample counts as stride^2 pixels.
+    """
     is_seen = np.zeros(instance_ids.max() + 1, np.bool_)
     find_seen(instance_ids, is_seen)
     seen = np.flatnonzero(is_seen)
@@ -121,7 +124,7 @@ def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int3
 
 
 def vote_stride(camera: Camera) -> int:
-    """Return the stride of voting pixels along rows and columns, px."""
+    """Return the distance between voting pixels along rows and columns, px."""
     return max(1, camera.width // VOTES_ACROSS)
 
 
@@ -133,8 +136,8 @@ class LabeledMap(Protocol):
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
         """Return the most likely instance (ceil(H / stride), ceil(W / stride)) at the measured surface, 0 = none.
 
-        Samples every stride-th depth reading of every stride-th row of `frame.depth`. Unlike ray-casting, the look-up
-        cannot see an instance behind a new object.
+        Samples every stride-th depth reading of every stride-th row of `frame.depth`. Unlike ray casting, the
+        look-up never returns an instance that is hidden behind a new object.
         """
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
@@ -146,19 +149,19 @@ class LabeledMap(Protocol):
 
 @dataclass(frozen=True)
 class Matches:
-    """Instances of a frame's N clusters."""
+    """Instances assigned to a frame's N clusters."""
 
     frame_index: int
     clusters: PointClusters
     overlaps: Overlaps  # overlaps with the instances of the map before this frame
-    instance_ids: Int32  # (N,) id of an existing or a new instance, 0 = none
+    instance_ids: Int32  # (N,) id of an existing or a new instance of each cluster, 0 = none
 
 
 def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min_pixels: int) -> None:
     """Update the table with the `class_evidence` (N, C) of the clusters.
 
-    An instance is in view if at least `min_pixels` pixels show it, or if it was detected. Frames without a detector
-    run are ignored.
+    An instance is in view if it is visible in at least `min_pixels` pixels, or if it was detected. Frames without a
+    detector run are ignored.
     """
     if not matches.clusters.detected:
         return
@@ -175,7 +178,7 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min
 
 
 def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding]:
-    """Return the embeddings by cluster, weighted by score. Clusters without an embedding are omitted."""
+    """Return the embedding of each cluster, weighted by its score. Clusters without an embedding are omitted."""
     if clusters.embeddings is None:
         return {}
     embedded = np.flatnonzero(clusters.embeddings.any(axis=1) & (clusters.scores > 0))
@@ -195,7 +198,7 @@ class Association:
     create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; updates have no minimum
     # minimum cluster size to create an instance, px, >= 1; also the minimum denominator of the overlap
     create_points: int = 50
-    split_instances: bool = True  # True = create an instance for the second of two clusters that match an instance
+    split_instances: bool = True  # True = create an instance for the second of two clusters that match the same one
     merge_overlap: float = 1.0  # minimum overlap with one cluster to merge two instances, in [0, 1]; 1 = no merging
     # minimum number of frames with a joint cluster, minus frames with separate clusters, to merge, >= 1
     merge_frames: int = 3
@@ -216,7 +219,7 @@ class Association:
         self._merge_votes: Counter[tuple[int, int]] = Counter()  # votes by pair of instances; see merge_frames
 
     def match(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> tuple[PixelLists, Matches]:
-        """Return the clusters over each pixel, and their matches with existing and new instances of the map."""
+        """Return the clusters at each pixel, and their matches with existing and new instances of the map."""
         points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = self.look_up(scene, frame, pose, points)
         return points, self.associate(scene.table, overlaps, clusters, frame.index)
@@ -230,7 +233,7 @@ class Association:
         return count_overlaps(points, scene.instances_seen(frame, pose.T_world_camera, stride), stride)
 
     def associate(self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, frame_index: int) -> Matches:
-        """Return the matches. Each cluster is matched with an instance, or creates one if score and size suffice."""
+        """Return the matches. An unmatched cluster creates an instance if its score and size are sufficient."""
         frame_index = table.number_of(frame_index)
         allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
@@ -257,7 +260,7 @@ class Association:
         observe(table, matches, class_evidence, self.create_points)
 
     def merge(self, scene: LabeledMap, matches: Matches) -> None:
-        """Merge instances that are often under one cluster and rarely detected separately (after Voxblox++)."""
+        """Merge two instances that often share one cluster and are rarely detected separately (as in Voxblox++)."""
         matched = sorted(set(matches.instance_ids[matches.instance_ids > 0].tolist()))
         self._merge_votes.subtract(combinations(matched, 2))
         for k, row in enumerate(matches.overlaps.over_smaller(self.create_points)):
@@ -269,10 +272,10 @@ class Association:
                 if self._merge_votes[pair] >= self.merge_frames and self._same_class(scene.table, *pair):
                     scene.merge(*pair)
                     self._forget(pair[1])
-                    return  # the overlaps are outdated now; later frames detect other pairs again
+                    return  # the overlaps are now outdated; other pairs can be merged in later frames
 
     def _same_class(self, table: InstanceTable, a: int, b: int) -> bool:
-        """Return True if the classes of two instances allow a merge; a book is not merged with its table."""
+        """Return True if the classes of two instances allow a merge, unlike those of a book and a table."""
         known = [table.class_probabilities(table.records[k])[None] for k in (a, b)]
         return bool(class_agreement(*known)[0, 0] >= self.merge_agreement)
 
@@ -281,7 +284,7 @@ class Association:
 
 
 def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the label space of a map, set by its first frame; `known` is () before it.
+    """Return the label space of a map, set by its first frame; `known` is () before the first frame.
 
     Raises DataError if a later frame has a different label space.
     """

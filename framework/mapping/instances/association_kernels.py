@@ -20,10 +20,10 @@ from framework.mapping.voxels.voxel_walk import prefetch_element
 def look_up_instances(
     grid: Grid, evidence: Evidence, depth: Float32, view: Pinhole, stride: int, instance_ids: Int32
 ) -> None:
-    """Fill instance_ids (ceil(H / stride), ceil(W / stride)) with the most likely instances of voxels; 0 = none.
+    """Fill instance_ids (ceil(H / stride), ceil(W / stride)) with the most likely instances of voxels, 0 = none.
 
-    Looks up the nearest voxel to every stride-th depth reading of every stride-th row of `depth` (H, W). `view` holds
-    T_world_camera.
+    Looks up the voxel nearest to every stride-th depth reading of every stride-th row of `depth` (H, W), m. `view`
+    contains T_world_camera.
     """
     columns = instance_ids.shape[1]
     for row in prange(instance_ids.shape[0]):
@@ -50,7 +50,7 @@ def look_up_instances(
 
 @njit(cache=True, nogil=True)
 def find_seen(instance_ids, seen):
-    """Set seen (ids + 1,) to True for each instance in instance_ids (h, w)."""
+    """Set seen[id] to True for each instance id in instance_ids (h, w)."""
     for instance in instance_ids.flat:
         if instance > 0:
             seen[instance] = True
@@ -58,7 +58,7 @@ def find_seen(instance_ids, seen):
 
 @device
 def _add_run(count, list_id, label, offsets, clusters, column, votes):
-    """Add `count` pixels of an instance to the votes (N + 1, M + 1) of a list's clusters and of the last row."""
+    """Add `count` pixels of an instance to votes (N + 1, M + 1), in the rows of a list's clusters and the last row."""
     votes[votes.shape[0] - 1, column[label]] += count
     for entry in range(offsets[list_id], offsets[list_id + 1]):
         votes[clusters[entry], column[label]] += count
@@ -68,8 +68,8 @@ def _add_run(count, list_id, label, offsets, clusters, column, votes):
 def count_votes(points, instance_ids, stride, column, votes):
     """Add the number of pixels of each cluster (row) on each instance (column) to votes (CHUNKS, N + 1, M + 1).
 
-    The last row counts all pixels. The kernel counts runs of pixels: incrementing a counter for each pixel would stall
-    on memory.
+    The last row counts all pixels. The kernel counts runs of equal pixels, because incrementing a counter in memory for
+    each pixel would be slower.
     """
     list_ids, offsets, clusters = points.list_ids, points.offsets, points.clusters
     rows = instance_ids.shape[0]

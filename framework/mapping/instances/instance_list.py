@@ -30,8 +30,8 @@ class InstanceClass(Enum):
 class Confirmation:
     """Conditions for an instance to be in the `mesh` and the `instances` of a map. Other instances are tentative.
 
-    `min_confidence` is low because unlikely instances rank last and cost little precision, while omitted instances are
-    lost.
+    `min_confidence` is low because unlikely instances rank last and cost little precision, whereas omitted instances
+    reduce recall.
     """
 
     min_observations: int = 3  # minimum number of frames with a detection to confirm an instance, >= 1
@@ -51,7 +51,7 @@ class Confirmation:
         return record.observations >= self.min_observations and record.confidence >= self.min_confidence
 
     def counts(self, table: InstanceTable) -> Bool:
-        """Return an array (ids + 1,), True if an instance meets all conditions except the minimum area."""
+        """Return an array (last id + 1,), indexed by id: True = all conditions except the minimum area are met."""
         counts = np.zeros(table.last_id + 1, np.bool_)
         for record in table.records.values():
             counts[record.id] = self.is_met(record)
@@ -62,15 +62,15 @@ class Confirmation:
         return vertices_of_area(self.min_area, voxel_size)
 
     def too_small(self, instance_ids: Int32, voxel_size: float) -> Bool:
-        """Return an array (V,), True if a vertex belongs to an instance below `min_area`; `instance_ids` is (V,)."""
+        """Return an array (V,), True for each vertex of an instance below `min_area`. `instance_ids` is (V,)."""
         return np.asarray((np.bincount(instance_ids) < self.min_vertices(voxel_size))[instance_ids])
 
 
 class InstanceTableMap(SceneMap):
     """A map that keeps its instances in a table.
 
-    `mesh` and `instances` contain the confirmed instances. `render` also contains the tentative instances. Ids and
-    classes ignore the minimum area, because computing the area requires a mesh.
+    `mesh` and `instances` contain the confirmed instances. `render` also contains the tentative instances.
+    `instance_ids` and `most_likely_classes` ignore the minimum area, because computing the area requires a mesh.
     """
 
     table: InstanceTable
@@ -128,25 +128,28 @@ def vertices_of_area(area: float, voxel_size: float) -> int:
 
 
 def vertices_by_id(instance_ids: Int32) -> dict[int, Int32]:
-    """Return the vertices (M,) of each instance, ascending, from the ids (V,) of all vertices; id 0 is omitted."""
+    """Return the ascending vertex indices (M,) of each instance by id, given the instance id (V,) of each vertex.
+
+    Id 0 is omitted.
+    """
     order = np.argsort(instance_ids, kind="stable").astype(np.int32)
     ids, starts = np.unique(instance_ids[order], return_index=True)
     return {int(k): vertices for k, vertices in zip(ids, np.split(order, starts[1:]), strict=False) if k > 0}
 
 
 def aligned_box(points: Float32) -> Box:
-    """Return the axis-aligned box around points (M, 3) m in the world frame."""
+    """Return the axis-aligned bounding box of points (M, 3), m, in the world frame."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     return Box((low + high) / 2, high - low, np.eye(3))
 
 
 def box_around(points: Float32, up: Float64 | None) -> Box:
-    """Return the smallest upright box around points (M, 3) m; if `up` is unknown, the box along the points' axes."""
+    """Return the smallest upright box around points (M, 3), m; if `up` is None, the box along their principal axes."""
     return oriented_box(points) if up is None else upright_box(points, up)
 
 
 def upright_box(points: Float32, up: Float64) -> Box:
-    """Return the box around points (M, 3) m with its third axis along `up` and the smallest ground rectangle."""
+    """Return the box around points (M, 3), m, with its third axis along `up` (3,) and the smallest footprint."""
     ground_axes = np.linalg.svd(up[None])[2][1:]  # (2, 3)
     center = points.mean(axis=0, dtype=np.float64)
     ground, heights = (points - center) @ ground_axes.T, (points - center) @ up
@@ -160,10 +163,10 @@ def upright_box(points: Float32, up: Float64) -> Box:
 
 
 def oriented_box(points: Float32) -> Box:
-    """Return the box along the principal axes of the convex hull of points (M, 3) m, which may be coplanar (Open3D)."""
+    """Return the box along the principal axes of the convex hull of points (M, 3), m, which may be coplanar."""
     import open3d as o3d  # takes half a second and 170 MB; most maps have gravity and do not need it
 
-    four = np.resize(points, (max(len(points), 4), 3))  # Qhull needs four; repeated points change nothing
+    four = np.resize(points, (max(len(points), 4), 3))  # Qhull needs four points; repeated points do not change the box
     box = o3d.geometry.OrientedBoundingBox.create_from_points(
         o3d.utility.Vector3dVector(four.astype(np.float64)), robust=True
     )

@@ -76,8 +76,8 @@ class InstanceRecord:
 class InstanceTable:
     """The instances of a map by id; ids start at 1 and are never reused.
 
-    Class evidence is combined by the rule of the voxels. `logarithmic`: True = it is log-likelihoods, False = it is
-    proportional, such as votes.
+    Class evidence is combined by the same rule as in the voxels. `logarithmic` is True for log-likelihoods, and False
+    for evidence that is proportional to probability, such as votes.
     """
 
     def __init__(self, combine: Combine = Combine.SUM, logarithmic: bool = True) -> None:
@@ -90,7 +90,7 @@ class InstanceTable:
         self.embedding_space = ""  # space of the instances' embeddings; "" = no embeddings
 
     def create(self, classes: int, frame_index: int) -> InstanceRecord:
-        """Create an instance without observations."""
+        """Create an instance without observations, with zero evidence for each of `classes` classes."""
         self.last_id += 1
         record = InstanceRecord(self.last_id, np.zeros(classes), first_frame=frame_index, last_frame=frame_index)
         self.records[self.last_id] = record
@@ -143,13 +143,13 @@ class InstanceTable:
         return self.distribution(record.class_evidence)
 
     def distribution(self, evidence: Float64) -> Float32:
-        """Return the distribution (C,) of class evidence: the normalized likelihood or the normalized evidence."""
+        """Return the class distribution (C,) for class evidence (C,): the normalized likelihoods or votes."""
         likelihood = np.exp(evidence - evidence.max()) if self.logarithmic else evidence
         total = likelihood.sum()
         return np.asarray(likelihood / total if total > 0 else np.full_like(evidence, 1 / len(evidence)), np.float32)
 
     def class_ids(self) -> Int32:
-        """Return the most likely class (ids + 1,) of each instance, by id; -1 = no such instance."""
+        """Return the most likely class (last id + 1,) of each instance, indexed by id; -1 = no such instance."""
         class_ids = np.full(self.last_id + 1, -1, np.int32)
         for record in self.records.values():
             class_ids[record.id] = record.class_evidence.argmax()

@@ -35,8 +35,8 @@ class ObjectEmbedding:
     def __add__(self, other: ObjectEmbedding) -> ObjectEmbedding:
         if self.sum.shape != other.sum.shape:
             raise DataError(
-                f"embeddings of one space: expected equal lengths, got {len(self.sum)} and {len(other.sum)} numbers; "
-                "map again with one model"
+                f"embeddings: expected equal lengths, got {len(self.sum)} and {len(other.sum)}; map again with one "
+                "embedding model"
             )
         return ObjectEmbedding(self.sum + other.sum, self.weight + other.weight, self.count + other.count)
 
@@ -60,20 +60,20 @@ def added(known: ObjectEmbedding | None, new: ObjectEmbedding | None) -> ObjectE
 
 
 def agreed_space(known: str, found: str) -> str:
-    """Return the embedding space of a map, set by its first embeddings; `known` is "" before them.
+    """Return the embedding space of a map, set by its first embeddings; `known` is "" before the first embeddings.
 
     Raises DataError if later embeddings are from another space.
     """
     if known and known != found:
         raise DataError(
-            f"detector: expected embeddings of {known} (as in the map), got {found}; use the model of the "
+            f"detector: expected embeddings from {known} (as in the map), got {found}; use the model of the "
             "map, or map again"
         )
     return found
 
 
 def embedding_arrays(embeddings: Mapping[int, ObjectEmbedding]) -> dict[str, Array]:
-    """Return the arrays of a map file for embeddings by id; empty without embeddings."""
+    """Return the arrays of a map file for the embeddings of instances, by id; empty without embeddings."""
     if not embeddings:
         return {}
     values = list(embeddings.values())
@@ -86,7 +86,10 @@ def embedding_arrays(embeddings: Mapping[int, ObjectEmbedding]) -> dict[str, Arr
 
 
 def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, dict[int, ObjectEmbedding]]:
-    """Return the space and the embeddings by id of a map file. Raises DataError if they are invalid."""
+    """Return the embedding space and the embeddings, by instance id, of a map file.
+
+    Returns "" and no embeddings if the file has none. Raises DataError if the embeddings are invalid.
+    """
     if SPACE not in plain.values:
         return "", {}
     space = plain.values[SPACE]

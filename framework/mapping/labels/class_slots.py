@@ -1,12 +1,12 @@
 """Operations on all class slots of a voxel.
 
-The sixteen slots of compact storage are one SIMD vector. LLVM unrolls such a short loop before it can vectorize it. So
-these intrinsics emit vector instructions, which LLVM compiles for any little-endian processor. Exact storage has other
-types and more slots, and uses loops with the same results.
+The sixteen slots of compact storage are one SIMD vector. LLVM unrolls such a short loop before it can vectorize it.
+Therefore, these intrinsics emit vector instructions, which LLVM compiles for any little-endian processor. Exact storage
+has other types and more slots, and uses loops with the same results.
 
 A quantized score is a log-odds (or a vote) times the scale of the label rule, rounded. Each entry of `cluster_scores`
-(NO_CLASS + 1,) holds the score of a class in the upper bits. The lowest NEW_CLASSES bits mark its index among the
-named classes.
+(NO_CLASS + 1,) holds the score of a class in the upper bits. Bit m of the lowest NEW_CLASSES bits is set for the m-th
+named class.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ _OPTIONS = {"forceinline": True, "error_model": "numpy", "_nrt": False}  # the o
 def add_scores(classes, scores, cluster_scores, limit):
     """Add the scores of a cluster to the scores (T,) of a voxel's classes (T,). Scores stay at -limit or above.
 
-    Returns the bits of the named classes with a slot, the number of filled slots, and the excess of the largest score
-    over `limit`.
+    Returns the bits of the named classes that have a slot, the number of filled slots, and the excess of the largest
+    score over `limit`.
     """
     return _add_scores(classes, scores, cluster_scores, limit)
 
@@ -124,7 +124,7 @@ class _Slots:
         return self.builder.shuffle_vector(single, undefined, _all(0, _INT32))
 
     def bits(self, conditions: Any) -> Any:
-        """Return one bit per slot."""
+        """Return the conditions as an integer with one bit per slot."""
         return self.builder.bitcast(conditions, ir.IntType(CLASS_SLOTS))
 
     def call(self, name: str, *arguments: Any, of: str = "i16") -> Any:

@@ -1,7 +1,7 @@
 """Storage and update of the evidence rows of `label_evidence.py`.
 
-In compact storage a labeled voxel takes 80 bytes of slots: 8 for each instance slot and 3 for each class slot. A row
-takes 2 KiB. Only voxels near the surface and under masks are labeled.
+In compact storage, a labeled voxel takes 80 bytes of slots: 8 for each instance slot and 3 for each class slot. A row
+takes 2 KiB. Only voxels near the surface that were under a mask are labeled.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
 INSTANCE_SLOTS = 4  # number of instance slots of a voxel in compact storage
-RESERVED = 128  # number of labeled voxels reserved per block of the budget; most blocks have fewer; can grow
+RESERVED = 128  # number of labeled voxels reserved per block of the budget; most blocks have fewer; grows if needed
 ANY_INSTANCE = np.uint64(2**BITS - 1)
 SLOTS = Evidence._fields[1:]
 
 
 class Storage(Enum):
-    """Number of labels that a voxel stores."""
+    """Labels that a voxel stores: the most likely labels, or all labels."""
 
     COMPACT = "compact"
     EXACT = "exact"
@@ -52,7 +52,7 @@ class NewVoxels(NamedTuple):
 
 
 class EvidenceRows:
-    """Owner of the growing label evidence of a grid. The kernels work on `self.evidence`."""
+    """Label evidence of a growing voxel grid. The kernels modify `self.evidence`."""
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class EvidenceRows:
 
     @property
     def byte_count(self) -> int:
-        """Bytes in use; unused capacity takes no memory."""
+        """Size of the evidence in use, bytes. Unused capacity takes no memory."""
         rows = self._labeled[: self.row_count].nbytes + self._row_bits[: self.row_count].nbytes
         return rows + self._slots[: self.voxel_count].nbytes
 
@@ -94,7 +94,7 @@ class EvidenceRows:
         return Evidence(self.evidence.labeled[: self.row_count], **slots)
 
     def fill(self, saved: Evidence) -> None:
-        """Copy the evidence of a saved map, or its own evidence from before the instance slots were doubled."""
+        """Copy evidence into new slots: that of a saved map, or its own evidence when the number of slots increases."""
         self._instance_slots = max(self._instance_slots, saved.instance_ids.shape[1])
         self._free()
         self._reserve(len(saved.labeled), len(saved.instance_ids))
@@ -115,7 +115,7 @@ class EvidenceRows:
             self._free()
 
     def update(self, seen: SeenBlocks, measurement: Measurement) -> None:
-        """Update the voxels near the measured surface in the blocks that a frame has updated."""
+        """Update the voxels near the measured surface in the blocks that a frame updated."""
         if not (measurement.instance_id.any() or len(measurement.clusters)):
             return  # no evidence for or against any instance or class
         new = NewVoxels(*np.empty((3, len(seen.blocks)), np.int32))
@@ -166,7 +166,7 @@ class EvidenceRows:
         return named.astype(np.uint8)
 
     def _make_room(self, blocks: Int32, new: NewVoxels) -> None:
-        """Reserve slots for new.counts voxels of each block, and rows for blocks without a row; fills `new`."""
+        """Reserve slots for new voxels and rows for blocks without a row, and fill new.rows and new.starts."""
         before = self.row_count
         label_row = self.voxels.grid.label_row
         self._reserve(*number_new(blocks, new.counts, label_row, before, self.voxel_count, new.rows, new.starts))
@@ -184,7 +184,7 @@ class EvidenceRows:
         self._lay_out()
 
     def _make_room_for_instances(self, new: int) -> None:
-        """Double the slots until every voxel has `new` free slots."""
+        """Double the number of instance slots until every voxel has `new` free slots."""
         slots = self._instance_slots
         missing = new - int(fewest_free(self.in_use().instance_ids))
         while missing > 0:

@@ -64,10 +64,10 @@ def find_list_bits(offsets, clusters, instance_id, list_bits):
 
 @njit(cache=True, nogil=True, parallel=True)
 def update_rows(grid, seen, evidence, measurement, list_bits, row_bits, new, evicted):
-    """Update the near voxels with slots in the seen blocks, and the bits of their rows, row_bits (R,).
+    """Update the voxels near the surface that have slots, and the instance bits row_bits (R,) of their rows.
 
-    Sets new (A,) to the number of near voxels without slots and with clusters in their list, and evicted (A,) to the
-    number of evictions.
+    Sets new (A,) to the number of near voxels in each block without slots and with clusters in their list. Sets evicted
+    (A,) to the number of evictions.
     """
     list_ids = measurement.list_ids.ravel()
     blocks = seen.blocks.shape[0]
@@ -115,7 +115,7 @@ def number_new(blocks, new, row_of, row_count, voxel_count, rows, first_new):
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_new(grid, seen, evidence, measurement, list_bits, row_bits, new, free_classes, evicted):
-    """Assign slots to the `new` voxels of each block and update them like update_rows().
+    """Assign slots to the `new` voxels of each block, and update them as update_rows() does.
 
     free_classes (T,) are the class slots of a voxel without evidence. Evictions are added to evicted (A,).
     """
@@ -165,7 +165,10 @@ def _merge_voxel(ids, values, kept, dropped, combine):
 
 @njit(cache=True, nogil=True, parallel=True)
 def merge_instances(evidence, row_bits, kept, dropped, combine):
-    """Merge two instances in the rows whose row_bits (R,) have the dropped one's bit, and set the kept one's bit."""
+    """Merge instance `dropped` into `kept` in the rows whose row_bits (R,) contain the bit of `dropped`.
+
+    Adds the bit of `kept` to these rows.
+    """
     for row in prange(row_bits.shape[0]):
         if row_bits[row] & _instance_bit(dropped):
             row_bits[row] |= _instance_bit(kept)
@@ -176,7 +179,10 @@ def merge_instances(evidence, row_bits, kept, dropped, combine):
 
 @njit(cache=True, nogil=True)
 def sum_classes_of_instances(evidence, counts, sums):
-    """Add the quantized class scores of every labeled voxel to the sums (ids + 1, C) of its instance."""
+    """Add the quantized class scores of every labeled voxel to the sums (ids + 1, C) of its instance.
+
+    The instance of a voxel is its most likely instance with counts[id].
+    """
     for voxel in range(evidence.class_ids.shape[0]):
         instance = best_counted_instance(evidence, voxel, counts)
         for s in range(evidence.class_ids.shape[1] if instance > 0 else 0):

@@ -1,13 +1,13 @@
-"""Label evidence of the voxels: the likelihood of each instance and class, and its update by a frame.
+"""Label evidence of the voxels: the likelihood of each instance and class, and its update from a frame.
 
-The paper's rule is a voxel-wise Bayesian update by two independent recursions, eqs. [7] and [8]:
+The paper's rule is a voxel-wise Bayesian update by two independent recursions, eqs. (7) and (8) of docs/method.md:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t)
 
-In log space the update is a sum of log-likelihoods, from a uniform start. Only ratios matter. So a voxel stores the
-log-odds of each label over the unnamed labels. A label is unnamed if no cluster named it at this voxel. Other rules
-(counts, latest, most confident) store other values and combine new evidence with old evidence differently; see
-`Combine`.
+In log space, the update is a sum of log-likelihoods that starts from a uniform distribution. Only ratios matter.
+Therefore, a voxel stores the log-odds of each label over the unnamed labels. A label is unnamed if no cluster named it
+at this voxel. Other rules (counts, latest, most confident) store other values and combine new evidence with old
+evidence differently; see `Combine`.
 
 A block has an evidence row once one of its voxels has labels. Each labeled voxel has slots.
 
@@ -32,15 +32,15 @@ from framework.data import Bool, Float32, Float64, Int32, UInt8
 from framework.mapping.labels.class_slots import NEW_CLASSES, NO_CLASS
 
 Integers = npt.NDArray[Any]  # of int16, int32 or int64
-MAX_SCORE = 30_000  # largest quantized class score in compact storage; a larger score reduces all scores by the excess
-MAX_CLUSTER_SCORE = 2**15 - 1 - MAX_SCORE  # largest score of a cluster; a larger one could overflow int16
+MAX_SCORE = 30_000  # maximum quantized class score in compact storage; the excess is subtracted from all scores
+MAX_CLUSTER_SCORE = 2**15 - 1 - MAX_SCORE  # maximum score of a cluster; a larger score could overflow int16
 
 
 class Evidence(NamedTuple):
-    """Label evidence of all voxels, see the diagram above.
+    """Label evidence of all voxels; see the diagram in the module docstring.
 
-    Voxels are visited in any order. So the slots of a voxel are contiguous: the arrays of slots are views of one
-    structured array. In compact storage, the slots of a voxel take 80 bytes.
+    Voxels are visited in any order. Therefore, the slots of a voxel are contiguous: the arrays of slots are views of
+    one structured array. In compact storage, the slots of a voxel take 80 bytes.
     """
 
     labeled: Int32  # (R, 512) index of a voxel among the voxels with slots, -1 = no slots
@@ -53,7 +53,7 @@ class Evidence(NamedTuple):
 class Measurement(NamedTuple):
     """Evidence of the N clusters of one frame for C classes."""
 
-    list_ids: Int32  # (H, W) list of clusters of each pixel, see PixelLists, 0 = no cluster
+    list_ids: Int32  # (H, W) list of clusters of each pixel, 0 = no cluster; see PixelLists
     offsets: Int32  # (L + 1,) start of each list in `clusters`
     clusters: Int32  # (offsets[L],) clusters that update voxels
     instance_id: Int32  # (N,) instance associated with each cluster, 0 = none
@@ -61,21 +61,21 @@ class Measurement(NamedTuple):
     absence: np.float32  # log-odds, <= 0, of a matched instance in voxels outside its mask
     matched: Bool  # (ids + 1,) True if an instance was matched in this frame, by id
     class_scores: Integers  # (N, NO_CLASS + 1) int32, in exact storage int64; see pack_class_scores()
-    named_classes: UInt8  # (N, NEW_CLASSES) best classes of each cluster
-    combine: int  # Combine
+    named_classes: UInt8  # (N, NEW_CLASSES) most likely classes of each cluster
+    combine: int  # value of Combine
     max_score: int  # maximum score of a class
 
 
 def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8, UInt8]:
     """Return the evidence of N clusters over their unnamed classes, their named classes, and the bits of named classes.
 
-    If the evidence is log-likelihoods, a cluster names its NEW_CLASSES best classes, and each unnamed class gets the
-    mean likelihood of the unnamed classes. Otherwise a cluster names its best class, and has no evidence for other
-    classes.
+    If the `evidence` (N, C) is log-likelihoods, a cluster names its NEW_CLASSES most likely classes, and each unnamed
+    class gets the mean likelihood of the unnamed classes. Otherwise, a cluster names its most likely class, and has no
+    evidence for other classes.
 
     Returns:
         Evidence (N, C) over the unnamed classes; named classes (N, NEW_CLASSES), in which the first class repeats if
-        there are fewer; bits (N, NO_CLASS + 1), bit m for the m-th named class, 0 = unnamed.
+        there are fewer; bits (N, NO_CLASS + 1), 2^m for the m-th named class, 0 = unnamed.
     """
     c = evidence.shape[1]
     names = min(c, NEW_CLASSES) if logarithmic else min(c, 1)
@@ -96,9 +96,10 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
 
 
 def pack_class_scores(relative: Float64, scale: int, named_bit: UInt8, kind: type[np.signedinteger[Any]]) -> Integers:
-    """Return the evidence over the unnamed classes, quantized by `scale`, packed with `named_bit` (N, NO_CLASS + 1).
+    """Return the evidence `relative` (N, C) over the unnamed classes, quantized and packed with `named_bit`.
 
-    The upper bits hold the score and the lowest NEW_CLASSES bits the named bit, so that a voxel needs one look-up.
+    `named_bit` and the result are (N, NO_CLASS + 1). The upper bits of an entry hold the evidence times `scale`,
+    rounded, and the lowest NEW_CLASSES bits hold the named bit, so that a voxel needs one look-up.
     """
     packed = named_bit.astype(np.int64)
     packed[:, : relative.shape[1]] += np.rint(relative * scale).astype(np.int64) << NEW_CLASSES

@@ -51,7 +51,7 @@ def best_instance(evidence, voxel):
 
 @device
 def best_counted_instance(evidence, voxel, counts):
-    """Return the most likely instance with counts[id] of a labeled voxel, 0 if unnamed instances are more likely."""
+    """Return a labeled voxel's most likely instance with counts[id], 0 if unnamed instances are more likely."""
     best = np.int32(0)
     best_value = np.float32(0.0)
     for s in range(evidence.instance_ids.shape[1]):
@@ -72,9 +72,10 @@ def best_class(evidence, voxel):
 
 @device
 def add_evidence(labels, values, free, label, added, combine, limit):
-    """Combine evidence with a label's value, within +-`limit`. A new label gets a free slot or the least likely slot.
+    """Combine the evidence `added` with the value of a label, and limit the sum to +-`limit`.
 
-    Returns 1 if a label was evicted.
+    A new label gets a free slot, or the slot of the least likely label if it is more likely. Returns 1 if no slot was
+    free, so that a label was evicted or not stored.
     """
     if combine == LATEST:
         for s in range(1, len(labels)):
@@ -116,7 +117,7 @@ def best_first(labels, values, free):
 
 @device
 def best_class_first(classes, scores):
-    """Move the most likely class to slot 0, like best_first()."""
+    """Move the most likely class to slot 0, as best_first() does."""
     best = most_likely_slot(classes, scores)
     if best > 0:
         classes[0], classes[best] = classes[best], classes[0]
@@ -128,7 +129,7 @@ def sum_classes(classes, scores, measurement, k):
     """Add the evidence of cluster k to the class slots of a voxel. Returns the number of evictions."""
     limit, cluster_scores = measurement.max_score, measurement.class_scores[k]
     known, filled, excess = add_scores(classes, scores, cluster_scores, limit)
-    for s in range(filled if excess > 0 else 0):  # preserves the differences between scores
+    for s in range(filled if excess > 0 else 0):  # subtracting preserves the differences between scores
         scores[s] = max(scores[s] - excess, -limit)
     evicted = 0
     rejected = False
@@ -158,7 +159,7 @@ def sum_classes(classes, scores, measurement, k):
 
 @device
 def update_voxel(evidence, voxel, measurement, list_id):
-    """Apply both recursions to a labeled voxel at a pixel with list `list_id`. Returns the number of evictions."""
+    """Apply both recursions to a labeled voxel at a pixel of list `list_id`. Returns the number of evictions."""
     start, end = measurement.offsets[list_id], measurement.offsets[list_id + 1]
     ids = evidence.instance_ids[voxel]
     id_values = evidence.instance_value[voxel]

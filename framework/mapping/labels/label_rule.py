@@ -28,7 +28,7 @@ from framework.mapping.labels.pixel_lists import PixelLists, keep_on_top, remove
 from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VoxelHashing
 
-OTHER_CLASS = 0.3  # largest Bhattacharyya coefficient of the distributions of objects of different classes
+OTHER_CLASS = 0.3  # maximum Bhattacharyya coefficient of the class distributions of objects of different classes
 EXACT_BITS = 16  # additional bits of class scores in exact storage
 
 
@@ -53,7 +53,7 @@ class DetectionEvidence(NamedTuple):
 
 
 def floored_log(class_probabilities: Float32, floor: float) -> Float64:
-    """Return log P(O_u = c | I_t) (N, C) of eq. [7], mixed with a fraction `floor` of the uniform distribution.
+    """Return log P(O_u = c | I_t) (N, C) of eq. (7), mixed with a fraction `floor` of the uniform distribution.
 
     The mixture prevents a zero probability from the detector from ruling out a class.
     """
@@ -62,7 +62,7 @@ def floored_log(class_probabilities: Float32, floor: float) -> Float64:
 
 
 def vote_for_best(clusters: PointClusters, weights: Float32) -> DetectionEvidence:
-    """Return votes of the clusters, with weights (N,), for their instances and most likely classes."""
+    """Return the votes of the clusters for their instances and most likely classes, with `weights` (N,)."""
     classes = np.zeros(clusters.class_probabilities.shape)
     if len(clusters):
         classes[np.arange(len(clusters)), clusters.class_probabilities.argmax(axis=1)] = weights
@@ -75,8 +75,11 @@ class LabeledVoxels:
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    occlusion_area_ratio: float = 0.25  # maximum area ratio to assign pixels to the smaller cluster, in [0, 1]; 0 = off
-    support_overlap: float = 0.6  # minimum fraction of an instance inside a larger mask of another class; 1 = off
+    # maximum area ratio of overlapping clusters to assign pixels to the smaller cluster, in [0, 1]; 0 = off
+    occlusion_area_ratio: float = 0.25
+    # minimum fraction of an instance inside a larger mask of another class to apply the support rule, in [0, 1];
+    # 1 = off
+    support_overlap: float = 0.6
     update_unmatched: bool = False  # True = clusters without an instance also update class distributions
     instance_class: InstanceClass = InstanceClass.DETECTIONS  # source of an instance's class
     storage: Storage = Storage.COMPACT  # labels stored per voxel: COMPACT = top few labels, EXACT = all labels
@@ -127,7 +130,7 @@ class LabeledVoxels:
     def measurement(
         self, table: InstanceTable, points: PixelLists, matches: Matches, evidence: DetectionEvidence, rule: LabelRule
     ) -> Measurement:
-        """Return the evidence of a frame's clusters for the voxels by this rule."""
+        """Return the evidence of a frame's clusters in the form used by the voxel update."""
         updating = np.ones_like(matches.instance_ids) if self.update_unmatched else matches.instance_ids
         points = keep_on_top(points, updating, self.occlusion_area_ratio)
         supported = self.supported_instances(table, matches)
@@ -158,7 +161,7 @@ class LabeledVoxels:
         """Return an array (N, ids + 1), True if a cluster's object supports an instance, as a table supports a book.
 
         A supported instance is confirmed and of another class. Most of its visible part is inside the cluster's mask,
-        and it is at most half as large as the cluster. The mask of the large object covers the instance, but is no
+        and it is at most half as large as the cluster. The mask of the large object covers the instance, but is not
         evidence for its voxels.
         """
         overlaps, clusters = matches.overlaps, matches.clusters

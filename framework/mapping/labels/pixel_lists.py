@@ -1,7 +1,7 @@
-"""Pixel lists: the clusters over each pixel of overlapping masks.
+"""Pixel lists: the clusters at each pixel of overlapping masks.
 
-There are few different combinations of clusters over a pixel. Each combination is one list, and each pixel stores the
-index of its list, so that operations on lists are cheap. For two overlapping masks, clusters 0 and 1:
+Only a few different combinations of clusters occur. Each combination is one list, and each pixel stores the index of
+its list, so that operations on lists are fast. Example for two overlapping masks of clusters 0 and 1 (* = both):
 
     masks        list_ids (H, W)      list   clusters    offsets     clusters array
     0 0 .        1 1 0                0      none        0           [0, 0, 1, 1]
@@ -31,28 +31,28 @@ from framework.mapping.labels.pixel_lists_kernels import (
 
 
 class PixelLists(NamedTuple):
-    """L lists with N clusters in total; the clusters of list i are clusters[offsets[i] : offsets[i + 1]]."""
+    """L lists of N clusters. The clusters of list i are clusters[offsets[i] : offsets[i + 1]]."""
 
     list_ids: Int32  # (H, W) list of each pixel; list 0 is empty
     pixel_counts: Int32  # (L,) number of pixels of each list
-    offsets: Int32  # (L + 1,)
-    clusters: Int32  # (offsets[L],) in the order of the points
-    cluster_count: int  # N
+    offsets: Int32  # (L + 1,) start of each list in `clusters`
+    clusters: Int32  # (offsets[L],) clusters of all lists; within a list, in the order of the points
+    cluster_count: int  # number of clusters, N
 
 
 class ListTree(NamedTuple):
-    """Tree of the lists during construction. A list consists of its head, a cluster, and its parent list."""
+    """Tree of the lists during construction. A list consists of one cluster, its head, and of its parent list."""
 
-    head: Int32  # (capacity,)
-    parent: Int32  # (capacity,)
-    child: Int32  # (capacity,) latest list with this parent, 0 = none
+    head: Int32  # (capacity,) cluster of each list
+    parent: Int32  # (capacity,) parent of each list
+    child: Int32  # (capacity,) most recent list with this parent, 0 = none
     sibling: Int32  # (capacity,) previous list with the same parent, 0 = none
-    pixel_count: Int32  # (capacity,)
-    length: Int32  # (capacity,) number of clusters
+    pixel_count: Int32  # (capacity,) number of pixels of each list
+    length: Int32  # (capacity,) number of clusters of each list
 
 
 def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
-    """Return the clusters over each pixel of an image of `shape` (height, width), from the pixels of their points.
+    """Return the clusters at each pixel of an image of `shape` (height, width), from the pixels of their points.
 
     Lists without pixels are empty. Raises DataError if a pixel is outside the image.
     """
@@ -71,11 +71,11 @@ def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> Pix
 
 
 def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> PixelLists:
-    """Return the lists without clusters that have no instance or are much larger than another cluster of the pixel.
+    """Remove clusters that have no instance or are much larger than another cluster at the pixel; return the lists.
 
-    Large masks are coarse and cover small objects, such as a book on a couch. So a pixel keeps only clusters that are
-    at most 1 / `area_ratio` times as large as its smallest cluster. If `area_ratio` is 0, a pixel keeps all clusters.
-    `instance_ids` (N,) holds the instance of each cluster, 0 = none.
+    Large masks are coarse and cover small objects, such as a book on a couch. Therefore, a pixel keeps only clusters
+    that are at most 1 / `area_ratio` times as large as its smallest cluster. If `area_ratio` is 0, a pixel keeps all
+    clusters. `instance_ids` (N,) holds the instance of each cluster, 0 = none.
     """
     offsets, kept = np.empty_like(points.offsets), np.empty_like(points.clusters)
     keep_smallest(points.pixel_counts, points.offsets, points.clusters, instance_ids, area_ratio, offsets, kept)
@@ -83,13 +83,13 @@ def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> P
 
 
 def remove_supports(points: PixelLists, supported: Bool, seen: Int32, stride: int) -> PixelLists:
-    """Return the lists without clusters at pixels of instances that the cluster's object supports.
+    """Remove each cluster from the pixels of the instances that its object supports, and return the new lists.
 
     Args:
         points: Lists of clusters at the pixels.
         supported: (N, ids + 1) True if the cluster's object supports the instance.
-        seen: The map's instance at every stride-th pixel of every stride-th row.
-        stride: Stride of `seen` in px.
+        seen: The map's instance at every stride-th pixel of every stride-th row, 0 = none.
+        stride: Distance between the samples in `seen`, px.
     """
     instances = np.flatnonzero(supported.any(axis=0))
     column = np.zeros(supported.shape[1], np.int32)

@@ -22,7 +22,7 @@ def _are_inside(coordinates, width, height):
 
 @njit(cache=True, nogil=True)
 def link_points(coordinates, cluster, list_ids, tree):
-    """Fill list_ids (H, W) and the ListTree, which has a capacity of one list per point plus one.
+    """Fill list_ids (H, W) and the ListTree, whose capacity is the number of points plus one.
 
     The coordinates (2 P,) of the points alternate u and v. Returns the number of lists, 0 if a point is
     outside the image.
@@ -120,10 +120,10 @@ def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
 
 @njit(cache=True, nogil=True)
 def lists_without(offsets, clusters, supported, instances, replacement, origin, ends, kept):
-    """Fill replacement (L, 1 + J): the list that replaces each list at no instance (column 0) and at `instances` (J,).
+    """Fill replacement (L, 1 + J) with the list that replaces each list at pixels of each instance in `instances` (J,).
 
-    `origin` gets the list that each new list replaces, and `ends` the end of its clusters in `kept`. Returns the
-    numbers of new lists and of their clusters.
+    Column 0 is for pixels without one of these instances. Sets `origin` to the list that each new list replaces, and
+    `ends` to the end of its clusters in `kept`. Returns the number of new lists and the number of their clusters.
     """
     lists = offsets.shape[0] - 1
     new = length = 0

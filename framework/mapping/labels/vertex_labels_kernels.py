@@ -17,13 +17,13 @@ from framework.mapping.voxels.voxel_grid_kernels import (
 from framework.mapping.voxels.voxel_walk import voxel_number
 
 CORNERS = 8  # number of voxels around a vertex
-REACH = 2.0  # maximum distance of voting voxels from the surface, voxels; farther ones were seen by other pixels
+REACH = 2.0  # maximum distance of voting voxels from the surface, voxels; other pixels observed farther voxels
 CHUNK = 1024  # number of vertices that share scratch arrays
 
 
 @device
 def corner_voxels(grid, vertex, blocks, voxels, weights):
-    """Fill `blocks` (-1 = absent), `voxels` and trilinear `weights`, (8,) each, of the voxels around a vertex (3,) m.
+    """Fill `blocks` (-1 = absent), `voxels` and trilinear `weights`, (8,) each, of the voxels around a vertex (3,), m.
 
     Returns True if any voxel has label evidence.
     """
@@ -55,9 +55,9 @@ def keep_near(grid, blocks, voxels, weights):
 
 @device
 def majority(labels, weights):
-    """Return the voxel that has the largest weight among the voxels of the majority label; -1 without a majority.
+    """Return the index of the voxel with the largest weight among the voxels with the majority label; -1 = no majority.
 
-    The majority label is the entry of `labels` (8,) > 0 with more than half of the total weight.
+    The majority label is the positive entry of `labels` (8,) with more than half of the total of `weights` (8,).
     """
     total = np.float32(0.0)
     for c in range(CORNERS):
@@ -77,7 +77,7 @@ def majority(labels, weights):
 
 @device
 def _elect(grid, evidence, counts, blocks, voxels, weights, ids):
-    """Return the instance and class of a vertex by the majority of its corners, 0 and -1 without a majority."""
+    """Return the instance and class of a vertex by majority vote of its corners; 0 and -1 without a majority."""
     keep_near(grid, blocks, voxels, weights)
     for c in range(CORNERS):
         voxel = labeled_voxel(grid, evidence, blocks[c], voxels[c]) if weights[c] > 0 else np.int32(-1)

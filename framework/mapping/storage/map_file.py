@@ -26,10 +26,10 @@ from framework.mapping.voxels.voxel_grid_kernels import FARTHEST_BLOCK
 DEFLATE_LEVEL = 1  # zlib level; files are at most a tenth larger than at level 6 and take half the time
 
 HEADER = "header"
-LARGEST_HEADER = 2**28  # maximum size of the header, bytes; an hour with thousands of instances takes about 10 MB
-LARGEST_ID = 2**24  # largest instance id
-MAX_EVIDENCE = 1e12  # largest evidence for a class
-MAX_ARRAYS = 100  # maximum number of arrays in the list of a file
+LARGEST_HEADER = 2**28  # maximum size of the header, bytes; an hour of mapping with thousands of instances takes 10 MB
+LARGEST_ID = 2**24  # maximum instance id
+MAX_EVIDENCE = 1e12  # maximum absolute evidence for a class
+MAX_ARRAYS = 100  # maximum number of arrays listed in the header of a file
 MAX_MEMORY_FRACTION = 0.5  # maximum fraction of the machine's memory for a loaded map
 
 
@@ -67,7 +67,7 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
 
 
 def read_arrays(path: Path | str, expected_format: object) -> dict[str, Array]:
-    """Return the arrays listed as `names` in the header of a file. Raises DataError like read_map()."""
+    """Return the arrays listed as `names` in the header of a file. Raises DataError as read_map() does."""
     with map_file_errors(path), _opened(path) as archive:
         names = _header(archive).items("names")
     return read_map(path, expected_format, [str(name) for name in names[:MAX_ARRAYS]])[1]
@@ -100,7 +100,8 @@ def _opened(path: Path | str) -> Iterator[zipfile.ZipFile]:
         limit = MAX_MEMORY_FRACTION * machine_memory()
         if unpacked > limit:
             raise DataError(
-                f"expected at most {limit:.0f} unpacked bytes (half of this machine's memory), got {unpacked} bytes"
+                f"expected at most {limit:.0f} unpacked bytes (half of this machine's memory), got {unpacked}; use a "
+                "machine with more memory or a larger fuser.voxel_size"
             )
         yield archive
 
@@ -145,14 +146,14 @@ def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], lengt
 
 
 def check_known(name: str, array: Array, known: Iterable[int]) -> None:
-    """Raise DataError unless all values of the array are known, because kernels use them as indices."""
+    """Raise DataError unless all values of the array are in `known`, because kernels use the values as indices."""
     unknown = array[~np.isin(array, list(known))]
     if unknown.size:
         raise DataError(f"{name}: expected ids in the map, got {unknown[0]}")
 
 
 def check_numbers(name: str, numbers: Array, count: int) -> None:
-    """Raise DataError unless the array contains each number from 0 to `count` - 1 once, and otherwise only -1."""
+    """Raise DataError unless the array contains each integer from 0 to `count` - 1 once, and otherwise only -1."""
     used = numbers[numbers != -1]
     beyond = used[(used < 0) | (used >= count)]
     if beyond.size:
@@ -164,17 +165,18 @@ def check_numbers(name: str, numbers: Array, count: int) -> None:
 
 
 def check_blocks(coords: Any) -> None:
-    """Raise DataError unless blocks (B, 3) are unique and in range."""
+    """Raise DataError unless the block coordinates (B, 3) are unique and in range."""
     if len(coords) and np.abs(coords, dtype=np.int64).max() >= FARTHEST_BLOCK:
         raise DataError(
-            f"block_coords: expected values within {FARTHEST_BLOCK} of 0, got {coords.min()} to {coords.max()}"
+            f"block_coords: expected values in [{1 - FARTHEST_BLOCK}, {FARTHEST_BLOCK - 1}], got {coords.min()} to "
+            f"{coords.max()}"
         )
     if len(np.unique(coords, axis=0)) < len(coords):
         raise DataError("block_coords: expected unique blocks, got duplicates")
 
 
 def plain_table(table: InstanceTable) -> dict[str, Any]:
-    """Return an instance table as JSON values, without the embeddings in `table_arrays`."""
+    """Return an instance table as JSON values, without the embeddings, which `table_arrays` returns."""
     space = {SPACE: table.embedding_space} if table_arrays(table) else {}
     return {
         "combine": table.combine.name,
@@ -234,13 +236,14 @@ def _record(entry: MapHeader, last_id: int, classes: int) -> InstanceRecord:
     )
     if not np.abs(record.class_evidence).max() <= MAX_EVIDENCE:
         raise DataError(
-            f"{entry.name}.class_evidence: expected values within {MAX_EVIDENCE:g} of 0, got {evidence!r:.60}"
+            f"{entry.name}.class_evidence: expected numbers in [-{MAX_EVIDENCE:g}, {MAX_EVIDENCE:g}], got "
+            f"{evidence!r:.60}"
         )
     return record
 
 
 def _span(name: str, found: object) -> list[int]:
     if not isinstance(found, list) or len(found) != 2:
-        raise DataError(f"{name}: expected the first and last frame of each span, got {found!r:.60}")
+        raise DataError(f"{name}: expected a list [first frame, last frame], got {found!r:.60}")
     first = whole(name, found[0], -LARGEST_COUNT)
     return [first, whole(name, found[1], first)]

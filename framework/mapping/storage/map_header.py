@@ -12,14 +12,14 @@ from framework.errors import DataError
 
 MAX_CLASSES = 10_000  # maximum number of classes of a map; LVIS has 1,200
 LONGEST_NAME = 200  # maximum length of a class name, characters
-LARGEST_COUNT = 2**53  # maximum number of frames and evictions; JSON readers represent integers up to it exactly
+LARGEST_COUNT = 2**53  # maximum number of frames and evictions; JSON readers represent all integers up to it exactly
 
 Option = TypeVar("Option", bound=Enum)
 
 
 @dataclass(frozen=True)
 class MapHeader:
-    """A JSON object of the header. Each method reads one key and raises DataError if its value is invalid."""
+    """A JSON object in the header. Each method reads one key, and raises DataError if its value is invalid."""
 
     values: Mapping[str, Any]
     name: str = "header"
@@ -32,11 +32,11 @@ class MapHeader:
         return cls(found, name)
 
     def part(self, key: str) -> MapHeader:
-        """Return a nested object."""
+        """Return a nested JSON object."""
         return MapHeader.of(self._value(key), f"{self.name}.{key}")
 
     def parts(self, key: str) -> Iterator[MapHeader]:
-        """Yield the objects of a list."""
+        """Yield the JSON objects of a list."""
         for k, found in enumerate(self.items(key)):
             yield MapHeader.of(found, f"{self.name}.{key}[{k}]")
 
@@ -92,7 +92,7 @@ class MapHeader:
 
 
 def whole(name: str, found: object, low: int = 0, high: int = LARGEST_COUNT) -> int:
-    """Return an integer in [low, high]. Raises DataError that names the key for other values."""
+    """Return an integer in [low, high]. For other values, raises a DataError that names the key."""
     if isinstance(found, bool) or not isinstance(found, int) or not low <= found <= high:
         raise DataError(f"{name}: expected an integer in [{low}, {high}], got {found!r:.60}")
     return found

@@ -1,7 +1,8 @@
-"""Allocation of the blocks that a frame updates, along the truncation bands of its depth readings and in free space.
+"""Allocation and selection of the blocks that a frame updates.
 
-Candidates are gathered in a fixed number of chunks of image rows, and blocks are numbered serially. So the map does
-not depend on the number of threads.
+These are the blocks along the truncation bands of the depth readings, and existing blocks in the free space in front of
+them. Candidates are gathered in a fixed number of chunks of image rows, and blocks are numbered serially. Therefore,
+the map does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, FARTHEST_BLO
 
 MAX_SAMPLES = 4096  # maximum number of samples along the band of a reading, half a block apart; 6 by default
 REPEATS = 8  # maximum mean number of entries of a block in the lists of all chunks
-MIN_KEYS = 2**20  # number of keys that every frame may have, 8 MB; above it, the block budget is the limit
+MIN_KEYS = 2**20  # number of block keys that any frame may have, 8 MB; the block budget limits larger numbers
 
 
 class Allocator:
@@ -30,7 +31,7 @@ class Allocator:
         self.voxels = voxels
         self.sensor = sensor
         self._frames = 0
-        self._stamp = np.zeros(0, np.int32)  # (B,) last frame, from 1, in which a block was active
+        self._stamp = np.zeros(0, np.int32)  # (B,) last frame in which each block was active, 0 = none
         self._found = np.empty((CHUNKS, 4096), np.int64)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -38,7 +39,7 @@ class Allocator:
         return {**vars(self), "_stamp": self._stamp[: self.voxels.block_count]}
 
     def active_blocks(self, frame: Frame, T_world_camera: Float64) -> Int32:
-        """Allocate and return the blocks (A,) around the measured surface, and existing blocks in front of it.
+        """Return the blocks (A,) around the measured surface, allocated if new, and existing blocks in front of it.
 
         Raises MapFullError if the block budget is reached.
         """
@@ -53,7 +54,7 @@ class Allocator:
         return active[:count].copy()
 
     def allocate(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
-        """Allocate and return the blocks (N,), with repeats, along the truncation bands of `depth` (H, W) m.
+        """Allocate and return the blocks (N,), with repetitions, along the truncation bands of `depth` (H, W), m.
 
         Raises:
             MapFullError: If the block budget is reached. No memory is allocated if a single frame exceeds the budget.
@@ -63,10 +64,10 @@ class Allocator:
 
     def _surface_coords(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
         block_size = BLOCK_SIDE * float(self.voxels.grid.voxel_size)
-        # sample spacing of at most a quarter of a block at the largest depth
+        # sample spacing of at most a quarter of a block at the maximum depth
         footprint = float(self.sensor.max_depth) / camera.fx
         stride = max(1, min(8, int(0.25 * block_size / footprint)))
-        # sample spacing of at most half a block along the ray of a corner, at the largest depth of the frame
+        # sample spacing of at most half a block along the longest ray, at the maximum depth of the frame
         farthest = min(float(depth.max()), float(self.sensor.max_depth))
         band = float(self.sensor.truncation) + float(self.sensor.truncation_slope) * farthest
         longest = _longest_ray(camera)

@@ -11,8 +11,8 @@ from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, NO_KEY, devi
 from framework.mapping.voxels.voxel_walk import ray_direction
 
 CHUNKS = 32  # fixed number of chunks of image rows, so that block order does not depend on the number of threads
-WORD = 64  # bits
-RECENT = 1024  # number of recent block keys that a chunk caches, to list each block about once
+WORD = 64  # number of bits of a word
+RECENT = 1024  # number of recent block keys that a chunk caches, so that most blocks are listed once
 PROBES = 4  # number of probed pixels along each side of a block in the image, to detect free space behind it
 
 
@@ -56,7 +56,8 @@ def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
 def surface_blocks(depth, view, sensor, block_size, stride, samples, found, counts):
     """Write the keys of blocks along the band of every stride-th depth reading to `found` (CHUNKS, M), by chunk.
 
-    Counts (CHUNKS,) above M mean that `found` was too small.
+    Samples every stride-th row. Writes the number of keys of each chunk to counts (CHUNKS,); counts above M mean that
+    `found` is too small.
     """
     height, width = depth.shape
     rows, columns = (height + stride - 1) // stride, (width + stride - 1) // stride
@@ -87,14 +88,17 @@ def surface_blocks(depth, view, sensor, block_size, stride, samples, found, coun
 
 @njit(cache=True, nogil=True)
 def unpack(keys, coords):
-    """Write the integer coordinates of packed keys into `coords`."""
+    """Write the block coordinates of packed keys (N,) to `coords` (N, 3)."""
     for i in range(keys.shape[0]):
         coords[i, 0], coords[i, 1], coords[i, 2] = unpack_key(keys[i])
 
 
 @device
 def _extent(camera, size, margin):
-    """Return the half sides, m, of the box along the camera axes around a cube along the world axes, plus `margin`."""
+    """Return half the side lengths, m, of the camera-aligned box around a world-aligned cube, plus `margin`.
+
+    The cube has the side length `size`, m.
+    """
     half = np.float32(0.5) * size
     return (
         half * (abs(camera.R[0, 0]) + abs(camera.R[0, 1]) + abs(camera.R[0, 2])) + margin,
@@ -105,7 +109,7 @@ def _extent(camera, size, margin):
 
 @device
 def _bounds(camera, x, y, z, extent, near, far, shape):
-    """Return (visible, z0, z1, u0, u1, v0, v1): the depths (m) and inclusive pixels of the box around a world point."""
+    """Return (visible, z0, z1, u0, u1, v0, v1) of the box around a world point: its depths, m, and inclusive pixels."""
     height, width = shape
     pz = camera.R[2, 0] * x + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
     z0, z1 = max(pz - extent[2], near), min(pz + extent[2], far)
@@ -128,9 +132,10 @@ def _bounds(camera, x, y, z, extent, near, far, shape):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def solid_blocks_in_view(grid, region_count, block_count, camera, near, far, shape):
-    """Return the blocks (N,) with a surface in view, their depths (N, 2) m and inclusive pixels (N, 4) u0, u1, v0, v1.
+    """Return the blocks (N,) in view that contain a surface, their depths (N, 2) and their pixel windows (N, 4).
 
-    `camera` holds T_camera_world. Tests every region of the map, and every block of the regions in view.
+    Depths are the nearest and the farthest, m. Windows are u0, u1, v0, v1, inclusive. `camera` contains T_camera_world.
+    Tests every region of the map, and every block of the regions in view.
     """
     blocks = np.empty(block_count, np.int32)
     depths = np.empty((block_count, 2), np.float32)
@@ -166,7 +171,7 @@ def solid_blocks_in_view(grid, region_count, block_count, camera, near, far, sha
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sees_through(depth, sensor, z0, pixels):
-    """Return True if a probed depth reading in the block's window is behind z0, the depth of the block's front."""
+    """Return True if a probed depth reading in the block's pixel window is behind the block's minimum depth z0, m."""
     u0, u1, v0, v1 = pixels
     for row in range(PROBES):
         v = v0 + (v1 - v0) * row // (PROBES - 1)
@@ -181,7 +186,7 @@ def _sees_through(depth, sensor, z0, pixels):
 def choose_blocks(grid, found, region_count, depth, camera, sensor, stamp, frame, active):
     """Write the blocks `found` (N,) and the existing blocks in front of the surface to `active`. Returns their number.
 
-    Each block is written once. `camera` holds T_camera_world.
+    Each block is written once. `camera` contains T_camera_world.
     """
     n = 0
     for i in range(found.shape[0]):

@@ -1,8 +1,8 @@
 """Integration of depth images into the running averages of the visible voxels.
 
 The signed distance is projective, along z. Its running average is the TSDF of Curless and Levoy (1996). The truncation
-distance increases with depth like the sensor noise. Observations have full weight up to the depth at which sensor noise
-starts to increase. Beyond it, the weight falls with the square of the depth.
+distance increases with depth, as the sensor noise does. Observations have full weight up to the depth at which sensor
+noise starts to increase. Beyond it, the weight falls with the square of the depth.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ GOLDEN = 0.6180339887498949  # equidistributed rounding offsets frac(k * GOLDEN)
 class SeenBlocks(NamedTuple):
     """The A blocks updated by a frame and their voxels near the measured surface, valid until the next frame.
 
-    The near voxels of a block are contiguous. There are gaps between GROUPs of blocks.
+    The near voxels of a block are contiguous. There are gaps between groups of GROUP blocks.
     """
 
     blocks: Int32  # (A,) block indices
@@ -42,7 +42,7 @@ def _near_lists(blocks: int) -> tuple[UInt16, Int32]:
 
 
 class Integrator:
-    """Integrator of frames into a grid."""
+    """Integrator of frames into a voxel grid."""
 
     def __init__(self, voxels: VoxelGrid, sensor: Sensor) -> None:
         self.voxels = voxels
@@ -56,18 +56,17 @@ class Integrator:
         return {**vars(self), "_near_voxel": self._near_voxel[:0], "_near_pixel": self._near_pixel[:0]}
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near_band: float) -> SeenBlocks:
-        """Integrate one frame and return the voxels within near_band m of the measured surface.
+        """Integrate one frame, and return the updated blocks and their voxels within near_band m of the surface.
 
         Raises MapFullError if the block budget is reached; in this case the frame is not integrated.
         """
         return self._update(frame, T_world_camera, near_band, self._allocator.active_blocks(frame, T_world_camera))
 
     def integrate_object(self, frame: Frame, T_world_camera: Float64, near_band: float, mask: Bool) -> SeenBlocks:
-        """Integrate one frame into the grid of one object, and return the voxels as `integrate` does.
+        """Integrate one frame into the grid of one object, and return the same data as `integrate`.
 
-        The grid grows only within the object's `mask` (H, W).
-
-        All existing blocks are updated, including by depth readings outside the mask.
+        The grid grows only within the object's `mask` (H, W). Depth readings outside the mask also update the existing
+        blocks.
         """
         depth = np.where(mask, frame.depth, np.float32(0.0))
         self._allocator.allocate(frame.camera, depth, T_world_camera)

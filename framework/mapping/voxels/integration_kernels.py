@@ -21,18 +21,18 @@ from framework.mapping.voxels.voxel_grid_kernels import (
 from framework.mapping.voxels.voxel_walk import prefetch_row
 
 LAYER_VOXELS = BLOCK_SIDE**2
-GROUP = 16  # number of successive blocks of one thread, with contiguous near voxels
-FAR = 1e9  # m
-MIN_WEIGHT_BEHIND = (
-    0.02  # weight at the far end of the truncation band, fraction of the full weight; > 0 marks voxels as seen
-)
+GROUP = 16  # number of successive blocks that one thread updates; their near voxels are contiguous
+FAR = 1e9  # depth or distance of voxels without an observation, m
+# weight at the far end of the truncation band, as a fraction of the full weight; > 0, so that voxels count as observed
+MIN_WEIGHT_BEHIND = 0.02
 
 
 @device
 def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
-    """Project the voxels of a block (eq. [6]). Write pixel indices to pixel (512,) and depths (m) to scratch[:512].
+    """Project the voxels of a block (eq. (6) of docs/method.md) to pixel indices and depths.
 
-    Voxels outside the image get pixel 0 and a depth larger than any reading.
+    Writes the indices to pixel (512,) and the depths, m, to scratch[:512]. Voxels outside the image get pixel 0 and a
+    depth larger than any reading.
     """
     zero, half, one = np.float32(0.0), np.float32(0.5), np.float32(1.0)
     seven, three = np.int32(7), np.int32(3)
@@ -69,9 +69,9 @@ def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
 def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_band, scratch):
     """Update the running averages of the distances and weights (512,) of a block.
 
-    scratch[:512] holds the depths (m) of the voxels and gets their distances to the measured surface, m.
-    scratch[512:] holds their depth readings (m) and gets the weights of the new observations in the color averages,
-    0 = no color.
+    On input, scratch[:512] holds the depths, m, of the voxels, and scratch[512:] their depth readings, m. On output,
+    scratch[:512] holds their distances to the measured surface, m, and scratch[512:] the weights of the new
+    observations in the color averages, 0 = no color.
 
     Returns the number of voxels with a new color, and the number of voxels within near_band m of the surface.
     """
@@ -87,7 +87,7 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         band = sensor.truncation + sensor.truncation_slope * d
         sdf = d - scratch[n]
         seen = (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
-        # Behind the surface the weight falls with the distance, because observations from the other side contradict
+        # Behind the surface, the weight falls with the distance, because observations from the other side contradict
         # these voxels. The band widens with the noise, and only its far end loses weight. Otherwise noise would
         # displace surfaces.
         behind = max(least, min((band + sdf) * ramp, one))
@@ -112,10 +112,10 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
 
 @device
 def _average_colors(packed, color, pixel, start, rounding, scratch, seen):
-    """Update the running averages of the packed colors (512,) of a block in the layer from voxel `start` on.
+    """Update the running averages of the packed colors (512,) of a block, in the layer that begins at voxel `start`.
 
-    `color` holds the RGBA bytes of pixels, `pixel` (512,) the pixels of the voxels, scratch[512:] the weights of the
-    new observations, 0 = none. `seen` (64,) is scratch memory.
+    `color` holds the RGBA bytes of the pixels, `pixel` (512,) the pixel of each voxel, and scratch[512:] the weights of
+    the new observations, 0 = none. `seen` (64,) is scratch memory.
     """
     byte, one_byte, two_bytes = np.int32(255), np.int32(8), np.int32(16)
     zero, one, four, brightest = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(4 * 255)
@@ -139,7 +139,7 @@ def _average_colors(packed, color, pixel, start, rounding, scratch, seen):
 
 @device
 def _is_colored(scratch, start):
-    """Return True if a voxel of the layer from `start` on has a nonzero color weight in scratch[512:]."""
+    """Return True if any voxel of the layer that begins at `start` has a nonzero color weight in scratch[512:]."""
     largest = np.float32(0.0)
     for n in range(LAYER_VOXELS):
         largest = max(largest, scratch[start + n + BLOCK_VOXELS])
@@ -148,9 +148,10 @@ def _is_colored(scratch, start):
 
 @device
 def _list_near(pixel, near_band, near_voxel, near_pixel, entry, scratch):
-    """List the voxels with a distance scratch[:512] within near_band of the measured surface, and their pixels.
+    """List the voxels whose distance in scratch[:512] is within +-near_band, m, and their pixels.
 
-    The list begins at `entry`. The comparisons of a layer are bits of a word, so that the compiler vectorizes them.
+    The list begins at index `entry` of near_voxel and near_pixel. The comparisons of a layer are bits of a word, so
+    that the compiler vectorizes them.
     """
     for layer in range(BLOCK_SIDE):
         begin = layer * LAYER_VOXELS
@@ -169,8 +170,8 @@ def _list_near(pixel, near_band, near_voxel, near_pixel, entry, scratch):
 def integrate(grid, seen, depth, color, camera, sensor, rounding, near_band):
     """Update distance, weight and color of the voxels of `seen.blocks` that are visible in the depth image.
 
-    `seen` gets the voxels within near_band m of the measured surface. `color` (H, W) holds the RGBA bytes of pixels,
-    and `camera` holds T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers.
+    Writes the voxels within near_band m of the measured surface to `seen`. `color` (H, W) holds the RGBA bytes of the
+    pixels, and `camera` contains T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers.
 
     A block is updated in vectorized passes over its 512 voxels. The passes have no branches and read images in separate
     loops. They share one scratch array, so that the compiler can prove that arrays do not overlap.

@@ -8,7 +8,7 @@ import numpy as np
 
 from framework.data import Camera, Float32, Float64
 
-BOUNDS = {  # bounds of the parameters of Tsdf and VoxelHashing
+BOUNDS = {  # bounds of the parameters of Tsdf and VoxelHashing, in the units given there
     "voxel_size": (1e-4, 1.0),
     "truncation": (1e-4, 100.0),
     "truncation_slope": (0.0, 1.0),
@@ -20,7 +20,7 @@ BOUNDS = {  # bounds of the parameters of Tsdf and VoxelHashing
 
 
 class Sensor(NamedTuple):
-    """The parameters of integration."""
+    """Parameters for integrating depth images."""
 
     truncation: np.float32  # truncation distance at depth 0, m
     truncation_slope: np.float32  # increase of the truncation distance with depth, m per m
@@ -31,12 +31,12 @@ class Sensor(NamedTuple):
 
     @property
     def max_truncation(self) -> float:
-        """The largest truncation distance, m."""
+        """Maximum truncation distance, m."""
         return float(self.truncation + self.truncation_slope * self.max_depth)
 
     @property
     def depth_range(self) -> tuple[float, float]:
-        """The (nearest, farthest) integrated depth, m."""
+        """Minimum and maximum depth of integrated readings, m."""
         return float(self.min_depth), float(self.max_depth)
 
 
@@ -47,8 +47,8 @@ class Pinhole(NamedTuple):
     fy: np.float32
     cx: np.float32
     cy: np.float32
-    R: Float32  # (3, 3)
-    t: Float32  # (3,) m
+    R: Float32  # (3, 3) rotation of the pose
+    t: Float32  # (3,) m, translation of the pose
 
 
 def pinhole(camera: Camera, T: Float64) -> Pinhole:

@@ -8,9 +8,9 @@ Compared with dual contouring, the vertices are farther from sharp edges, and cl
 Few voxels are near the surface, so the search tests 64 voxels at once as bits of a word. Only cells with a vertex are
 visited individually. The index of a vertex is the number of set bits before its own bit.
 
-A block stores 192 bytes of words and 32 bytes of indices between updates. Its vertices are computed again after a
-change of its voxels, or of voxels of the next blocks that its cells share. The other vertices are copied. The result
-depends on the grid alone.
+A block stores 192 bytes of words and 32 bytes of indices between updates. Its vertices are recomputed if voxels
+of its cells change, in the block itself or in adjacent blocks. All other vertices are copied. The result depends on the
+grid alone.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from framework.mapping.voxels.meshing_kernels import (
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE
 
-# Largest difference between the corners of a cell, voxels of distance. Cells with a larger difference are on a
-# silhouette, between truncated free space and hidden space. The limit is high, because projective distances on oblique
-# surfaces are larger by 1 / cos of the viewing angle.
+# Maximum difference between the signed distances at the corners of a cell, voxels. Cells with a larger difference are
+# on a silhouette, between truncated free space and hidden space. The limit is high, because projective distances on
+# oblique surfaces are larger by a factor of 1 / cos(viewing angle).
 MAX_JUMP = 8.0
 
 
@@ -47,11 +47,11 @@ class UnlabeledMesh(NamedTuple):
 
 
 class SurfaceNets:
-    """The surface of a grid: `changed` marks written blocks, `extract` updates the surface."""
+    """The surface of a voxel grid. `changed` marks modified blocks, and `extract` updates the surface."""
 
     def __init__(self, voxels: VoxelGrid) -> None:
         self.voxels = voxels
-        # (B + 1, 8) one bit per voxel or cell; the last row stands for an absent block, index -1
+        # (B + 1, 8) one bit per voxel or cell; the last row, index -1, represents an absent block
         self._inside = np.zeros((1, BLOCK_SIDE), np.uint64)
         self._seen = np.zeros((1, BLOCK_SIDE), np.uint64)
         self._cells = np.zeros((1, BLOCK_SIDE), np.uint64)
@@ -60,7 +60,7 @@ class SurfaceNets:
         self._surface = UnlabeledMesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.int32))
 
     def changed(self, blocks: Int32) -> None:
-        """Mark `blocks` (A,) with changed voxels. Blocks added since the last `extract` are always marked."""
+        """Mark blocks (A,) whose voxels have changed. `extract` marks new blocks itself."""
         known = blocks[blocks < len(self._changed)]
         self._changed[known] = True
 

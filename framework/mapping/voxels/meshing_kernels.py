@@ -12,7 +12,7 @@ from framework.mapping.voxels.voxel_walk import voxel_number
 
 @device
 def _blocks_before(grid, block, out):
-    """Write the 2x2x2 blocks at offsets 0 or -1 along x, y, z to `out` (8,), -1 = none."""
+    """Write the 2 x 2 x 2 blocks at offsets 0 or -1 along x, y and z from a block to `out` (8,), -1 = none."""
     key, region = NO_LOOK_UP
     bx, by, bz = grid.block_coords[block, 0], grid.block_coords[block, 1], grid.block_coords[block, 2]
     for o in range(8):
@@ -21,7 +21,7 @@ def _blocks_before(grid, block, out):
 
 @njit(cache=True, nogil=True, parallel=True)
 def pack(tsdf, blocks, inside, seen):
-    """Pack flags of the blocks' negative voxels into `inside` (B + 1, 8), and of observed voxels into `seen`."""
+    """Pack one bit per voxel of the blocks into `inside`, 1 = negative, and `seen`, 1 = observed; (B + 1, 8) each."""
     for b in prange(len(blocks)):
         block = blocks[b]
         for z in range(BLOCK_SIDE):
@@ -37,7 +37,7 @@ def pack(tsdf, blocks, inside, seen):
 
 @njit(cache=True, nogil=True, parallel=True)
 def mark_stale(grid, changed, stale):
-    """Mark in `stale` (B,) the blocks with a cell corner in a changed block."""
+    """Set `stale` (B,) to True for the blocks that have a cell with a corner in a changed block."""
     for b in prange(len(changed)):
         before = np.empty(8, np.int32)
         _blocks_before(grid, changed[b], before)
@@ -48,7 +48,7 @@ def mark_stale(grid, changed, stale):
 
 @device
 def _any_and_all(words, around, z):
-    """Return two words for the cells of slice z: those with any, and those with all, of their corners in z set."""
+    """Return two words with one bit per cell of slice z: if any, and if all, of its corners in the slice are set."""
     up = 4 * (z >> 3)
     z &= 7
     here, block_x = words[around[up], z], words[around[up + 1], z]
@@ -68,7 +68,7 @@ def _cell_corners(tsdf, around, x, y, z, corners):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_cells(grid, blocks, inside, seen, most_jump, cells):
-    """Pack flags of the blocks' cells with a vertex into `cells` (B + 1, 8).
+    """Pack one bit per cell of the blocks into `cells` (B + 1, 8), 1 = has a vertex.
 
     `most_jump` is MAX_JUMP in stored units.
     """
@@ -218,7 +218,7 @@ def count_quads(grid, inside, cells, counts):
 
 @device
 def _vertex(cells, starts, before, x, y, z):
-    """Return the vertex index of a cell; the cell may be one cell before the block."""
+    """Return the vertex index of a cell. Coordinates of -1 refer to cells of the previous blocks."""
     block = before[(x < 0) + 2 * (y < 0) + 4 * (z < 0)]
     n = np.uint64((y & 7) * 8 + (x & 7))
     return starts[block, z & 7] + count_bits(cells[block, z & 7] & ((ONE << n) - ONE))

@@ -1,15 +1,15 @@
-"""Ray-casting of a camera view of the map by sphere tracing through its blocks, coarse to fine.
+"""Ray casting of a camera view of the map, by sphere tracing through its blocks from coarse to fine.
 
 1. Project the blocks in view to image tiles. This bounds the depths that the rays of each tile search.
 2. Cast a ray every few pixels. The ray skips absent regions and blocks in one step each and advances by the stored
    distance. The surface is where the field changes from positive to negative.
-3. If neighboring rays meet one surface, interpolate the depths of the pixels between them. Refine these depths on the
-   trilinear field by Newton's method, one image row at a time. If this fails, run a full search for the pixel.
+3. If neighboring rays hit the same surface, interpolate the depths of the pixels between them. Refine these depths on
+   the trilinear field by Newton's method, one image row at a time. If this fails, run a full search for the pixel.
 
-Interpolation could miss a surface narrower than the spacing of the coarse rays. So the spacing is kept below the size
-of the map's details. At depths where the spacing is larger, all pixels are searched.
+Interpolation could miss a surface that is narrower than the spacing of the coarse rays. Therefore, the spacing is kept
+below the size of the map's details. At depths where the spacing is larger, all pixels are searched.
 
-Rays are in voxels: o + z * d with d in voxels per m of depth z.
+Rays are o + z * d, where the origin o is in voxels, the depth z in m and d in voxels per m.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from framework.mapping.voxels.raycasting_kernels import (
 from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.sensors.noise_models import SensorKind
 
-MAX_STRIDE = 8  # px between coarse rays
+MAX_STRIDE = 8  # maximum distance between coarse rays, px
 
 
 def tile_bounds(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float32]:
-    """Return the nearest and farthest depths (Y, X) m of blocks along the rays of each tile."""
+    """Return the minimum and maximum depth (Y, X), m, of the blocks in view in each tile of TILE x TILE pixels."""
     tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
     tile_near, tile_far = np.full(tiles, sensor.max_depth), np.full(tiles, sensor.min_depth)
     view = pinhole(camera, inverse(T_world_camera))
@@ -54,9 +54,9 @@ def cast_view(
     voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None,
     kind: SensorKind = SensorKind.KINECT_V1,
 ) -> tuple[Float32, Float32]:  # fmt: skip
-    """Return the depth (H, W) m and the world-frame normals (H, W, 3) of the visible surface; depth 0 = no surface.
+    """Return the depth (H, W), m, and the world-frame normals (H, W, 3) of the visible surface; depth 0 = no surface.
 
-    With depth `readings` (H, W) m of a sensor `kind`, only the surface near the readings or in front of them is
+    With depth `readings` (H, W), m, of a sensor `kind`, only the surface near the readings or in front of them is
     searched.
     """
     tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
@@ -96,7 +96,7 @@ def render_surface(
     voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None,
     kind: SensorKind = SensorKind.KINECT_V1,
 ) -> SurfaceView:  # fmt: skip
-    """Return the view without labels; see `cast_view` for `readings` (H, W) m and `kind`.
+    """Return the view without labels; see `cast_view` for `readings` (H, W), m, and `kind`.
 
     Raises DataError if the camera, its pose or the readings are invalid.
     """

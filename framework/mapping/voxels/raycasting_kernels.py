@@ -27,14 +27,14 @@ REFINEMENTS = 4  # maximum number of Newton steps of a ray; a plane needs one, a
 CONVERGED = 0.2  # maximum last Newton step, voxels; the remaining error is a few hundredths of a voxel
 REACH = 3.0  # maximum distance from the start of a refinement to the surface, voxels
 DETAIL = 4.0  # maximum spacing of coarse rays, voxels; maps have few details smaller than the truncation band
-MARGIN = 8.0  # maximum protrusion of a surface between the coarse rays that meet it, voxels
-STEEPEST = 24.0  # maximum depth difference of coarse rays on one surface, voxels; reached by a distant floor
+MARGIN = 8.0  # maximum protrusion of a surface between the coarse rays that hit it, voxels
+STEEPEST = 24.0  # maximum depth difference between coarse rays on one surface, voxels; a distant floor reaches it
 MAX_SHIFT = 10.0  # maximum distance between a depth reading and the surface of the map, voxels
 
 
 @device
 def _ray(view, scale, u, v):
-    """Return (d, step): the ray of pixel (u, v), voxels per m of depth, and the depth step (m) of one voxel."""
+    """Return (d, step): the ray of pixel (u, v), voxels per m of depth, and the depth step, m, of a voxel along it."""
     dx, dy, dz = ray_direction(view, u, v)
     dx, dy, dz = dx * scale, dy * scale, dz * scale
     return (dx, dy, dz), np.float32(1.0) / np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -42,10 +42,10 @@ def _ray(view, scale, u, v):
 
 @device
 def _refined(grid, o, d, step, z, reach, key, region):
-    """Return (z, nx, ny, nz, key, region): the zero of the trilinear field within `reach` m of depth z; z = 0 = none.
+    """Return (z, nx, ny, nz, key, region): the zero of the trilinear field within `reach` m of depth z.
 
-    (nx, ny, nz) is the gradient, stored units per voxel. A zero where the field rises along the ray is a back face and
-    is ignored.
+    (nx, ny, nz) is the gradient, stored units per voxel. z is 0 if there is no zero. A zero where the field increases
+    along the ray is a back face and is ignored.
     """
     zero = np.float32(0.0)
     nx = ny = nz = zero
@@ -71,7 +71,7 @@ def _refined(grid, o, d, step, z, reach, key, region):
 
 @device
 def _first_surface(grid, o, d, step, near, far, key, region):
-    """Return (z, nx, ny, nz, key, region) of the first front face along the ray; z = 0 = none."""
+    """Return (z, nx, ny, nz, key, region) of the first front face between depths `near` and `far`, m; z = 0: none."""
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     to_voxels = grid.tsdf_unit / grid.voxel_size
     reach = np.float32(REACH) * step
@@ -96,7 +96,7 @@ def _first_surface(grid, o, d, step, near, far, key, region):
             continue
         stored = grid.tsdf[np.uint32(block), np.uint32(voxel_number(i, j, k))]
         if stored == UNSEEN:
-            z += step + step  # more than one observed voxel is in front of a surface
+            z += step + step  # skips no surface: more than one observed voxel is in front of each
             from_front = False
             continue
         distance = np.float32(stored) * to_voxels
@@ -111,7 +111,11 @@ def _first_surface(grid, o, d, step, near, far, key, region):
 
 @njit(cache=True, nogil=True)
 def bound_tiles(depths, pixels, tile_near, tile_far):
-    """Extend tile_near and tile_far (Y, X) m to the `depths` (N, 2) m of blocks at `pixels` (N, 4), u0 u1 v0 v1."""
+    """Extend the depth bounds tile_near and tile_far (Y, X), m, of the tiles to include N blocks.
+
+    `depths` (N, 2), m, are the minimum and maximum depths of the blocks. `pixels` (N, 4) are their windows u0, u1, v0,
+    v1, inclusive.
+    """
     for n in range(depths.shape[0]):
         u0, u1, v0, v1 = pixels[n]
         for ty in range(v0 // TILE, v1 // TILE + 1):
@@ -124,8 +128,8 @@ def bound_tiles(depths, pixels, tile_near, tile_far):
 def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
     """Fill `depth` (m) at every stride-th pixel, and in the last row and column of an image, by a full search.
 
-    The image is (H, W), `depth` is (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1), 0 = no surface. `view`
-    holds T_world_camera.
+    `shape` is (H, W). `depth` is (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1), 0 = no surface. `view`
+    contains T_world_camera.
     """
     scale = np.float32(1.0) / grid.voxel_size
     for y in prange(depth.shape[0]):
@@ -142,10 +146,10 @@ def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
 
 @device
 def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near, far, corners):
-    """Bound the search in the cells (X,) of pixels between two rows of coarse depths (X + 1,) m, -1 = not searched.
+    """Bound the search in the cells (X,) of pixels between two rows of coarse depths (X + 1,), m, -1 = not searched.
 
-    near and far get the depth range, m, of a surface in the cell; far 0 = no surface. corners (4, X) gets the inverse
-    depths of the surface, in row order, if the cell has exactly one surface; otherwise 0.
+    Sets near and far (X,) to the depth range, m, of a surface in the cell; far 0 = no surface. Sets corners (4, X) to
+    the inverse depths of the surface, 1 / m, in row order, if the cell has exactly one surface, otherwise to 0.
     """
     zero, one, none = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
     margin, rise = np.float32(MARGIN) * voxel, np.float32(STEEPEST) * voxel
@@ -182,9 +186,9 @@ def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near
 
 @device
 def _start_row(corners, b, stride, limits, depth):
-    """Fill depth (W,) m by interpolation between the corners (4, X) of cells; 0 = unknown.
+    """Fill depth (W,), m, by interpolation between the corners (4, X) of the cells; 0 = unknown.
 
-    `b` is the vertical position between the upper (0) and lower (1) corners.
+    `b` is the vertical position between the upper corners (0) and the lower corners (1).
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     width = depth.shape[0]
@@ -200,10 +204,10 @@ def _start_row(corners, b, stride, limits, depth):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, normals):
-    """Fill depth (H, W) m and world-frame normals (H, W, 3) of the visible surface; 0 = none.
+    """Fill depth (H, W), m, and world-frame normals (H, W, 3) of the visible surface; 0 = none.
 
-    `view` holds T_world_camera. `coarse` is the result of cast_coarse() or cast_near(). No pixel is searched beyond its
-    limit (H, W) m. Normals are the gradient of the trilinear field.
+    `view` contains T_world_camera. `coarse` is the result of cast_coarse() or cast_near(). No pixel is searched beyond
+    its depth in `limits` (H, W), m. Normals are the normalized gradients of the trilinear field.
     """
     height, width = depth.shape
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -253,13 +257,13 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, depth):
-    """Fill depth like cast_coarse(), starting at the camera's depth readings (H, W) m.
+    """Fill `depth` as cast_coarse() does, but start the search at the camera's depth readings (H, W), m.
 
-    No pixel is searched beyond its limit (H, W) m. At limit 0 the depth is -1 (not searched), because
-    neighboring pixels may still be searched.
+    No pixel is searched beyond its depth in `limits` (H, W), m. If the limit is 0, the depth is -1 (not searched),
+    because neighboring pixels may still be searched.
 
-    Depth readings are noisy, and a wrong pose displaces them. So the search starts at the extrapolation of the two
-    previous rays if the reading agrees with it. Otherwise it starts at the reading plus the last displacement.
+    Depth readings are noisy, and a wrong pose displaces them. Therefore, the search starts at the extrapolation of the
+    two previous rays if the reading agrees with it. Otherwise it starts at the reading plus the last displacement.
     """
     height, width = readings.shape
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -296,7 +300,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def paint(grid, view, depth, color):
-    """Fill color (H, W, 3) with the map's color at the surface at `depth` (H, W) m, seen from `view`."""
+    """Fill color (H, W, 3) with the map's color at the surface at `depth` (H, W), m, seen from `view`."""
     height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size
     for v in prange(height):
@@ -309,7 +313,7 @@ def paint(grid, view, depth, color):
 
 @device
 def voxel_seen(grid, view, u, v, z, key, region):
-    """Return (block, index, key, region) of the nearest voxel to pixel (u, v) at depth z (m); see find_block()."""
+    """Return (block, index, key, region) of the voxel nearest to pixel (u, v) at depth z, m; see find_block()."""
     scale = np.float32(1.0) / grid.voxel_size
     half = np.float32(0.5)
     x, y, w = seen_point(view, u, v, z)
@@ -322,7 +326,10 @@ def voxel_seen(grid, view, u, v, z, key, region):
 
 @njit(cache=True, nogil=True, parallel=True)
 def label(grid, evidence, view, depth, instance_ids, class_ids):
-    """Fill instance_ids and class_ids (H, W) from the voxels nearest to the surface at `depth` (H, W) m."""
+    """Fill instance_ids, 0 = none, and class_ids, -1 = none, (H, W) from the voxels nearest to the surface.
+
+    The surface is at `depth` (H, W), m.
+    """
     height, width = depth.shape
     for v in prange(height):
         key, region = NO_LOOK_UP

@@ -1,4 +1,4 @@
-"""TSDF volume with integration, surface extraction, ray-casting and serialization, and its parameters."""
+"""TSDF volume with integration, surface extraction, ray casting and serialization, and its parameters."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NO_BLOCKS = np.zeros(0, np.int32)
 
 
 class TsdfVolume:
-    """Voxels, their integrator and their surface, updated when blocks change."""
+    """A TSDF: voxels, their integrator and their cached surface."""
 
     def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int) -> None:
         self.sensor = sensor
@@ -44,7 +44,7 @@ class TsdfVolume:
 
     @property
     def voxel_size(self) -> float:
-        """Side of a voxel in m."""
+        """Side of a voxel, m."""
         return float(self.voxels.grid.voxel_size)
 
     @property
@@ -52,7 +52,7 @@ class TsdfVolume:
         return self.voxels.block_count * BLOCK_VOXELS
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near: float) -> SeenBlocks:
-        """Integrate one frame and return the voxels within `near` m of the measured surface.
+        """Integrate one frame, and return the updated blocks and their voxels within `near` m of the surface.
 
         Raises MapFullError if the block budget is reached; in this case the frame is not integrated.
         """
@@ -62,11 +62,11 @@ class TsdfVolume:
         return seen
 
     def renew_colors(self) -> None:
-        """Let the next observation of each voxel replace its color."""
+        """Mark all colors as outdated, so that the next observation of each voxel replaces its color."""
         mark_outdated(self.voxels.grid.color, self.voxels.block_count)
 
     def changed(self, blocks: Int32 | None = None) -> None:
-        """Invalidate derived data after a change of the voxels of `blocks` (A,); None = of any blocks."""
+        """Invalidate derived data after a change of the voxels in `blocks` (A,); None = in any block."""
         self._mesh = self._gravity = None
         if blocks is None:
             self._nets = None
@@ -113,7 +113,7 @@ class TsdfVolume:
 
     @classmethod
     def load(cls, header: MapHeader, arrays: dict[str, Any], rows: int) -> TsdfVolume:
-        """Return the volume of a map file with `rows` label rows. Raises DataError if the file is invalid."""
+        """Return the volume of a map file with `rows` evidence rows. Raises DataError if the file is invalid."""
         saved = header.part("sensor")
         sensor = Sensor(**{name: np.float32(saved.number(name, BOUNDS[name])) for name in Sensor._fields})
         max_blocks = header.whole("max_blocks", 1, MAX_BLOCKS)
@@ -126,7 +126,7 @@ class TsdfVolume:
         return volume
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Copy the arrays of a map file into an empty volume. Their types and shapes must be checked before."""
+        """Copy the arrays of a map file into an empty volume. The caller checks their types and shapes first."""
         coords = arrays["block_coords"]
         check_blocks(coords)
         self.voxels.allocate(coords)

@@ -1,9 +1,9 @@
 """Voxel hashing: blocks of 8^3 voxels in a hash table, allocated near observed surfaces.
 
-After Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing" (2013). The hash table holds regions
-of 8^3 blocks. A region is a dense table of block indices. Neighboring look-ups along a ray or a row of voxels are
-usually in the same region. So nearly all look-ups cost one comparison and one load, and a ray skips unmapped space by
-region.
+The method is that of Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing" (2013). The hash table
+holds regions of 8^3 blocks. A region is a dense table of block indices. Neighboring look-ups along a ray or a row of
+voxels are usually in the same region. Therefore, nearly all look-ups cost one comparison and one load, and a ray skips
+an unmapped region in one step.
 
 Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory, x varies fastest: voxel
 (x, y, z) of a block has the index (z * 8 + y) * 8 + x.
@@ -31,10 +31,10 @@ except ImportError:  # Windows
 Element = TypeVar("Element", bound=np.generic)
 Made = TypeVar("Made")
 MAX_BLOCKS = 2**31 // BLOCK_VOXELS  # maximum number of blocks of a map; voxel indices are 32-bit
-REGION_SIDE = 8  # blocks
+REGION_SIDE = 8  # side of a region, blocks
 REGION_BLOCKS = REGION_SIDE**3
 WEIGHT_ONE = 256  # stored weight of one observation
-TSDF_MAX = 32767  # stored value of the largest truncation distance
+TSDF_MAX = 32767  # stored value of the maximum truncation distance
 FIRST_RESERVED = 1024  # initial capacity, blocks or voxels
 
 
@@ -42,7 +42,7 @@ class Grid(NamedTuple):
     """The arrays of a VoxelGrid for the kernels. B and S are capacities; only the first entries are in use."""
 
     voxel_size: np.float32  # m
-    tsdf_unit: np.float32  # distance of a stored tsdf of 1, m
+    tsdf_unit: np.float32  # distance represented by a stored tsdf of 1, m
     table_keys: npt.NDArray[np.int64]  # (T,) packed region coordinates, NO_KEY = free; T is a power of two
     table_regions: Int32  # (T,) region index
     region_coords: Int32  # (S, 3) region coordinates; the first block is at 8 times these
@@ -52,7 +52,7 @@ class Grid(NamedTuple):
     tsdf: npt.NDArray[np.int16]  # (B, 512) signed distance in tsdf_unit, positive in front of the surface, or UNSEEN
     weight: npt.NDArray[np.uint16]  # (B, 512) in 1/256 observations
     color: npt.NDArray[np.uint32]  # (B, 512) packed, see pack_color()
-    solid: UInt8  # (B,) 1 = a voxel is behind a surface; rays skip other blocks
+    solid: UInt8  # (B,) 1 = any voxel is behind a surface; rays skip all other blocks
     label_row: Int32  # (B,) row of the block in the label evidence, -1 = none
 
 
@@ -87,7 +87,7 @@ def reserved(most: int, make: Callable[[int], Made]) -> Made:
 
 
 class VoxelGrid:
-    """Owner of the growing arrays of the grid. The kernels work on `self.grid`."""
+    """Voxel grid with growing arrays. The kernels modify `self.grid`."""
 
     def __init__(self, voxel_size: float, max_truncation: float, max_blocks: int) -> None:
         self.max_blocks = max_blocks
@@ -110,14 +110,14 @@ class VoxelGrid:
 
     @property
     def byte_count(self) -> int:
-        """Bytes in use; unused capacity takes no memory."""
+        """Size of the arrays in use, bytes. Unused capacity takes no memory."""
         grid = self.grid
         regions = sum(array[: self.region_count].nbytes for array in (grid.region_coords, grid.region_blocks))
         blocks = sum(getattr(grid, name)[: self.block_count].nbytes for name in OF_BLOCKS)
         return int(grid.table_keys.nbytes + grid.table_regions.nbytes + regions + blocks)
 
     def allocate(self, coords: Int32) -> Int32:
-        """Return the blocks (N,) at `coords` (N, 3). New blocks are allocated in the given order.
+        """Return the block indices (N,) at block coordinates (N, 3). Missing blocks are allocated in the given order.
 
         Raises MapFullError if more than `max_blocks` are needed; blocks allocated before the error remain.
         """
@@ -157,7 +157,7 @@ class VoxelGrid:
 
 
 def grown(array: npt.NDArray[Element], length: int, zeros: bool = False) -> npt.NDArray[Element]:
-    """Return a copy of `array` with `length` rows. New rows are uninitialized or zeros."""
+    """Return a copy of `array` with `length` rows. New rows are uninitialized, or 0 if `zeros` is True."""
     longer = (np.zeros if zeros else np.empty)((length, *array.shape[1:]), array.dtype)
     longer[: len(array)] = array
     return longer

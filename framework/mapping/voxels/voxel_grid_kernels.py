@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-BLOCK_SIDE = 8  # voxels
+BLOCK_SIDE = 8  # side of a block, voxels
 BLOCK_VOXELS = BLOCK_SIDE**3
-UNSEEN = -32768  # stored distance of an unobserved voxel; avoids loading the weight
-NO_KEY = -1
+UNSEEN = -32768  # stored distance of an unobserved voxel; makes it unnecessary to read the weight
+NO_KEY = -1  # key of a free slot
 NO_LOOK_UP = (np.int64(-2), np.int32(-1))  # key and region before the first find_block()
 
 # Decorator for functions in inner loops of kernels. Arrays have no reference counts (_nrt), because threads would wait
-# for their updates.
+# for each other to update them.
 device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nrt=False)
 
 
 @device
 def one_more(count, condition):
-    """Return count + condition as int32. Numba would add in 64 bits, and half as many fit into a vector."""
+    """Return count + condition as int32. Numba would add in 64 bits, so that half as many numbers fit into a vector."""
     return np.int32(count + (np.int32(1) if condition else np.int32(0)))
 
 
@@ -30,7 +30,7 @@ _KEY_MASK = (1 << _KEY_BITS) - 1
 
 @device
 def pack_key(x, y, z):
-    """Return the key, >= 0, of region or block coordinates."""
+    """Return the key, >= 0, of the coordinates of a region or a block."""
     return (
         ((np.int64(x) + _KEY_OFFSET) & _KEY_MASK) << (2 * _KEY_BITS)
         | ((np.int64(y) + _KEY_OFFSET) & _KEY_MASK) << _KEY_BITS
@@ -79,7 +79,7 @@ def child_number(bx, by, bz):
 def find_block(grid, bx, by, bz, last_key, last_region):
     """Return (block, key, region) at block coordinates; block -1 = not allocated.
 
-    `last_key` and `last_region` come from the previous call. This cache makes neighboring look-ups cheap.
+    `last_key` and `last_region` come from the previous call. This cache makes look-ups in the same region fast.
     """
     key = pack_key(bx >> 3, by >> 3, bz >> 3)
     if key != last_key:
@@ -93,7 +93,8 @@ def find_block(grid, bx, by, bz, last_key, last_region):
 def insert_blocks(grid, coords, start, region_count, block_count, blocks):
     """Allocate the new blocks of coords[start:] in order, and write the index of each block to blocks (N,).
 
-    Returns (next, region_count, block_count). If next < len(coords), a capacity was reached: grow and call again.
+    Returns (next, region_count, block_count). If next < len(coords), a capacity is exhausted: grow the arrays and call
+    again.
     """
     size = grid.table_keys.shape[0]
     region, last_key = np.int32(-1), np.int64(NO_KEY)
@@ -160,7 +161,7 @@ OUTDATED = np.uint32(1 << 31)  # marker bit of a color that the next observation
 
 @device
 def pack_color(red, green, blue):
-    """Return a packed color from channels in quarters of a level, 0 to 1020. Ten bits let averages converge."""
+    """Return a packed color from channels in quarters of an 8-bit level, 0 to 1020. Ten bits let averages converge."""
     return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE) | COLORED
 
 
@@ -175,7 +176,7 @@ def mark_outdated(color, blocks):
 
 @device
 def unpack_color(packed):
-    """Return (red, green, blue), float32, in quarters of a level."""
+    """Return (red, green, blue), float32, in quarters of an 8-bit level."""
     bits = np.int32(packed)
     return (
         np.float32(np.int32(bits & _CHANNEL)),
@@ -196,7 +197,7 @@ def is_solid(tsdf):
 
 @njit(cache=True, nogil=True)
 def find_solid_blocks(grid, block_count):
-    """Fill grid.solid of the first `block_count` blocks from their distances."""
+    """Set grid.solid of the first `block_count` blocks from their distances."""
     for block in range(block_count):
         grid.solid[block] = is_solid(grid.tsdf[block])
 

@@ -1,8 +1,8 @@
 """Device functions that read the voxel grid: rays, cell borders, trilinear fields, and memory prefetch.
 
 Functions for a whole image row work in passes that the compiler vectorizes. Look-ups branch and wait for memory, while
-arithmetic does not. So one pass gathers the eight corners of each point with many concurrent loads. Another pass does
-the arithmetic for eight pixels at a time. The last axis of their arrays is the pixel.
+arithmetic does not. Therefore, one pass gathers the eight corners of each point with many concurrent loads. Another
+pass does the arithmetic for eight pixels at a time. The last axis of their arrays is the pixel.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _READ, _L2, _DATA = 0, 2, 1  # arguments of llvm.prefetch: for reading, into the
 
 @device
 def ray_direction(view, u, v):
-    """Return the world-frame ray (dx, dy, dz) of pixel (u, v), m per m of depth. `view` holds T_world_camera."""
+    """Return the world-frame ray (dx, dy, dz) of pixel (u, v), m per m of depth. `view` contains T_world_camera."""
     ray_x = (np.float32(u) - view.cx) / view.fx
     ray_y = (np.float32(v) - view.cy) / view.fy
     return (
@@ -35,7 +35,7 @@ def ray_direction(view, u, v):
 
 @device
 def seen_point(view, u, v, z):
-    """Return the world point (x, y, z), m, of pixel (u, v) at depth z (m). `view` holds T_world_camera."""
+    """Return the world point (x, y, z), m, of pixel (u, v) at depth z, m. `view` contains T_world_camera."""
     dx, dy, dz = ray_direction(view, u, v)
     return view.t[0] + z * dx, view.t[1] + z * dy, view.t[2] + z * dz
 
@@ -44,7 +44,7 @@ def seen_point(view, u, v, z):
 def _leave_slab(z, start, d, inverse_d, size, inverse_size):
     """Return the parameter at which the ray leaves its cell along one axis; see leave_cell()."""
     cell = np.floor((start + z * d) * inverse_size)
-    # not d: a ray parallel to the slab has a huge inverse_d and leaves the slab far away
+    # not the sign of d: a ray parallel to the slab has a huge inverse_d and leaves the slab far away
     if inverse_d > np.float32(0.0):
         cell += np.float32(1.0)
     return (cell * size - start) * inverse_d
@@ -156,7 +156,7 @@ def trilinear(grid, block, x, y, z):
 
 @device
 def _add_color(red, green, blue, total, packed, weight):
-    """Return the sums with a packed color and its weight added. A voxel without color adds nothing."""
+    """Return the sums after adding a packed color and its weight. A voxel without a color adds nothing."""
     weight = weight if packed & COLORED else np.float32(0.0)
     r, g, b = unpack_color(packed)
     return red + weight * r, green + weight * g, blue + weight * b, total + weight
@@ -164,7 +164,10 @@ def _add_color(red, green, blue, total, packed, weight):
 
 @device
 def blend(p, x1, y1, z1):
-    """Return (red, green, blue) at fractions (x1, y1, z1) between eight packed colors; ignores voxels without color."""
+    """Return (red, green, blue) in [0, 255] at fractions (x1, y1, z1) of a voxel between eight packed colors.
+
+    Voxels without a color are ignored.
+    """
     one, zero = np.float32(1.0), np.float32(0.0)
     x0, y0, z0 = one - x1, one - y1, one - z1
     r, g, b, total = _add_color(zero, zero, zero, zero, p[0], x0 * y0 * z0)
@@ -221,7 +224,7 @@ def directions(view, scale, v):
 
 @device
 def points_of_row(view, scale, v, depth, points):
-    """Fill `points` (3, W), in voxels, with the points of row v at `depth` (W,) m."""
+    """Fill `points` (3, W), in voxels, with the points of row v at `depth` (W,), m."""
     origin, change = directions(view, scale, v)
     tx, ty, tz = view.t[0] * scale, view.t[1] * scale, view.t[2] * scale
     for n in range(depth.shape[0]):
@@ -260,11 +263,11 @@ def gather_corners(grid, values, depth, points, missing, found):
 
 @device
 def step_to_surface(view, scale, v, found, points, converged, reach, limits, depth, normals):
-    """Move each depth (W,) m by one Newton step along its ray to the zero of the trilinear field.
+    """Move each depth (W,), m, by one Newton step along its ray to the zero of the trilinear field.
 
     `found` (8, W) holds the distances around `points` (3, W). A depth becomes 0 if the field is unknown, if it does not
-    fall along the ray, or if the zero is farther than `reach` voxels or beyond limits (W,) m. A depth is negated if the
-    step is longer than `converged` voxels. normals (3, W) gets the direction of the gradient.
+    decrease along the ray, or if the zero is farther than `reach` voxels or beyond `limits` (W,), m. A depth is negated
+    if the step is longer than `converged` voxels. Sets normals (3, W) to the normalized gradients.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     origin, change = directions(view, scale, v)

@@ -1,8 +1,9 @@
 """Tree of Gaussian mixtures over all masks of a frame, our first interpretation of section 3.2.2 of the paper.
 
-Level 1 has one Gaussian per mask, initialized with the mask's pixels as responsibilities. Every further level splits
-each node into children, fitted to the node's own points. A point belongs to the mask of its most probable leaf. The
-split and the number of levels are our choice: the paper names a hierarchical EM algorithm without these details.
+Level 1 has one Gaussian per mask, and a point is initially assigned to the Gaussian of its mask. Every further level
+splits each node into children, which are fitted to the node's own points. A point belongs to the mask of its most
+probable leaf. The split and the number of levels are our choice, because the paper names a hierarchical EM algorithm
+without these details.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class FrameTree:
     masks: tuple[Int64, ...]  # (M,) mask of each node, for each level
 
     def leaves(self) -> tuple[Float64, Float64, Float64, Int64]:
-        """Return the weights (L,), means (L, 3) m, covariances (L, 3, 3) m^2 and masks (L,) of the leaves."""
+        """Return the weights (L,), means (L, 3), m, covariances (L, 3, 3), m^2, and masks (L,) of the leaves."""
         parts = []
         for k, (level, masks) in enumerate(zip(self.levels, self.masks, strict=True)):
             below = self.levels[k + 1].firsts if k + 1 < len(self.levels) else np.zeros(len(level) + 1, np.int64)
@@ -49,7 +50,7 @@ class FrameTree:
         return weights, means, covariances, masks
 
     def masks_of(self, points: Float32) -> Int32:
-        """Return the mask (S,) of the most probable leaf for each point (S, 3) m; -1 if the tree has no leaf."""
+        """Return the mask (S,) of the most probable leaf for each point (S, 3), m; -1 if the tree has no leaf."""
         weights, means, covariances, masks = self.leaves()
         best = np.empty(len(points), np.int32)
         find_most_probable(points, coefficients(weights, means, covariances), best)
@@ -60,7 +61,7 @@ def grow(
     points: Float32, masks: Int32, count: int, settings: EmSettings, *, levels: int, children: int,
     gaussians_per_mask: int, initialization: Initialization, min_support: float,
 ) -> FrameTree:  # fmt: skip
-    """Grow a tree of at most `levels` levels over points (S, 3) m with masks (S,) in [0, `count`), in ascending order.
+    """Grow a tree of at most `levels` levels over points (S, 3), m, with ascending masks (S,) in [0, `count`).
 
     A node with at least MIN_NODE points gets `children` children. A node is dropped in favor of its siblings if its
     weight is below `min_support`, or if it has too few points for a covariance.
@@ -91,8 +92,8 @@ def grow(
 def corners(means: Float64, covariances: Float64, children: int) -> Mixtures:
     """Return the initial children of M Gaussians, offset by one standard deviation along the longest axes.
 
-    The offsets have both signs, so 2, 4 or 8 children lie along one, two or three axes. The children have equal weights
-    and a quarter of the covariance.
+    The offsets have both signs. Therefore, 2, 4 or 8 children lie along one, two or three axes. The children have equal
+    weights and a quarter of the covariance.
     """
     count, axes = len(means), children.bit_length() - 1
     values, vectors = np.linalg.eigh(covariances)  # ascending
@@ -112,7 +113,7 @@ def corners(means: Float64, covariances: Float64, children: int) -> Mixtures:
 
 def _level(fitted: Mixtures, chosen: Int64, above: Float64, min_support: float) -> tuple[Level, Int64]:
     """Return the level below the nodes with weights `above`, and the index of the component of each new node."""
-    boxes = np.zeros((len(chosen), 2, 3))  # no uniform component
+    boxes = np.zeros((len(chosen), 2, 3))  # without a uniform component
     level = level_below(fitted, boxes, chosen, above, min_support)
     kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
     return level, np.nonzero(kept)[1]
@@ -121,7 +122,7 @@ def _level(fitted: Mixtures, chosen: Int64, above: Float64, min_support: float) 
 def _start(
     points: Float32, masks: Int32, count: int, gaussians: int, initialization: Initialization, max_iterations: int
 ) -> Int32:
-    """Return the initial Gaussian (S,) of each point; those of mask k start at index k * `gaussians`."""
+    """Return the index (S,) of the initial Gaussian of each point; the Gaussians of mask k start at k * `gaussians`."""
     starts = np.searchsorted(masks, np.arange(count + 1))
     labels = np.asarray(masks * np.int32(gaussians), np.int32)
     if gaussians > 1:

@@ -24,7 +24,7 @@ def keep_best_cluster(pixels: Int32, cluster: Int32, rank: Int32, owner: Int32, 
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_most_probable(points: Float32, rows: Float32, best: Int32) -> None:
-    """Set best (S,) to the Gaussian of largest weighted density at each point, -1 = none; ties go to the first."""
+    """Set best (S,) to the Gaussian with the largest weighted density at a point, -1 = none; ties go to the first."""
     for block in prange((len(points) + BLOCK - 1) // BLOCK):
         begin = block * BLOCK
         n = min(BLOCK, len(points) - begin)

@@ -14,17 +14,17 @@ from numba import njit
 from framework.data import Float32, Float64
 
 LOG_2PI = float(np.log(2 * np.pi))
-JACOBI_SWEEPS = 6  # upper limit; 4 suffice for a 3x3 matrix in double precision
+JACOBI_SWEEPS = 6  # maximum number of sweeps; 4 suffice for a 3x3 matrix in double precision
 # ratio of the sum of squared off-diagonal elements to the squared trace; below it, eigenvalues are exact to 14 digits
 NEGLIGIBLE = 1e-28
 ABSENT = np.float32(-1e30)  # log density of a component with weight 0; finite, so that differences are finite
-FACTORS = 64  # factors per logarithm; with up to 10^4 components, the product stays below 1e256
+FACTORS = 64  # number of factors per logarithm; with up to 10^4 components, the product stays below 1e256
 SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and respect infinities
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32) -> None:
-    """Set out[i] = log(pi_k N(x_i | mu_k, Sigma_k))."""
+    """Set out[i] = log(pi_k N(x_i | mu_k, Sigma_k)), given the coefficients `row` of component k."""
     c, mx, my, mz = row[0], row[1], row[2], row[3]  # unpacking the array takes longer than the loop
     w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
@@ -36,7 +36,7 @@ def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to_density(x: Float32, y: Float32, z: Float32, row: Float32, values: Float32) -> None:
-    """Set values = max(values, log_densities)."""
+    """Set values[i] to the maximum of values[i] and the result of log_densities() for point i."""
     c, mx, my, mz = row[0], row[1], row[2], row[3]
     w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
@@ -56,7 +56,7 @@ def add_to(values: Float32, summands: Float32) -> None:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to(values: Float32, others: Float32, n: int) -> None:
-    """Set the first n entries of values to max(values, others); unlike max(), a comparison vectorizes."""
+    """Set the first n values to max(values, others), by a comparison, which vectorizes, unlike max()."""
     for i in range(n):
         values[i] = others[i] if others[i] > values[i] else values[i]
 
@@ -135,7 +135,10 @@ def invert(values: Float32, others: Float32, n: int) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: Float32, moment: Float64) -> None:
-    """Add sum_i gamma_i (1, x_i, x_i x_i^T) to the moment. Single precision suffices within a block."""
+    """Add sum_i gamma_i (1, x_i, x_i x_i^T) with gamma_i = densities[i] * scale[i] to the moment.
+
+    Single precision suffices within a block.
+    """
     zero = np.float32(0.0)
     s, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
     for i in range(len(x)):
@@ -205,7 +208,7 @@ def floor_eigenvalues(Sigma: Float64, floor: float) -> None:
 
 @njit(cache=True, nogil=True)
 def set_coefficients(weight: float, mean: Float64, Sigma: Float64, row: Float32) -> None:
-    """Set row to log(pi_k / sqrt((2 pi)^3 |Sigma|)), mu_k, and L^-1 of Sigma = L L^T, row by row.
+    """Set `row` (10,) to log(pi_k / sqrt((2 pi)^3 |Sigma|)), mu_k, and the rows of L^-1, where Sigma = L L^T.
 
     In single precision, whitening by L^-1 is accurate even where terms with Sigma^-1 would cancel.
     """

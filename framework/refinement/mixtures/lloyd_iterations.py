@@ -1,6 +1,6 @@
 """Lloyd's k-means for many point sets in parallel, and initialization of k-means and expectation maximization.
 
-scikit-learn fits one set per call, which takes far longer for the masks of a frame.
+scikit-learn fits one set per call, which takes much longer for the masks of a frame.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from framework.refinement.neighborhood import Neighborhoods
 
 
 def cluster(points: Float32, starts: Int64, centers: Float64, max_iterations: int) -> tuple[Int32, Float64]:
-    """Return the labels (S,) and centers (N, K, 3) m of k-means on each set `points[starts[k]:starts[k + 1]]`.
+    """Return the labels (S,) and centers (N, K, 3), m, of k-means on each set `points[starts[k]:starts[k + 1]]`.
 
-    `centers` (N, K, 3) m are the initial centers. Iteration ends when no label changes or after `max_iterations`. A
+    `centers` (N, K, 3), m, are the initial centers. Iteration ends when no label changes, or after `max_iterations`. A
     center without points stays in place. Ties go to the first center.
     """
     labels = np.full(len(points), -1, np.int32)
@@ -30,16 +30,16 @@ def nearest_centers(points: Float32, begins: Int64, ends: Int64, centers: Float6
 
 
 def depth_groups(points: Float32, starts: Int64, groups: int) -> Float64:
-    """Return the means (N, groups, 3) m of `groups` equal-sized groups of points by depth, to initialize `cluster`.
+    """Return the means (N, groups, 3), m, of `groups` equal-sized groups of points by depth, to initialize `cluster`.
 
-    Depth separates an occluder, the supporting surface and the wall behind. A set with fewer points than groups gives
-    repeated centers. An empty set gives zeros.
+    Depth separates an occluder, the supporting surface and the wall behind the object. For a set with fewer points than
+    groups, centers are repeated. For an empty set, they are 0.
     """
     return np.asarray(group_depths(points, starts, groups), np.float64)
 
 
 def start_centers(around: Neighborhoods, object_centers: int, background_centers: int) -> Float64:
-    """Return the `depth_groups` (N, object_centers + background_centers, 3) of each mask, then those of its ring."""
+    """Return the `depth_groups` (N, object_centers + background_centers, 3), m, of each mask and then of its ring."""
     of_ring = around.of_ring
     mask_starts = np.concatenate([[0], np.cumsum(around.mask_counts)])
     ring_starts = np.concatenate([[0], np.cumsum(around.ring_counts)])
@@ -55,7 +55,7 @@ def start_labels(
 
     Lloyd's algorithm groups the ring's points and, separately, the mask's points with `log_odds` (S,) of at least 0. It
     starts from groups of equal size by depth and runs for at most `iterations` iterations. The mask's other points
-    start in the nearest group of the ring, or in the object if there are no background components.
+    get the nearest group of the ring, or an object component if there are no background components.
     """
     labels = np.empty(len(around.points_camera), np.int32)
     start_all(

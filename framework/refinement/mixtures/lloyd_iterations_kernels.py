@@ -18,7 +18,7 @@ def lloyd_all(points: Float32, starts: Int64, centers: Float64, max_iterations: 
 
 @njit(cache=True, nogil=True)
 def lloyd(points: Float32, centers: Float64, max_iterations: int, labels: Int32) -> None:
-    """Run Lloyd iterations on one set; update `centers` and `labels`."""
+    """Run Lloyd iterations on one set, and update `centers` and `labels` in place."""
     sums = np.zeros((len(centers), 4))
     for _ in range(max_iterations):
         changed = False
@@ -63,7 +63,7 @@ def nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) -
 
 @njit(cache=True, nogil=True, parallel=True)
 def group_depths(points: Float32, starts: Int64, groups: int) -> Float64:
-    """Return the `depth_groups` (sets, groups, 3) of each set."""
+    """Return the `depth_groups` (N, groups, 3), m, of each set."""
     means = np.zeros((len(starts) - 1, groups, 3))
     for k in prange(len(starts) - 1):
         means[k] = depth_groups_of(points[starts[k] : starts[k + 1]], groups)
@@ -72,7 +72,7 @@ def group_depths(points: Float32, starts: Int64, groups: int) -> Float64:
 
 @njit(cache=True, nogil=True)
 def depth_groups_of(points: Float32, groups: int) -> Float64:
-    """Return the `depth_groups` (groups, 3) of one set."""
+    """Return the `depth_groups` (groups, 3), m, of one set."""
     n, means = len(points), np.zeros((groups, 3))
     if n == 0:
         return means
@@ -88,13 +88,13 @@ def depth_groups_of(points: Float32, groups: int) -> Float64:
 
 @njit(cache=True, nogil=True)
 def _by_depth(points: Float32) -> Int64:
-    """Return the points' indices by increasing depth. This stable radix sort compiles faster than np.argsort."""
+    """Return the indices of the points by increasing depth. This stable radix sort compiles faster than np.argsort."""
     n = len(points)
     depths = np.empty(n, np.float32)
     for i in range(n):
         depths[i] = points[i, 2]
     bits, keys = depths.view(np.int32), np.empty(n, np.int64)
-    for i in range(n):  # bits of positive numbers sort like the numbers; bits of negative numbers sort in reverse
+    for i in range(n):  # bits of positive numbers have the order of the numbers, bits of negative ones the reverse
         keys[i] = (np.int64(bits[i]) if bits[i] >= 0 else np.int64(bits[i] ^ np.int32(0x7FFFFFFF))) + (1 << 31)
     order, sorted_ = np.arange(n), np.empty(n, np.int64)
     starts = np.empty(257, np.int64)
@@ -149,7 +149,7 @@ def _start_one(
 
 @njit(cache=True, nogil=True)
 def _group(points: Float32, chosen: Bool, groups: int, first_label: int, iterations: int, labels: Int32) -> Float64:
-    """Set the labels of the chosen points; return the centers (groups, 3) of their groups."""
+    """Set the labels of the chosen points, and return the centers (groups, 3), m, of their groups."""
     own, own_labels, count = np.empty_like(points), np.empty(len(points), np.int32), 0
     for i in range(len(points)):
         if chosen[i]:

@@ -22,7 +22,7 @@ from framework.refinement.mixtures.mixture_kernels import (
     improve_all,
 )
 
-BATCH = 16 * BLOCK  # number of points that a thread processes at once
+BATCH = 16 * BLOCK  # maximum number of points that a thread processes at once
 
 
 def fit(
@@ -35,7 +35,7 @@ def fit(
     set's bounding box.
 
     `prior_log_odds` (S,) is the evidence of each point for the first `own_components`. Their densities at point i are
-    multiplied by exp(prior_log_odds[i]) in eq. [2]. The log-likelihood uses the weighted densities, so it is defined
+    multiplied by exp(prior_log_odds[i]) in eq. (2). The log-likelihood uses the weighted densities, so it is defined
     only up to a constant.
     """
     n = len(starts) - 1
@@ -60,7 +60,8 @@ def likely_members(
     """Return an array (S,), True for `points[begins[k]:ends[k]]` with a posterior above `min_posterior` in mixture k.
 
     The posterior is the probability of the first `own_components`, which form the object. For a mixture without
-    components, all points are True, because there is no evidence against them. Points outside the ranges are False.
+    components, all entries are True, because there is no evidence against the points. Entries outside the ranges are
+    False.
     """
     weights, means, covariances = mixtures.weights, mixtures.means, mixtures.covariances
     rows = coefficients(weights.ravel(), means.reshape(-1, 3), covariances.reshape(-1, 3, 3))
@@ -82,7 +83,7 @@ def blocks_of(begins: Int64, ends: Int64, size: int) -> Blocks:
 
 
 def log_densities_of(densities: Float64) -> Float32:
-    """Return log(densities), ABSENT for 0."""
+    """Return log(densities); ABSENT for densities of 0."""
     return np.where(densities > 0, np.log(np.maximum(densities, 1e-300)), ABSENT).astype(np.float32)
 
 

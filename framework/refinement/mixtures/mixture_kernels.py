@@ -25,15 +25,15 @@ from framework.refinement.mixtures.gaussian import (
     set_coefficients,
 )
 
-MIN_SUPPORT = 4.0  # minimum points of a component; with fewer it has no 3D covariance and is dropped
-BLOCK = 256  # points that a kernel processes at once; their densities fit into the L1 cache
-MARGIN = 1e-3  # nats, above the rounding error of log densities in single precision
+MIN_SUPPORT = 4.0  # minimum number of points of a component; with fewer, it has no 3D covariance and is dropped
+BLOCK = 256  # number of points that a kernel processes at once; their densities fit into the L1 cache
+MARGIN = 1e-3  # bound of the rounding error of log densities in single precision, nats
 
 
 class EmSettings(NamedTuple):
-    """The settings of expectation maximization."""
+    """Settings of expectation maximization."""
 
-    max_iterations: int
+    max_iterations: int  # maximum number of iterations
     tolerance: float  # minimum increase of the mean log-likelihood to continue EM, nats per point
     variance_floor: float  # minimum eigenvalue of a covariance, m^2
     outlier_fraction: float  # initial fraction of outlier points; 0 = no uniform component
@@ -52,7 +52,7 @@ class Mixtures(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """B blocks of points, each of one set."""
+    """B blocks of consecutive points; all points of a block belong to one set."""
 
     sets: Int64  # (B,) index of the set
     begins: Int64  # (B,) index of the first point
@@ -143,7 +143,10 @@ def _any_left(weights: Float64) -> bool:
 def _expect(
     xyz: Float32, odds: Float32, own_components: int, rows: Float32, log_outlier: np.float32, moments: Float64
 ) -> tuple[float, float]:
-    """Run the E-step [2] and sum the M-step's moments; return sum_i log p(x_i) and the outliers' N_k."""
+    """Run the E-step, eq. (2), and sum the moments of the M-step.
+
+    Returns sum_i log p(x_i), and N_k of the uniform component.
+    """
     components = len(rows)
     densities = np.empty((components, BLOCK), np.float32)
     largest, evidence = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
@@ -175,7 +178,7 @@ def _maximize(
     moments: Float64, center: Float64, count: int, variance_floor: float, weights: Float64, means: Float64,
     covariances: Float64,
 ) -> None:  # fmt: skip
-    """Run the M-step [3, 4]."""
+    """Run the M-step, eqs. (3) and (4)."""
     for j in range(len(weights)):
         N_k = moments[j, 0]
         if N_k < MIN_SUPPORT:
@@ -249,7 +252,10 @@ def _claim_batch(
     points: Float32, odds: Float32, rows: Float32, log_outlier: np.float32, own_components: int, min_posterior: float,
     claimed: Bool,
 ) -> None:  # fmt: skip
-    """Claim points, mostly without exponentials: a sum of n terms is between its largest term and n times this term."""
+    """Run `claim` for one batch, mostly without exponentials.
+
+    They are unnecessary for most points, because a sum of n terms is between its largest term and n times this term.
+    """
     components = len(rows)
     log_bound = math.log(min_posterior / (1.0 - min_posterior))
     certain = np.float32(log_bound + math.log(components - own_components + 1.0) + MARGIN)

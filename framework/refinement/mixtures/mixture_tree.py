@@ -1,8 +1,8 @@
 """Hierarchical Gaussian mixtures: trees over many point sets, grown level by level in parallel.
 
-After Eckart, Kim, Troccoli, Kelly and Kautz, "Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016. Every
-node is a small mixture of its own points, and a point descends only to its best child. With J children per node, a
-level costs J Gaussians per point; a flat mixture with as many components costs J^level.
+The method follows Eckart, Kim, Troccoli, Kelly and Kautz, "Accelerated Generative Models for 3D Point Cloud Data", CVPR
+2016. Every node is a small mixture of its own points, and a point descends only to its best child. With J children per
+node, a level costs J Gaussians per point; a flat mixture with as many components costs J^level.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class Level:
     weights: Float64  # (M,) pi, above 0
     means: Float64  # (M, 3) mu, m
     covariances: Float64  # (M, 3, 3) Sigma, m^2
-    firsts: Int64  # (Q + 1,)
+    firsts: Int64  # (Q + 1,) start of the children of each node
     outlier_weights: Float64  # (Q,) pi of the uniform component among the children of node q; 0 for a leaf
-    outlier_boxes: Float64  # (Q, 2, 3) m, lowest and highest corner of the uniform component's box
+    outlier_boxes: Float64  # (Q, 2, 3) m, minimum and maximum corner of the uniform component's box
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -89,8 +89,9 @@ def fit(
     """Grow a tree of at most `levels` levels over each point set `points[starts[k]:starts[k + 1]]`.
 
     A node with at least `min_points` points gets `children` children, fitted to its points by `mixture.fit` with the
-    labels of `cut`. Each point then descends to its best child, or stays if the uniform component is more likely. A
-    child with a weight below `min_support` is dropped in favor of its siblings. A set with too few points has no nodes.
+    labels of `cut`. Each point then descends to its best child, or remains at the node if the uniform component is more
+    likely. A child with a weight below `min_support` is dropped in favor of its siblings. A set with too few points has
+    no nodes.
     """
     grown: list[Level] = []
     above = np.ones(len(starts) - 1)  # weights of the points' current nodes
@@ -113,7 +114,7 @@ def fit(
 
 
 def cut(points: Float32, starts: Int64, groups: int) -> Int32:
-    """Return labels (S,) in [0, groups) that cut each set into compact groups, to initialize `mixture.fit`.
+    """Return labels (S,) in [0, groups) that divide each set into compact groups, to initialize `mixture.fit`.
 
     Variance-based bisection cuts the group with the largest scatter along one axis at its mean. A group is not cut if
     one part would have too few points for a component.
@@ -126,9 +127,9 @@ def cut(points: Float32, starts: Int64, groups: int) -> Int32:
 def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: float) -> Float32:
     """Return the object's fraction (M,) of each node j from its points' evidence `log_odds[starts[j]:starts[j + 1]]`.
 
-    The evidence o_i of a point is its log-likelihood ratio. The fraction rho maximizes sum_i log(rho exp(o_i) + 1 -
-    rho), with `above_points` additional points at the parent's fraction `above` (M,). It is the fixed point of EM over
-    the points' classes.
+    The evidence o_i of a point is its log-likelihood ratio of object to background. The fraction rho maximizes sum_i
+    log(rho exp(o_i) + 1 - rho), with `above_points` additional points at the parent's fraction `above` (M,). It is the
+    fixed point of EM over the points' classes.
     """
     ratios = above.astype(np.float32)
     set_own_ratios(log_odds, starts, above_points, ratios)
@@ -153,7 +154,7 @@ def object_ratios(tree: MixtureTree, sample: Neighborhoods, odds: Float32, paren
 def claimed(tree: MixtureTree, ratios: list[Float32], own: Neighborhoods, odds: Float32, min_posterior: float) -> Bool:
     """Return an array (S,), True for points of the masks with a posterior above `min_posterior` at their deepest level.
 
-    `odds` (S,) are the points' own log-odds.
+    `odds` (S,) are the log-odds of the points for the object.
     """
     claimed, remaining = np.zeros(len(own.points_camera), bool), np.arange(len(own.points_camera))
     points, starts = own.points_camera, own.starts
@@ -187,7 +188,7 @@ def level_below(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64,
 
 
 def ranges(points: Float32, starts: Int64, chosen: Int64) -> tuple[Float32, Int64]:
-    """Return the points of the chosen sets and the start of each set."""
+    """Return the points of the chosen sets and the starts (chosen + 1,) of these sets."""
     counts = np.diff(starts)
     if len(chosen) == len(counts):
         return points, starts

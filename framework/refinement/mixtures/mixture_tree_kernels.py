@@ -9,12 +9,12 @@ from framework.data import Float32, Float64, Int32, Int64
 from framework.refinement.mixtures.gaussian import SIMD, constant_exponential, exponentials, log_densities
 from framework.refinement.mixtures.mixture_kernels import MIN_SUPPORT, Blocks
 
-RATIO_ITERATIONS = 20  # EM iterations for a node's object fraction; for distinct classes, each halves the error
+RATIO_ITERATIONS = 20  # number of EM iterations for an object fraction; for distinct classes, each halves the error
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
-    """Split each set of points into groups along the axes of largest variance."""
+    """Divide each set of points into groups along the axes of largest scatter."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             _cut_one(points[starts[k] : starts[k + 1]], groups, labels[starts[k] : starts[k + 1]])
@@ -76,7 +76,7 @@ def _measure(points: Float32, members: Int64, mean: Float64, scatter: Float64) -
 
 @njit(cache=True, nogil=True)
 def bounding_boxes(points: Float32, starts: Int64, least_side: float) -> Float64:
-    """Return the bounding box (N, 2, 3) of each set, with sides of at least `least_side`."""
+    """Return the bounding box (N, 2, 3), m, of each set, with sides of at least `least_side`, m."""
     boxes = np.zeros((len(starts) - 1, 2, 3))
     for k in range(len(starts) - 1):
         for a in range(3):
@@ -93,7 +93,7 @@ def pass_down(
     points: Float32, log_odds: Float32, blocks: Blocks, rows: Float32, ratios: Float32, firsts: Int64,
     log_outliers: Float32, outlier_ratios: Float32, child: Int64, posterior: Float32,
 ) -> None:  # fmt: skip
-    """Set the child with the largest density and the object's posterior at each point."""
+    """Set `child` (S,) to the child with the largest density at each point, and `posterior` (S,) to the object's."""
     for b in prange(len(blocks.sets)):
         q, own = blocks.sets[b], slice(blocks.begins[b], blocks.ends[b])
         children = slice(firsts[q], firsts[q + 1])
@@ -137,7 +137,7 @@ def _pass_block(
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def take_better(densities: Float32, j: np.int32, largest: Float32, best: Int32) -> None:
-    """Set `best` to j and `largest` to the density where the density is larger than `largest`."""
+    """Set `best` to j, and `largest` to the density, for points where the density exceeds `largest`."""
     for i in range(len(largest)):
         better = densities[i] > largest[i]
         best[i] = j if better else best[i]

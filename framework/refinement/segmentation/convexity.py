@@ -7,11 +7,11 @@ connected components. It follows these papers:
 - Furrer et al., "Incremental Object Database: Building 3D Models from Multiple Partial Observations", IROS 2018
 - Voxblox++: Grinvald et al., "Volumetric Instance-Aware Semantic Mapping and 3D Object Discovery", RA-L 2019
 
-Three changes give sharper borders under sensor noise:
+Three changes make borders sharper in the presence of sensor noise:
 
 - planes are fitted in inverse depth, which is linear on a plane in space, in cells of a few pixels;
 - at a crease, each cell takes the plane of an adjacent window on its own side (the filter of Kuwahara et al. 1976);
-- pixels at edges join the adjacent segment with the best prediction of their depth.
+- pixels at edges join the adjacent segment that best predicts their depth.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def segments(
     """Return the segment label (H, W) of each pixel, in [0, count) or -1 = none, and the count.
 
     Planes are fitted to windows of (2 `window` + 1)^2 cells of `cell` x `cell` px. Gaps of up to 2 `closing` cells in
-    edges are closed. Segments of fewer than `min_pixels` pixels are merged with their neighbors. The noise is that of
-    the depth sensor `sensor`.
+    edges are closed. Segments of fewer than `min_pixels` pixels are merged with their neighbors. `sensor` determines
+    the noise.
     """
     slope = np.float32(limits.max_slope * cell * 2 / (camera.fx + camera.fy))  # relative change of depth per cell
     pinhole = np.array(
@@ -66,7 +66,7 @@ def segments(
     edges = count_edges(planes, pinhole, noise, limits.max_angle, normal_sigma(1.0, window, cell, camera))
     min_cells = max(min_pixels // cell**2, 1)
     labels, count = connected(inverse, _closed(edges, closing), noise, slope, min_cells)
-    for _ in range(2 + 2 * closing):  # width of an edge
+    for _ in range(2 + 2 * closing):  # maximum width of an edge, cells
         labels, planes = absorbed(inverse, labels, planes, noise)
     # poles and legs consist of edges, so cells without a segment are connected by depth alone
     rest, rest_count = connected(inverse, (labels >= 0) | (inverse <= 0), noise, slope, min_cells)
@@ -75,7 +75,7 @@ def segments(
 
 
 def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> float:
-    """Return the standard deviation (rad) of the angle between two normals, fitted at 1 m with `depth_noise` (m).
+    """Return the standard deviation, rad, of the angle between two normals, fitted at 1 m with `depth_noise`, m.
 
     It is proportional to 1 / z. The slope of a line through M readings has the standard deviation sigma / (sqrt(M) *
     rms offset).

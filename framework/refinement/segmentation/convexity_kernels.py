@@ -33,13 +33,13 @@ _axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the cal
 
 @njit(cache=True, nogil=True)
 def _sigma(z: float, noise: Noise) -> float:
-    """Return the standard deviation (m) of depth z (m)."""
+    """Return the standard deviation, m, of depth z, m."""
     return float(max(axial_sigma(z, noise), noise.min_noise))
 
 
 @njit(cache=True, nogil=True)
 def _noise_at(inverse: float, noise: Noise) -> np.float32:
-    """Return the noise of inverse depth, 1 / m."""
+    """Return the difference that counts as noise at an inverse depth, 1 / m."""
     return np.float32(noise.factor * _sigma(1.0 / inverse, noise) * inverse * inverse)
 
 
@@ -75,7 +75,7 @@ def _add_offset(
     own: Float32, other: Float32, gate: Float32, gate_slope: Float32, x: np.float32, y: np.float32, reach: np.float32,
     sums: Float32,
 ) -> None:  # fmt: skip
-    """Add the moments of the cells at one offset (x, y) to the sums of each cell of a row."""
+    """Add the moments of the cells at one offset (x, y), cells, to the sums of each cell of a row."""
     zero, one = np.float32(0), np.float32(1)
     n, sx, sy, sxx, sxy, syy, se, sxe, sye, see = sums
     for c in range(len(own)):
@@ -325,7 +325,7 @@ def connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, mi
 
 @njit(cache=True, nogil=True)  # too little work for threads
 def absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> tuple[Int32, Float32]:
-    """Return labels and planes grown by one cell. A free cell joins the neighbor that best predicts its depth."""
+    """Return labels and planes grown by one cell. An unlabeled cell joins the neighbor that best predicts its depth."""
     rows, columns = inverse.shape
     new_labels, new_planes = labels.copy(), planes.copy()
     for r in range(rows):
@@ -368,7 +368,7 @@ def pixel_labels(
             d = inverse[r, c]
             gate = _noise_at(d, noise)
             label = labels[r, c]
-            alone = True  # inside a segment there is only one label
+            alone = True  # True if all adjacent cells have the same label
             for n in range(9):
                 s, t = r + n // 3 - 1, c + n % 3 - 1
                 inside = 0 <= s < rows and 0 <= t < columns

@@ -17,7 +17,7 @@ STEP = 2  # stride of the readings used in a cell, px
 FULL = (CELL // STEP) ** 2  # number of readings in a full cell
 REFITS = 3  # number of passes that collect the cells of a plane again; the last pass hardly changes the plane
 TRIM = 1.5  # maximum deviation of a cell in a fit, times the median deviation of the plane's cells
-SIGMAS = 3.0  # maximum distance of a reading on a plane, standard deviations of the noise
+SIGMAS = 3.0  # maximum distance of a reading on a plane, in standard deviations of the noise
 MAX_PLANES = 32  # maximum number of planes; frames have fewer large planes
 
 
@@ -88,7 +88,7 @@ def _length(m: Float64) -> float:
 
 @njit(cache=True, nogil=True)
 def _allowed(moment: Float64, noise: float, sensor: DepthNoise) -> float:
-    """Return the maximum rms of inverse depth at the mean depth of a cell, 1/m, for this sensor.
+    """Return the maximum rms deviation of inverse depth, 1/m, at the mean depth of a cell for this sensor.
 
     The noise of KINECT_V1 is the minimum, because real floors and walls are not flat.
     """
@@ -97,7 +97,7 @@ def _allowed(moment: Float64, noise: float, sensor: DepthNoise) -> float:
 
 @njit(cache=True, nogil=True)
 def _lies_in(moment: Float64, m: Float64, distance: float, noise: float, sensor: DepthNoise) -> bool:
-    """Return True if a cell is on the plane. A point at inverse depth q is |q - m . r| / (|m| q) m off the plane."""
+    """Return True if a cell is on the plane. The distance at inverse depth q is |q - m . r| / (|m| q)."""
     allowed = _allowed(moment, noise, sensor)
     return bool(_deviation(moment, m) <= allowed + distance * _length(m) * moment[6] / moment[0])
 
@@ -112,7 +112,7 @@ def _area(moment: Float64, m: Float64, spacing: float) -> float:
 
 @njit(cache=True, nogil=True)
 def write_flatness(cells: Float64, distance: float, noise: float, sensor: DepthNoise, flatness: Float64) -> None:
-    """Set the rms deviation, 1/m, of each cell (C, 10) that is full and flat enough to seed a plane."""
+    """Set flatness (C,) to the rms deviation, 1/m, of each cell that is full and flat enough to seed a plane."""
     m = np.zeros(3)
     for i in range(len(cells)):
         if 2 * cells[i, 0] >= FULL and _solve(cells[i], m) and _lies_in(cells[i], m, distance, noise, sensor):
@@ -124,7 +124,7 @@ def find_plane_cells(
     cells: Float64, columns: int, seeds: Int64, free: Bool, distance: float, noise: float, sensor: DepthNoise,
     min_area: float, spacing: float, found: Float64,
 ) -> int:  # fmt: skip
-    """Set `found` to m, deviation, area, fraction and behind of each plane and clear `free` at its cells; return K."""
+    """Set `found` to m, deviation, area, fraction and behind of each plane, and clear `free` at its cells; return K."""
     m, total = np.zeros(3), np.zeros(10)
     tried = np.zeros(len(cells), np.bool_)
     readings = 0.0
@@ -170,7 +170,7 @@ def _grow(
     cells: Float64, columns: int, seed: int, free: Bool, distance: float, noise: float, sensor: DepthNoise, m: Float64,
     region: Int64,
 ) -> int:  # fmt: skip
-    """Set `region` to the cells connected to the seed in one plane and m to this plane; return the number of cells.
+    """Set `region` to the cells connected to the seed in one plane, and m to this plane; return the number of cells.
 
     The plane is fitted again with every new cell.
     """
@@ -203,7 +203,7 @@ def _grow(
 def _collect(
     cells: Float64, free: Bool, m: Float64, distance: float, noise: float, sensor: DepthNoise, deviations: Float64
 ) -> None:
-    """Set the deviation of each free cell that lies in the plane, and infinity for all other cells."""
+    """Set deviations (C,) to the rms deviation of each free cell on the plane, and to infinity for all other cells."""
     slope = distance * _length(m)
     for i in range(len(cells)):
         deviations[i] = np.inf
@@ -217,7 +217,7 @@ def _collect(
 def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> None:
     """Set m to the plane of the best-fitting cells, at least half of them, and `total` to the sum of their moments.
 
-    The other cells lie on both sides of the intersection of two planes and would tilt the planes towards each other.
+    The other cells are on both sides of the intersection of two planes, and would tilt the planes towards each other.
     """
     inside, count = np.empty(len(deviations)), 0
     for i in range(len(deviations)):
@@ -300,7 +300,7 @@ def label_points(
 def find_off_planes(
     cluster: Int32, pixels: Int32, on_plane: UInt8, max_own: float, counts: Int64, stays: Bool, structure: Bool
 ) -> Bool:
-    """Return an array (P,), True for the kept points, and clear `structure` at kept points on planes."""
+    """Return an array (P,), True for the kept points, and set `structure` to False at kept points on planes."""
     labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
     for part in prange(len(counts)):
         own = slice(part * PART, (part + 1) * PART)
@@ -328,7 +328,7 @@ def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
 
 @njit(cache=True, nogil=True)
 def _count_on_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, labels: UInt8, counts: Int64) -> None:
-    """Count points by cluster and plane, in runs of equal labels, to avoid a slow memory write for each point."""
+    """Count points by cluster and plane. Runs of equal labels are counted together, to avoid a write for each point."""
     k, label, count = 0, 0, 0
     for i in range(len(cluster)):
         labels[i] = on_plane[pixels[i, 1], pixels[i, 0]]

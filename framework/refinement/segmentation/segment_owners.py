@@ -26,9 +26,9 @@ def owned_segments(
 ) -> PointClusters:
     """Return the clusters without points outside their segments; `labels` (H, W) in [0, `count`), -1 = none.
 
-    A segment belongs to the mask that covers the most pixels, if they are more than a fraction `min_overlap` of the
-    segment. With `whole_segments`, the readings of a cluster's segments outside its mask are added to the cluster, if
-    the points determine the camera pose.
+    A segment belongs to the mask that covers the most of its pixels, if these are more than a fraction `min_overlap` of
+    the segment. With `whole_segments`, the readings of a cluster's segments outside its mask are added to the cluster,
+    if the points determine the camera pose.
     """
     owners = find_owners(clusters.pixels, clusters.cluster, len(clusters), labels, count, min_overlap)
     kept, missing, missing_owner = judged(clusters.pixels, clusters.cluster, labels, owners)
@@ -73,12 +73,12 @@ def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
 
 
 def points_at(pixels: Int32, frame: Frame, T_world_camera: Float64) -> Float32:
-    """Return the points (P, 3), m, of `frame` at `pixels` (P, 2) (u, v) in the world frame, computed as in `lift`."""
+    """Return the world-frame points (P, 3), m, of `frame` at `pixels` (P, 2), u and v, as computed by `lift`."""
     return np.asarray(transform(T_world_camera, _readings(pixels, frame)), np.float32)
 
 
 def _readings(pixels: Int32, frame: Frame) -> Float64:
-    """Return the depth readings at `pixels` (P, 2) (u, v) as points (P, 3), m, in the camera frame."""
+    """Return the depth readings at `pixels` (P, 2), u and v, as camera-frame points (P, 3), m."""
     camera = frame.camera
     z = frame.depth[pixels[:, 1], pixels[:, 0]].astype(np.float64)
     return np.stack([(pixels[:, 0] - camera.cx) / camera.fx * z, (pixels[:, 1] - camera.cy) / camera.fy * z, z], axis=1)

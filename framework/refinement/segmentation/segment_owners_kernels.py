@@ -29,7 +29,7 @@ def find_owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, cou
 
 @njit(cache=True, nogil=True)
 def judged(pixels: Int32, cluster: Int32, labels: Int32, owners: Int32) -> tuple[Bool, Int32, Int32]:
-    """Return True (P,) for kept points, the other pixels (A, 2) of owned segments, and their owners (A,)."""
+    """Return an array (P,), True for kept points, the other pixels (A, 2) of owned segments, and their owners (A,)."""
     height, width = labels.shape
     kept, covered = np.ones(len(cluster), np.bool_), np.zeros(labels.shape, np.bool_)
     for i in range(len(cluster)):

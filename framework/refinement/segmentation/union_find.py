@@ -18,7 +18,7 @@ def root(parents: Int32, cell: int) -> int:
 
 @njit(cache=True, nogil=True)
 def unite(parents: Int32, a: int, b: int) -> None:
-    """Join the components of two cells. The smaller root remains, so that a component is named by its first cell."""
+    """Join the components of two cells. The smaller root remains, so that the root of a component is its first cell."""
     a, b = root(parents, a), root(parents, b)
     if a < b:
         parents[b] = a

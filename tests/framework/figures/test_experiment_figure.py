@@ -216,7 +216,7 @@ def test_figure_choice_invalid_settings_raise_one_line_error(figure: Any, messag
 def test_write_figure_without_data_raises_one_line_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected a folder of runs, got no folder"):
         write_figure(tmp_path / "nowhere")
-    with pytest.raises(DataError, match=r"expected the folder of an experiment with multirun\.yaml, got a folder"):
+    with pytest.raises(DataError, match=r"expected the folder of an experiment, got a folder without multirun\.yaml"):
         write_figure(tmp_path)
     root = experiment(tmp_path / "none")
     with pytest.raises(DataError, match="expected a block `figure:`, got none"):

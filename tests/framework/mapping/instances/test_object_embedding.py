@@ -138,9 +138,9 @@ def test_resumed_map_accumulates_embeddings(tmp_path: Path) -> None:
 def test_embeddings_of_other_space_raise() -> None:
     fuser = mapped("bayesian_tsdf", embeddings=EMBEDDINGS)
     frame = room().frame(walk(4)[0], 9)
-    with pytest.raises(DataError, match=r"detector: expected embeddings of words@1 \(as in the map\)"):
+    with pytest.raises(DataError, match=r"detector: expected embeddings from words@1 \(as in the map\)"):
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=EMBEDDINGS, space="words@2")
-    with pytest.raises(DataError, match="embeddings of one space: expected equal lengths, got 2 and 3 numbers"):
+    with pytest.raises(DataError, match="embeddings: expected equal lengths, got 2 and 3;"):
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=np.eye(3))
 
 
