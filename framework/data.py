@@ -48,7 +48,7 @@ LONGEST_FOCAL_LENGTH = 1e6  # maximum focal length, px
 UNIT_TOLERANCE = 1e-3  # maximum | |v| - 1 | of a unit vector
 LONGEST_EMBEDDING = 65_536  # maximum number of dimensions; published networks have 500 to 4,000
 LONGEST_SPACE = 300  # maximum number of characters of an embedding space name
-SAME_TIME = 1e-5  # s, maximum difference of equal timestamps; trajectory.txt has 1e-9 s steps, a Unix time 1e-6 s
+SAME_TIME = 1e-5  # s, maximum difference of equal timestamps; rounding: trajectory.txt 1e-9 s, Unix time 2e-7 s
 PROBABILITY_TOLERANCE = 1e-3  # maximum error of a sum of probabilities, due to softmax in half precision
 
 
@@ -120,14 +120,14 @@ class FrameTruth:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape (height, width) of the ids, px."""
+        """Shape (height, width) of `instance_ids`, px."""
         return self.instance_ids.shape
 
 
 class DeferredTruth(FrameTruth):
     """Ground truth of a frame whose ids are rendered or decoded on first access, once for all threads.
 
-    An access raises the errors of `render`, and DataError if `render` does not return int32 ids of `shape`.
+    Access raises the errors of `render`, and DataError if `render` does not return int32 ids of `shape`.
     """
 
     def __init__(
@@ -502,13 +502,13 @@ def _check_objects(found: Detections | PointClusters, n: int, c: int) -> None:
 
 def _check_embeddings(name: str, rows: Float32 | None, space: str, n: int) -> None:
     if not isinstance(cast(object, space), str) or len(space) > LONGEST_SPACE:
-        raise DataError(f"{name}: expected an embedding_space of at most {LONGEST_SPACE} characters, got {space!r:.60}")
+        raise DataError(f"{name}: expected a space name of at most {LONGEST_SPACE} characters, got {space!r:.60}")
     if rows is None:
         if space:
             raise DataError(f"{name}: expected embeddings for embedding_space {space!r}, got none")
         return
     if not space:
-        raise DataError(f"{name}: expected a name in embedding_space, got an empty string")
+        raise DataError(f"{name}: expected a name in embedding_space, got an empty string; set it to MODEL@REVISION")
     check_array(name, rows, (n, None), np.float32)
     if not 1 <= rows.shape[1] <= LONGEST_EMBEDDING:
         raise DataError(f"{name}: expected 1 to {LONGEST_EMBEDDING} columns, got {rows.shape[1]}")

@@ -18,9 +18,9 @@ _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
 
 
 class InstanceMapError(Exception):
-    """Base of every known error. The command line prints it as one line; `debug=true` adds the traceback.
+    """Base class of all known errors. The command line prints one line; `debug=true` adds the traceback.
 
-    The message is printable and of limited length for any input.
+    For any input, the message is printable and its length is limited.
     """
 
     def __init__(self, message: object = "") -> None:

@@ -35,22 +35,25 @@ def transform(T_a_b: Float64, points_b: npt.NDArray[np.floating]) -> npt.NDArray
 
     Args:
         T_a_b: The rigid transform (4, 4).
-        points_b: The points (..., 3) in frame b.
+        points_b: The points (..., 3) in frame b, m.
 
     Returns:
-        The points (..., 3) in frame a, with the same dtype.
+        The points (..., 3) in frame a, m, with the same dtype.
     """
     moved = points_b @ T_a_b[:3, :3].T.astype(points_b.dtype) + T_a_b[:3, 3].astype(points_b.dtype)
     return np.asarray(moved, points_b.dtype)
 
 
 def skew(v: Float64) -> Float64:
-    """Return the skew-symmetric matrix S (3, 3) of v, with S @ w = v x w."""
+    """Return the skew-symmetric matrix S (3, 3) of a vector v (3,), with S @ w = v x w."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def adjoint(T: Float64) -> Float64:
-    """Return the adjoint (6, 6) of a rigid motion: T exp(xi) = exp(Ad xi) T for twists (translation, rotation)."""
+    """Return the adjoint Ad (6, 6) of a rigid motion T (4, 4): T exp(xi) = exp(Ad xi) T.
+
+    The twist xi is (translation, rotation).
+    """
     Ad = np.zeros((6, 6))
     Ad[:3, :3] = Ad[3:, 3:] = T[:3, :3]
     Ad[:3, 3:] = skew(T[:3, 3]) @ T[:3, :3]
@@ -91,7 +94,7 @@ def rotation_angle(R: Float64) -> float:
 
 
 def pose_distance(T_world_a: Float64, T_world_b: Float64) -> float:
-    """Return the maximum of the distance (m) and the rotation angle (rad) between two poses."""
+    """Return the distance (m) or the rotation angle (rad) between two poses (4, 4), whichever value is larger."""
     T_a_b = inverse(T_world_a) @ T_world_b
     return max(float(np.linalg.norm(T_a_b[:3, 3])), rotation_angle(T_a_b[:3, :3]))
 
@@ -103,7 +106,7 @@ def nearest_rotation(R: Float64) -> Float64:
 
 
 def nearest_rigid(matrix: Float64) -> Float64:
-    """Return a pose (4, 4) without the rounding errors of its rotation. Raises DataError if it is not rigid."""
+    """Return a pose (4, 4) with the rounding errors of its rotation removed. Raises DataError if it is not rigid."""
     if not np.isfinite(matrix).all():
         raise DataError("pose: expected finite values, got NaN or infinity")
     if not np.allclose(matrix[3], (0, 0, 0, 1)):
@@ -120,7 +123,10 @@ def nearest_rigid(matrix: Float64) -> Float64:
 
 
 def interpolate(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Float64:
-    """Return the pose (4, 4) at a fraction in [0, 1] between a and b: linear translation, slerp of rotation."""
+    """Return the pose (4, 4) at `fraction` of the motion from a to b; 0 = a, 1 = b.
+
+    The translation is interpolated linearly, and the rotation spherically (slerp).
+    """
     R_a, R_b = T_world_a[:3, :3], T_world_b[:3, :3]
     T = np.eye(4)
     T[:3, :3] = R_a @ Rotation.from_rotvec(fraction * Rotation.from_matrix(R_a.T @ R_b).as_rotvec()).as_matrix()
@@ -136,7 +142,7 @@ def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDAr
         points_camera: The points (..., 3) in the camera frame, m.
 
     Returns:
-        The pixel coordinates (u, v) (..., 2).
+        The pixel coordinates (u, v) (..., 2), px.
     """
     x, y, z = points_camera[..., 0], points_camera[..., 1], points_camera[..., 2]
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
@@ -147,7 +153,7 @@ def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Flo
 
     Args:
         camera: The camera.
-        pixels: The pixel coordinates (u, v) (P, 2).
+        pixels: The pixel coordinates (u, v) (P, 2), px.
         depth: The depths (P,) along z, m.
 
     Returns:
@@ -159,7 +165,7 @@ def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Flo
 
 
 def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
-    """Raise DataError if a cluster has a pixel outside of the image (height, width). Kernels do not check bounds."""
+    """Raise DataError if a pixel is outside of the image `shape` (height, width), px. Kernels do not check bounds."""
     u, v = clusters.pixels.T
     if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
         raise DataError(

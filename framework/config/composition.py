@@ -183,9 +183,10 @@ def _message_of(error: BaseException) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _no_such_option(error)
     if isinstance(error, OverrideParseException):
-        return f"{error.override!r}: expected an override of the form key=value; {error.message.splitlines()[0]}"
+        return f"override: expected KEY=VALUE, got {error.override!r}; quote values with special characters"
     if isinstance(error, HydraException) and isinstance(error.__cause__, ConfigAttributeError | ConfigKeyError):
-        return f"{_joined(str(error).partition('To append')[0])} {_known_keys(error.__cause__)}"
+        prefix = "" if str(error).startswith("Could not override") else f"{_joined(str(error))} "
+        return f"{prefix}{_known_keys(error.__cause__)}"
     if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
         return _joined(f"{error} {error.__cause__}")
     if isinstance(error, InterpolationResolutionError):  # the message of the resolver is between its type and the key
@@ -215,7 +216,7 @@ def _no_such_option(error: MissingConfigException) -> str:
 
 
 def _known_keys(error: OmegaConfBaseException) -> str:
-    """Return an error message with the existing keys at the position of an unknown key."""
+    """Return the error message for an unknown key, with a similar key or all keys of its parent."""
     keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
     close = get_close_matches(str(error.key), keys, n=1)
     path = str(error.full_key or error.key)

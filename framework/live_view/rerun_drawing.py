@@ -240,7 +240,10 @@ class RerunDrawing:
 
 
 def turned(up: Float64, forward: Float64) -> Float64:
-    """Return R_view_world (3, 3), which maps the unit vector `up` (3,) to z and the level part of `forward` to y."""
+    """Return the rotation R_view_world (3, 3) for a view with z up.
+
+    It maps the unit vector `up` (3,) to z, and the horizontal component of `forward` (3,) to y.
+    """
     across = np.cross(forward, up)
     across = across / np.linalg.norm(across) if across.any() else np.linalg.svd(up[None])[2][1]
     return np.stack([across, np.cross(up, across), up])

@@ -42,7 +42,10 @@ def main() -> None:
 
 
 def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> None:
-    """Write the ray-cast image of a run from `pose`, or from the pose of `frame`. Raises DataError."""
+    """Write the ray-cast image of a run, seen from `pose` or, if it is None, from the pose of `frame`. Raises DataError.
+
+    `pose` is T_world_camera: tx, ty, tz, m, and the unit quaternion qx, qy, qz, qw. None for both = the middle frame.
+    """
     from framework.api import scene_of  # slow import: after the arguments are checked
     from framework.figures.raycast_figure import write_raycast
     from framework.reporting.run_contents import RunContents
@@ -81,7 +84,7 @@ def pose_of_frame(contents: RunContents, frame: int | None) -> int:
         return numbers.index(frame)
     known = (*numbers, *lost)
     if not min(known) <= frame <= max(known):
-        raise DataError(f"--frame: expected {min(known)} to {max(known)}, got {frame}")
+        raise DataError(f"--frame: expected a number from {min(known)} to {max(known)}, got {frame}")
     nearest = min(numbers, key=lambda number: abs(number - frame))
     what = "a lost frame" if frame in lost else "a frame that was not mapped"
     raise DataError(f"--frame: expected a mapped frame, got {frame} ({what}); use the nearest one, --frame {nearest}")
