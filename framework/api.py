@@ -185,11 +185,11 @@ class Mapper(Map):
         """Detect, track, refine and fuse the next frame of a video. A lost frame is not fused.
 
         Args:
-            color: (H, W, 3) uint8 RGB, or a Frame, which replaces all arguments.
+            color: (H, W, 3) uint8 RGB, or a Frame, which replaces all other arguments.
             depth: (H, W) float32, m along z; 0 = no reading.
             pose: (4, 4) T_world_camera; None = unknown.
             camera: The camera; None = the camera of the last frame.
-            timestamp: Time of the color image, s; None = the number of the frame (from 0) / 30.
+            timestamp: Time of the color image, s; None = the frame number (from 0) / 30.
             up: (3,) unit vector opposite to gravity in the camera frame; None = unknown.
             depth_timestamp: Time of the depth image, s; None = the time of the color image.
             sensor: The kind of the depth sensor; None = the kind of the last frame, initially KINECT_V1.
@@ -369,7 +369,7 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
 
 
 def load_scene(path: Path | str) -> SceneMap:
-    """Read a map without the query interface of `load_map`."""
+    """Read a map as a SceneMap, without the query interface of `load_map`."""
     from framework.baselines import object_map, open3d_map, semantic_map
     from framework.mapping import instance_map
     from framework.mapping.storage.map_file import read_format

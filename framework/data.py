@@ -40,7 +40,7 @@ UInt8 = npt.NDArray[np.uint8]
 UInt16 = npt.NDArray[np.uint16]
 Bool = npt.NDArray[np.bool_]
 
-ROTATION_TOLERANCE = 1e-3  # maximum entry of |R R^T - I| of a rigid transform; published poses have 4 digits
+ROTATION_TOLERANCE = 1e-3  # maximum entry of |R R^T - I| of a rigid transform; some published poses have 4 digits
 COVARIANCE_TOLERANCE = 1e-9  # maximum rounding error of a covariance, relative to its largest entry
 MAX_PIXELS = 2**25  # maximum number of pixels of an image; a frame of 8K video is smaller
 WIDEST = 10.0  # maximum lateral distance per depth, m/m: a field of view of 168 degrees
@@ -101,7 +101,7 @@ class Camera:
         return self.height, self.width
 
     def scaled(self, factor: float) -> Camera:
-        """Return the camera of the image resized by `factor`, with pixel centers at integers."""
+        """Return the camera of the image resized by `factor`. Width and height are rounded to integers."""
         width, height = round(self.width * factor), round(self.height * factor)
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
@@ -111,7 +111,7 @@ class Camera:
 class FrameTruth:
     """The ground-truth instances visible in a frame, for simulated detectors and evaluation only."""
 
-    instance_ids: Int32 = field(repr=False)  # (H, W)
+    instance_ids: Int32 = field(repr=False)  # (H, W), 0 = no instance
     class_names: Mapping[int, str | None]  # by instance id; None = unknown class, not evaluated
     of_depth: bool = False  # True = seen from the pose of the depth image, False = from that of the color image
 
@@ -357,15 +357,15 @@ class Box:
 class Instance:
     """One object of the map."""
 
-    id: int  # 32-bit, from 1
+    id: int  # positive 32-bit integer
     class_probabilities: Float32  # (C,) a distribution over the map's classes
     confidence: float  # in [0, 1], ranks instances in the evaluation
     observations: int  # number of frames in which it was detected
     first_frame: int  # `Frame.index` of the first detection
     last_frame: int  # `Frame.index` of the last detection
     vertices: Int32  # (M,) indices of its vertices in the map's InstanceMesh
-    aabb: Box
-    obb: Box
+    aabb: Box  # axis-aligned bounding box in the world frame
+    obb: Box  # oriented bounding box in the world frame
     embedding: Float32 | None = None  # (D,) unit vector in the map's `embedding_space`; None = no embedding
     embedding_spread: float | None = None  # in [0, 1], 1 - |mean of the unit vectors|: 0 = all equal
 
@@ -375,7 +375,7 @@ class InstanceMesh:
     """The surface of a map."""
 
     vertices: Float32  # (V, 3) m, world frame
-    triangles: Int32  # (F, 3)
+    triangles: Int32  # (F, 3) vertex indices
     colors: UInt8  # (V, 3) RGB
     instance_ids: Int32  # (V,), 0 = no instance
     class_ids: Int32  # (V,) index into `classes`, -1 = no class

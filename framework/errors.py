@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 LONGEST_WORD = 200  # maximum number of characters of an input, such as a name, in a message
-LONGEST_MESSAGE = 1000  # maximum number of characters; a list of all options or labels has about 500
+LONGEST_MESSAGE = 1000  # maximum number of characters of a message; a list of all options or labels has about 500
 
 _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
 
@@ -44,7 +44,7 @@ class NoPoseError(FrameError):
 
 
 class MapFullError(InstanceMapError):
-    """The map has reached its block budget. The map up to this frame is kept."""
+    """The map has reached its maximum number of blocks. The map up to this frame is kept."""
 
 
 class PartialRunError(InstanceMapError):

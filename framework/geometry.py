@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from framework.data import Camera, Float32, Float64, Int32, PointClusters
 from framework.errors import DataError
 
-RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| due to rounding; published poses have six digits, lost poses R = 0
+RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| due to rounding in files; larger for lost poses, stored as R = 0
 EXACT_WITHIN = 1e-12  # maximum entry of |R R^T - I| of a float64 rotation, which is not changed
 
 
@@ -52,7 +52,7 @@ def skew(v: Float64) -> Float64:
 def adjoint(T: Float64) -> Float64:
     """Return the adjoint Ad (6, 6) of a rigid motion T (4, 4): T exp(xi) = exp(Ad xi) T.
 
-    The twist xi is (translation, rotation).
+    The twist xi (6,) consists of translation, m, and rotation, rad.
     """
     Ad = np.zeros((6, 6))
     Ad[:3, :3] = Ad[3:, 3:] = T[:3, :3]
@@ -165,7 +165,7 @@ def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Flo
 
 
 def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
-    """Raise DataError if a pixel is outside of the image `shape` (height, width), px. Kernels do not check bounds."""
+    """Raise DataError if a pixel is outside of an image of `shape` (height, width), px. Kernels check no bounds."""
     u, v = clusters.pixels.T
     if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
         raise DataError(

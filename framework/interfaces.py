@@ -65,7 +65,7 @@ class RGBDVideo(ABC):
 
     name: str  # name of the scene, for tables
     annotation: str = ""  # release of the ground truth, for tables; "" = only one release exists
-    domain: str = ""  # image domain, compared with `Detector.domain`: "rendered rooms"; "" = photographs or unknown
+    domain: str = ""  # image domain, such as "rendered rooms", for `Detector.domain`; "" = photographs or unknown
 
     def has_poses(self) -> bool:
         """Return True if frames may have ground-truth poses. Called before any frame is read."""
@@ -208,7 +208,7 @@ class MapFuser(ABC):
         If a fuser does not use `timer`, the run reports the total time as `fusion`.
 
         Raises:
-            MapFullError: The block budget of the map is reached.
+            MapFullError: The map has reached its maximum number of blocks.
         """
 
     def renew_colors(self) -> None:  # noqa: B027  # optional
@@ -261,7 +261,7 @@ class SceneMap(ABC):
 
     @property
     def depth_range(self) -> tuple[float, float]:
-        """Nearest and farthest integrated depth, m."""
+        """Minimum and maximum depth of integrated readings, m."""
         return 0.0, float("inf")
 
     @property

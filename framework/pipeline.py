@@ -46,7 +46,7 @@ WITHOUT_THREADS = (
 
 @dataclass
 class Pipeline:
-    """The stages and the loop: `Pipeline(detector, tracker, refiner, fuser).run(video)`."""
+    """The stages and the mapping loop: `Pipeline(detector, tracker, refiner, fuser).run(video)`."""
 
     detector: Detector
     tracker: PoseTracker
@@ -125,7 +125,7 @@ class Pipeline:
         return replace(journal.result(), keyframes=keyframes, color_delay=self.color_to_depth.estimate)
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
-        """Return the keyframes of the tracker. A pending error of the tracker's thread is stored in `journal`."""
+        """Return the keyframes of the tracker. A pending error of its thread is stored in `journal.stopped_by`."""
         try:
             return self.tracker.keyframes()
         except Exception as error:
@@ -155,7 +155,7 @@ class Pipeline:
         )
 
     def map_all(self, video: RGBDVideo, journal: Journal, interruption: Interruption) -> None:
-        """Run the loop. Raises Interrupted between two frames after a signal."""
+        """Map all frames of `video`. Raises Interrupted between two frames after a signal."""
         prefetch = self.prefetch
         if prefetch > 0 and not parallel_kernels_are_thread_safe():
             log.info(WITHOUT_THREADS)

@@ -301,7 +301,7 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
 
 
 def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
-    """Return the interfaces of the fields that contain a plugin or plugins by name (Mapping[str, interface])."""
+    """Return the interface of each field that contains a plugin or a mapping of plugins (Mapping[str, interface])."""
     found = {}
     for name, hint in get_type_hints(plugin_class).items():
         of = get_args(hint)

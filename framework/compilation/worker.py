@@ -25,7 +25,7 @@ TESTED = ("0.68.1",)
 
 def work() -> None:
     """Read one kernel per line, compile it, and print an error or an empty line."""
-    gc.freeze()  # numba's many permanent objects slow the garbage collector
+    gc.freeze()  # numba's many permanent objects slow down garbage collection
     gc.set_threshold(200_000, 20, 20)
     wanted = {(kernel.module, kernel.name) for kernel in listed(DEFAULT, OTHERS)}
     names = {name for _, name in wanted}

@@ -77,7 +77,7 @@ def installed_config_dirs() -> dict[Path, str]:
 
 
 class InstalledConfigs(SearchPathPlugin):
-    """Search path plugin with the config folders of installed packages, once registered with Hydra."""
+    """Hydra search path plugin that adds the config folders of installed packages."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder, package in installed_config_dirs().items():
@@ -85,7 +85,10 @@ class InstalledConfigs(SearchPathPlugin):
 
 
 class FileConfigSource(hydra_api.FileConfigSource):
-    """Hydra's reader of YAML folders with a check of each file. Hydra distinguishes sources by name."""
+    """Reader of YAML folders that checks each file.
+
+    The class has the same name as Hydra's reader, because Hydra distinguishes sources by class name.
+    """
 
     def load_config(self, config_path: str) -> ConfigResult:
         path = Path(self.path, self._normalize_file_name(config_path))

@@ -81,7 +81,7 @@ def check_count(name: str, value: int, most: int) -> None:
 
 
 def checked_rows(node: Any) -> dict[str, list[str]]:
-    """Return the overrides of each row of an experiment by name; empty without `rows`.
+    """Return the overrides of each row of an experiment by name; empty if `node` is None.
 
     Raises ConfigError if the overrides of a row are not a list of strings.
     """

@@ -54,7 +54,8 @@ MIN_FRACTION = 0.3  # minimum fraction of the points in a mask that belong to it
 def seen_instances(masks: Bool, frame: Frame, T_world_camera: Float64, mesh: InstanceMesh) -> Int32:
     """Return the id (N,) of the instance with the most points in each mask (N, H, W); 0 = fraction below MIN_FRACTION.
 
-    The points are the mesh vertices, with or without an instance, that agree with the frame's depth.
+    The points are the mesh vertices, with or without an instance, that agree with the frame's depth if the camera is at
+    T_world_camera (4, 4).
     """
     chosen = slice(None, None, -(-len(mesh.vertices) // MAX_POINTS) or 1)
     points_camera = transform(inverse(T_world_camera), mesh.vertices[chosen])

@@ -48,8 +48,8 @@ class RerunDrawing:
         self._first_s: float | None = None  # timestamp of the first frame
         self._path: list[Float32] = []  # (3,) positions of the last path segment
         self._pieces = 0
-        self._up: Float64 | None = None  # (3,) as drawn
-        self._forward: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) direction of the first camera
+        self._up: Float64 | None = None  # (3,) up direction, as drawn
+        self._forward: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) z axis of the first camera
         self._mesh: InstanceMesh | None = None  # as last drawn, with the shown instances
         self._names: dict[int, str] = {}  # names of the shown instances
         self._named: dict[int, str] = {}  # names of all instances so far

@@ -41,7 +41,8 @@ def job(config: DictConfig) -> None:
     log.info("%s", out)
     if found.errors:
         settings = " ".join(dict.fromkeys(finding.setting for finding in found.errors if finding.setting))
-        raise DataError(f"dataset: expected a usable recording, got errors{f'; try {settings}' if settings else ''}")
+        count = f"{len(found.errors)} error{'s' * (len(found.errors) > 1)} (listed above)"
+        raise DataError(f"dataset: expected a usable recording, got {count}{f'; set {settings}' if settings else ''}")
 
 
 def main() -> None:

@@ -42,9 +42,10 @@ def main() -> None:
 
 
 def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> None:
-    """Write the ray-cast image of a run, seen from `pose` or, if it is None, from the pose of `frame`. Raises DataError.
+    """Write the ray-cast image of a run, as seen from `pose`, or from the pose of `frame`. Raises DataError.
 
-    `pose` is T_world_camera: tx, ty, tz, m, and the unit quaternion qx, qy, qz, qw. None for both = the middle frame.
+    `pose` is T_world_camera as position tx, ty, tz, m, and unit quaternion qx, qy, qz, qw. If both arguments are None,
+    the middle frame is used.
     """
     from framework.api import scene_of  # slow import: after the arguments are checked
     from framework.figures.raycast_figure import write_raycast

@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # heavy imports are local
 log = logging.getLogger(__name__)
 jobs = Jobs()
 
-MIN_PIXELS = 100  # px, minimum size of evaluated objects
+MIN_PIXELS = 100  # minimum number of pixels of evaluated objects
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="detect")
