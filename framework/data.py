@@ -43,7 +43,7 @@ Bool = npt.NDArray[np.bool_]
 ROTATION_TOLERANCE = 1e-3  # maximum entry of |R R^T - I| of a rigid transform; some published poses have 4 digits
 COVARIANCE_TOLERANCE = 1e-9  # maximum rounding error of a covariance, relative to its largest entry
 MAX_PIXELS = 2**25  # maximum number of pixels of an image; a frame of 8K video is smaller
-WIDEST = 10.0  # maximum lateral distance per depth, m/m: a field of view of 168 degrees
+WIDEST = 10.0  # maximum lateral distance per depth, m/m: half a field of view of 168.6 degrees
 LONGEST_FOCAL_LENGTH = 1e6  # maximum focal length, px
 UNIT_TOLERANCE = 1e-3  # maximum | |v| - 1 | of a unit vector
 LONGEST_EMBEDDING = 65_536  # maximum number of dimensions; published networks have 500 to 4,000
@@ -84,9 +84,11 @@ class Camera:
         horizontal = max(self.cx, self.width - 1 - self.cx, -self.cx)
         vertical = max(self.cy, self.height - 1 - self.cy, -self.cy)
         if horizontal > WIDEST * self.fx or vertical > WIDEST * self.fy:
+            slopes = (WIDEST, max(horizontal / self.fx, vertical / self.fy))
+            widest, found = (2 * math.degrees(math.atan(slope)) for slope in slopes)
             raise DataError(
-                f"Camera: expected a field of view of at most {WIDEST:g} m laterally per m of depth, got "
-                f"{self.width}x{self.height} px with fx, fy, cx, cy = {numbers}; set fx, fy, cx, cy in px, not as "
+                f"Camera: expected a field of view of at most {widest:.1f} degrees, got {found:.1f} degrees "
+                f"({self.width}x{self.height} px with fx, fy, cx, cy = {numbers}); set fx, fy, cx, cy in px, not as "
                 "fractions of width and height"
             )
 
@@ -505,7 +507,7 @@ def _check_embeddings(name: str, rows: Float32 | None, space: str, n: int) -> No
         raise DataError(f"{name}: expected a space name of at most {LONGEST_SPACE} characters, got {space!r:.60}")
     if rows is None:
         if space:
-            raise DataError(f"{name}: expected embeddings for embedding_space {space!r}, got none")
+            raise DataError(f"{name}: expected embeddings for embedding_space {space!r}, got none; pass both")
         return
     if not space:
         raise DataError(f"{name}: expected a name in embedding_space, got an empty string; set it to MODEL@REVISION")
@@ -527,5 +529,6 @@ def _check_distributions(name: str, rows: Float32, shape: tuple[int, int]) -> No
     if rows.size and (rows.min() < 0 or np.abs(rows.sum(axis=1) - 1).max() > PROBABILITY_TOLERANCE):
         worst = rows.sum(axis=1)[np.abs(rows.sum(axis=1) - 1).argmax()]
         raise DataError(
-            f"{name}: expected a distribution in each row, got a sum of {worst:.4f}, minimum {rows.min():.4f}"
+            f"{name}: expected a probability distribution in each row, got a sum of {worst:.4f} and a minimum of "
+            f"{rows.min():.4f}"
         )

@@ -205,7 +205,7 @@ def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueu
             except queue.Empty:
                 event, text = "", ""
                 if not any(thread.is_alive() for thread in threads):
-                    raise DataError("kernels: expected running processes, got none; run the command again") from None
+                    raise DataError("kernels: expected running workers, got none; run the command again") from None
             if event == "done":
                 left -= 1
                 bar.update()

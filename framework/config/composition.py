@@ -50,7 +50,7 @@ def add_config_dir(folder: Path) -> None:
     Raises ConfigError if the folder does not exist.
     """
     if not folder.is_dir():
-        raise ConfigError(f"--config-dir: expected a folder, got {folder}")
+        raise ConfigError(f"--config-dir: expected an existing folder, got {folder}")
     _added.append(folder.resolve())
 
 

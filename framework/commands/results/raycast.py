@@ -68,7 +68,7 @@ def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> N
     names = {key: scene.classes[int(one.class_probabilities.argmax())] for key, one in objects.items()}
     view = scene.render(source.camera or NOT_CAMERA, T_world_camera)
     if not (view.depth > 0).any():
-        raise DataError(f"raycast: expected a pose with the map in view, got {place}")
+        raise DataError(f"raycast: expected a pose with the map in view, got {place}; set another --frame or --pose")
     centers = {key: one.aabb.center for key, one in objects.items()}
     note = f"{contents.name}, {place}, ray-cast from the final map. Commit {contents.record.commit}."
     write_raycast(out, view, names, centers, note)
@@ -78,7 +78,7 @@ def pose_of_frame(contents: RunContents, frame: int | None) -> int:
     """Return the index of a frame's pose in the trajectory; None = middle pose. Raises DataError without any pose."""
     numbers, lost = contents.frame_numbers, contents.lost_frames
     if not numbers:
-        raise DataError(f"{contents.record.directory}: expected mapped frames, got none")
+        raise DataError(f"{contents.record.directory}: expected mapped frames, got none; set --pose")
     if frame is None:
         return len(numbers) // 2
     if frame in numbers:
