@@ -61,7 +61,7 @@ def make_code_only_for(names: set[str]) -> None:
     from numba.core.codegen import CPUCodeLibrary, JITCPUCodegen
     from numba.core.registry import cpu_target
 
-    cpu_target.target_context.refresh()  # compiles numba's runtime before its code generation is replaced
+    cpu_target.target_context.refresh()  # compile numba's own runtime before the methods are replaced
     finalize, set_env = CPUCodeLibrary._finalize_final_module, JITCPUCodegen.set_env
 
     def finalize_without_code(library: Any) -> None:

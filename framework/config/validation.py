@@ -20,11 +20,11 @@ PHRASES: Mapping[Any, str] = {
     bool: "true or false",
     int: "an integer",
     float: "a number",
-    str: "a text value",
+    str: "a string",
     Path: "a path",
     NoneType: "null",
-    list[str]: "a list of text values",
-    dict[str, str]: "text values by name",
+    list[str]: "a list of strings",
+    dict[str, str]: "a mapping from names to strings",
 }
 """Valid values by type, for error messages."""
 

@@ -89,7 +89,7 @@ class DrawingThread:
     def __init__(self, scene: SceneMap, drawing: Drawing, frame_interval: int, map_interval: float) -> None:
         self._scene, self._drawing, self._frame_interval = scene, drawing, frame_interval
         self._snapshots = Pace(map_interval, SNAPSHOT_FRACTION)
-        self._taken, self._next_up = 0, FIRST_UP  # number of snapshots; next snapshot with an estimate of up
+        self._taken, self._next_up = 0, FIRST_UP  # snapshots so far; next snapshot that estimates the up direction
         self._pictures = Pace(0.0, PICTURE_FRACTION, time.thread_time)
         self._maps = Pace(map_interval, MAP_FRACTION, time.thread_time)
         self._frames = 0

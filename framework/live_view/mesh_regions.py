@@ -31,7 +31,7 @@ class MeshRegions:
         self._digests: dict[Region, bytes] = {}
 
     def changed(self, vertices: Float32, triangles: Int32, colors: UInt8) -> Iterator[tuple[Region, MeshPart]]:
-        """Yield the parts of a mesh that changed or vanished since the last call, with their regions.
+        """Yield the parts of a mesh that changed or were removed since the last call, with their regions.
 
         The mesh consists of vertices (V, 3), m, in the world frame, triangles (F, 3) and RGB colors (V, 3).
         """

@@ -171,7 +171,7 @@ def test_build_flattens_parameters_of_parts() -> None:
             ["expected all methods of Detector in Abstract, got none for: detect; implement them"],
         ),
         ({"_partial_": True}, ["got '_partial_'"]),
-        ({"_target_": f"{HERE}.OddField"}, ["bool, int, float, str, Path, Enum or list", "got ndarray"]),
+        ({"_target_": f"{HERE}.OddField"}, ["bool, int, float, str, Path, Enum or list", "got numpy.ndarray | None"]),
         ({"_target_": f"{HERE}.Assembled", "nms": 2}, ["Assembled", "nms", "[0, 1]", "got 2"]),
         ({"_target_": f"{HERE}.Assembled", "nms": "high"}, ["Assembled: nms: expected a number, got 'high'"]),
         ({"_target_": f"{HERE}.Assembled", "suppression": {"nms": 0.1}}, ["got 'suppression'"]),
