@@ -71,7 +71,7 @@ clean: ## remove the environment and all caches, but not outputs/
 PIP_INSTALL = PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_USE_PEP517=1 $(BIN)/python -m pip install \
 	$(if $(wildcard $@),--quiet)
 
-# torch is installed first with its exact version, so that pip prefers a local CPU wheel, if the machine has one.
+# torch is installed first with its exact version, so that pip uses a local CPU wheel if the machine has one.
 $(INSTALLED): pyproject.toml
 	@$(MAKE) --no-print-directory system-libraries
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || "$(or $(PYTHON),python3)" -m venv $(VENV)
@@ -117,12 +117,12 @@ system-libraries: ## install missing system packages with apt
 	if test -z "$$missing"; then exit 0; fi; \
 	apt="apt-get update && apt-get install --yes --no-install-recommends$$missing"; \
 	if ! command -v apt-get >/dev/null; then \
-		echo "missing system packages (Debian names):$$missing; install their equivalents" >&2; exit 1; \
+		echo "system packages: expected$$missing (Debian names), got none of them; install their equivalents" >&2; exit 1; \
 	elif test "$$(id -u)" = 0; then \
 		echo "installing$$missing"; DEBIAN_FRONTEND=noninteractive bash -c "$$apt" >/dev/null; \
 	elif sudo -n true 2>/dev/null || { test -t 0 && command -v sudo >/dev/null; }; then \
 		echo "installing$$missing"; sudo DEBIAN_FRONTEND=noninteractive bash -c "$$apt" >/dev/null; \
 	else \
-		echo "missing system packages; run as root: $$apt" >&2; exit 1; \
+		echo "system packages: expected$$missing, got none of them; run as root: $$apt" >&2; exit 1; \
 	fi
 	@"$(or $(PYTHON),python3)" -c '$(IN_RANGE)' || { echo "python: expected Python 3.11 to 3.13, got none; install one of these versions" >&2; exit 1; }

@@ -44,8 +44,8 @@ _own = Path(__file__).resolve().with_name("framework")
 _found = find_spec("framework")
 if _found is None or _own not in [Path(path).resolve() for path in _found.submodule_search_locations or ()]:
     raise ImportError(
-        f"framework: expected InstanceMap's package at {_own}, got {_found and _found.origin}; rename the other "
-        "package or start Python in another folder"
+        f"framework: expected InstanceMap's package at {_own}, got {(_found and _found.origin) or 'none'}; rename the "
+        "other package or start Python in another folder"
     )
 
 from framework import __version__

@@ -77,9 +77,10 @@ def module_of(command: str) -> str:
 
 
 def leave_working_folder(arguments: list[str]) -> None:
-    """Remove the working folder from the module search path. It may be a run directory from an untrusted source.
+    """Remove the working folder from the module search path, because its files may be from an untrusted source.
 
-    With --config-dir, which registers plugins of the user, append it instead. `python -P` always excludes it.
+    With --config-dir, which registers the user's own plugins, the folder is moved to the end of the path instead.
+    `python -P` always excludes it.
     """
     try:
         here = str(Path.cwd())

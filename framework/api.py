@@ -120,7 +120,7 @@ def begin(config: DictConfig) -> Pipeline:
 
 
 def scene_of(key: str, run: Path) -> SceneMap:
-    """Read the map of a stored run. Raises DataError that names `key`."""
+    """Read the map of a stored run. Raises DataError that names the config key or command `key`."""
     if not (run / MAP).is_file():
         raise DataError(f"{key}: expected a run directory, got {run} without {MAP}")
     return load_scene(run / MAP)
@@ -168,7 +168,7 @@ class Mapper(Map):
         finalize(self, viewer.end)  # when the mapper is deleted, or at exit
         self._camera: Camera | None = None  # camera of the last frame
         self._sensor = SensorKind.KINECT_V1  # kind of the depth sensor of the last frame
-        self._T_world_color: Float64 | None = None  # pose of the color image of the last frame that is not lost
+        self._T_world_color: Float64 | None = None  # (4, 4) pose of the color image of the last mapped frame
         self._frames = 0  # number of calls of `add`
 
     def add(
@@ -185,11 +185,11 @@ class Mapper(Map):
         """Detect, track, refine and fuse the next frame of a video. A lost frame is not fused.
 
         Args:
-            color: (H, W, 3) uint8 RGB, or a Frame, which replaces all arguments.
+            color: (H, W, 3) uint8 RGB, or a Frame, which replaces all other arguments.
             depth: (H, W) float32, m along z; 0 = no reading.
             pose: (4, 4) T_world_camera; None = unknown.
             camera: The camera; None = the camera of the last frame.
-            timestamp: Time of the color image, s; None = the time at a rate of 30 frames per second.
+            timestamp: Time of the color image, s; None = the frame number (from 0) / 30.
             up: (3,) unit vector opposite to gravity in the camera frame; None = unknown.
             depth_timestamp: Time of the depth image, s; None = the time of the color image.
             sensor: The kind of the depth sensor; None = the kind of the last frame, initially KINECT_V1.
@@ -249,13 +249,13 @@ class Mapper(Map):
     def at_pixel(
         self, u: int, v: int, camera: Camera | None = None, T_world_camera: Float64 | None = None
     ) -> Instance | None:
-        """Return the object at a pixel of the last frame with a pose, or of another view.
+        """Return the object at a pixel of the last mapped frame, or of another view.
 
         Args:
             u: The column of the pixel, px.
             v: The row of the pixel, px.
             camera: The camera; None = the camera of the last frame.
-            T_world_camera: The pose (4, 4); None = the pose of the color image of the last frame that is not lost.
+            T_world_camera: The pose (4, 4); None = the pose of the color image of the last mapped frame.
 
         Returns:
             The object; None = no object.
@@ -327,8 +327,8 @@ def export(
         formats: "glb", "ply", "usd", "obj", "floorplan" or "graph".
         out: The output folder; None = `export` in the run directory.
         objects: Classes or ids of the exported objects; () = the whole scene.
-        up: The up direction (3,) in the world frame, for a run without one.
-        floor: The floor height along `up`, m, for a run without one.
+        up: The up direction (3,) in the world frame; None = the up direction of the run.
+        floor: The floor height along the up direction, m; None = the floor height of the run.
         choices: min_confidence, triangles, coloring, collision, resolution, robot_height; see
             `instancemap export --help`.
 
@@ -356,11 +356,11 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
         model: Folder, file or huggingface.co id of the embedding model; None = the model of the run's detector.
 
     Returns:
-        The matching objects, best first, and the ranking that was used.
+        The matching objects, best first, and the ranking method.
 
     Raises:
         ConfigError: The query is invalid.
-        DataError: The run has no map, the words are unknown, or embeddings are missing.
+        DataError: The run has no map, a word of the query is unknown, or embeddings are missing.
     """
     question = TextQuery(words, by, None if model is None else str(model))
     if isinstance(run, Map):
@@ -369,7 +369,7 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
 
 
 def load_scene(path: Path | str) -> SceneMap:
-    """Read a map without the query interface of `load_map`."""
+    """Read a map as a SceneMap, without the query interface of `load_map`."""
     from framework.baselines import object_map, open3d_map, semantic_map
     from framework.mapping import instance_map
     from framework.mapping.storage.map_file import read_format

@@ -41,15 +41,15 @@ UInt8 = npt.NDArray[np.uint8]
 UInt16 = npt.NDArray[np.uint16]
 Bool = npt.NDArray[np.bool_]
 
-ROTATION_TOLERANCE = 1e-3  # maximum entry of |R R^T - I| of a rigid transform; published poses have 4 digits
+ROTATION_TOLERANCE = 1e-3  # maximum entry of |R R^T - I| of a rigid transform; some published poses have 4 digits
 COVARIANCE_TOLERANCE = 1e-9  # maximum rounding error of a covariance, relative to its largest entry
 MAX_PIXELS = 2**25  # maximum number of pixels of an image; a frame of 8K video is smaller
-WIDEST = 10.0  # maximum lateral distance per depth, m/m: a field of view of 168 degrees
+WIDEST = 10.0  # maximum lateral distance per depth, m/m: half a field of view of 168.6 degrees
 LONGEST_FOCAL_LENGTH = 1e6  # maximum focal length, px
 UNIT_TOLERANCE = 1e-3  # maximum | |v| - 1 | of a unit vector
 LONGEST_EMBEDDING = 65_536  # maximum number of dimensions; published networks have 500 to 4,000
 LONGEST_SPACE = 300  # maximum number of characters of an embedding space name
-SAME_TIME = 1e-5  # s, maximum difference of equal timestamps; trajectory.txt has 1e-9 s steps, a Unix time 1e-6 s
+SAME_TIME = 1e-5  # s, maximum difference of equal timestamps; rounding: trajectory.txt 1e-9 s, Unix time 2e-7 s
 PROBABILITY_TOLERANCE = 1e-3  # maximum error of a sum of probabilities, due to softmax in half precision
 
 
@@ -85,9 +85,11 @@ class Camera:
         horizontal = max(self.cx, self.width - 1 - self.cx, -self.cx)
         vertical = max(self.cy, self.height - 1 - self.cy, -self.cy)
         if horizontal > WIDEST * self.fx or vertical > WIDEST * self.fy:
+            slopes = (WIDEST, max(horizontal / self.fx, vertical / self.fy))
+            widest, found = (2 * math.degrees(math.atan(slope)) for slope in slopes)
             raise DataError(
-                f"Camera: expected a field of view of at most {WIDEST:g} m laterally per m of depth, got "
-                f"{self.width}x{self.height} px with fx, fy, cx, cy = {numbers}; set fx, fy, cx, cy in px, not as "
+                f"Camera: expected a field of view of at most {widest:.1f} degrees, got {found:.1f} degrees "
+                f"({self.width}x{self.height} px with fx, fy, cx, cy = {numbers}); set fx, fy, cx, cy in px, not as "
                 "fractions of width and height"
             )
 
@@ -102,7 +104,7 @@ class Camera:
         return self.height, self.width
 
     def scaled(self, factor: float) -> Camera:
-        """Return the camera of the image resized by `factor`, with pixel centers at integers."""
+        """Return the camera of the image resized by `factor`. Width and height are rounded to integers."""
         width, height = round(self.width * factor), round(self.height * factor)
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
@@ -112,7 +114,7 @@ class Camera:
 class FrameTruth:
     """The ground-truth instances visible in a frame, for simulated detectors and evaluation only."""
 
-    instance_ids: Int32 = field(repr=False)  # (H, W)
+    instance_ids: Int32 = field(repr=False)  # (H, W), 0 = no instance
     class_names: Mapping[int, str | None]  # by instance id; None = unknown class, not evaluated
     of_depth: bool = False  # True = seen from the pose of the depth image, False = from that of the color image
 
@@ -121,14 +123,14 @@ class FrameTruth:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape (height, width) of the ids, px."""
+        """Shape (height, width) of `instance_ids`, px."""
         return self.instance_ids.shape
 
 
 class DeferredTruth(FrameTruth):
     """Ground truth of a frame whose ids are rendered or decoded on first access, once for all threads.
 
-    An access raises the errors of `render`, and DataError if `render` does not return int32 ids of `shape`.
+    Access raises the errors of `render`, and DataError if `render` does not return int32 ids of `shape`.
     """
 
     def __init__(
@@ -368,15 +370,15 @@ class Box:
 class Instance:
     """One object of the map."""
 
-    id: int  # 32-bit, from 1
+    id: int  # positive 32-bit integer
     class_probabilities: Float32  # (C,) a distribution over the map's classes
     confidence: float  # in [0, 1], ranks instances in the evaluation
     observations: int  # number of frames in which it was detected
     first_frame: int  # `Frame.index` of the first detection
     last_frame: int  # `Frame.index` of the last detection
     vertices: Int32  # (M,) indices of its vertices in the map's InstanceMesh
-    aabb: Box
-    obb: Box
+    aabb: Box  # axis-aligned bounding box in the world frame
+    obb: Box  # oriented bounding box in the world frame
     embedding: Float32 | None = None  # (D,) unit vector in the map's `embedding_space`; None = no embedding
     embedding_spread: float | None = None  # in [0, 1], 1 - |mean of the unit vectors|: 0 = all equal
 
@@ -386,7 +388,7 @@ class InstanceMesh:
     """The surface of a map."""
 
     vertices: Float32  # (V, 3) m, world frame
-    triangles: Int32  # (F, 3)
+    triangles: Int32  # (F, 3) vertex indices
     colors: UInt8  # (V, 3) RGB
     instance_ids: Int32  # (V,), 0 = no instance
     class_ids: Int32  # (V,) index into `classes`, -1 = no class
@@ -513,13 +515,13 @@ def _check_objects(found: Detections | PointClusters, n: int, c: int) -> None:
 
 def _check_embeddings(name: str, rows: Float32 | None, space: str, n: int) -> None:
     if not isinstance(cast(object, space), str) or len(space) > LONGEST_SPACE:
-        raise DataError(f"{name}: expected an embedding_space of at most {LONGEST_SPACE} characters, got {space!r:.60}")
+        raise DataError(f"{name}: expected a space name of at most {LONGEST_SPACE} characters, got {space!r:.60}")
     if rows is None:
         if space:
-            raise DataError(f"{name}: expected embeddings for embedding_space {space!r}, got none")
+            raise DataError(f"{name}: expected embeddings for embedding_space {space!r}, got none; pass both")
         return
     if not space:
-        raise DataError(f"{name}: expected a name in embedding_space, got an empty string")
+        raise DataError(f"{name}: expected a name in embedding_space, got an empty string; set it to MODEL@REVISION")
     check_array(name, rows, (n, None), np.float32)
     if not 1 <= rows.shape[1] <= LONGEST_EMBEDDING:
         raise DataError(f"{name}: expected 1 to {LONGEST_EMBEDDING} columns, got {rows.shape[1]}")
@@ -538,5 +540,6 @@ def _check_distributions(name: str, rows: Float32, shape: tuple[int, int]) -> No
     if rows.size and (rows.min() < 0 or np.abs(rows.sum(axis=1) - 1).max() > PROBABILITY_TOLERANCE):
         worst = rows.sum(axis=1)[np.abs(rows.sum(axis=1) - 1).argmax()]
         raise DataError(
-            f"{name}: expected a distribution in each row, got a sum of {worst:.4f}, minimum {rows.min():.4f}"
+            f"{name}: expected a probability distribution in each row, got a sum of {worst:.4f} and a minimum of "
+            f"{rows.min():.4f}"
         )

@@ -12,15 +12,15 @@ from contextlib import contextmanager
 from typing import Any
 
 LONGEST_WORD = 200  # maximum number of characters of an input, such as a name, in a message
-LONGEST_MESSAGE = 1000  # maximum number of characters; a list of all options or labels has about 500
+LONGEST_MESSAGE = 1000  # maximum number of characters of a message; a list of all options or labels has about 500
 
 _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
 
 
 class InstanceMapError(Exception):
-    """Base of every known error. The command line prints it as one line; `debug=true` adds the traceback.
+    """Base class of all known errors. The command line prints one line; `debug=true` adds the traceback.
 
-    The message is printable and of limited length for any input.
+    For any input, the message is printable and its length is limited.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -44,7 +44,7 @@ class NoPoseError(FrameError):
 
 
 class MapFullError(InstanceMapError):
-    """The map has reached its block budget. The map up to this frame is kept."""
+    """The map has reached its maximum number of blocks. The map up to this frame is kept."""
 
 
 class PartialRunError(InstanceMapError):

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from framework.data import Camera, Float32, Float64, Int32, PointClusters
 from framework.errors import DataError
 
-RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| of a rounded pose; files have 6 digits or more, lost poses R = 0
+RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| due to rounding in files; larger for lost poses, stored as R = 0
 EXACT_WITHIN = 1e-12  # maximum entry of |R R^T - I| of a float64 rotation, which is not changed
 
 
@@ -35,10 +35,10 @@ def transform(T_a_b: Float64, points_b: npt.NDArray[np.floating]) -> npt.NDArray
 
     Args:
         T_a_b: The rigid transform (4, 4).
-        points_b: The points (..., 3) in frame b.
+        points_b: The points (..., 3) in frame b, m.
 
     Returns:
-        The points (..., 3) in frame a, with the dtype of `points_b`.
+        The points (..., 3) in frame a, m, with the same dtype.
     """
     moved = points_b @ T_a_b[:3, :3].T.astype(points_b.dtype) + T_a_b[:3, 3].astype(points_b.dtype)
     return np.asarray(moved, points_b.dtype)
@@ -50,7 +50,10 @@ def skew(v: Float64) -> Float64:
 
 
 def adjoint(T: Float64) -> Float64:
-    """Return the adjoint (6, 6) of a rigid motion: T exp(xi) = exp(Ad xi) T for twists (translation, rotation)."""
+    """Return the adjoint Ad (6, 6) of a rigid motion T (4, 4): T exp(xi) = exp(Ad xi) T.
+
+    The twist xi (6,) consists of translation, m, and rotation, rad.
+    """
     Ad = np.zeros((6, 6))
     Ad[:3, :3] = Ad[3:, 3:] = T[:3, :3]
     Ad[:3, 3:] = skew(T[:3, 3]) @ T[:3, :3]
@@ -91,7 +94,7 @@ def rotation_angle(R: Float64) -> float:
 
 
 def pose_distance(T_world_a: Float64, T_world_b: Float64) -> float:
-    """Return the maximum of the distance (m) and the rotation angle (rad) between two poses."""
+    """Return the distance (m) or the rotation angle (rad) between two poses (4, 4), whichever value is larger."""
     T_a_b = inverse(T_world_a) @ T_world_b
     return max(float(np.linalg.norm(T_a_b[:3, 3])), rotation_angle(T_a_b[:3, :3]))
 
@@ -103,7 +106,7 @@ def nearest_rotation(R: Float64) -> Float64:
 
 
 def nearest_rigid(matrix: Float64) -> Float64:
-    """Return a pose (4, 4) with its rotation corrected for rounding errors. Raises DataError if it is not rigid."""
+    """Return a pose (4, 4) with the rounding errors of its rotation removed. Raises DataError if it is not rigid."""
     if not np.isfinite(matrix).all():
         raise DataError("pose: expected finite values, got NaN or infinity")
     if not np.allclose(matrix[3], (0, 0, 0, 1)):
@@ -120,9 +123,9 @@ def nearest_rigid(matrix: Float64) -> Float64:
 
 
 def interpolate(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Float64:
-    """Return the pose (4, 4) at a fraction of the motion from a (0) to b (1); other fractions extrapolate.
+    """Return the pose (4, 4) at `fraction` of the motion from a to b; 0 = a, 1 = b.
 
-    Translations are interpolated linearly, and rotations by slerp.
+    The translation is interpolated linearly, and the rotation spherically (slerp).
     """
     R_a, R_b = T_world_a[:3, :3], T_world_b[:3, :3]
     T = np.eye(4)
@@ -140,7 +143,7 @@ def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDAr
         points_camera: The points (..., 3) in the camera frame, m.
 
     Returns:
-        The pixel coordinates (u, v), px, as an array (..., 2).
+        The pixel coordinates (u, v) (..., 2), px.
     """
     x, y, z = points_camera[..., 0], points_camera[..., 1], points_camera[..., 2]
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
@@ -151,7 +154,7 @@ def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Flo
 
     Args:
         camera: The camera.
-        pixels: The pixel coordinates (u, v), px, as an array (P, 2).
+        pixels: The pixel coordinates (u, v) (P, 2), px.
         depth: The depths (P,) along z, m.
 
     Returns:
@@ -163,7 +166,7 @@ def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Flo
 
 
 def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
-    """Raise DataError if a cluster has a pixel outside of the image (height, width). Kernels do not check bounds."""
+    """Raise DataError if a pixel is outside of an image of `shape` (height, width), px. Kernels check no bounds."""
     u, v = clusters.pixels.T
     if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
         raise DataError(

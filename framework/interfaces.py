@@ -7,9 +7,9 @@
 
 A plugin is a dataclass that implements one of these interfaces. Its fields are its parameters, of type bool, int,
 float, str, Path, Enum or list[str]. Document the unit and bounds next to each default. Validate the values in
-`__post_init__`, and assign other state there as plain attributes. A field may also be a component (a dataclass whose
-fields become parameters of the plugin), another plugin, or a mapping of plugins. A YAML file in the config group of the
-stage registers the plugin.
+`__post_init__`, and assign other state there as plain attributes. A field may also be a part (a dataclass whose fields
+become parameters of the plugin), another plugin, or a mapping of plugins by name. A YAML file in the stage's config
+group registers the plugin.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class RGBDVideo(ABC):
 
     name: str  # name of the scene, for tables
     annotation: str = ""  # release of the ground truth, for tables; "" = only one release exists
-    domain: str = ""  # image domain, compared with `Detector.domain`: "rendered rooms"; "" = photographs or unknown
+    domain: str = ""  # image domain, such as "rendered rooms", for `Detector.domain`; "" = photographs or unknown
 
     def has_poses(self) -> bool:
         """Return True if frames may have ground-truth poses. Called before any frame is read."""
@@ -114,11 +114,11 @@ class LiveVideo(RGBDVideo):
 
     @abstractmethod
     def frames(self) -> Generator[FrameReader | None]:
-        """Yield a reader for each new frame, and None at least ten times a second while there is no frame.
+        """Yield a reader for each new frame, and None at least ten times per second while there is no new frame.
 
         Frame indices increase. Timestamps are capture times, s since 1970 on this computer's clock. Each reader is
-        called at most once, in another thread, while the generator waits. The device is opened with the first `next`
-        and closed with the generator, which may happen at any yield.
+        called at most once, in another thread, while the generator waits. The first `next` opens the device. Closing
+        the generator, which may happen at any yield, closes the device.
 
         Raises:
             DataError: The device cannot be opened, or fails.
@@ -157,13 +157,13 @@ class PoseTracker(ABC):
         """
 
     def renew_colors(self) -> None:  # noqa: B027  # optional
-        """Forget images of earlier frames, because their color was displaced against depth. By default, keep them.
+        """Discard the color images of earlier frames, which were displaced relative to depth. By default, keep them.
 
-        Called once, when the estimated delay of color is used for the first time.
+        Called once, when the estimated color delay is used for the first time.
         """
 
     def keyframes(self) -> Mapping[str, Array]:
-        """Return the arrays of the keyframes, for `load_keyframes`; empty if the tracker has no keyframes."""
+        """Return the arrays of the keyframes by name, for `load_keyframes`; empty if the tracker has no keyframes."""
         return {}
 
     def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
@@ -179,7 +179,7 @@ class PoseTracker(ABC):
         """
         raise ConfigError(
             f"tracker: expected a tracker with relocalization in a stored map, got {type(self).__name__}; "
-            "choose another tracker"
+            "set tracker=voxel_hashing_icp"
         )
 
 
@@ -188,9 +188,9 @@ class ClusterRefiner(ABC):
 
     @abstractmethod
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        """Return the refined clusters; their number may change. `pixels` contains the pixel of each point in `frame`.
+        """Return the refined clusters; their number may change. Each point has its pixel in `frame`.
 
-        `framework.refinement.refine` bypasses this method for clusters that are `exact`.
+        `framework.refinement.refine` does not call this method for `exact` clusters.
         """
 
 
@@ -201,20 +201,20 @@ class MapFuser(ABC):
 
     @abstractmethod
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
-        """Integrate `frame`, taken at `pose`, and the evidence of its `clusters`.
+        """Integrate `frame`, captured at `pose`, and the evidence of its `clusters`.
 
         If `clusters.detected` is false, `clusters` is empty and instances in view do not lose confidence.
         `timer` measures data association, the update of labels and instances, and the integration of depth and color.
-        A fuser that does not use it reports their total time as `fusion`.
+        If a fuser does not use `timer`, the run reports the total time as `fusion`.
 
         Raises:
-            MapFullError: The block budget of the map is reached.
+            MapFullError: The map has reached its maximum number of blocks.
         """
 
     def renew_colors(self) -> None:  # noqa: B027  # optional
-        """Let later observations replace the colors of the map, which were displaced. By default, average both.
+        """Let later observations replace the map's colors, which were displaced. By default, colors are averaged.
 
-        Called once, when the estimated delay of color is used for the first time.
+        Called once, when the estimated color delay is used for the first time.
         """
 
     def resume(self, scene: SceneMap) -> None:
@@ -224,7 +224,7 @@ class MapFuser(ABC):
             ConfigError: The fuser cannot resume this map.
         """
         raise ConfigError(
-            f"fuser: expected a fuser with support for stored maps, got {type(self).__name__}; choose another fuser"
+            f"fuser: expected a fuser with support for stored maps, got {type(self).__name__}; set fuser=bayesian_tsdf"
         )
 
 
@@ -233,7 +233,7 @@ class MapStatistics:
     """The size of a map."""
 
     voxels: int  # number of allocated voxels
-    bytes: int  # size of the arrays
+    bytes: int  # size of the map's arrays, bytes
     evictions: int = 0  # number of label slots reassigned to another label
 
 
@@ -261,12 +261,12 @@ class SceneMap(ABC):
 
     @property
     def depth_range(self) -> tuple[float, float]:
-        """Nearest and farthest integrated depth, m."""
+        """Minimum and maximum depth of integrated readings, m."""
         return 0.0, float("inf")
 
     @property
     def embedding_space(self) -> str:
-        """The space of `Instance.embedding`, as in Detections; "" if there are no embeddings."""
+        """The space of `Instance.embedding`, as in `Detections.embedding_space`; "" = no embeddings."""
         return ""
 
     def instance_ids(self) -> frozenset[int]:
@@ -287,19 +287,19 @@ class SceneMap(ABC):
 
     @abstractmethod
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Return the view of the map from a camera. Raises DataError if T_world_camera is not a pose."""
+        """Return the view from `camera` at T_world_camera (4, 4). Raises DataError if this is not a rigid transform."""
 
     def render_near(
         self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
     ) -> SurfaceView:
-        """Return the surface near the measured `depth` (H, W) m, for tracking.
+        """Return the surface near the measured depth, for tracking.
 
         A map may start its search at the depth measurements. It may omit pixels without a measurement, and surfaces far
         behind a measurement.
 
         Args:
             camera: The camera.
-            T_world_camera: Its pose (4, 4).
+            T_world_camera: The pose (4, 4) of the camera.
             depth: (H, W) float32, m along z; 0 = no measurement.
             sensor: The kind of the depth sensor, with its noise model.
         """
@@ -307,7 +307,7 @@ class SceneMap(ABC):
 
     @abstractmethod
     def mesh(self) -> InstanceMesh:
-        """Return the surface, with color, instance and class of each vertex."""
+        """Return the surface as a mesh, with color, instance and class of each vertex."""
 
     @abstractmethod
     def instances(self) -> Mapping[int, Instance]:
@@ -334,10 +334,10 @@ class Viewer:
         """Start a video and write files to `directory`. Raises ConfigError if the viewer cannot start."""
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
-        """Show an integrated frame, or a frame with a lost pose. `stage_ms` contains the stage times by name, ms."""
+        """Show a mapped frame, or a frame with a lost pose. `stage_ms` contains the stage times by name, ms."""
 
     def skip(self, reason: str) -> None:
-        """Report an unusable frame."""
+        """Show the reason for a skipped frame."""
 
     def end(self) -> None:
         """Finish the video. Called once after `begin`, also after an error of the run."""

@@ -39,14 +39,14 @@ log = logging.getLogger(__name__)
 
 WITHOUT_POSES = "add the poses of the sequence, or estimate them with tracker=voxel_hashing_icp"
 WITHOUT_THREADS = (
-    "numba's threading layer is not thread-safe; detection runs in the calling thread; call "
+    "numba's threading layer is not thread-safe; detection runs in the calling thread; for parallel detection, call "
     "instancemap.configure_process() before numba is imported"
 )
 
 
 @dataclass
 class Pipeline:
-    """The stages and the loop: `Pipeline(detector, tracker, refiner, fuser).run(video)`."""
+    """The stages and the mapping loop: `Pipeline(detector, tracker, refiner, fuser).run(video)`."""
 
     detector: Detector
     tracker: PoseTracker
@@ -65,7 +65,7 @@ class Pipeline:
             raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}; set it to 0")
         self.viewer = GuardedViewer(self.viewer)
         self.color_to_depth = ColorToDepth(delay=None)
-        self.T_world_color: Float64 | None = None  # pose of the last frame's color camera
+        self.T_world_color: Float64 | None = None  # (4, 4) pose of the last frame's color camera
 
     def run(self, video: RGBDVideo) -> RunResult:
         """Map `video` frame by frame.
@@ -125,7 +125,7 @@ class Pipeline:
         return replace(journal.result(), keyframes=keyframes, color_delay=self.color_to_depth.estimate)
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
-        """Return the keyframes of the tracker. A pending error of its thread becomes `journal.stopped_by`."""
+        """Return the keyframes of the tracker. A pending error of its thread is stored in `journal.stopped_by`."""
         try:
             return self.tracker.keyframes()
         except Exception as error:
@@ -133,7 +133,7 @@ class Pipeline:
             return self.tracker.keyframes()
 
     def empty_map_reason(self, journal: Journal) -> str:
-        """Return the error message for an empty map."""
+        """Return the reason for an empty map, for an error message."""
         result = journal.result()
         if result.frames == 0:
             return "expected at least one frame, got none"
@@ -155,7 +155,7 @@ class Pipeline:
         )
 
     def map_all(self, video: RGBDVideo, journal: Journal, interruption: Interruption) -> None:
-        """Run the loop. Raises Interrupted between two frames after a signal."""
+        """Map all frames of `video`. Raises Interrupted between two frames after a signal."""
         prefetch = self.prefetch
         if prefetch > 0 and not parallel_kernels_are_thread_safe():
             log.info(WITHOUT_THREADS)
@@ -217,7 +217,7 @@ class Pipeline:
     ) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
         """Read frame `number` of the video in its `turn`, and detect its objects.
 
-        Returns the frame, its detections and its stage times, or the error of the frame. None = end of the video.
+        Returns the frame with its detections and stage times, or the error of the frame; None = end of the video.
         """
         try:
             with turn:
@@ -233,7 +233,7 @@ class Pipeline:
         return frame, detections, [reading, *times]
 
     def detect(self, frame: Frame, number: int) -> tuple[Detections, list[StageTime]]:
-        """Return the detections of frame `number` of the video (from 0), and the detection time if the detector ran."""
+        """Return the detections of frame `number` (from 0) of the video, and the detection time if the detector ran."""
         if number % self.detection_interval:
             return Detections.none(frame.depth.shape, self.detector.classes, detected=False), []
         began = time.perf_counter()

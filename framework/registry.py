@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.config.composition import config_loader, running_loader
 from framework.config.hydra_api import CachingConfigRepository, create_defaults_list
 from framework.config.renamed_keys import rename_hint
+from framework.config.validation import values_of
 from framework.errors import ConfigError, InstanceMapError, first_line
 from framework.files.search_paths import PROJECT_ROOT
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDVideo, Viewer
@@ -34,12 +35,12 @@ STAGES: Mapping[str, type[Any]] = {
     "refiner": ClusterRefiner,
     "fuser": MapFuser,
 }
-"""Interfaces of the options, by config group. These groups affect results."""
+"""Interface of the options in each config group. These groups affect results."""
 
 GROUPS: Mapping[str, type[Any]] = {**STAGES, "viewer": Viewer}
-"""Interfaces of the options, by config group of plugins."""
+"""Interface of the options in each config group of plugins."""
 
-REGISTER = "; register your class with a YAML {stage}/NAME.yaml in a folder given by --config-dir"
+REGISTER = "; register your class with a file {stage}/NAME.yaml in a folder given by --config-dir"
 
 Plugin = TypeVar("Plugin")
 
@@ -47,11 +48,11 @@ Plugin = TypeVar("Plugin")
 def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
     """Build the plugin of a config node: `_target_` names the class, the other keys are its parameters.
 
-    The class must be the `_target_` of a registered option of the stage. Options are registered by this project, by an
-    installed package, and by --config-dir (without a running Hydra: `framework.config.composition.add_config_dir`). The
-    modules of other classes are not imported, so a config cannot run unregistered code. The class must also be a
-    concrete dataclass that implements `interface`. Interpolations in the node are resolved against the config that
-    contains it.
+    The class must be the `_target_` of a registered option of the stage. Options are registered by this project, by
+    installed packages, and by folders given by --config-dir (without a running Hydra:
+    `framework.config.composition.add_config_dir`). The modules of other classes are not imported, so a config cannot
+    run unregistered code. The class must also be a concrete dataclass that implements `interface`. Interpolations in
+    the node are resolved against the config that contains it.
 
     Args:
         interface: The interface of the plugin. It is not annotated as `type[Plugin]`, which excludes abstract classes.
@@ -120,7 +121,8 @@ def parameter_fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[An
         more = parameter_fields(kind) if _is_part(kind) else {name: (field, kind)}
         if twice := found.keys() & more.keys():
             raise ConfigError(
-                f"{plugin_class.__name__}: expected unique parameters, got two {', '.join(sorted(twice))}"
+                f"{plugin_class.__name__}: expected unique parameter names, got {', '.join(sorted(twice))} twice; "
+                "rename the fields"
             )
         found |= more
     return found
@@ -136,7 +138,7 @@ def _fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]
 
 
 def stage_of(interface: Callable[..., object]) -> str:
-    """Return the config group of the plugins that implement `interface` or a base class of it."""
+    """Return the config group of plugins that implement `interface`, which may be a subclass, such as RGBDSequence."""
     assert isinstance(interface, type)
     return next(stage for stage, of in GROUPS.items() if issubclass(interface, of))
 
@@ -214,7 +216,8 @@ def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
     if inspect.isabstract(found):
         missing = ", ".join(sorted(found.__abstractmethods__))
         raise ConfigError(
-            f"{where}: expected an implementation of {missing} of {interface.__name__}, got none in {class_name}"
+            f"{where}: expected all methods of {interface.__name__} in {class_name}, got none for: {missing}; "
+            "implement them"
         )
     with _errors_at(where):
         parameter_fields(found)
@@ -255,7 +258,7 @@ def check_option(where: str, plugin_class: type, node: DictConfig) -> None:
 
 
 def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
-    """Return the parameters of a plugin (with defaults), and its nested plugins."""
+    """Return the parameters of a plugin, with defaults for omitted ones, and its nested plugins by parameter."""
     stages = plugin_fields(plugin_class)
     fields = parameter_fields(plugin_class)
     typed = [
@@ -266,9 +269,12 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
     try:
         schema: DictConfig = OmegaConf.structured(dataclasses.make_dataclass(plugin_class.__name__, typed))
     except OmegaConfBaseException as error:
+        field, kind = fields[str(error.full_key).partition("[")[0]]
+        found = getattr(kind, "__name__", kind)
+        found = found if field.default is dataclasses.MISSING else f"{found} with the default {field.default!r}"
         raise ConfigError(
-            f"{where}: expected parameters of type bool, int, float, str, Path, Enum or list[str], got another type "
-            f"({first_line(error)})"
+            f"{where}: {field.name}: expected a parameter and default of type bool, int, float, str, Path, Enum or "
+            f"list[str], got {found}"
         ) from error
     plugins: dict[str, Any] = {}
     for key in map(str, node):
@@ -284,14 +290,18 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
             plugins[key] = _inner(f"{where}: {key}", stages[key], node[key], holds_one(plugin_class, key))
             continue
         try:
-            schema[key] = node[key]
-        except OmegaConfBaseException as error:
+            value = node[key]
+        except OmegaConfBaseException as error:  # interpolation of a missing key
             raise ConfigError(f"{where}: {key}: {first_line(error)}") from error
+        try:
+            schema[key] = value
+        except OmegaConfBaseException as error:
+            raise ConfigError(f"{where}: {key}: expected {values_of(fields[key][1])}, got {_shown(value)}") from error
     return schema, plugins
 
 
 def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
-    """Return the interfaces of the fields that contain a plugin or plugins by name (Mapping[str, interface])."""
+    """Return the interface of each field that contains a plugin or a mapping of plugins (Mapping[str, interface])."""
     found = {}
     for name, hint in get_type_hints(plugin_class).items():
         of = get_args(hint)

@@ -1,4 +1,7 @@
-"""Arguments and errors of commands. An error gives one line on stderr and an exit status; `debug=true` a traceback."""
+"""Arguments and errors of commands.
+
+An error prints one line on stderr and sets the exit status. `debug=true` adds the traceback.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +65,7 @@ def one_line_errors() -> Iterator[None]:
 
 
 def print_error(error: BaseException, prefix: str = "error: ") -> None:
-    """Print an error as one line to stderr, after its traceback with `debug=true`."""
+    """Print an error as one line to stderr. With `debug=true`, print its traceback first."""
     if "debug=true" in sys.argv:
         traceback.print_exception(error)
     tqdm.write(f"{prefix}{one_line(error)}", file=sys.stderr)  # above a progress bar
@@ -104,7 +107,7 @@ def print_for_directories(description: str, directory_help: str, write: Callable
 
 @dataclass
 class Jobs:
-    """Error reports and exit status of the jobs of a sweep. An error does not stop the other jobs."""
+    """Error reports and exit status of the jobs of a run or sweep. An error does not stop the other jobs."""
 
     status: int = 0
 

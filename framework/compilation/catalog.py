@@ -65,7 +65,7 @@ class Kernel:
         return tuple(map(_type_of, ast.parse(f"f({self.types})", mode="eval").body.args))  # type: ignore[attr-defined]
 
     def is_compiled(self) -> bool:
-        """Return True if numba's cache contains the kernel and is newer than all called kernels."""
+        """Return True if numba's cache contains the kernel and is newer than the code of all called kernels."""
         cache = self.dispatcher._cache
         index = Path(cache._cache_file._index_path) if cache._enabled else None
         if index is None or not index.exists():
@@ -106,7 +106,7 @@ def line_of(dispatcher: Any, signature: Iterable[Any]) -> str:
 
 
 def compile_for_run() -> None:
-    """Compile the listed kernels of all imported modules. Logs a warning if a kernel fails.
+    """Compile the listed kernels of all imported modules. Logs a warning if a compilation fails.
 
     A run calls this function after building its stages, and again after building its video.
     """
@@ -205,7 +205,7 @@ def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueu
             except queue.Empty:
                 event, text = "", ""
                 if not any(thread.is_alive() for thread in threads):
-                    raise DataError("kernels: expected running processes, got none; run the command again") from None
+                    raise DataError("kernels: expected running workers, got none; run the command again") from None
             if event == "done":
                 left -= 1
                 bar.update()

@@ -25,7 +25,7 @@ TESTED = ("0.68.1",)
 
 def work() -> None:
     """Read one kernel per line, compile it, and print an error or an empty line."""
-    gc.freeze()  # numba's many permanent objects slow the garbage collector
+    gc.freeze()  # numba's many permanent objects slow down garbage collection
     gc.set_threshold(200_000, 20, 20)
     wanted = {(kernel.module, kernel.name) for kernel in listed(DEFAULT, OTHERS)}
     names = {name for _, name in wanted}
@@ -61,7 +61,7 @@ def make_code_only_for(names: set[str]) -> None:
     from numba.core.codegen import CPUCodeLibrary, JITCPUCodegen
     from numba.core.registry import cpu_target
 
-    cpu_target.target_context.refresh()  # numba's own runtime, before the replacement
+    cpu_target.target_context.refresh()  # compile numba's own runtime before the methods are replaced
     finalize, set_env = CPUCodeLibrary._finalize_final_module, JITCPUCodegen.set_env
 
     def finalize_without_code(library: Any) -> None:

@@ -50,7 +50,7 @@ def add_config_dir(folder: Path) -> None:
     Raises ConfigError if the folder does not exist.
     """
     if not folder.is_dir():
-        raise ConfigError(f"--config-dir: expected a folder, got {folder}")
+        raise ConfigError(f"--config-dir: expected an existing folder, got {folder}")
     _added.append(folder.resolve())
 
 
@@ -77,7 +77,7 @@ def installed_config_dirs() -> dict[Path, str]:
 
 
 class InstalledConfigs(SearchPathPlugin):
-    """Search path plugin with the config folders of installed packages, once registered with Hydra."""
+    """Hydra search path plugin that adds the config folders of installed packages."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder, package in installed_config_dirs().items():
@@ -85,7 +85,10 @@ class InstalledConfigs(SearchPathPlugin):
 
 
 class FileConfigSource(hydra_api.FileConfigSource):
-    """Hydra's reader of YAML folders with a check of each file. Hydra distinguishes sources by name."""
+    """Reader of YAML folders that checks each file.
+
+    The class has the same name as Hydra's reader, because Hydra distinguishes sources by class name.
+    """
 
     def load_config(self, config_path: str) -> ConfigResult:
         path = Path(self.path, self._normalize_file_name(config_path))
@@ -183,9 +186,10 @@ def _message_of(error: BaseException) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _no_such_option(error)
     if isinstance(error, OverrideParseException):
-        return f"{error.override!r}: expected an override of the form key=value; {error.message.splitlines()[0]}"
+        return f"override: expected KEY=VALUE, got {error.override!r}; quote values with special characters"
     if isinstance(error, HydraException) and isinstance(error.__cause__, ConfigAttributeError | ConfigKeyError):
-        return f"{_joined(str(error).partition('To append')[0])} {_known_keys(error.__cause__)}"
+        prefix = "" if str(error).startswith("Could not override") else f"{_joined(str(error))} "
+        return f"{prefix}{_known_keys(error.__cause__)}"
     if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
         return _joined(f"{error} {error.__cause__}")
     if isinstance(error, InterpolationResolutionError):  # the message of the resolver is between its type and the key
@@ -215,7 +219,7 @@ def _no_such_option(error: MissingConfigException) -> str:
 
 
 def _known_keys(error: OmegaConfBaseException) -> str:
-    """Return an error message with the existing keys at the position of an unknown key."""
+    """Return the error message for an unknown key, with a similar key or all keys of its parent."""
     keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
     close = get_close_matches(str(error.key), keys, n=1)
     path = str(error.full_key or error.key)

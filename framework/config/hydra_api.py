@@ -1,4 +1,4 @@
-"""Private Hydra APIs in use. All other modules import them from here.
+"""Private APIs of Hydra. All other modules import them from here.
 
 Tested with the versions in TESTED; `hydra-core>=1.3.8,<1.4` in pyproject.toml has to match them.
 """

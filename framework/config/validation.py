@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from enum import Enum
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, get_args, get_type_hints
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.errors import ConfigError, first_line
+from framework.errors import ConfigError
 
 MAX_DETECTIONS = 1000  # maximum number of detections per image; each has a mask of the image size; COCO evaluates 100
 MAX_PROPOSALS = 100_000  # maximum number of proposals of a network per image
 LONGEST_SIDE = 2**13  # px, maximum side of the input image of a network
+PHRASES: Mapping[Any, str] = {
+    bool: "true or false",
+    int: "an integer",
+    float: "a number",
+    str: "a string",
+    Path: "a path",
+    NoneType: "null",
+    list[str]: "a list of strings",
+    dict[str, str]: "a mapping from names to strings",
+}
+"""Valid values by type, for error messages."""
 
 
 def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
@@ -68,13 +81,13 @@ def check_count(name: str, value: int, most: int) -> None:
 
 
 def checked_rows(node: Any) -> dict[str, list[str]]:
-    """Return the overrides of each row of an experiment by name; empty without `rows`.
+    """Return the overrides of each row of an experiment by name; empty if `node` is None.
 
     Raises ConfigError if the overrides of a row are not a list of strings.
     """
     if node is not None and not isinstance(node, Mapping):
         raise ConfigError(
-            f"rows: expected names with overrides, got {node!r}; write for example mine: [refiner=identity]"
+            f"rows: expected names with overrides, got {node!r}; write, for example, mine: [refiner=identity]"
         )
     rows = {str(name): overrides for name, overrides in (node or {}).items()}
     for name, overrides in rows.items():
@@ -93,9 +106,23 @@ def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:
     """
     if not isinstance(node, Mapping):
         raise ConfigError(f"{name}: expected keys and values, got {node!r}")
-    try:
-        content = OmegaConf.to_container(OmegaConf.merge(OmegaConf.structured(kind), OmegaConf.create(dict(node))))
-    except OmegaConfBaseException as error:
-        raise ConfigError(f"{name}: {first_line(error)}") from error
+    block, types = OmegaConf.structured(kind), get_type_hints(kind)
+    for key in map(str, node):
+        if key not in types:
+            raise ConfigError(f"{name}: expected one of {', '.join(types)}, got {key!r}")
+        try:
+            block = OmegaConf.merge(block, OmegaConf.create({key: node[key]}))
+        except OmegaConfBaseException as error:
+            raise ConfigError(f"{name}.{key}: expected {values_of(types[key])}, got {node[key]!r}") from error
+    content = OmegaConf.to_container(block)
     assert isinstance(content, dict)
     return {str(key): value for key, value in content.items()}
+
+
+def values_of(kind: Any) -> str:
+    """Return the valid values of a parameter of type `kind` as a phrase for error messages, such as "an integer"."""
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return f"one of {', '.join(kind.__members__)}"
+    if isinstance(kind, UnionType):
+        return " or ".join(map(values_of, get_args(kind)))
+    return PHRASES.get(kind, str(kind))

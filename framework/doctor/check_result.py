@@ -28,7 +28,10 @@ class Check:
 
     @classmethod
     def of(cls, name: str, passed: bool, detail: str, fix: str = "", required: bool = False) -> Check:
-        """Return the result of a check, with its fix if it failed."""
+        """Return the result of a check.
+
+        A failed check includes its fix. Its status is ERROR if `required`, otherwise MISSING.
+        """
         if passed:
             return cls(name, Status.OK, detail)
         return cls(name, Status.ERROR if required else Status.MISSING, detail, fix)

@@ -35,11 +35,11 @@ def _run(code: str) -> tuple[str, str]:
     try:
         done = subprocess.run(command, env=environment, input="", capture_output=True, text=True, timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        return "", f"does not finish within {TIMEOUT_S:g} s"
+        return "", f"not finished within {TIMEOUT_S:g} s"
     if done.returncode == 0:
         return done.stdout.rpartition("\n")[0].rpartition("\n")[2], ""
     message = re.split(r"^\s.*\n", done.stderr, flags=re.MULTILINE)[-1] if done.returncode == 1 else ""
-    error = " ".join(message.split()) or f"ends the process with status {done.returncode}"
+    error = " ".join(message.split()) or f"process ended with status {done.returncode}"
     return "", anonymous(error)[:300]
 
 

@@ -54,7 +54,7 @@ def published() -> Iterator[Check]:
 
 
 def _named() -> Iterator[tuple[str, str]]:
-    """Yield each option with its weight path or model id; OPTION.PARAMETER if the option has several."""
+    """Yield the name and the path or model id of each option's weights; the name is OPTION.PARAMETER for several."""
     for path in sorted((CONF / "detector").glob("*.yaml")):
         content = _content(path).items()
         values = {key: value for key, value in content if isinstance(value, str) and MODEL_ID.match(value)}
@@ -67,7 +67,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _hub_cache() -> Path:
-    """Return the model folder of huggingface_hub, which reads these environment variables."""
+    """Return the model folder of huggingface_hub, as selected by its environment variables."""
     if given := os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE"):
         return Path(given)
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

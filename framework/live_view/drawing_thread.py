@@ -1,8 +1,8 @@
 """A thread that draws a run without blocking the pipeline.
 
-Frames that arrive during drawing are drawn next. Of images and maps, only the newest is drawn. The fuser may write the
-map at any time, so the pipeline's thread takes snapshots between two frames. The time for snapshots and drawing is
-limited to fixed fractions of the run time, regardless of the map's size.
+Frames that arrive during drawing are drawn next. Only the newest image and the newest map are drawn. The fuser may
+write the map at any time, so the pipeline's thread takes snapshots between two frames. The time for snapshots and
+drawing is limited to fixed fractions of the run time, regardless of the map's size.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class MapSnapshot:
     index: int  # Frame.index of the last integrated frame
     timestamp: float  # s
     mesh: InstanceMesh
-    objects: Mapping[int, tuple[int, float]]  # SceneMap.most_likely_classes
-    up: Float64 | None  # (3,) last estimate of the up direction; None = unknown
+    objects: Mapping[int, tuple[int, float]]  # as returned by SceneMap.most_likely_classes
+    up: Float64 | None  # (3,) last estimate of the up direction, world frame; None = unknown
 
 
 class Drawing(Protocol):
@@ -89,7 +89,7 @@ class DrawingThread:
     def __init__(self, scene: SceneMap, drawing: Drawing, frame_interval: int, map_interval: float) -> None:
         self._scene, self._drawing, self._frame_interval = scene, drawing, frame_interval
         self._snapshots = Pace(map_interval, SNAPSHOT_FRACTION)
-        self._taken, self._next_up = 0, FIRST_UP  # number of snapshots, and snapshot of the next up estimate
+        self._taken, self._next_up = 0, FIRST_UP  # snapshots so far; next snapshot that estimates the up direction
         self._pictures = Pace(0.0, PICTURE_FRACTION, time.thread_time)
         self._maps = Pace(map_interval, MAP_FRACTION, time.thread_time)
         self._frames = 0
@@ -187,7 +187,7 @@ class DrawingThread:
 
 
 class Pace:
-    """Rate limiter: once per `interval` s, and at most a fraction of the time measured by `clock`."""
+    """Rate limiter: at most once per `interval` s, and at most `fraction` of the time measured by `clock`."""
 
     def __init__(self, interval: float, fraction: float, clock: Callable[[], float] = time.perf_counter) -> None:
         self.interval = interval  # s

@@ -14,7 +14,7 @@ TINT = 0.6  # fraction of the instance color in a vertex color; the rest is the 
 
 
 class InstanceColors:
-    """Palette of overview.png, by instance."""
+    """Colors of the instances, from the palette of overview.png."""
 
     def __init__(self) -> None:
         self._centroids: dict[int, Float64] = {}  # (3,) m, at the first observation
@@ -48,13 +48,14 @@ class InstanceColors:
 
 MAX_POINTS = 8_000  # maximum number of map points projected into a frame
 NEAR = 0.05  # maximum distance between a point and the depth reading, relative to depth
-MIN_FRACTION = 0.3  # minimum fraction of the points under a mask that belong to its instance
+MIN_FRACTION = 0.3  # minimum fraction of the points in a mask that belong to its instance
 
 
 def seen_instances(masks: Bool, frame: Frame, T_world_camera: Float64, mesh: InstanceMesh) -> Int32:
-    """Return the ids (N,) of the instances with the most points under the masks (N, H, W); 0 = below MIN_FRACTION.
+    """Return the id (N,) of the instance with the most points in each mask (N, H, W); 0 = fraction below MIN_FRACTION.
 
-    The points are mesh vertices with or without an instance that agree with the frame's depth.
+    The points are the mesh vertices, with or without an instance, that agree with the frame's depth if the camera is at
+    T_world_camera (4, 4).
     """
     chosen = slice(None, None, -(-len(mesh.vertices) // MAX_POINTS) or 1)
     points_camera = transform(inverse(T_world_camera), mesh.vertices[chosen])

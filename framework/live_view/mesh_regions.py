@@ -24,14 +24,17 @@ class MeshPart:
 
 
 class MeshRegions:
-    """Cubes of `side` m with digests of their last content."""
+    """Cubes of side `side`, m, with digests of the last mesh part in each."""
 
     def __init__(self, side: float) -> None:
         self.side = side
         self._digests: dict[Region, bytes] = {}
 
     def changed(self, vertices: Float32, triangles: Int32, colors: UInt8) -> Iterator[tuple[Region, MeshPart]]:
-        """Yield the changed and removed parts of a mesh since the last call."""
+        """Yield the parts of a mesh that changed or were removed since the last call, with their regions.
+
+        The mesh consists of vertices (V, 3), m, in the world frame, triangles (F, 3) and RGB colors (V, 3).
+        """
         gone = set(self._digests)
         for region, chosen in _by_region(vertices, triangles, self.side):
             gone.discard(region)

@@ -48,8 +48,8 @@ class RerunDrawing:
         self._first_s: float | None = None  # timestamp of the first frame
         self._path: list[Float32] = []  # (3,) positions of the last path segment
         self._pieces = 0
-        self._up: Float64 | None = None  # (3,) as drawn
-        self._forward: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) direction of the first camera
+        self._up: Float64 | None = None  # (3,) up direction, as drawn
+        self._forward: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) z axis of the first camera
         self._mesh: InstanceMesh | None = None  # as last drawn, with the shown instances
         self._names: dict[int, str] = {}  # names of the shown instances
         self._named: dict[int, str] = {}  # names of all instances so far
@@ -240,7 +240,10 @@ class RerunDrawing:
 
 
 def turned(up: Float64, forward: Float64) -> Float64:
-    """Return R_view_world (3, 3), which maps the unit vector `up` (3,) to z and the level part of `forward` to y."""
+    """Return the rotation R_view_world (3, 3) for a view with z up.
+
+    It maps the unit vector `up` (3,) to z, and the horizontal component of `forward` (3,) to y.
+    """
     across = np.cross(forward, up)
     across = across / np.linalg.norm(across) if across.any() else np.linalg.svd(up[None])[2][1]
     return np.stack([across, np.cross(up, across), up])

@@ -55,7 +55,7 @@ def open_window(port: int, memory_limit: str) -> None:
 def page_server() -> Iterator[str]:
     """Run rerun's web server and return its address. Raises OSError on failure.
 
-    Each call uses a new home folder: rerun sends usage statistics from the second start on.
+    Each call uses a new home folder, because rerun sends usage statistics from the second start in a home folder.
     """
     port = free_port()
     ports = ["--port", str(free_port()), "--web-viewer-port", str(port)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-DEPTH_STEP = 0.05  # fraction of the depth; a larger step is an edge
+DEPTH_STEP = 0.05  # minimum depth step of an edge, fraction of the depth
 REACH = 4  # px, maximum width of the missing depth at an edge
 DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # (u, v) of the searched neighbors
 SEARCHED_ROWS = 120  # number of searched rows of an image
@@ -13,7 +13,7 @@ SEARCHED_ROWS = 120  # number of searched rows of an image
 
 @njit(cache=True, nogil=True)
 def find_edges(depth, edges):
-    """Write (u, v, z) of the pixels on the nearer side of depth steps to edges (N, 3). Return their number, <= N."""
+    """Write (u, v, z), px and m, of pixels on the nearer side of depth steps to edges (N, 3). Return their number."""
     height, width = depth.shape
     count = 0
     for v in range(REACH, height - REACH, max(height // SEARCHED_ROWS, 1)):

@@ -1,4 +1,4 @@
-"""Registration of color images to depth images of other times, by the motion of the camera.
+"""Registration of color images to depth images taken at other times, from the camera's motion.
 
 Color is taken dt = t_color + delay - t_depth after depth, with the timestamps t_color and t_depth of the images and a
 constant delay. With the last two poses, at the times t_last and t_depth, and constant velocity:
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 class RegisteredFrame(NamedTuple):
     """A frame with color registered to depth."""
 
-    frame: Frame  # with the color at each depth pixel
+    frame: Frame  # with the color of each depth pixel
     T_world_color: Float64  # (4, 4) pose of the color camera
     color_pixels: Int32 | None = None  # (H, W) flat index of each reading's color pixel, -1 = none; None = same pixel
 
@@ -125,7 +125,7 @@ class ColorToDepth:
 
 
 def _shift(frame: Frame, T_a_b: Float64) -> float:
-    """Return the image motion, px, of points at NEAR for a small motion of the camera."""
+    """Return the image motion, px, of points at the depth NEAR for a small motion of the camera."""
     return frame.camera.fx * (rotation_angle(T_a_b[:3, :3]) + math.hypot(*T_a_b[:3, 3]) / NEAR)
 
 

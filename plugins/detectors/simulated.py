@@ -106,7 +106,7 @@ class SimulatedDetector(Detector):
     """
 
     seed: int = 0  # seed of the simulated errors, >= 0
-    min_pixels: int = 64  # minimum size of a detected instance, px, >= 1
+    min_pixels: int = 64  # minimum number of pixels of a detected instance, >= 1
     clutter_rate: float = 0.0  # fraction of objects of unknown class that are detected, in [0, 1]
     # probability of a common mask of an object and a touching object of unknown class, in [0, 1]
     attach_rate: float = 0.0
@@ -117,7 +117,7 @@ class SimulatedDetector(Detector):
     miss_spread: float = 0.0  # standard deviation of the logit of the detection rate over objects, >= 0
     split_rate: float = 0.05  # probability of splitting an object into two detections, in [0, 1]
     shift: float = 1.5  # standard deviation of the mask shift along x and y, px, >= 0
-    bleed: float = 2.0  # distance of the mask border outside the object, px; negative = inside
+    bleed: float = 2.0  # offset of the mask border from the object border, px; positive = outside, negative = inside
     boundary_noise: float = 2.5  # standard deviation of the mask border's displacement, px, >= 0
     boundary_scale: float = 12.0  # correlation length of the mask border's displacement, px, >= 2
     mask_grid: int = 28  # number of cells per side of a mask, >= 4; 0 = full resolution

@@ -21,9 +21,9 @@ class WithEmbeddings(Detector):
     detector: Detector  # wrapped detector; replace it with detector@detector.detector=NAME
     model: str = "google/siglip2-base-patch16-224"  # CLIP or SigLIP model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model repository
-    frame_interval: int = 1  # interval between embedded frames, in frames, >= 1; 1 = every frame
-    min_score: float = 0.3  # minimum score of an embedded detection, in [0, 1]; weaker detections are wrong too often
-    min_pixels: int = 200  # minimum mask size of an embedded detection, px, >= 1
+    frame_interval: int = 1  # interval between frames with embeddings, in frames, >= 1; 1 = every frame
+    min_score: float = 0.3  # minimum score of a detection with an embedding, in [0, 1]; weaker ones are often wrong
+    min_pixels: int = 200  # minimum number of mask pixels of a detection with an embedding, >= 1
     context: float = 1.2  # ratio of the square crop's side to the longer side of the object's box, >= 1
     background_contrast: float = 0.4  # contrast of the background in the crop, in [0, 1]; 0 = gray, 1 = unchanged
     batch_size: int = 16  # number of crops per batch, >= 1

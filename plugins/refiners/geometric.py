@@ -23,16 +23,15 @@ class Geometric(ClusterRefiner):
     if the cluster points determine the camera pose. All points of a mask without a segment are removed.
     """
 
-    cell_size: int = 2  # side of the cells of averaged readings, px, >= 1
+    cell_size: int = 2  # side of the cells in which depth readings are averaged, px, >= 1
     window_radius: int = 3  # radius of the square windows for plane fits, in cells, >= 1
-    noise_factor: float = 3.0  # noise threshold of depth, in standard deviations of the sensor, >= 0.1
-    # minimum standard deviation of depth, m, >= 0; half of the rounding step for rounded readings
-    min_noise: float = 0.0
+    noise_factor: float = 3.0  # maximum depth difference that counts as noise, in standard deviations, >= 0.1
+    min_noise: float = 0.0  # minimum standard deviation of depth, m, >= 0; half the step of rounded readings
     max_slope: float = 4.0  # maximum slope of a surface, m per m, >= 0.1; steeper = depth jump (4 = 76 degrees)
     max_angle: float = 15.0  # maximum concave angle within a segment, beyond noise, degrees, in (0, 90)
     closing_radius: int = 1  # radius of the morphological closing of edges, in cells, >= 0
-    min_segment: int = 100  # minimum size of a segment, px, >= 1; smaller segments are merged with their neighbors
-    min_overlap: float = 0.8  # minimum fraction of a segment under its mask, in [0, 1)
+    min_segment: int = 100  # minimum number of pixels of a segment, >= 1; smaller segments are merged with neighbors
+    min_overlap: float = 0.8  # minimum fraction of a segment inside its mask, in [0, 1)
     grow_to_segments: bool = True  # True = add the segments' pixels outside the mask
 
     def __post_init__(self) -> None:

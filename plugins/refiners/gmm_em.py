@@ -38,9 +38,9 @@ class GmmEm(ClusterRefiner):
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
     std_floor: float = 0.01  # minimum standard deviation of a Gaussian along any axis, m
     outlier_fraction: float = 0.0  # initial fraction of outliers, in [0, 1); 0 = no uniform component
-    min_posterior: float = 0.5  # minimum posterior of the object for a kept point, in (0, 1)
-    mask_log_odds: float = 4.0  # prior log-odds of the object deep in the mask, nats, >= 0; 0 = initialization only
-    expected_bleed: float = 0.4  # distance inside the mask with prior log-odds 0, in ring widths, >= 0 and < 1
+    min_posterior: float = 0.5  # minimum posterior probability of the object to keep a point, in (0, 1)
+    mask_log_odds: float = 4.0  # prior log-odds of the object far inside the mask, nats, >= 0; 0 = initialization only
+    expected_bleed: float = 0.4  # distance inside the mask border with prior log-odds 0, in ring widths, in [0, 1)
     ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:

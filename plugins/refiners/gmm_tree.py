@@ -39,9 +39,9 @@ class GmmTree(ClusterRefiner):
     min_support: float = 1e-4  # minimum fraction of the tree's points in a node, in [0, 1); other nodes are dropped
     min_node: int = 32  # minimum number of points of a node with children, >= 8
     parent_points: float = 4.0  # weight of the parent's object fraction as a prior, in points, >= 0
-    min_posterior: float = 0.5  # minimum posterior of the object for a kept point, in (0, 1)
-    mask_log_odds: float = 2.0  # prior log-odds of the object deep in the mask, nats, >= 0
-    expected_bleed: float = 0.5  # distance inside the mask with prior log-odds 0, in ring widths, >= 0 and < 1
+    min_posterior: float = 0.5  # minimum posterior probability of the object to keep a point, in (0, 1)
+    mask_log_odds: float = 2.0  # prior log-odds of the object far inside the mask, nats, >= 0
+    expected_bleed: float = 0.5  # distance inside the mask border with prior log-odds 0, in ring widths, in [0, 1)
     ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:

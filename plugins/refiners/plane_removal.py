@@ -30,7 +30,7 @@ class PlaneRemoval(ClusterRefiner):
     min_frame_fraction: float = 0.04  # minimum fraction of the frame's readings on a plane, in [0, 1]
     max_behind_ratio: float = 0.1  # maximum ratio of readings behind a plane to readings on the plane, >= 0
     max_tilt: float = 180.0  # maximum angle from the camera's up axis to the normal, degrees, in [0, 180]; 60 = floors
-    max_cluster_fraction: float = 0.5  # maximum fraction of the plane's points in a cluster for removal, in [0, 1]
+    max_cluster_fraction: float = 0.5  # fraction of a plane's points above which a cluster keeps them, in [0, 1]
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -93,7 +93,7 @@ class VoxelHashingIcp(PoseTracker):
     depth_weight: float = 1.0  # weight of the point-to-plane term, in [0, 1]; 0 = color only
     max_translation: float = 0.3  # maximum translation between frames, m, > 0; proportional to depth beyond 5 m (TUKEY)
     max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; lost above it
-    min_visible: float = 0.05  # minimum fraction of visible points (in mapped parts of the view), in [0, 1]
+    min_visible: float = 0.05  # minimum fraction of a frame's points that are visible in the map, in [0, 1]
     min_matched: float = 0.4  # minimum fraction of the visible points with a nonzero weight, in [0, 1]
     # minimum ratio of smallest to mean eigenvalue of the dimensionless normal matrix, in [0, 1]; doubled while lost
     min_information: float = 1e-3

@@ -165,12 +165,12 @@ def test_data_objects_accept_valid_values() -> None:
         (
             detections,
             {"class_probabilities": np.full((2, 2), 0.4, np.float32)},
-            "expected a distribution in each row, got a sum of .*, minimum",
+            "expected a probability distribution in each row, got a sum of .* and a minimum of",
         ),
         (
             detections,
             {"class_probabilities": np.array([[1.5, -0.5], [1, 0]], np.float32)},
-            "expected a distribution in each row, got a sum of .*, minimum",
+            "expected a probability distribution in each row, got a sum of .* and a minimum of",
         ),
         (
             clusters,
@@ -242,19 +242,19 @@ def test_camera_out_of_range_value_raises(wrong: dict[str, float]) -> None:
         ),
         (
             {"fx": 1e-300},
-            "Camera: expected a field of view of at most 10 m laterally per m of depth",
+            "Camera: expected a field of view of at most 168.6 degrees, got",
         ),
         (
             {"fy": 1e-5},
-            "Camera: expected a field of view of at most 10 m laterally per m of depth",
+            "Camera: expected a field of view of at most 168.6 degrees, got",
         ),
         (
             {"cx": 1e9},
-            "Camera: expected a field of view of at most 10 m laterally per m of depth",
+            "Camera: expected a field of view of at most 168.6 degrees, got",
         ),
         (
             {"cy": -1e9},
-            "Camera: expected a field of view of at most 10 m laterally per m of depth",
+            "Camera: expected a field of view of at most 168.6 degrees, got",
         ),
         ({"fx": 1e300}, "at most 1e\\+06 px"),
         ({"width": 10**9, "height": 10**9}, "at most 33554432 px, got 1000000000x1000000000"),

@@ -20,7 +20,7 @@ def main() -> None:
     parser.add_argument("source", metavar="IN", type=Path, help=".pth or .pkl file, or name of a published network")
     parser.add_argument("target", metavar="OUT", type=Path, help="output .safetensors file")
     parser.add_argument("--kind", choices=["torchvision", "detectron2"], help="format of IN; default: detected")
-    classes = "comma-separated class names in network order; default: COCO"
+    classes = "comma-separated class names in network order; default: COCO classes"
     parser.add_argument("--classes", metavar="NAMES", help=classes)
     epsilon = "epsilon of batch normalization, torchvision only; default: 0, as in torchvision's COCO checkpoint"
     parser.add_argument("--norm-eps", metavar="EPS", type=float, default=0.0, help=epsilon)

@@ -110,7 +110,8 @@ def _as_text(sections: Mapping[str, list[Check]], errors: int) -> str:
             lines.append(f"  {check.status.value}  {check.name:<{width}}  {check.detail}".rstrip())
             lines += [f"      {'':<{width}}  fix: {check.fix}"] if check.fix else []
         lines.append("")
-    lines += [LEGEND, f"{errors} required checks failed." if errors else "All required checks passed."]
+    failed = f"{errors} required check{'s' * (errors > 1)} failed."
+    lines += [LEGEND, failed if errors else "All required checks passed."]
     return "\n".join(lines).encode("ascii", "backslashreplace").decode()
 
 

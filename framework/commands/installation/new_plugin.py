@@ -130,7 +130,7 @@ def check_name(stage: str, name: str) -> None:
         )
     if is_value(name):
         raise ConfigError(
-            f"NAME: expected a text value in YAML, got {name} (a null, boolean or number); choose another name such as "
+            f"NAME: expected a YAML string, got {name} (null, boolean or number in YAML); choose another name such as "
             f"my_{name}"
         )
     if keyword.iskeyword(name) or name in FOLDERS:
@@ -145,8 +145,8 @@ def check_name(stage: str, name: str) -> None:
     class_name = names_of(stage, name)["class_name"]
     if any(re.search(rf"\b{class_name}\b", _template(stage, template)) for template in ("plugin.py", "test.py")):
         raise ConfigError(
-            f"NAME: expected a unique class name, got {class_name} for {name}, a name in the template; choose a longer "
-            "name"
+            f"NAME: expected a class name that is unused in the template, got {class_name} (from {name}); choose a "
+            "longer name"
         )
 
 

@@ -24,7 +24,7 @@ jobs = Jobs()
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="check")
 @jobs.reported
 def job(config: DictConfig) -> None:
-    """Check the dataset of the config, and print the findings and save an image of them."""
+    """Check the dataset of the config, print the findings, and save an image of them."""
     out = checked_file("out", config.out, ".png") if config.out is not None else Path("outputs", "check.png").absolute()
 
     from framework.checking.recording_check import check
@@ -41,7 +41,8 @@ def job(config: DictConfig) -> None:
     log.info("%s", out)
     if found.errors:
         settings = " ".join(dict.fromkeys(finding.setting for finding in found.errors if finding.setting))
-        raise DataError(f"dataset: expected a usable recording, got errors{f'; try {settings}' if settings else ''}")
+        count = f"{len(found.errors)} error{'s' * (len(found.errors) > 1)} (listed above)"
+        raise DataError(f"dataset: expected a usable recording, got {count}{f'; set {settings}' if settings else ''}")
 
 
 def main() -> None:

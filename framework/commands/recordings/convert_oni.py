@@ -83,7 +83,7 @@ def convert(source: Path, target: Path) -> None:
 
 
 def _write_png(path: Path, image: Array) -> None:
-    """Write an image: depth (H, W) uint16 or BGR (H, W, 3) uint8."""
+    """Write an image: depth (H, W) uint16, mm, or color (H, W, 3) uint8 BGR."""
     _, data = cv2.imencode(".png", image, PNG)
     with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())

@@ -49,6 +49,6 @@ def main() -> None:
         best = upright(written.ups)
         if best is not None and best != writing.turned:
             degrees = QUARTER * best.quarters
-            print(f"the images are not upright, which lowers detection quality; rotate them with --rotate {degrees}")
+            print(f"the images are not upright, which lowers detection quality; import again with --rotate {degrees}")
         print(f"check it: instancemap check dataset=rgbd_folder dataset.root={root}")
         print(f"map it: instancemap dataset=rgbd_folder dataset.root={root}")

@@ -38,7 +38,7 @@ def main() -> None:
         names = parsed.scenes.split(",")
         unknown = [name for name in names if name not in SCENES]
         if unknown:
-            raise ConfigError(f"--scenes: expected some of {', '.join(SCENES)}, got {unknown[0]!r}")
+            raise ConfigError(f"--scenes: expected one or more of {', '.join(SCENES)}, got {unknown[0]!r}")
         if parsed.jobs < 1:
             raise ConfigError(f"--jobs: expected at least 1, got {parsed.jobs}")
         recording = BenchmarkSettings(parsed.seed, parsed.frames, parsed.rate, parsed.width, parsed.camera_speed)

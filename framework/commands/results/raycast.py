@@ -42,7 +42,11 @@ def main() -> None:
 
 
 def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> None:
-    """Write the ray-cast image of a run from `pose`, or from the pose of `frame`. Raises DataError."""
+    """Write the ray-cast image of a run, as seen from `pose`, or from the pose of `frame`. Raises DataError.
+
+    `pose` is T_world_camera as position tx, ty, tz, m, and unit quaternion qx, qy, qz, qw. If both arguments are None,
+    the middle frame is used.
+    """
     from framework.api import scene_of  # slow import: after the arguments are checked
     from framework.figures.raycast_figure import write_raycast
     from framework.reporting.run_contents import RunContents
@@ -64,7 +68,7 @@ def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> N
     names = {key: scene.classes[int(one.class_probabilities.argmax())] for key, one in objects.items()}
     view = scene.render(source.camera or NOT_CAMERA, T_world_camera)
     if not (view.depth > 0).any():
-        raise DataError(f"raycast: expected a pose with the map in view, got {place}")
+        raise DataError(f"raycast: expected a pose with the map in view, got {place}; set another --frame or --pose")
     centers = {key: one.aabb.center for key, one in objects.items()}
     note = f"{contents.name}, {place}, ray-cast from the final map. Commit {contents.record.commit}."
     write_raycast(out, view, names, centers, note)
@@ -74,14 +78,14 @@ def pose_of_frame(contents: RunContents, frame: int | None) -> int:
     """Return the index of a frame's pose in the trajectory; None = middle pose. Raises DataError without any pose."""
     numbers, lost = contents.frame_numbers, contents.lost_frames
     if not numbers:
-        raise DataError(f"{contents.record.directory}: expected mapped frames, got none")
+        raise DataError(f"{contents.record.directory}: expected mapped frames, got none; set --pose")
     if frame is None:
         return len(numbers) // 2
     if frame in numbers:
         return numbers.index(frame)
     known = (*numbers, *lost)
     if not min(known) <= frame <= max(known):
-        raise DataError(f"--frame: expected {min(known)} to {max(known)}, got {frame}")
+        raise DataError(f"--frame: expected a number from {min(known)} to {max(known)}, got {frame}")
     nearest = min(numbers, key=lambda number: abs(number - frame))
     what = "a lost frame" if frame in lost else "a frame that was not mapped"
     raise DataError(f"--frame: expected a mapped frame, got {frame} ({what}); use the nearest one, --frame {nearest}")

@@ -21,7 +21,7 @@ from framework.config.composition import config_loader
 from framework.config.validation import checked_rows
 from framework.errors import ConfigError
 
-GLOB_COUNT = 1_000_000  # upper bound on the values of a glob(), which depend on the file system
+GLOB_COUNT = 1_000_000  # upper bound on the number of values of a glob(), which depends on the file system
 COUNTED = (ValueType.SIMPLE_CHOICE_SWEEP, ValueType.CHOICE_SWEEP, ValueType.RANGE_SWEEP)
 
 Choices = Mapping[str, str | None]

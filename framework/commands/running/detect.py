@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # heavy imports are local
 log = logging.getLogger(__name__)
 jobs = Jobs()
 
-MIN_PIXELS = 100  # px, minimum size of evaluated objects
+MIN_PIXELS = 100  # minimum number of pixels of evaluated objects
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="detect")
@@ -113,7 +113,9 @@ def _written(
                 ids = np.array([i for i in np.unique(true_ids).tolist() if i and i in names], np.int32)
                 yield true_ids == ids[:, None, None], [names[i] for i in ids.tolist()], found
     if results.frames == 0:
-        raise DataError(f"{sequence.name}: expected usable frames, got none of {len(sequence)}")
+        raise DataError(
+            f"{sequence.name}: expected usable frames, got none of {len(sequence)}; the log lists the reasons"
+        )
 
 
 def write_labels(path: Path, classes: tuple[str, ...]) -> Path:

@@ -53,8 +53,8 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
 
     - completed: the outputs are complete. The returned Interruption contains a signal that arrived during writing, or
       that ended a live video.
-    - partial: a signal, a stage or the disk ended the run after the first mapped frame. The outputs are written as far
-      as possible, and marked as partial. Raises Interrupted, or PartialRunError from the cause.
+    - partial: a signal, or an error of a stage or of the disk, ended the run after the first mapped frame. The outputs
+      are written as far as possible, and marked as partial. Raises Interrupted, or PartialRunError from the cause.
     - nothing was mapped: raises the cause.
 
     The first signal takes effect after the current frame or output, the second signal immediately.

@@ -1,6 +1,6 @@
 """`instancemap show-refinement dataset=D detector=X refiner=R out=FILE`: draw a frame before and after refinement.
 
-The figure shows the masks in the image, their points from the side, and metrics.
+The figure shows the masks in the image, their 3D points viewed from the side, and metrics.
 """
 
 from __future__ import annotations

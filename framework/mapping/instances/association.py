@@ -196,10 +196,11 @@ class Association:
     # minimum Bhattacharyya coefficient of the class distributions to match, in [0, 1]; 0 = any classes match
     min_class_agreement: float = 0.0
     create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; updates have no minimum
-    # minimum cluster size to create an instance, px, >= 1; also the minimum denominator of the overlap
+    # minimum number of points of a cluster to create an instance, >= 1; also the minimum denominator of the overlap
     create_points: int = 50
-    split_instances: bool = True  # True = create an instance for the second of two clusters that match the same one
-    merge_overlap: float = 1.0  # minimum overlap with one cluster to merge two instances, in [0, 1]; 1 = no merging
+    split_instances: bool = True  # True = create an instance for the second of two clusters that match an instance
+    # minimum overlap of two instances with one cluster to merge them, in [0, 1]; 1 = no merging
+    merge_overlap: float = 1.0
     # minimum number of frames with a joint cluster, minus frames with separate clusters, to merge, >= 1
     merge_frames: int = 3
     # minimum Bhattacharyya coefficient of the class distributions to merge, in [0, 1]; 0 = any classes are merged

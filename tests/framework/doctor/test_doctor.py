@@ -106,7 +106,7 @@ def test_doctor_isolated_code_returns_last_line_or_error(tmp_path: Path, monkeyp
     codes = ["import json", "import ending", "import talking; print('loaded')", "import missing_library"]
     assert list(isolated.run_all(codes).values()) == [
         ("", ""),
-        ("", "ends the process with status 3"),
+        ("", "process ended with status 3"),
         ("loaded", ""),
         ("", "ModuleNotFoundError: No module named 'missing_library'"),
     ]

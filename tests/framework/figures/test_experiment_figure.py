@@ -203,7 +203,7 @@ def test_stage_times_figure_averages_sequences(tmp_path: Path, caplog: pytest.Lo
     [
         ({"kind": "pie"}, r"figure\.kind: expected one of stage_times, maps, got 'pie'"),
         ({"kind": "stage_times", "zoom": True}, r"figure\.kind: expected maps with figure\.zoom=true, got stage_times"),
-        ({"colour": "red"}, "figure: Key 'colour'"),
+        ({"colour": "red"}, "figure: expected one of kind, sequences, names, zoom, got 'colour'"),
         ("maps", "figure: expected keys and values"),
     ],
 )

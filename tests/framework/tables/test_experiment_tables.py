@@ -220,7 +220,7 @@ def test_table_on_other_data_has_no_published_numbers(
     assert "- Published numbers are for the original SceneNN data (sequences=scenenn) and omitted" in text
 
 
-def test_table_published_row_without_values_is_only_named(sweep: Path) -> None:
+def test_table_published_row_without_values_is_omitted(sweep: Path) -> None:
     """The paper reports Hz, but neither times per stage nor lost frames."""
     of_dataset(sweep, "scenenn")
     for columns, named in ((["stage_ms.refinement.median"], True), (["frames_lost"], False)):

@@ -66,11 +66,11 @@ def test_new_plugin_files_pass_ruff(stage: str, name: str, tmp_path: Path) -> No
         ("x" * (LONGEST_NAME + 1), f"at most {LONGEST_NAME} characters"),
         ("class", "NAME: expected a name other than a Python keyword, conf or"),
         ("conf", "NAME: expected a name other than a Python keyword, conf or"),
-        ("null", "NAME: expected a text value in YAML, got null (a null, boolean or number)"),
-        ("nan", "NAME: expected a text value in YAML, got nan (a null, boolean or number)"),
-        ("on", "NAME: expected a text value in YAML, got on (a null, boolean or number)"),
-        ("config_error", "NAME: expected a unique class name, got ConfigError for"),
-        ("cluster_refiner", "NAME: expected a unique class name, got ClusterRefiner for"),
+        ("null", "NAME: expected a YAML string, got null (null, boolean or number in YAML)"),
+        ("nan", "NAME: expected a YAML string, got nan (null, boolean or number in YAML)"),
+        ("on", "NAME: expected a YAML string, got on (null, boolean or number in YAML)"),
+        ("config_error", "NAME: expected a class name that is unused in the template, got ConfigError"),
+        ("cluster_refiner", "NAME: expected a class name that is unused in the template, got ClusterRefiner"),
     ],
 )
 def test_new_plugin_invalid_name_raises(name: str, message: str) -> None:

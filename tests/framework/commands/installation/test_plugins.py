@@ -183,7 +183,7 @@ FAULTY_OPTIONS = {
     "no_key": ("_target_: plugins.detectors.none.NoDetections\nscore: 1\n", "expected no parameters, got 'score'"),
     "no_number": (
         "_target_: plugins.detectors.simulated.SimulatedDetector\nmin_pixels: many\nseed: ${seed}\n",
-        "min_pixels: Value 'many' of type 'str' could not be converted to Integer",
+        "min_pixels: expected an integer, got 'many'",
     ),
     "no_option": ("defaults: [unregistered, _self_]\n", "detector: expected one of"),
 }

@@ -22,8 +22,8 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--scenes", "bedroom,011"], "--scenes: expected some of living_chairs, bedroom"),
-        (["--scenes", ""], "scenes: expected some of"),
+        (["--scenes", "bedroom,011"], "--scenes: expected one or more of living_chairs, bedroom"),
+        (["--scenes", ""], "scenes: expected one or more of"),
         (["--jobs", "0"], "--jobs: expected at least 1"),
         (["--frames", "0"], "frames: expected at least 1"),
         (["--seed", "-1"], "seed: expected at least 0"),

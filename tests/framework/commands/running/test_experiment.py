@@ -267,7 +267,7 @@ def test_experiment_unknown_row_raises() -> None:
         (["row=half,hafl"], "error: row: expected one of"),
         (
             ["row=half,whole", "fuser.capcity=3"],
-            "error: Could not override 'fuser.capcity'. fuser.capcity: expected a known key, got capcity; did you mean",
+            "error: fuser.capcity: expected a known key, got capcity; did you mean",
         ),
         (["seed=range(0,0)"], "error: seed=range(0,0): expected at least one value, got none"),
     ],
