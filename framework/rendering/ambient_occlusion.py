@@ -39,14 +39,14 @@ def _directions() -> Float32:
     """
     pixel, ray = np.arange(TILE**2)[:, None], np.arange(RAYS)
     angle = 2 * np.pi / RAYS * (ray + (pixel * 7 % TILE**2) / TILE**2)
-    sine = np.sqrt(((ray + pixel) % RAYS + 0.5) / RAYS)  # within a tile, each ray takes every elevation
+    sine = np.sqrt(((ray + pixel) % RAYS + 0.5) / RAYS)  # each ray has every elevation in some pixel of a tile
     return np.stack([sine * np.cos(angle), sine * np.sin(angle), np.sqrt(1 - sine**2)], axis=-1).astype(np.float32)
 
 
 def _reaches() -> Float32:
     """Return the distances (TILE^2, STEPS), m, of the samples along a ray, for each pixel in a tile.
 
-    The distances are jittered, except for the last one: RANGE_M.
+    The distances are jittered, except for the last one, which is RANGE_M.
     """
     pixel = np.arange(TILE**2)
     shift = (pixel * 5 % TILE**2 + 0.5) / TILE**2

@@ -9,7 +9,7 @@ from framework.data import Float32, Float64, Int32
 
 TO_LAMP = np.array([-0.45, -0.75, -0.6])  # direction to the lamp, camera frame: above and to the left of the viewer
 LAMP = TO_LAMP / np.linalg.norm(TO_LAMP)
-AMBIENT, DIFFUSE = 0.70, 0.34  # brightness from all directions and from the lamp, relative to the unlit color
+AMBIENT, DIFFUSE = 0.70, 0.34  # relative brightness of ambient light, and of the lamp at perpendicular incidence
 
 
 @njit(cache=True, nogil=True)

@@ -31,7 +31,9 @@ class ObjectColors:
         self.color_of |= {self.true_objects[key]: color for key, color in zip(named, colors, strict=True)}
 
     def objects(self, ids: Int32, true_ids: Int32) -> dict[int, int]:
-        """Return the object number by instance id of a map. Unmatched instances become new objects in dark colors.
+        """Return the object number of each instance of a map, by instance id.
+
+        Unmatched instances become new objects in dark colors.
 
         Args:
             ids: (V,) instance ids of the map's points, 0 = none.
@@ -45,7 +47,7 @@ class ObjectColors:
 
 
 def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
-    """Return the ground-truth id by matched instance id.
+    """Return the ground-truth id of each matched instance, by instance id.
 
     The matching is one-to-one and maximizes the sum of IoU. Pairs with an IoU below SAME_OBJECT_IOU are omitted.
 

@@ -42,7 +42,7 @@ def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEA
 
 
 def object_colors(centroids: Mapping[int, Float64], likely: Set[int]) -> dict[int, UInt8]:
-    """Return the RGB color (3,) by object id.
+    """Return the RGB color (3,) of each object, by object id.
 
     Args:
         centroids: Centroid (3,), m, by object id.
@@ -54,9 +54,12 @@ def object_colors(centroids: Mapping[int, Float64], likely: Set[int]) -> dict[in
 
 
 def class_colors(objects: Sequence[tuple[str, float]]) -> dict[str, UInt8]:
-    """Return the RGB color (3,) by class name, from the class name and confidence of each object.
+    """Return the RGB color (3,) of each class, by class name.
 
     The colors of the classes with the most confident objects differ most.
+
+    Args:
+        objects: Class name and confidence of each object.
     """
     most: dict[str, float] = {}
     for name, confidence in objects:

@@ -217,7 +217,7 @@ def _edge_functions(a, b, c):
 
 @njit(cache=True, nogil=True, inline="always")
 def _in_camera(T, x, y, z):
-    """Return the camera-frame coordinates of a point in the world frame, m; T is T_world_camera."""
+    """Return the camera-frame coordinates, m, of a point x, y, z (m) in the world frame; T is T_world_camera."""
     x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
     return (
         T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,
@@ -233,7 +233,7 @@ def _cross(p, q):
 
 @njit(cache=True, nogil=True)
 def _is_out_of_sight(center, radius, intrinsics, width, height):
-    """Return True if a sphere, m, in the camera frame is completely outside the view frustum."""
+    """Return True if a sphere is completely outside the view frustum; its center (m) is in the camera frame."""
     fx, fy, cx, cy = intrinsics
     x, y, z = center
     for distance, slope in (

@@ -36,7 +36,7 @@ def draw_fronts(
 
     Args:
         points: (P, 3) m, world frame.
-        normals: (P, 3) world frame.
+        normals: (P, 3) normals of the points, world frame.
         T: (4, 4) T_world_camera.
         intrinsics: fx, fy, cx, cy, px.
         nearest: (H, W) output; pixels without a point keep their values.

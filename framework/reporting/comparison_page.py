@@ -148,7 +148,7 @@ class Comparison:
             values = self._values(row.key, row.scale)
             if any(value is not None for value in values):
                 rows.append(TableRow(row.name, compared(values, row.digits, row.better), row.unit))
-        lead = "The best value is bold. Below each value: its difference from the first run."
+        lead = "The best value is bold. The difference from the first run is below each value."
         return Table("figures", "Metrics", "Metric", rows, lead)
 
     def _values(self, key: str, scale: float = 1.0) -> list[float | None]:

@@ -16,7 +16,7 @@ from framework.reporting.run_contents import RunContents
 from framework.reporting.truth_section import css_class
 from framework.runs.instances_file import StoredInstance
 
-SHOWN_CLASSES = 6  # maximum number of classes shown of an object's class distribution
+SHOWN_CLASSES = 6  # maximum number of most probable classes that are shown for an object
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,10 @@ def object_data(
 
 
 def _size(one: StoredInstance, up: Float64 | None) -> str:
-    """Return the length, width and height of an object's oriented box, cm; without `up`, the sides by length."""
+    """Return the length, width and height of an object's oriented box as text, cm.
+
+    If `up` is None, the sides are in descending order of length.
+    """
     sides = np.sort(one.obb.extent)[::-1]
     if up is not None:
         upright = int(np.abs(one.obb.rotation.T @ up).argmax())

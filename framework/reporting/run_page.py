@@ -138,9 +138,9 @@ class RunReport:
         return {"whole": whole, "text": self._path_text(), "legend": keys, "details": details}
 
     def _top_views(self, up: Float64) -> tuple[str, str | None]:
-        """Return the SVG of the path with the objects, and the SVG of the enlarged path; None if it is large enough.
+        """Return the SVG of the path with the objects, and the SVG of the enlarged path.
 
-        `up` (3,) is the unit vector opposite to gravity.
+        The second is None if the path is large enough in the first. `up` (3,) is the unit vector opposite to gravity.
         """
         contents = self.contents
         colors = colors_by_id(contents.objects)
@@ -216,7 +216,7 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
 
 
 def overview_url(path: Path) -> str:
-    """Return overview.png, reduced to OVERVIEW_WIDTH, as a `data:` URL; "" if it cannot be read."""
+    """Return overview.png, reduced to a width of OVERVIEW_WIDTH, as a `data:` URL; "" if it cannot be read."""
     try:
         small = Image.fromarray(read_color(path))
     except FrameError:

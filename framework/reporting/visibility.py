@@ -31,7 +31,7 @@ class Sightings:
 
     @property
     def growth(self) -> Float64:
-        """Fraction (n,), in [0, 1], of the visible vertices that were visible up to each pose."""
+        """Fraction (n,), in [0, 1], of the visible vertices that are visible from this or an earlier pose."""
         counts = np.bincount(self.first_seen, minlength=len(self.chosen) + 1)[: len(self.chosen)]
         return np.asarray(np.cumsum(counts) / max(1, counts.sum()))
 

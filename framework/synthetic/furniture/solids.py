@@ -2,8 +2,8 @@
 
 A shape is at the origin, with z up and lengths in meters. Its texture coordinates are its initial 3D coordinates in
 meters, so that a solid texture moves with the shape. Faces are subdivided, because light is baked into the vertices.
-Parameters of several shapes: `segments` is the number of subdivisions of a rounding, and `spacing` the maximum vertex
-spacing on faces, m.
+`segments` is the number of subdivisions of a rounded edge or of a circumference. `spacing` is the maximum distance
+between adjacent vertices on flat faces, m.
 """
 
 from __future__ import annotations
