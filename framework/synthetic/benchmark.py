@@ -165,9 +165,9 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: floa
 
 
 def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[Scene, tuple[float, float]]:
-    """Return a random scene, and the fractions of its classes and of its objects that are visible in enough views.
+    """Return a random scene, and the fractions of its classes and of its objects that are visible.
 
-    Enough views are a fraction LONG_SEEN of the scored views.
+    An object counts as visible if it is visible in at least a fraction LONG_SEEN of the scored views.
     """
     room = furnish_scene(spec, rng)
     surfaces = room.surfaces
