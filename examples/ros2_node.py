@@ -3,7 +3,8 @@ r"""ROS 2 node that maps the images of a depth camera and publishes the objects 
     python examples/ros2_node.py --ros-args -r color:=/camera/color/image_raw \
         -r depth:=/camera/aligned_depth_to_color/image_raw -r camera_info:=/camera/color/camera_info
 
-Depth must be registered to color. Each marker is the box of one object in the world frame; its text is the class.
+Depth must be registered to color. Each marker is the axis-aligned bounding box of one object in the world frame. Its
+text is the class name.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from instancemap import Camera, FrameError, Mapper
 
 
 class InstanceMapNode(Node):
-    """Node with one map."""
+    """Node that maps synchronized color and depth images into one map."""
 
     def __init__(self, *overrides: str) -> None:
         super().__init__("instancemap")
@@ -57,14 +58,14 @@ class InstanceMapNode(Node):
 
 
 def rgb(image: Image) -> np.ndarray:
-    """Convert a message to an RGB image (H, W, 3), uint8."""
+    """Convert an image message to an RGB image (H, W, 3), uint8."""
     pixels = np.frombuffer(bytes(image.data), np.uint8).reshape(image.height, image.step)[:, : 3 * image.width]
     pixels = pixels.reshape(image.height, image.width, 3)
     return pixels[..., ::-1] if image.encoding == "bgr8" else pixels
 
 
 def meters(image: Image) -> np.ndarray:
-    """Convert a message to depth (H, W), float32, m; 0 = no reading."""
+    """Convert an image message to depth (H, W), float32, m; 0 = no reading."""
     kind, unit = (np.float32, 1.0) if image.encoding == "32FC1" else (np.uint16, 0.001)
     values = np.frombuffer(bytes(image.data), kind).reshape(image.height, -1)[:, : image.width] * np.float32(unit)
     return np.nan_to_num(values, nan=0.0, posinf=0.0).astype(np.float32)

@@ -13,35 +13,41 @@ from framework.data import Camera, Float32
 from framework.rendering.ambient_occlusion_kernels import RAYS, STEPS, TILE, trace_occlusion
 
 RANGE_M = 0.35  # maximum distance of occluders
-DEPTH = 0.75  # relative darkening of a fully occluded point
+DEPTH = 0.75  # relative darkening of a point whose rays are all occluded
 
 
 def openness(camera: Camera, depth: Float32, normals_camera: Float32) -> Float32:
-    """Return the unoccluded fraction (H, W) of the ambient light, in (0, 1].
+    """Return the fraction (H, W), in (0, 1], of the ambient light that reaches each pixel's surface point.
 
     Args:
         camera: Camera of the depth image.
-        depth: (H, W) m along z, 0 = none.
+        depth: (H, W) m along z, 0 = no surface.
         normals_camera: (H, W, 3) unit vectors, camera frame.
     """
     occluded = np.zeros(depth.shape, np.float32)
     trace_occlusion(depth, normals_camera, camera.K.astype(np.float32), _directions(), _reaches(), occluded)
-    # mean of the valid pixels of a tile
+    # mean over the valid pixels of a tile
     mean = cv2.blur(occluded, (TILE, TILE))
     fraction = cv2.blur((depth > 0).astype(np.float32), (TILE, TILE))
     return np.asarray(1 - DEPTH * mean / np.maximum(fraction, 1e-6), np.float32)
 
 
 def _directions() -> Float32:
-    """Return cosine-weighted rays (TILE^2, RAYS, 3) in the frame of two tangents and the normal."""
+    """Return the ray directions (TILE^2, RAYS, 3) of each pixel in a tile.
+
+    The directions are cosine-weighted unit vectors; their components are along two tangents and the normal.
+    """
     pixel, ray = np.arange(TILE**2)[:, None], np.arange(RAYS)
     angle = 2 * np.pi / RAYS * (ray + (pixel * 7 % TILE**2) / TILE**2)
-    sine = np.sqrt(((ray + pixel) % RAYS + 0.5) / RAYS)  # a tile contains each elevation in each direction
+    sine = np.sqrt(((ray + pixel) % RAYS + 0.5) / RAYS)  # each ray has every elevation in some pixel of a tile
     return np.stack([sine * np.cos(angle), sine * np.sin(angle), np.sqrt(1 - sine**2)], axis=-1).astype(np.float32)
 
 
 def _reaches() -> Float32:
-    """Return the sampled distances (TILE^2, STEPS) m along a ray: jittered distances, and the end of the ray."""
+    """Return the distances (TILE^2, STEPS), m, of the samples along a ray, for each pixel in a tile.
+
+    The distances are jittered, except for the last one, which is RANGE_M.
+    """
     pixel = np.arange(TILE**2)
     shift = (pixel * 5 % TILE**2 + 0.5) / TILE**2
     fraction = (np.arange(STEPS) + shift[:, None]) / (STEPS - 1)

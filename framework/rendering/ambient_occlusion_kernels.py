@@ -1,4 +1,4 @@
-"""Kernels of ambient_occlusion.py."""
+"""Numba kernels of ambient_occlusion.py."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from numba import njit
 
 from framework.data import Float32
 
-RAYS = 8  # number of rays per pixel; the rays differ within a tile, and tiles are averaged
+RAYS = 8  # number of rays per pixel
 STEPS = 4  # number of samples along a ray
-TILE = 4  # side of a tile, px
-SLACK_M = np.float32(2e-3)  # minimum depth behind the surface for a hit
-THICKNESS_M = np.float32(0.15)  # assumed thickness of surfaces; rays farther behind are not occluded
+TILE = 4  # side of a tile, px; rays differ between the pixels of a tile, and the result is averaged over a tile
+SLACK_M = np.float32(2e-3)  # minimum depth of an occluded sample behind the surface
+THICKNESS_M = np.float32(0.15)  # assumed thickness of surfaces; samples farther behind the surface are not occluded
 HALF = np.float32(0.5)  # px, distance from the border of a pixel to its center
 
 
@@ -19,7 +19,16 @@ HALF = np.float32(0.5)  # px, distance from the border of a pixel to its center
 def trace_occlusion(
     depth: Float32, normals: Float32, K: Float32, directions: Float32, reaches: Float32, occluded: Float32
 ) -> None:
-    """Write the fraction (H, W) of occluded rays of each pixel."""
+    """Write the fraction of occluded rays of each pixel with depth to `occluded` (H, W).
+
+    Args:
+        depth: (H, W) m along z, 0 = no surface.
+        normals: (H, W, 3) unit vectors, camera frame.
+        K: (3, 3) camera matrix, px.
+        directions: (TILE^2, RAYS, 3) unit vectors, components along two tangents and the normal.
+        reaches: (TILE^2, STEPS) m, distances of the samples along a ray.
+        occluded: (H, W) output in [0, 1].
+    """
     height, width = depth.shape
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     for v in range(height):

@@ -1,4 +1,4 @@
-"""The camera path in the image of a map."""
+"""Drawing of the camera path into the image of a map."""
 
 from __future__ import annotations
 
@@ -12,19 +12,26 @@ from framework.geometry import inverse, project, transform
 from framework.rendering.palette import PAPER
 from framework.rendering.surface import Hits
 
-PATH_START, PATH_END = (40, 110, 220), (235, 90, 40)
+PATH_START, PATH_END = (40, 110, 220), (235, 90, 40)  # RGB
 
 
 @dataclass(frozen=True)
 class ProjectedPath:
-    """The positions of a camera, projected into the image of another camera."""
+    """Camera positions, projected into the image of another camera; P of them are in front of it."""
 
-    pixels: Float64  # (F, 2) u v
-    hidden: Bool  # (F,) occluded by the surface
+    pixels: Float64  # (P, 2) u v, px
+    hidden: Bool  # (P,) occluded by the surface
 
     @classmethod
     def of(cls, poses: Float64, camera: Camera, T_world_camera: Float64, hits: Hits) -> ProjectedPath:
-        """Return the positions of `poses` (F, 4, 4) in the image of `camera`; `hits` is its view of the surface."""
+        """Project the camera positions of `poses` into an image.
+
+        Args:
+            poses: (F, 4, 4) poses of the mapping camera in the world frame.
+            camera: Camera of the image.
+            T_world_camera: (4, 4) pose of the image's camera.
+            hits: Visible surface points of the image.
+        """
         positions = poses[:, :3, 3]
         points = transform(inverse(T_world_camera), positions)
         points = points[points[:, 2] > 0.05]
@@ -36,13 +43,13 @@ class ProjectedPath:
         return cls(np.asarray(pixels, np.float64), (depth > 0) & (depth < points[:, 2]))
 
     def shades(self) -> UInt8:
-        """Return RGB colors (F, 3) from blue to orange."""
+        """Return the RGB colors (P, 3) of the positions, from blue (start) to orange (end)."""
         fraction = np.linspace(0, 1, max(2, len(self.pixels)))[: len(self.pixels), None]
         mixed = (1 - fraction) * np.array(PATH_START) + fraction * np.array(PATH_END)
         return np.asarray(np.rint(mixed), np.uint8)
 
     def draw(self, image: Image.Image) -> None:
-        """Draw a line with dots at its ends; occluded segments are thin."""
+        """Draw the path as a line with a dot at each end; occluded segments are thin."""
         canvas = ImageDraw.Draw(image)
         points = [tuple(pixel) for pixel in self.pixels.tolist()]
         shades = [tuple(shade) for shade in self.shades().tolist()]

@@ -1,4 +1,4 @@
-"""Placement of object names in an image: on large objects, or next to small objects with a line."""
+"""Placement of object names in an image: on large objects, or next to small objects with a leader line."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from PIL import Image, ImageDraw, ImageFont
 from framework.data import Bool, Int32
 from framework.rendering.palette import INK, PAPER
 
-MIN_PIXELS = 60  # minimum size of an object with a name, px
-ROOM = 0.75  # minimum distance from the name to the border of its object, relative to the height of the name
-NEAREST, FARTHEST, STEP = 24, 160, 8  # px, minimum, maximum and step of the distance of a name next to its object
+MIN_PIXELS = 60  # minimum area of an object with a name, pixels
+ROOM = 0.75  # minimum distance from the center of a name to the border of its object, relative to the name's height
+NEAREST, FARTHEST, STEP = 24, 160, 8  # px, minimum, maximum and step of the distance from an object to its name
 DIRECTIONS = 32  # number of directions from an object to its name
-ABOUT = 0.9  # minimum distance from the border, relative to the largest distance
-ON_OTHERS = 0.1  # maximum fraction of a name over other objects, for a name on its object
-COVERING = 150.0  # px, cost of a name completely over objects
-CROSSING = 100.0  # px, cost of a line completely over other objects
-SAMPLES = 24  # number of sampled points of a line
-DOT = 2.5  # px, radius of a line's end on the object
-AROUND = 3  # px, margin of a name
-HALO = 3  # width of the halo of a name, px
+ABOUT = 0.9  # minimum distance of a candidate point from the object's border, relative to the largest distance
+ON_OTHERS = 0.1  # maximum fraction of a name's area over other objects, for a name on its object
+COVERING = 150.0  # px, cost of a name whose whole area is over objects
+CROSSING = 100.0  # px, cost of a leader line whose whole length is over other objects
+SAMPLES = 24  # number of sampled points of a leader line
+DOT = 2.5  # px, radius of the dot at the object's end of a leader line
+AROUND = 3  # px, margin around a name
+HALO = 3  # px, width of the halo around the letters of a name
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom, px
 
@@ -36,14 +36,18 @@ class Label:
     text: str
     u: float  # px, column of the center
     v: float  # px, row of the center
-    target: tuple[float, float] | None = None  # u, v, px, end of the line; None = the name is on the object
+    target: tuple[float, float] | None = None  # u, v, px, end of the leader line; None = the name is on its object
 
 
 def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tuple[float, float]]) -> list[Label]:
-    """Return the labels with the `names` (by id) for an image of `ids` (H, W), 0 = none; large objects come first.
+    """Return the labels of the objects in an image, largest object first.
 
-    Labels do not overlap and are inside the image. Names that do not fit are omitted. `size` returns the width and
-    height of a text, px.
+    Labels do not overlap and are inside the image. Names that do not fit are omitted.
+
+    Args:
+        ids: (H, W) object id of each pixel, 0 = none.
+        names: Name by object id.
+        size: Function that returns the width and height of a text, px.
     """
     pixels = np.bincount(ids.ravel(), minlength=max([0, *names]) + 1)
     shown = sorted((key for key in names if pixels[key] >= MIN_PIXELS), key=lambda key: (-pixels[key], key))
@@ -70,7 +74,7 @@ def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tup
 
 
 def draw_labels(image: Image.Image, labels: Sequence[Label], font: ImageFont.FreeTypeFont) -> None:
-    """Draw the names and their lines."""
+    """Draw the names and their leader lines."""
     canvas = ImageDraw.Draw(image)
     for label in labels:
         if label.target is not None:
@@ -84,15 +88,15 @@ def draw_labels(image: Image.Image, labels: Sequence[Label], font: ImageFont.Fre
 
 
 def text_size(text: str, font: ImageFont.FreeTypeFont) -> tuple[float, float]:
-    """Return the width and height of a name, px."""
+    """Return the width and height of a text, px."""
     left, _, right, _ = font.getbbox(text, anchor="mm")
     return right - left, float(font.size)
 
 
 def _widest_part(mask: Bool) -> tuple[float, float, float]:
-    """Return the point (u, v) with the largest distance from the border of a mask (H, W), and this distance, px.
+    """Return the point (u, v) of a mask (H, W) that is farthest from its border, and this distance, px.
 
-    Among points with similar distances, the point nearest to the center is returned.
+    Among points with similar distances, the point nearest to the centroid of the mask is returned.
     """
     u, v, width, height = cv2.boundingRect(mask.astype(np.uint8))
     framed = np.pad(mask[v : v + height, u : u + width], 1).astype(np.uint8)
@@ -105,9 +109,18 @@ def _widest_part(mask: Bool) -> tuple[float, float, float]:
 def _place_next_to(
     u: float, v: float, size: tuple[float, float], boxes: Sequence[Box], objects: Bool, others: Bool
 ) -> tuple[float, float] | None:
-    """Return the best free position for the name of an object at (u, v).
+    """Return the center (u, v), px, of the best free position for the name of an object; None if there is none.
 
-    Costs are the distance, the covered `objects` (H, W), and the `others` (H, W) below the line.
+    The cost of a position is the sum of three terms, px: the distance from the object, COVERING times the fraction of
+    the name over objects, and CROSSING times the fraction of the leader line over other objects.
+
+    Args:
+        u: Column of the point on the object, px.
+        v: Row of the point on the object, px.
+        size: Width and height of the name, px.
+        boxes: Boxes of the names that are already placed.
+        objects: (H, W) mask of all objects.
+        others: (H, W) mask of all other objects.
     """
     best, least = None, np.inf
     angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
@@ -142,5 +155,5 @@ def _is_free(box: Box, taken: Sequence[Box], shape: tuple[int, ...]) -> bool:
 
 
 def _nearest_point(box: Box, u: float, v: float) -> tuple[float, float]:
-    """Return the nearest point of a box to (u, v)."""
+    """Return the point of a box that is nearest to (u, v), px."""
     return min(max(u, box[0]), box[2]), min(max(v, box[1]), box[3])

@@ -12,12 +12,12 @@ from framework.rendering.ambient_occlusion import openness
 from framework.rendering.lit_view_kernels import light_up, paint
 from framework.rendering.surface import FrontSides, Surface
 
-SUPERSAMPLING = 2  # rays per pixel in each direction
+SUPERSAMPLING = 2  # number of samples per pixel in each direction
 NOTHING = (229, 232, 236)  # RGB of empty pixels; not white, because surfaces may be white
 
 
 class LitView:
-    """The view of a surface by `camera` at `T_world_camera`, before coloring."""
+    """View of a surface from `camera` at `T_world_camera`, with lighting but without colors."""
 
     def __init__(self, surface: Surface, camera: Camera, T_world_camera: Float64) -> None:
         R_world_camera = T_world_camera[:3, :3]
@@ -32,16 +32,16 @@ class LitView:
         self._light *= cv2.resize(ambient, self._light.shape[::-1])
 
     def in_colors(self, colors: UInt8) -> UInt8:
-        """Return the image (H, W, 3) RGB in the colors (V, 3) of the vertices."""
+        """Return the lit image (H, W, 3), RGB, in the RGB `colors` (V, 3) of the vertices."""
         return self._developed(self._fine.interpolated(colors * np.float32(1.08)))
 
     def in_instances(self, colors: UInt8, ids: Int32, color_of: Mapping[int, UInt8]) -> UInt8:
-        """Return the image (H, W, 3) RGB with one color per instance.
+        """Return the lit image (H, W, 3), RGB, with one color per instance.
 
         Args:
             colors: (V, 3) RGB of the vertices; their brightness remains visible.
-            ids: (V,) instances of the vertices, 0 = none.
-            color_of: RGB color (3,) by id.
+            ids: (V,) instance ids of the vertices, 0 = none.
+            color_of: RGB color (3,) by instance id.
         """
         palette = np.zeros((max([0, *color_of]) + 1, 3), np.float32)
         for key, rgb in color_of.items():
@@ -52,7 +52,10 @@ class LitView:
         return self._developed(painted)
 
     def _developed(self, color: Float32) -> UInt8:
-        """Return the lit image at the camera's resolution; `color` is modified in place."""
+        """Return the lit image (H, W, 3), RGB, at the camera's resolution.
+
+        `color` is the unlit image at the supersampled resolution; it is modified in place.
+        """
         np.clip(color * self._light[..., None], 0, 255, out=color)
         color[self._fine.depth <= 0] = NOTHING
         return np.asarray(cv2.resize(color, self.hits.depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)

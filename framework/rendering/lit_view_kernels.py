@@ -1,4 +1,4 @@
-"""Kernels of lit_view.py."""
+"""Numba kernels of lit_view.py."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ from numba import njit
 
 from framework.data import Float32, Float64, Int32
 
-TO_LAMP = np.array([-0.45, -0.75, -0.6])  # in the camera frame: above and to the left of the viewer
+TO_LAMP = np.array([-0.45, -0.75, -0.6])  # direction to the lamp, camera frame: above and to the left of the viewer
 LAMP = TO_LAMP / np.linalg.norm(TO_LAMP)
-AMBIENT, DIFFUSE = 0.70, 0.34  # light from all directions and from the lamp
+AMBIENT, DIFFUSE = 0.70, 0.34  # relative brightness of ambient light, and of the lamp at perpendicular incidence
 
 
 @njit(cache=True, nogil=True)
 def light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Float32) -> None:
-    """Write the brightness (H, W). Convert the normals (H, W, 3) to unit vectors towards the camera, in its frame."""
+    """Write the relative brightness of each pixel to `light` (H, W).
+
+    `normals` (H, W, 3), world frame, are replaced by unit vectors in the camera frame that face the camera.
+    """
     R = R_world_camera
     for v in range(normals.shape[0]):
         y = (v - K[1, 2]) / K[1, 1]
@@ -31,7 +34,14 @@ def light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Float
 
 @njit(cache=True, nogil=True)
 def paint(ids: Int32, gray: Float32, palette: Float32, painted: Float32) -> None:
-    """Write the unlit color (H, W, 3) of each pixel's instance, with some texture."""
+    """Write the unlit color of each pixel's instance, RGB, to `painted` (H, W, 3).
+
+    Args:
+        ids: (H, W) instance ids, 0 = none.
+        gray: (H, W) brightness of the surface, 0 to 255, for some texture.
+        palette: (N, 3) RGB color by instance id.
+        painted: (H, W, 3) output.
+    """
     height, width = ids.shape
     for v in range(height):
         for u in range(width):

@@ -15,24 +15,29 @@ UNKNOWN = (206, 184, 152)  # RGB of ground-truth instances of unknown class (not
 
 
 class ObjectColors:
-    """Objects of one scene in several maps, numbered from 1: ground-truth instances and unmatched map instances."""
+    """Numbers and colors of the objects of one scene, shared by several maps.
+
+    The objects are the ground-truth instances and the unmatched map instances, numbered from 1.
+    """
 
     def __init__(self, truth: SceneTruth) -> None:
         ids = np.setdiff1d(truth.instance_ids, [0]).tolist()
-        self.true_objects = {key: k for k, key in enumerate(ids, start=1)}  # object by ground-truth instance
+        self.true_objects = {key: k for k, key in enumerate(ids, start=1)}  # object number by ground-truth id
         self.name_of = {k: name for key, k in self.true_objects.items() if (name := truth.class_names.get(key))}
-        self.color_of: dict[int, UInt8] = dict.fromkeys(self.true_objects.values(), np.array(UNKNOWN, np.uint8))  # (3,)
+        self.color_of: dict[int, UInt8] = dict.fromkeys(self.true_objects.values(), np.array(UNKNOWN, np.uint8))
         named = [key for key in ids if self.true_objects[key] in self.name_of]
         centroids = [truth.points_world[truth.instance_ids == key].mean(axis=0) for key in named]
         colors = instance_colors(np.array(centroids, np.float64).reshape(-1, 3))
         self.color_of |= {self.true_objects[key]: color for key, color in zip(named, colors, strict=True)}
 
     def objects(self, ids: Int32, true_ids: Int32) -> dict[int, int]:
-        """Return the object of each instance of a map. Unmatched instances become new objects in dark colors.
+        """Return the object number of each instance of a map, by instance id.
+
+        Unmatched instances become new objects in dark colors.
 
         Args:
-            ids: (V,) instances of the points, 0 = none.
-            true_ids: (V,) ground-truth instances of the points, 0 = none.
+            ids: (V,) instance ids of the map's points, 0 = none.
+            true_ids: (V,) ground-truth ids of the map's points, 0 = none.
         """
         same = {key: self.true_objects[true] for key, true in same_objects(ids, true_ids).items()}
         others = np.setdiff1d(ids, [0, *same]).tolist()
@@ -42,9 +47,13 @@ class ObjectColors:
 
 
 def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
-    """Return the ground-truth id of each matched instance, from the two ids of each of V points; 0 = none.
+    """Return the ground-truth id of each matched instance, by instance id.
 
-    The matching maximizes the sum of IoU. Pairs with an IoU below SAME_OBJECT_IOU are omitted.
+    The matching is one-to-one and maximizes the sum of IoU. Pairs with an IoU below SAME_OBJECT_IOU are omitted.
+
+    Args:
+        ids: (V,) instance ids of the points, 0 = none.
+        true_ids: (V,) ground-truth ids of the points, 0 = none.
     """
     found, rows = np.unique(ids, return_inverse=True)
     true, columns = np.unique(true_ids, return_inverse=True)
@@ -57,6 +66,6 @@ def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
 
 
 def relabeled(ids: Int32, object_of: Mapping[int, int]) -> Int32:
-    """Return the object (V,) of each id, 0 = none."""
+    """Return the object number (V,) of each of the instance `ids` (V,), 0 = none."""
     values, inverse = np.unique(ids, return_inverse=True)
     return np.array([object_of.get(key, 0) for key in values.tolist()], np.int32)[inverse]

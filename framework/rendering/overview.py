@@ -23,7 +23,7 @@ TITLE_HEIGHT = 56  # px
 LEGEND_ROW = 30  # px
 LEGEND_COLUMNS, LEGEND_ROWS = 9, 4
 PNG_LEVEL = 3  # zlib level; the default of 6 is much slower for a 3% smaller file
-LABEL_PX, LEGEND_PX, TITLE_PX = 17, 17, 22
+LABEL_PX, LEGEND_PX, TITLE_PX = 17, 17, 22  # font sizes
 
 
 def write_overview(
@@ -34,7 +34,7 @@ def write_overview(
     Args:
         path: PNG file.
         mesh: Mesh of the map.
-        instances: Class name and confidence by id; all other ids are background.
+        instances: Class name and confidence by instance id; all other ids are background.
         poses: (F, 4, 4) T_world_camera of the mapped frames.
         title: Title above the images.
     """
@@ -44,7 +44,7 @@ def write_overview(
 
 
 def overview(mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], poses: Float64, title: str) -> UInt8:
-    """Return the overview image (H, W, 3) RGB."""
+    """Return the overview image (H, W, 3), RGB; for the arguments, see `write_overview`."""
     ids = np.where(np.isin(mesh.instance_ids, list(instances)), mesh.instance_ids, 0).astype(np.int32)
     shown = [key for key in sorted(instances) if (ids == key).any()]
     centroids = np.array([mesh.vertices[ids == key].mean(axis=0) for key in shown], np.float64).reshape(-1, 3)

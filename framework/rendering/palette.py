@@ -1,4 +1,4 @@
-"""Colors for images; nearby instances get dissimilar colors."""
+"""Colors for instances and classes; nearby instances get dissimilar colors."""
 
 from __future__ import annotations
 
@@ -9,24 +9,27 @@ import numpy as np
 
 from framework.data import Float64, UInt8
 
-PAPER, INK, FAINT_INK = (250, 250, 248), (32, 36, 42), (120, 126, 134)
+PAPER, INK, FAINT_INK = (250, 250, 248), (32, 36, 42), (120, 126, 134)  # RGB of the background and of texts
 
-NEAR_M = 0.8  # distance scale for dissimilar colors
-ALIKE = 22.0  # scale of the CIE76 distance between similar colors
-HUES = 18
-CLEAR = ((165, 245), (105, 250), (190, 200))  # saturation and value of each shade
-DARK = ((130, 95), (60, 125))  # disjoint from CLEAR
+NEAR_M = 0.8  # distance within which objects get dissimilar colors (scale of an exponential decay)
+ALIKE = 22.0  # CIE76 color difference below which colors are similar (scale of an exponential decay)
+HUES = 18  # number of hues
+CLEAR = ((165, 245), (105, 250), (190, 200))  # saturation and value of each shade, 0 to 255
+DARK = ((130, 95), (60, 125))  # saturation and value of darker shades, disjoint from CLEAR
 
 
 def candidates(shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
-    """Return the RGB colors (K, 3) of all hues in each shade."""
+    """Return the RGB colors (K, 3) of all hues in each shade; a shade is a saturation and a value, 0 to 255."""
     hues = np.arange(HUES) * (180 // HUES)
     hsv = np.array([(hue, *shade) for shade in shades for hue in hues], np.uint8)
     return np.asarray(cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0], np.uint8)
 
 
 def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
-    """Return RGB colors (N, 3) for objects at centroids (N, 3) m, chosen greedily and dissimilar for nearby objects."""
+    """Return RGB colors (N, 3) for objects at the centroids (N, 3), m.
+
+    The colors are chosen greedily, one object after another. Nearby objects get dissimilar colors.
+    """
     rgb = candidates(shades)
     lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0]
     likeness = np.exp(-np.linalg.norm(lab[:, None] - lab[None], axis=2) / ALIKE)  # (K, K)
@@ -39,14 +42,25 @@ def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEA
 
 
 def object_colors(centroids: Mapping[int, Float64], likely: Set[int]) -> dict[int, UInt8]:
-    """Return RGB colors (3,) by id for objects at centroids (3,) m; likely objects have the colors of overview.png."""
+    """Return the RGB color (3,) of each object, by object id.
+
+    Args:
+        centroids: Centroid (3,), m, by object id.
+        likely: Ids of the likely objects, which get the same colors as in overview.png.
+    """
     ordered = sorted(centroids, key=lambda key: (key not in likely, key))
     positions = np.array([centroids[key] for key in ordered], np.float64).reshape(-1, 3)
     return dict(zip(ordered, instance_colors(positions), strict=True))
 
 
 def class_colors(objects: Sequence[tuple[str, float]]) -> dict[str, UInt8]:
-    """Return RGB colors (3,) by class, from the class and confidence of objects; likely classes differ most."""
+    """Return the RGB color (3,) of each class, by class name.
+
+    The colors of the classes with the most confident objects differ most.
+
+    Args:
+        objects: Class name and confidence of each object.
+    """
     most: dict[str, float] = {}
     for name, confidence in objects:
         most[name] = max(confidence, most.get(name, 0.0))

@@ -18,12 +18,12 @@ from framework.rendering.rasterizer_kernels import bounding_spheres, draw_triang
 class VisibilityBuffer:
     """The visible triangle of each pixel."""
 
-    triangle: Int32  # (H, W), NO_TRIANGLE = none
+    triangle: Int32  # (H, W) index of the triangle, NO_TRIANGLE = none
     depth: Float32  # (H, W) m along z, 0 = none
     uv: Float32  # (H, W, 2) barycentric weights of the triangle's second and third vertex
 
     def nearest(self, triangles: Int32, labels: Int32) -> Int32:
-        """Return the label (H, W) of the corner with the largest barycentric weight, 0 = none.
+        """Return the label (H, W) of the triangle corner with the largest barycentric weight in each pixel, 0 = none.
 
         Args:
             triangles: (F, 3) vertex indices of the mesh.
@@ -46,7 +46,10 @@ class Rasterizer:
         self._spheres = bounding_spheres(self._vertices, self._triangles)
 
     def draw(self, camera: Camera, T_world_camera: Float64) -> VisibilityBuffer:
-        """Return the nearest triangle of each pixel. Ties are broken deterministically."""
+        """Return the nearest triangle of each pixel of a camera at `T_world_camera` (4, 4).
+
+        Triangles with equal depth are selected deterministically.
+        """
         triangle = np.empty(camera.shape, np.int32)
         depth = np.empty(camera.shape, np.float32)
         uv = np.empty((*camera.shape, 2), np.float32)

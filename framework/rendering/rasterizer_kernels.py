@@ -1,4 +1,4 @@
-"""Kernels of rasterizer.py."""
+"""Numba kernels of rasterizer.py."""
 
 from __future__ import annotations
 
@@ -8,16 +8,21 @@ from numba import njit
 
 from framework.data import Float32, Float64, Int32
 
-NO_TRIANGLE = -1
+NO_TRIANGLE = -1  # index for pixels without a triangle
 CHUNK = 32  # number of triangles culled together
 SLACK = 0.01  # px, margin of bounds against rounding
-CELLS = 1023  # number of cells along each axis of the bounding cube
+CELLS = 1023  # largest cell index along each axis of the bounding cube
 NEAR = 1e-9  # m, near plane for the bounds of triangles partly behind the camera
 
 
 @njit(cache=True, nogil=True)
 def morton_codes(vertices: Float32, triangles: Int32) -> npt.NDArray[np.uint32]:
-    """Return the Morton code (F,) of each triangle's center in the bounding cube of the mesh, 10 bits per axis."""
+    """Return the Morton code (F,) of each triangle's centroid in the bounding cube of all centroids, 10 bits per axis.
+
+    Args:
+        vertices: (V, 3) coordinates.
+        triangles: (F, 3) vertex indices.
+    """
     middle = np.empty((len(triangles), 3), np.float32)
     for f in range(len(triangles)):
         for axis in range(3):
@@ -43,7 +48,14 @@ def morton_codes(vertices: Float32, triangles: Int32) -> npt.NDArray[np.uint32]:
 
 @njit(cache=True, nogil=True)
 def bounding_spheres(vertices: Float32, triangles: Int32) -> Float64:
-    """Return the bounding spheres (ceil(F / CHUNK), 4) of chunks of triangles: center (m, world) and radius (m)."""
+    """Return a bounding sphere for each chunk of CHUNK consecutive triangles.
+
+    The array (ceil(F / CHUNK), 4) contains the center (x, y, z), in the frame of the vertices, and the radius, m.
+
+    Args:
+        vertices: (V, 3) m.
+        triangles: (F, 3) vertex indices.
+    """
     spheres = np.zeros(((len(triangles) + CHUNK - 1) // CHUNK, 4))
     for chunk in range(len(spheres)):
         part = triangles[chunk * CHUNK : (chunk + 1) * CHUNK]
@@ -75,10 +87,24 @@ def draw_triangles(
     depth: Float32,
     uv: Float32,
 ) -> None:
-    """Write triangle (H, W), depth (H, W) and uv (H, W, 2); x (W,) and y (H,) are pixel coordinates at z = 1."""
+    """Rasterize triangles, and write the arrays of a `VisibilityBuffer`.
+
+    Args:
+        vertices: (V, 3) m, world frame.
+        triangles: (F, 3) vertex indices.
+        order: (F,) triangle indices to write to `triangle`.
+        spheres: Bounding spheres of the triangles, from `bounding_spheres`.
+        T_world_camera: (4, 4) camera pose.
+        intrinsics: fx, fy, cx, cy, px.
+        x: (W,) coordinate of each pixel column at z = 1.
+        y: (H,) coordinate of each pixel row at z = 1.
+        triangle: (H, W) output, index of the visible triangle, NO_TRIANGLE = none.
+        depth: (H, W) output, m along z, 0 = none.
+        uv: (H, W, 2) output, barycentric weights of the second and third vertex.
+    """
     height, width = triangle.shape
     closeness = np.zeros((height, width))  # 1/m
-    triangle[:] = NO_TRIANGLE  # indices into `triangles` until the second pass
+    triangle[:] = NO_TRIANGLE  # the first pass writes indices into `triangles`, the second pass values of `order`
     for chunk in range(len(spheres)):
         center = _in_camera(T_world_camera, spheres[chunk, 0], spheres[chunk, 1], spheres[chunk, 2])
         if _is_out_of_sight(center, spheres[chunk, 3], intrinsics, width, height):
@@ -122,7 +148,15 @@ def draw_triangles(
 
 @njit(cache=True, nogil=True)
 def nearest(triangle: Int32, uv: Float32, triangles: Int32, labels: Int32, image: Int32) -> None:
-    """Set each covered pixel to the label of the nearest vertex of its triangle."""
+    """Set each covered pixel of `image` (H, W) to the label of its triangle's corner with the largest weight.
+
+    Args:
+        triangle: (H, W) index of the visible triangle, NO_TRIANGLE = none.
+        uv: (H, W, 2) barycentric weights of the second and third vertex.
+        triangles: (F, 3) vertex indices.
+        labels: (V,) labels of the vertices.
+        image: (H, W) output; other pixels keep their values.
+    """
     for v in range(triangle.shape[0]):
         for u in range(triangle.shape[1]):
             f = triangle[v, u]
@@ -134,7 +168,15 @@ def nearest(triangle: Int32, uv: Float32, triangles: Int32, labels: Int32, image
 
 @njit(cache=True, nogil=True)
 def interpolate(triangle: Int32, uv: Float32, triangles: Int32, values: Float32, image: Float32) -> None:
-    """Set each covered pixel to the interpolated values of its triangle's vertices."""
+    """Set each covered pixel of `image` (H, W, C) to the interpolated values of its triangle's vertices.
+
+    Args:
+        triangle: (H, W) index of the visible triangle, NO_TRIANGLE = none.
+        uv: (H, W, 2) barycentric weights of the second and third vertex.
+        triangles: (F, 3) vertex indices.
+        values: (V, C) values of the vertices.
+        image: (H, W, C) output; other pixels keep their values.
+    """
     for v in range(triangle.shape[0]):
         for u in range(triangle.shape[1]):
             f = triangle[v, u]
@@ -149,7 +191,7 @@ def interpolate(triangle: Int32, uv: Float32, triangles: Int32, values: Float32,
 
 @njit(cache=True, nogil=True, inline="always")
 def _corners(vertices, triangles, f, T_world_camera):
-    """Return the corners of triangle f in the camera frame."""
+    """Return the three corners of triangle f, m, in the camera frame."""
     i, j, k = np.uint64(triangles[f, 0]), np.uint64(triangles[f, 1]), np.uint64(triangles[f, 2])
     return (
         _in_camera(T_world_camera, vertices[i, 0], vertices[i, 1], vertices[i, 2]),
@@ -175,7 +217,7 @@ def _edge_functions(a, b, c):
 
 @njit(cache=True, nogil=True, inline="always")
 def _in_camera(T, x, y, z):
-    """Return the camera-frame coordinates of a world point."""
+    """Return the camera-frame coordinates, m, of a point x, y, z (m) in the world frame; T is T_world_camera."""
     x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
     return (
         T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,
@@ -191,7 +233,7 @@ def _cross(p, q):
 
 @njit(cache=True, nogil=True)
 def _is_out_of_sight(center, radius, intrinsics, width, height):
-    """Return True if a sphere is outside of the view frustum."""
+    """Return True if a sphere is completely outside the view frustum; its center (m) is in the camera frame."""
     fx, fy, cx, cy = intrinsics
     x, y, z = center
     for distance, slope in (
@@ -208,7 +250,10 @@ def _is_out_of_sight(center, radius, intrinsics, width, height):
 
 @njit(cache=True, nogil=True, inline="always")
 def _pixels_of(a, b, c, intrinsics, width, height):
-    """Return the ranges of columns and rows possibly covered by a triangle: column begin and end, row begin and end."""
+    """Return the pixel bounds of a triangle: first column, end column, first row and end row.
+
+    The corners a, b and c are in the camera frame, m. The ends are exclusive.
+    """
     fx, fy, cx, cy = intrinsics
     if min(a[2], b[2], c[2]) > NEAR:
         za, zb, zc = 1 / a[2], 1 / b[2], 1 / c[2]
@@ -226,7 +271,10 @@ def _pixels_of(a, b, c, intrinsics, width, height):
 
 @njit(cache=True, nogil=True)
 def _bounds_in_front(a, b, c):
-    """Return left, right, top and bottom at z = 1 of a triangle clipped at z = NEAR."""
+    """Return the left, right, top and bottom bounds, projected to z = 1, of a triangle that is clipped at z = NEAR.
+
+    The corners a, b and c are in the camera frame, m.
+    """
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
     for p, q in ((a, b), (b, c), (c, a)):
         x, y, z = p

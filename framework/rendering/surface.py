@@ -11,7 +11,7 @@ from framework.data import Bool, Camera, Float32, Float64, Int32
 from framework.rendering.rasterizer import Rasterizer, VisibilityBuffer
 from framework.rendering.rasterizer_kernels import NO_TRIANGLE, interpolate
 
-VOTES, VOTERS = 20000, 50  # numbers of sampled triangles and cameras for determining the front side
+VOTES, VOTERS = 20000, 50  # approximate numbers of triangles and cameras that are sampled to determine the front side
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,11 @@ class Hits:
     camera: Camera
     buffer: VisibilityBuffer
     vertices: Float32  # (V, 3) m, in the world frame
-    triangles: Int32  # (F, 3); `buffer` contains their indices
+    triangles: Int32  # (F, 3) vertex indices; `buffer` contains indices into this array
 
     @property
     def depth(self) -> Float32:
-        """Depth (H, W) m along z, 0 = none."""
+        """Depth (H, W), m along z, 0 = none."""
         return self.buffer.depth
 
     @property
@@ -35,11 +35,11 @@ class Hits:
 
     @property
     def points_world(self) -> Float32:
-        """Points (H, W, 3), m, in the world frame; 0 = none."""
+        """Points (H, W, 3), m, in the world frame; zero vector = none."""
         return self.interpolated(self.vertices)
 
     def subsampled(self, n: int) -> Hits:
-        """Return the hits of every n-th pixel in both directions."""
+        """Return the hits of every n-th column and row."""
         seen, c = self.buffer, self.camera
         triangle, depth = np.ascontiguousarray(seen.triangle[::n, ::n]), np.ascontiguousarray(seen.depth[::n, ::n])
         height, width = depth.shape
@@ -48,28 +48,36 @@ class Hits:
         return replace(self, camera=camera, buffer=buffer)
 
     def interpolated(self, values: Float32) -> Float32:
-        """Return the interpolated values (H, W, C) of the vertices (V, C), 0 = none."""
+        """Return the vertex values (V, C), interpolated at each pixel (H, W, C); 0 for pixels without a surface."""
         image = np.zeros((*self.camera.shape, values.shape[1]), np.float32)
         interpolate(self.buffer.triangle, self.buffer.uv, self.triangles, np.ascontiguousarray(values), image)
         return image
 
     def nearest(self, labels: Int32) -> Int32:
-        """Return the label (H, W) of the nearest corner from the labels (V,), 0 = none."""
+        """Return for each pixel the label (H, W) of the triangle corner with the largest weight, 0 = none.
+
+        `labels` (V,) are the labels of the vertices.
+        """
         return self.buffer.nearest(self.triangles, labels)
 
 
 class Surface:
-    """Triangles whose winding defines the front side."""
+    """Triangle mesh whose winding order defines the front side."""
 
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
-        self.vertices = np.ascontiguousarray(vertices, np.float32)  # (V, 3) m
-        self.triangles = np.ascontiguousarray(triangles, np.int32)  # (F, 3)
+        self.vertices = np.ascontiguousarray(vertices, np.float32)  # (V, 3) m, world frame
+        self.triangles = np.ascontiguousarray(triangles, np.int32)  # (F, 3) vertex indices
 
     @classmethod
     def seen_from(cls, vertices: Float32, triangles: Int32, poses: Float64) -> Surface:
-        """Return the surface with its front towards the cameras at `poses` (F, 4, 4).
+        """Return the surface whose front side faces the cameras.
 
-        Mesh extractors use different winding orders.
+        The winding order is reversed if necessary, because mesh extractors use different winding orders.
+
+        Args:
+            vertices: (V, 3) m, world frame.
+            triangles: (F, 3) vertex indices.
+            poses: (P, 4, 4) T_world_camera.
         """
         some = cls(vertices, triangles[:: max(1, len(triangles) // VOTES)])
         centers = vertices[some.triangles].mean(axis=1)
@@ -84,13 +92,13 @@ class Surface:
 
     @cached_property
     def face_normals(self) -> Float32:
-        """Normals (F, 3) with twice the area as length."""
+        """Face normals (F, 3), world frame; the length of a normal is twice the area of its triangle, m^2."""
         a, b, c = self.vertices[self.triangles].transpose(1, 0, 2)
         return np.cross(b - a, c - a)
 
     @cached_property
     def vertex_normals(self) -> Float32:
-        """Unit normals (V, 3), averaged over adjacent triangles by area."""
+        """Unit normals (V, 3), world frame: the area-weighted mean over the adjacent triangles."""
         corners, weights = self.triangles.ravel(), np.repeat(self.face_normals, 3, axis=0)
         x, y, z = (np.bincount(corners, weights[:, k], minlength=len(self.vertices)) for k in range(3))
         length = np.maximum(np.sqrt(x**2 + y**2 + z**2), 1e-12)
@@ -98,10 +106,10 @@ class Surface:
 
 
 class FrontSides:
-    """The triangles of a surface that face a viewpoint; back-facing walls and ceilings in front of them are omitted."""
+    """The triangles of a surface that face a viewpoint. Back-facing walls and ceilings do not hide them."""
 
     def __init__(self, surface: Surface, eye_world: Float64) -> None:
-        self._eye_world = eye_world  # (3,) m
+        self._eye_world = eye_world  # (3,) m, position of the viewpoint
         self._vertices = surface.vertices
         rays = surface.vertices[surface.triangles[:, 0]] - eye_world.astype(np.float32)
         x, y, z = (surface.face_normals * rays).T
@@ -109,7 +117,7 @@ class FrontSides:
         self._rasterizer = Rasterizer(self._vertices, self._triangles)
 
     def seen_by(self, camera: Camera, R_world_camera: Float64) -> Hits:
-        """Return the view of a camera at the viewpoint."""
+        """Return the visible surface points of a camera at the viewpoint with rotation `R_world_camera` (3, 3)."""
         T_world_camera = np.eye(4)
         T_world_camera[:3, :3], T_world_camera[:3, 3] = R_world_camera, self._eye_world
         return Hits(camera, self._rasterizer.draw(camera, T_world_camera), self._vertices, self._triangles)

@@ -10,15 +10,22 @@ from framework.rendering.viewpoint_kernels import draw_fronts, sum_level_normals
 
 FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical; narrow, for a weak perspective
 ELEVATIONS_RAD = np.deg2rad([38.0, 52.0])
-AZIMUTHS = 16  # number of candidates around the vertical
+AZIMUTHS = 16  # number of candidate directions around the up direction
 MARGIN = 1.04  # size of the view relative to its content
 TRIAL_WIDTH, TRIAL_HEIGHT = 96, 72  # px, size of candidate images
 TRIAL_POINTS = 60000  # approximate maximum number of vertices in candidate images
-LEVEL_CONE_RAD = np.deg2rad(30)  # maximum angle of floor normals to the mean up direction of the cameras
+LEVEL_CONE_RAD = np.deg2rad(30)  # maximum angle between floor normals and the mean up direction of the cameras
 
 
 def upward(poses: Float64, surface: Surface) -> Float64:
-    """Return the up direction (3,): the mean of the cameras' -y axes, refined by floors and table tops."""
+    """Return the up direction (3,), a unit vector in the world frame.
+
+    It is the mean of the cameras' -y axes, refined with the normals of floors and table tops.
+
+    Args:
+        poses: (F, 4, 4) T_world_camera.
+        surface: Surface of the map.
+    """
     up = -poses[:, :3, 1].mean(axis=0)
     up /= np.linalg.norm(up)
     cone = LEVEL_CONE_RAD
@@ -32,11 +39,11 @@ def upward(poses: Float64, surface: Surface) -> Float64:
 
 
 def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the camera, of width x height px, and the T_world_camera with the best view of a surface.
+    """Return the camera and the pose T_world_camera (4, 4) with the best view of a surface.
 
     Args:
         surface: Surface in view.
-        instance_ids: (V,) instances of the surface's vertices, 0 = none.
+        instance_ids: (V,) instance ids of the surface's vertices, 0 = none.
         poses: (F, 4, 4) T_world_camera of the mapped frames.
         width: Width of the image in px.
         height: Height of the image in px.
@@ -63,12 +70,17 @@ def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int,
             score *= 1 + 0.15 * np.cos(azimuth)  # prefer the direction of the cameras
             if score > best_score:
                 best_score, R, shown = score, R_trial, points[visible]
-    # framed for the visible points, without the ceiling and the near walls
+    # frame only the visible points, without the ceiling and the near walls
     return fitted(R, shown, width, height)
 
 
 def looking(forward: Float64, up: Float64) -> Float64:
-    """Return the rotation (3, 3) of a camera with viewing direction `forward` (3,) and image up direction `up` (3,)."""
+    """Return the rotation R_world_camera (3, 3) of a camera from its viewing direction and its up direction.
+
+    Args:
+        forward: (3,) viewing direction, world frame.
+        up: (3,) up direction of the image, world frame; not parallel to `forward`.
+    """
     z = forward / np.linalg.norm(forward)
     x = np.cross(z, up)
     x /= np.linalg.norm(x)
@@ -76,19 +88,29 @@ def looking(forward: Float64, up: Float64) -> Float64:
 
 
 def fitted(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the nearest camera and pose with this rotation that see the points (P, 3) in width x height px."""
+    """Return a camera and its nearest pose T_world_camera (4, 4) with all points, except outliers, in view.
+
+    Args:
+        R_world_camera: (3, 3) rotation of the camera.
+        points_world: (P, 3) m.
+        width: Width of the image in px.
+        height: Height of the image in px.
+    """
     return _framed(R_world_camera, _without_strays(points_world), width, height)
 
 
 def _without_strays(points: Float32) -> Float32:
-    """Return the points (P, 3) without outliers at their border."""
+    """Return the points (P, 3) whose coordinates are between the 0.3rd and the 99.7th percentile of each axis.
+
+    If no point is left, return all points.
+    """
     low, high = np.percentile(points, [0.3, 99.7], axis=0)
     kept = points[((points >= low) & (points <= high)).all(axis=1)]
     return kept if len(kept) else points
 
 
 def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the camera and pose as in `fitted`, with all points, including outliers, in view."""
+    """Return the camera and pose of `fitted`, but with all points, including outliers, in view."""
     focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     x, y, z = R_world_camera.T @ points_world.T
@@ -104,7 +126,14 @@ def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: 
 
 
 def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: Float64) -> Int32:
-    """Return the indices of the visible points (P, 3): the nearest front-facing point of each pixel."""
+    """Return the indices of the visible points: the nearest front-facing point of each pixel.
+
+    Args:
+        points: (P, 3) m, world frame.
+        normals: (P, 3) unit vectors, world frame.
+        camera: Camera of the image.
+        T_world_camera: (4, 4) pose of the camera.
+    """
     nearest = np.full(camera.shape, -1, np.int32)
     points, normals = (
         np.ascontiguousarray(points),
@@ -115,5 +144,8 @@ def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: 
 
 
 def _score(instance_ids: Int32) -> float:
-    """Return the score of an image from its pixel ids. Square roots favor ten small objects over one large object."""
+    """Return the score of a view from the instance ids (N,) of its visible points, 0 = none.
+
+    The square roots favor many small objects over one large object.
+    """
     return float(np.sqrt(np.bincount(instance_ids, minlength=1)[1:]).sum() + np.sqrt(len(instance_ids)))

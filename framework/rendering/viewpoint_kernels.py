@@ -1,4 +1,4 @@
-"""Kernels of viewpoint.py."""
+"""Numba kernels of viewpoint.py."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ from framework.data import Float32, Float64, Int32
 
 @njit(cache=True, nogil=True)
 def sum_level_normals(normals: Float32, up: Float64, cosine: float) -> tuple[Float64, float]:
-    """Return the sum (3,) of the face normals (F, 3) in a cone around `up` (3,), and their fraction of the area."""
+    """Return the sum (3,) of the face normals in a cone around `up`, and their faces' fraction of the total area.
+
+    Args:
+        normals: (F, 3) face normals; the length is proportional to the area.
+        up: (3,) unit vector, the axis of the cone.
+        cosine: Cosine of the half angle of the cone.
+    """
     total, inside, area = np.zeros(3), 0.0, 0.0
     for f in range(len(normals)):
         x, y, z = normals[f, 0], normals[f, 1], normals[f, 2]
@@ -26,7 +32,15 @@ def sum_level_normals(normals: Float32, up: Float64, cosine: float) -> tuple[Flo
 def draw_fronts(
     points: Float32, normals: Float32, T: Float64, intrinsics: tuple[float, float, float, float], nearest: Int32
 ) -> None:
-    """Write the indices (H, W) of the nearest front-facing points (P, 3) for the camera at T = T_world_camera."""
+    """Write the index of the nearest front-facing point in each pixel to `nearest`.
+
+    Args:
+        points: (P, 3) m, world frame.
+        normals: (P, 3) normals of the points, world frame.
+        T: (4, 4) T_world_camera.
+        intrinsics: fx, fy, cx, cy, px.
+        nearest: (H, W) output; pixels without a point keep their values.
+    """
     fx, fy, cx, cy = intrinsics
     height, width = nearest.shape
     depth = np.full(nearest.shape, np.inf)

@@ -23,14 +23,14 @@ from framework.runs.timings_file import StageTimes
 from framework.runtime.run_log import FUSION, STAGES
 
 WIDTH, HEIGHT, FLAT_HEIGHT, TIMES_HEIGHT, GROWTH_HEIGHT = 560.0, 380.0, 180.0, 240.0, 390.0  # px
-LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 40.0  # px around the axes
-TEXT_PX, DOT_PX = 12.0, 10.0
-FOOT = 36.0  # px below a top view, for the scale bar
-MARGIN = 0.08  # relative to the size of a top view
-MIN_EXTENT_M = 0.04  # minimum extent of the shorter side of a top view
+LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 40.0  # px, margins around the axes
+TEXT_PX, DOT_PX = 12.0, 10.0  # font size; diameter of the dots at the ends of a path
+FOOT = 36.0  # px, height below a top view for the scale bar
+MARGIN = 0.08  # margin on each side of a top view, relative to its content
+MIN_EXTENT_M = 0.04  # minimum vertical extent of a top view
 LABEL_WIDTH_PX = 46.0  # minimum width of a footprint with a label
-MAX_POINTS = 240  # maximum number of points of a line
-CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+MAX_POINTS = 240  # maximum number of frames in the chart of stage times
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])  # of the unit cube
 COLORS = {
     "card": "#ffffff",
     "line": "#e3e5e8",
@@ -52,7 +52,7 @@ COLORS = {
     "run-4": "#8a6d00",
     "run-5": "#5b6570",
 }
-"""Light colors of report.css by variable name; the SVG contains the variables."""
+"""Colors of report.css in light mode, by variable name. In the SVG, the CSS variables replace the colors."""
 RUN_COLORS = ("accent", "refinement", "tracking", "run-3", "run-4", "run-5")
 RUN_WIDTHS = (6.0, 4.5, 3.0, 2.2, 1.6, 1.2)  # px, decreasing so that coinciding paths remain visible
 VARIABLES = {color: f"var(--{name})" for name, color in COLORS.items()}
@@ -62,7 +62,7 @@ VARIABLES = {color: f"var(--{name})" for name, color in COLORS.items()}
 class Footprint:
     """An object in the top view."""
 
-    corners_world: Float64  # (8, 3) m
+    corners_world: Float64  # (8, 3) m, corners of the bounding box
     name: str
     color: str  # #rrggbb
 
@@ -73,7 +73,7 @@ class PlottedPath:
 
     positions: Float64  # (P, 3) m, in the world frame
     lost_after: Sequence[int] = ()  # indices of the last positions before tracking was lost
-    color: str = "accent"  # of COLORS
+    color: str = "accent"  # key of COLORS
     width: float = 2.0  # px
 
 
@@ -88,7 +88,7 @@ class StageRow:
 
 
 def box_corners(box: Box) -> Float64:
-    """Return the corners (8, 3) of a box, m."""
+    """Return the corners (8, 3) of a box, m, in the world frame."""
     return np.asarray(box.center + (CORNERS * box.extent) @ box.rotation.T)
 
 
@@ -109,9 +109,14 @@ def top_view(
     up: Float64,
     height: float = HEIGHT,
 ) -> tuple[str, float]:
-    """Return a chart of paths and objects from above, and the size of the paths relative to the view's width.
+    """Return the SVG of a top view, and the extent of the paths relative to the view's width.
 
-    Ground-truth paths are dashed.
+    Args:
+        paths: Estimated paths, at least one.
+        true_paths: Positions (n, 3), m, of each ground-truth path; drawn as a dashed line.
+        objects: Objects, drawn as outlines.
+        up: (3,) unit vector opposite to gravity, world frame.
+        height: Height of the chart, px.
     """
     plot_height = height - FOOT
     plane = _horizontal(paths[0].positions, up)
@@ -152,15 +157,15 @@ def top_view(
 
 
 def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT_HEIGHT) -> str:
-    """Return a chart of the position errors (n,), m, over the frames."""
+    """Return the SVG of a chart of the position errors (n,), m, by frame number (n,)."""
     figure, axes = _chart(height, frames[0], frames[-1], "Position error, mm")
     axes.plot(frames, 1e3 * errors, color=COLORS["accent"], linewidth=2, gid="chart-errors")
     axes.set_ylim(0, max(1.08e3 * float(errors.max(initial=0.0)), 1e-3))
-    return _svg(figure, "Position error over the frames")
+    return _svg(figure, "Position error by frame")
 
 
 def stage_areas(times: StageTimes) -> str:
-    """Return a chart of the stacked stage times as running medians."""
+    """Return the SVG of a stacked area chart with the running median of each stage's time."""
     chosen = np.unique(np.linspace(0, len(times.frames) - 1, MAX_POINTS).astype(int))
     stages = [row.stage for row in stage_rows(times)]
     layers = [np.nan_to_num(running_median(times.milliseconds[stage], WINDOW))[chosen] for stage in stages]
@@ -170,17 +175,17 @@ def stage_areas(times: StageTimes) -> str:
         for stage, area in zip(stages, areas, strict=True):
             area.set_gid(f"chart-stage-{stage}")
         axes.set_ylim(0, max(float(np.percentile(np.sum(layers, axis=0), 98)) * 1.2, 1e-3))
-    return _svg(figure, "Stage times over the frames")
+    return _svg(figure, "Stage times by frame")
 
 
 def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int], last_frame: int) -> str:
-    """Return a chart of the fraction of the final surface and the number of final objects up to each frame.
+    """Return the SVG of a chart of the surface and the objects of the final map that were visible up to each frame.
 
     Args:
-        frames: Frames of `fraction`.
-        fraction: (n,) fraction of the final surface.
-        first_frames: First frame of each object.
-        last_frame: Last frame of the sequence.
+        frames: Frame numbers of `fraction`.
+        fraction: (n,) fraction of the final surface that was visible up to each frame, in [0, 1].
+        first_frames: Number of the first frame of each object.
+        last_frame: Number of the last frame of the sequence.
     """
     first, last = min([0, *frames]), max(last_frame, 1)
     figure, axes = _chart(GROWTH_HEIGHT, first, last, "", LEFT)
@@ -196,11 +201,11 @@ def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int]
     counts.set_ylim(0, max(1, len(ordered)))
     counts.yaxis.set_major_locator(MaxNLocator(4, integer=True))
     counts.tick_params(length=0, labelsize=TEXT_PX, labelcolor=COLORS["accent"])
-    return _svg(figure, "Visible surface and detected objects over the frames")
+    return _svg(figure, "Visible surface and detected objects by frame")
 
 
 def round_length(longest: float) -> float:
-    """Return the largest length of 1, 2 or 5 times a power of ten that is at most `longest`."""
+    """Return the largest length, at most `longest`, that is 1, 2 or 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(max(longest, 1e-9)))
     return float(max(factor * power for factor in (1, 2, 5) if factor * power <= longest * (1 + 1e-9) or factor == 1))
 
@@ -223,7 +228,14 @@ def _chart(height: float, first: float, last: float, title: str, right: float = 
 
 
 def _horizontal(positions: Float64, up: Float64) -> Float64:
-    """Return the right and forward directions (2, 3) of the top view in which the path is widest."""
+    """Return the right and up axes (2, 3) of the top view, unit vectors in the world frame.
+
+    The right axis is the horizontal direction of the largest variance of the positions.
+
+    Args:
+        positions: (P, 3) m, world frame.
+        up: (3,) unit vector opposite to gravity, world frame.
+    """
     any_level = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     level = np.stack([any_level, np.cross(up, any_level)]) / np.linalg.norm(any_level)
     _, _, Vt = np.linalg.svd((positions - positions.mean(axis=0)) @ level.T, full_matrices=True)
@@ -232,7 +244,15 @@ def _horizontal(positions: Float64, up: Float64) -> Float64:
 
 
 def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, px: float, gid: str) -> bool:
-    """Draw an object at `corners` (8, 2) m. Return False if it has no area. `px` is the size of a pixel, m."""
+    """Draw an object, and return True; return False without drawing if its outline has no area.
+
+    Args:
+        axes: Axes of the top view.
+        one: Object to draw.
+        corners: (8, 2) m, corners of the object in the axes of the top view.
+        px: Size of a pixel, m.
+        gid: Id of the outline in the SVG.
+    """
     try:
         outline = corners[ConvexHull(corners).vertices]
     except QhullError:  # the object is a line in the top view
@@ -247,10 +267,16 @@ def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, px: float, gid
 
 
 def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) -> str:
-    """Return an `<svg>` element without inline styles, which the page's policy forbids."""
+    """Return a figure as an `<svg>` element without inline styles, which the page's content security policy forbids.
+
+    Args:
+        figure: Figure to convert.
+        label: Accessible name of the chart.
+        titles: Tooltip by element id.
+    """
     file = StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "instancemap"}), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph")  # the browser has additional fonts
+        warnings.filterwarnings("ignore", "Glyph")  # the browser draws glyphs that are missing in matplotlib's font
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
     text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", file.getvalue(), flags=re.DOTALL)
     text = re.sub(r' style="([^"]*)"', _attributes, text[text.index("<svg") :])
@@ -263,7 +289,7 @@ def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) ->
 
 
 def _attributes(style: re.Match[str]) -> str:
-    """Convert CSS properties to presentation attributes with the color variables of the page."""
+    """Convert inline CSS properties to SVG attributes, and colors to the color variables of the page."""
     pairs = [item.split(":", 1) for item in style[1].split(";") if ":" in item]
     kept = [(key.strip(), value.strip()) for key, value in pairs if not key.strip().startswith("font")]
     return "".join(f' {key}="{VARIABLES.get(value, value)}"' for key, value in kept)

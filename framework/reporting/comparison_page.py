@@ -1,4 +1,4 @@
-"""Comparison page of several runs."""
+"""HTML page that compares several runs."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
-MAX_MAPS = 6  # maximum number of maps in the page, with a total size of at most one map
+MAX_MAPS = 6  # maximum number of maps in the page; their total size is that of the map in the page of one run
 
 
 @dataclass(frozen=True)
 class Row:
-    """A metric of several runs."""
+    """A metric in the comparison table."""
 
     key: str  # of metrics.json
     name: str
-    unit: str
-    digits: int
-    scale: float = 1.0
+    unit: str  # "" = none
+    digits: int  # number of decimal places
+    scale: float = 1.0  # factor from the unit of metrics.json to `unit`
     better: int = 0  # 1 = higher is better, -1 = lower is better
 
 
@@ -59,16 +59,16 @@ ROWS = (
 
 @dataclass(frozen=True)
 class Cell:
-    """The value of one run."""
+    """The value of one run in a table."""
 
     text: str  # "" = unknown
     best: bool = False
-    difference: str = ""  # from the first run, "" = none
+    difference: str = ""  # from the value of the first run, "" = none
 
 
 @dataclass(frozen=True)
 class TableRow:
-    """The values of all runs."""
+    """A table row with the values of all runs."""
 
     name: str
     cells: list[Cell]
@@ -83,7 +83,7 @@ class Table:
     title: str
     first: str  # heading of the first column
     rows: list[TableRow]
-    lead: str = ""
+    lead: str = ""  # text below the title, "" = none
     empty: str = ""  # text for a table without rows; "" = omit the section
 
 
@@ -93,12 +93,17 @@ class Comparison:
 
     runs: Sequence[RunContents]
     names: Sequence[str]  # unique
-    links: Sequence[str]  # to the page of each run, "" = none
-    scenes: Sequence[MapScene | None]  # of the first MAX_MAPS
+    links: Sequence[str]  # link to the page of each run, "" = none
+    scenes: Sequence[MapScene | None]  # maps of the first MAX_MAPS runs; None = empty map
 
     @classmethod
     def of(cls, runs: Sequence[RunContents], links: Sequence[str]) -> Comparison:
-        """Return the comparison of the runs, with maps decimated to the total size of one map."""
+        """Return the comparison of the runs. The maps are decimated to the total size of one map.
+
+        Args:
+            runs: Outputs of the runs, at least one.
+            links: Link to the page of each run, "" = none.
+        """
         mapped = runs[:MAX_MAPS]
         no_footage = Footage(NOT_CAMERA, {}, {}, {}, {})
         scenes = [MapScene.of(run, no_footage, 1 / len(mapped)) for run in mapped]
@@ -143,7 +148,7 @@ class Comparison:
             values = self._values(row.key, row.scale)
             if any(value is not None for value in values):
                 rows.append(TableRow(row.name, compared(values, row.digits, row.better), row.unit))
-        lead = "The best value is bold. Differences are relative to the first run."
+        lead = "The best value is bold. The difference from the first run is below each value."
         return Table("figures", "Metrics", "Metric", rows, lead)
 
     def _values(self, key: str, scale: float = 1.0) -> list[float | None]:
@@ -201,7 +206,15 @@ class Comparison:
 
 
 def compared(values: Sequence[float | None], digits: int, better: int) -> list[Cell]:
-    """Return the cells of a row: the best value is marked, and nonzero rounded differences from the first are added."""
+    """Return the cells of a row, with the best value marked and the differences from the first run.
+
+    Differences that round to zero are omitted.
+
+    Args:
+        values: Value of each run, None = unknown.
+        digits: Number of decimal places.
+        better: 1 = higher is better, -1 = lower is better, 0 = no best value.
+    """
     known = [round(value, digits) for value in values if value is not None]
     best = None if not better or len(set(known)) < 2 else max(known) if better > 0 else min(known)
     cells = []
@@ -217,12 +230,12 @@ def compared(values: Sequence[float | None], digits: int, better: int) -> list[C
 
 
 def short_names(directories: Sequence[Path]) -> list[str]:
-    """Return the paths of the directories relative to their common parent."""
+    """Return the paths of the directories relative to their deepest common parent directory."""
     resolved = [path.resolve() for path in directories]
     common = Path(os.path.commonpath([path.parent for path in resolved]))
     return [str(path.relative_to(common)) for path in resolved]
 
 
 def _target(node: Any) -> str:
-    """Return the class name of a plugin."""
+    """Return the class name of a plugin from its config node, "" for a node without a plugin."""
     return str(node.get("_target_")).rpartition(".")[2] if isinstance(node, dict) else ""

@@ -1,4 +1,4 @@
-"""The map of a run for the viewer: decimated, with object colors and an initial view."""
+"""The map of a run for the viewer of the report: decimated, with object colors and an initial view."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from framework.runs.run_directory import LIKELY
 
 VIEW_WIDTH, VIEW_HEIGHT = 960, 640  # px, aspect ratio of the initial view
 PATH_POINTS = 400  # maximum number of points of the camera path
-PROGRESS_PICTURES = 4  # number of images at equal intervals; the last image shows the whole map
-PROGRESS_SCALE = 0.5  # image size relative to the initial view
-PROGRESS_QUALITY = 80  # of WebP
+PROGRESS_PICTURES = 4  # number of mapping progress images, at equal intervals; the last image shows the whole map
+PROGRESS_SCALE = 0.5  # size of mapping progress images, relative to the initial view
+PROGRESS_QUALITY = 80  # WebP quality of mapping progress images, 0 to 100
 
 
 @dataclass(frozen=True)
 class ProgressPicture:
-    """An image of the visible part of the final map up to a frame."""
+    """An image of the part of the final map that was visible up to a frame."""
 
-    url: str  # data:
-    frame: int
-    fraction: float  # visible fraction of the surface
+    url: str  # `data:` URL
+    frame: int  # frame number
+    fraction: float  # visible fraction of the surface, in [0, 1]
 
 
 @dataclass(frozen=True)
 class MapScene:
-    """The map of one run in the viewer."""
+    """The map of one run in the viewer of the report."""
 
     contents: RunContents
     mesh: InstanceMesh  # decimated; the front sides of its triangles face the cameras
@@ -53,7 +53,13 @@ class MapScene:
 
     @classmethod
     def of(cls, contents: RunContents, footage: Footage, fraction: float = 1.0) -> MapScene | None:
-        """Return the map, decimated to a fraction of MAX_TRIANGLES and MAX_BYTES; None for an empty map."""
+        """Return the map, decimated to a fraction of MAX_TRIANGLES and MAX_BYTES; None for an empty map.
+
+        Args:
+            contents: Outputs of the run.
+            footage: Images of the run's sequence; may be empty.
+            fraction: Fraction of the size limits, in (0, 1].
+        """
         if contents.mesh is None or not len(contents.poses):
             return None
         mesh = replace(contents.mesh, instance_ids=contents.instance_ids(contents.mesh))
@@ -68,7 +74,7 @@ class MapScene:
         return cls(contents, mesh, surface, seen, up)
 
     def glb(self) -> str:
-        """Return the map as base64 of a gzip-compressed GLB file. The result is deterministic."""
+        """Return the map as a base64-encoded, gzip-compressed GLB file. The result is deterministic."""
         steps = max(1, len(self.sightings.chosen))
         names = {one.id: one.class_name for one in self.contents.objects}
         content = scene_glb(self.mesh, (self.sightings.first_seen / steps).astype(np.float32), names, self.up)
@@ -76,18 +82,18 @@ class MapScene:
 
     @property
     def likely_labels(self) -> Int32:
-        """Index (V,) of the likely object of each vertex, from 1; 0 = none."""
+        """Label (V,) of each vertex: the position of its object in `likely_ids`, counted from 1; 0 = none."""
         likely = np.array([0, *likely_ids(self.contents)])
         indices = np.minimum(np.searchsorted(likely, self.mesh.instance_ids), len(likely) - 1)
         return np.where(likely[indices] == self.mesh.instance_ids, indices, 0).astype(np.int32)
 
     @cached_property
     def view(self) -> tuple[Camera, Float64]:
-        """Initial view: a camera and its T_world_camera."""
+        """Initial view: a camera and its pose T_world_camera (4, 4)."""
         return best_view(self.surface, self.likely_labels, self.contents.poses, VIEW_WIDTH, VIEW_HEIGHT)
 
     def data(self) -> dict[str, Any]:
-        """Return the data that the viewer's script needs in addition to the GLB."""
+        """Return the data that viewer.js needs in addition to the GLB file, as JSON values."""
         poses = self.contents.poses
         _, T_world_camera = self.view
         eye, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
@@ -115,7 +121,11 @@ class MapScene:
         }
 
     def progress_pictures(self) -> list[ProgressPicture]:
-        """Return images, from the initial view, of the surface visible up to several frames; none for short runs."""
+        """Return images of the mapping progress from the initial view.
+
+        Each image shows the surface that was visible up to its frame. Runs with fewer than PROGRESS_PICTURES poses have
+        no images.
+        """
         steps = len(self.sightings.chosen)
         if steps < PROGRESS_PICTURES:
             return []
@@ -136,19 +146,19 @@ class MapScene:
 
 
 def likely_ids(contents: RunContents) -> list[int]:
-    """Return the ids of the objects in overview.png."""
+    """Return the ids of the objects with a confidence of at least LIKELY, as in overview.png."""
     return [one.id for one in contents.objects if one.confidence >= LIKELY]
 
 
 def colors_by_id(objects: tuple[StoredInstance, ...]) -> dict[int, UInt8]:
-    """Return the RGB color (3,) by object id, gray for objects without a position."""
+    """Return the RGB color (3,) by object id; objects without vertices are gray."""
     positions = {one.id: one.centroid for one in objects if one.centroid is not None}
     colors = object_colors(positions, {one.id for one in objects if one.confidence >= LIKELY})
     return {one.id: colors.get(one.id, np.array((150, 150, 150), np.uint8)) for one in objects}
 
 
 def hex_color(color: UInt8) -> str:
-    """Return a color as #rrggbb."""
+    """Return an RGB color (3,) as `#rrggbb`."""
     return "#" + bytes(color.tolist()).hex()
 
 

@@ -21,19 +21,19 @@ POLICY = (
 
 
 def page(template: str, title: str, context: Mapping[str, Any], data: Mapping[str, Any], maps: Sequence[str]) -> str:
-    """Return the HTML file. Its policy allows only the project's scripts and no network access.
+    """Return a page as HTML. Its content security policy allows only the scripts in assets/ and no network access.
 
     Args:
         template: File in templates/ that extends page.html.
         title: Title of the page.
         context: Variables of the template.
         data: Data for the scripts, written as JSON.
-        maps: Maps as base64 of gzip-compressed GLB.
+        maps: Maps as base64-encoded, gzip-compressed GLB files.
     """
     style, *scripts = [(ASSETS / name).read_text(encoding="utf-8") for name in (STYLE, *SCRIPTS)]
     script = "\n".join(scripts)
     if "</script" in script.lower() or "</style" in style.lower():
-        raise DataError(f"{ASSETS}: expected no end tag in scripts and styles, got </script or </style")
+        raise DataError(f"{ASSETS}: expected no </script in *.js and no </style in {STYLE}, got one; write <\\/ for </")
     environment = Environment(
         loader=PackageLoader("framework.reporting"),
         autoescape=True,

@@ -16,7 +16,7 @@ from framework.reporting.run_contents import RunContents
 from framework.reporting.truth_section import css_class
 from framework.runs.instances_file import StoredInstance
 
-SHOWN_CLASSES = 6  # maximum shown classes of an object's class distribution
+SHOWN_CLASSES = 6  # maximum number of most probable classes that are shown for an object
 
 
 @dataclass(frozen=True)
@@ -25,19 +25,19 @@ class ObjectRow:
 
     instance: StoredInstance
     color: str  # #rrggbb
-    picture: Picture | None
-    size: str
-    longest: float  # cm
-    position: str
-    truth: str  # "" = not compared
+    picture: Picture | None  # None = never visible
+    size: str  # side lengths of the bounding box, cm
+    longest: float  # cm, longest side of the bounding box
+    position: str  # center of the bounding box, m, world frame
+    truth: str  # result of the comparison with the ground truth, "" = not compared
     css: str  # CSS class of the outcome
-    iou: str
+    iou: str  # IoU with the ground-truth instance, "" = none
 
 
 def object_rows(
     contents: RunContents, pictures: Mapping[int, Picture], judgments: Mapping[int, Judgment]
 ) -> list[ObjectRow]:
-    """Return the rows of the table, most confident object first."""
+    """Return the rows of the table, most confident object first; `pictures` and `judgments` are by object id."""
     colors = colors_by_id(contents.objects)
     rows = []
     for one in sorted(contents.objects, key=lambda one: (-one.confidence, one.id)):
@@ -61,7 +61,7 @@ def object_rows(
 def object_data(
     one: StoredInstance, contents: RunContents, picture: Picture | None, judgment: Judgment | None
 ) -> dict[str, Any]:
-    """Return the data of an object for the panel."""
+    """Return the data of an object for the panel next to the map, as JSON values."""
     likeliest = sorted(one.class_probabilities.items(), key=lambda entry: (-entry[1], entry[0]))[:SHOWN_CLASSES]
     height = _height_above_floor(one, contents)
     return {
@@ -81,7 +81,10 @@ def object_data(
 
 
 def _size(one: StoredInstance, up: Float64 | None) -> str:
-    """Return length, width and height of the box in cm; without `up`, the sides are sorted by length."""
+    """Return the length, width and height of an object's oriented box as text, cm.
+
+    If `up` is None, the sides are in descending order of length.
+    """
     sides = np.sort(one.obb.extent)[::-1]
     if up is not None:
         upright = int(np.abs(one.obb.rotation.T @ up).argmax())
@@ -91,7 +94,7 @@ def _size(one: StoredInstance, up: Float64 | None) -> str:
 
 
 def _height_above_floor(one: StoredInstance, contents: RunContents) -> float | None:
-    """Return the height of the lower end of the box, m; None if the floor is unknown."""
+    """Return the height of the lowest point of an object's box above the floor, m; None if the floor is unknown."""
     floor, up = contents.record.metrics.get("map.floor_m"), contents.up
     if not isinstance(floor, float) or up is None:
         return None

@@ -18,18 +18,18 @@ from framework.rendering.surface import Surface
 from framework.reporting.run_source import Footage
 
 WIDTH, HEIGHT = 264, 198  # px
-MAX_LARGE_PICTURES = 120  # maximum number of objects with images of full size; more objects get smaller images
-QUALITY = 78  # of WebP
-MARGIN = 0.25  # around an object, relative to its size
-MIN_CROP = 0.12  # relative to the width of the image
-OUTLINE = (255, 255, 255)  # on both sides of the colored outline
+MAX_LARGE_PICTURES = 120  # maximum number of objects with full-size images; with more objects, all images are smaller
+QUALITY = 78  # WebP quality, 0 to 100
+MARGIN = 0.25  # margin on each side of an object, relative to its size
+MIN_CROP = 0.12  # minimum width of the crop, relative to the width of the image
+OUTLINE = (255, 255, 255)  # RGB of the lines on both sides of the colored outline
 
 
 @dataclass(frozen=True)
 class Picture:
     """An image in the page."""
 
-    url: str  # data:
+    url: str  # `data:` URL
     source: str  # "frame 12" or "map"
 
 
@@ -42,10 +42,12 @@ class Photographer:
         self._rasterizer = Rasterizer(mesh.vertices, mesh.triangles)
 
     def pictures(self, labels: Int32, best: Mapping[int, int], colors: Mapping[int, UInt8]) -> dict[int, Picture]:
-        """Return an image of each label from the pose with the best view, with the object outlined in its color.
+        """Return an image of each visible object by label.
+
+        The image shows the object from the pose with the best view, outlined in its color.
 
         Args:
-            labels: (V,) labels of the mesh's vertices, 0 = none.
+            labels: (V,) object labels of the mesh's vertices, 0 = none.
             best: Index of the pose with the best view, by label.
             colors: RGB color (3,) by label.
         """
@@ -61,14 +63,21 @@ class Photographer:
         return taken
 
     def _seen_from(self, k: int) -> tuple[UInt8, str]:
-        """Return the image (H, W, 3) RGB and its source."""
+        """Return the image (H, W, 3), RGB, at pose k and its source: the frame, or else a rendering of the map."""
         if k in self._footage.images:
             return self._footage.images[k], f"frame {self._footage.frames[k]}"
         return LitView(self._surface, self._camera, self._poses[k]).in_colors(self._mesh.colors), "map"
 
 
 def _crop(image: UInt8, mask: Bool, color: UInt8, scale: float) -> UInt8:
-    """Return the part of an image (H, W, 3) around a mask (H, W), with the outline of the mask."""
+    """Return the part of an image around an object, with the object's outline.
+
+    Args:
+        image: (H, W, 3) RGB.
+        mask: (H, W) pixels of the object.
+        color: (3,) RGB of the outline.
+        scale: Size of the result, relative to WIDTH x HEIGHT px.
+    """
     height, width = mask.shape
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     center_u, center_v = (columns[0] + columns[-1] + 1) / 2, (rows[0] + rows[-1] + 1) / 2
@@ -89,7 +98,7 @@ def _crop(image: UInt8, mask: Bool, color: UInt8, scale: float) -> UInt8:
 
 
 def webp_url(image: Image.Image, quality: int) -> str:
-    """Return an image as a `data:` URL."""
+    """Return an image as a `data:` URL with the WebP quality `quality`, 0 to 100."""
     file = BytesIO()
     image.save(file, "WEBP", quality=quality, method=4)
     return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"

@@ -1,4 +1,4 @@
-"""The outputs of a run for its report."""
+"""The outputs of a run that its report shows."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class RunContents:
     """The outputs of a run; None = missing."""
 
     record: Record
-    partial: str  # reason for an early end, "" = complete run
+    partial: str  # reason for the early end of the run, "" = complete run
     mesh: InstanceMesh | None
     objects: tuple[StoredInstance, ...]  # sorted by id
     timestamps: Float64  # (P,) s, of the mapped frames
@@ -51,7 +51,7 @@ class RunContents:
         elif path_exists(directory / PARTIAL_METRICS):
             record, partial = read_partial(directory)
         else:
-            raise DataError(f"{directory}: expected a run directory, got no {METRICS} or {PARTIAL_METRICS}")
+            raise DataError(f"{directory}: expected a run directory with {METRICS} or {PARTIAL_METRICS}, got neither")
         mesh, objects = _map_of(record)
         timestamps, poses = np.zeros(0), np.zeros((0, 4, 4))
         if path_exists(directory / TRAJECTORY):
@@ -74,7 +74,7 @@ class RunContents:
 
     @property
     def up(self) -> Float64 | None:
-        """Unit vector (3,) opposite to gravity, None if unknown."""
+        """Unit vector (3,) opposite to gravity, in the world frame; None if unknown."""
         values = [self.record.metrics.get(f"map.up.{axis}") for axis in "xyz"]
         up = np.array([value if is_number(value) else np.nan for value in values], np.float64)
         length = np.linalg.norm(up)
@@ -97,19 +97,19 @@ class RunContents:
 
     @property
     def lost_frames(self) -> tuple[int, ...]:
-        """Numbers of the frames without a pose."""
+        """Numbers of the frames without a pose, empty if unknown."""
         if self.times is None or not self.tracked_frames:
             return ()
         return tuple(np.setdiff1d(self.times.frames, self.tracked_frames).tolist())
 
     @property
     def lost_after(self) -> list[int]:
-        """Indices of the last poses before lost frames."""
+        """Index in `poses` of the last pose before each gap of lost frames."""
         before = np.searchsorted(self.tracked_frames, self.lost_frames) - 1
         return sorted({max(0, int(k)) for k in before})
 
     def instance_ids(self, mesh: InstanceMesh) -> Int32:
-        """Return the object ids of the mesh's vertices (V,), 0 = none or not in instances.json."""
+        """Return the object id (V,) of each vertex of a mesh; 0 = none, or not in instances.json."""
         listed = np.isin(mesh.instance_ids, [one.id for one in self.objects])
         return np.where(listed, mesh.instance_ids, 0).astype(np.int32)
 

@@ -1,4 +1,4 @@
-"""Report page of one run."""
+"""HTML page with the report of one run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
 OVERVIEW_WIDTH = 1400  # px, of the image for browsers without WebGL
-SMALL_PATH = 0.3  # relative to the width of the top view: smaller paths are also shown enlarged
+SMALL_PATH = 0.3  # extent, relative to the width of the top view, up to which a path is also shown enlarged
 TOP_VIEW_KEY = (
     ("mine", "estimated"),
     ("truth", "ground truth"),
@@ -52,15 +52,15 @@ TOP_VIEW_KEY = (
 
 @dataclass(frozen=True)
 class RunReport:
-    """The contents of a run's page."""
+    """The content of a run's page."""
 
     contents: RunContents
     scene: MapScene | None  # None = empty map
     source: RunSource
-    pictures: Mapping[int, Picture]
-    true_path: TruePath | None
-    check: TruthCheck | None
-    why_unchecked: str  # reason for the missing comparison of an evaluated run
+    pictures: Mapping[int, Picture]  # by object id
+    true_path: TruePath | None  # None = fewer than three ground-truth poses
+    check: TruthCheck | None  # None = not compared with the ground truth
+    why_unchecked: str  # reason why an evaluated run is not compared, "" = none
 
     @classmethod
     def of(cls, contents: RunContents) -> RunReport:
@@ -138,7 +138,10 @@ class RunReport:
         return {"whole": whole, "text": self._path_text(), "legend": keys, "details": details}
 
     def _top_views(self, up: Float64) -> tuple[str, str | None]:
-        """Return the chart of the path with the objects, and an enlarged chart for a small path."""
+        """Return the SVG of the path with the objects, and the SVG of the enlarged path.
+
+        The second is None if the path is large enough in the first. `up` (3,) is the unit vector opposite to gravity.
+        """
         contents = self.contents
         colors = colors_by_id(contents.objects)
         likely = set(likely_ids(contents))
@@ -157,7 +160,7 @@ class RunReport:
     def _path_text(self) -> str:
         steps = np.linalg.norm(np.diff(self.contents.poses[:, :3, 3], axis=0), axis=1)
         lost = len(self.contents.lost_frames)
-        text = f"Top view: {steps.sum():.2f} m in {len(self.contents.poses)} frames"
+        text = f"Top view: path of {steps.sum():.2f} m in {len(self.contents.poses)} frames"
         return f"{text}, {lost} lost." if lost else f"{text}, none lost."
 
     def _error_text(self) -> str:
@@ -184,7 +187,7 @@ class RunReport:
 
 
 def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
-    """Return the label, value, unit and note of each available main metric."""
+    """Return the label, value, unit and note of each main metric that the run has."""
     metrics = contents.record.metrics
 
     def known(key: str) -> float | None:
@@ -198,7 +201,7 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
     if (fps := known("fps")) is not None:
         found.append(("Frames per second", f"{fps:.1f}", "/s", "all stages"))
     if (count := known("instances.count")) is not None:
-        found.append(("Objects", str(len(likely_ids(contents))), "", f"likely, of {count:.0f}"))
+        found.append(("Objects", str(len(likely_ids(contents))), "", f"of {count:.0f}; confidence ≥ {LIKELY}"))
     if (ap50 := known("instances.ap50")) is not None:
         ap25 = known("instances.ap25")
         found.append(("AP50", f"{ap50:.2f}", "", "" if ap25 is None else f"AP25 {ap25:.2f}"))
@@ -213,7 +216,7 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
 
 
 def overview_url(path: Path) -> str:
-    """Return the scaled overview.png as a `data:` URL; "" if it cannot be read."""
+    """Return overview.png, reduced to a width of OVERVIEW_WIDTH, as a `data:` URL; "" if it cannot be read."""
     try:
         small = Image.fromarray(read_color(path))
     except FrameError:

@@ -20,7 +20,7 @@ from framework.runs.metrics import TRUTH, truth_sha256
 from framework.runs.provenance import leaves
 
 MAX_WIDTH = 640  # px, of stored images
-MIN_CLARITY = 0.3  # minimum clarity, because a blurred image of an object is better than a distant view
+MIN_CLARITY = 0.3  # lower limit of the clarity: a blurred close view of an object is better than a sharp distant view
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class RunSource:
 
     contents: RunContents
     video: RGBDSequence | None
-    why_not: str  # reason for a missing sequence
+    why_not: str  # reason why the sequence is unavailable, "" = available
 
     @classmethod
     def of(cls, contents: RunContents) -> RunSource:
         """Return the sequence opened from the run's config. If it is unreadable, `video` is None."""
         dataset = contents.record.dataset
         if any("${" in str(value) for _, value in leaves({"dataset": dataset})):
-            return cls(contents, None, "the config of the run is not resolved")
+            return cls(contents, None, "the interpolations in the config of the run are not resolved")
         try:
             video = build(RGBDVideo, OmegaConf.create(dataset))
         except (InstanceMapError, OSError) as error:
@@ -53,12 +53,13 @@ class RunSource:
         return None if self.video is None else self.video.camera
 
     def frame(self, k: int) -> Frame | None:
-        """Return the frame of pose k of the trajectory, None if it cannot be read."""
+        """Return the frame of the k-th pose of the trajectory; None if the frame cannot be read."""
         numbers = self.contents.tracked_frames
         if self.video is None or not numbers or self.contents.times is None:
             return None
         first = int(np.searchsorted(self.contents.times.frames, numbers[k]))
-        skipped = len(self.video) - len(self.contents.times.frames)  # frames without times may precede the frame
+        # frames that are missing in timings.csv may precede the frame
+        skipped = len(self.video) - len(self.contents.times.frames)
         for position in range(first, min(first + max(skipped, 0) + 1, len(self.video))):
             try:
                 frame = self.video[position]
@@ -71,9 +72,9 @@ class RunSource:
         return None
 
     def scene_truth(self) -> tuple[SceneTruth | None, str]:
-        """Return the ground-truth instances of the run's evaluation in the world frame of its map.
+        """Return the ground-truth instances of the run's evaluation, in the world frame of its map, and "".
 
-        If they are unavailable, returns None and the reason; the reason is "" for a run without ground truth.
+        If they are unavailable, return None and the reason; the reason is "" for a run without ground truth.
         """
         expected = self.contents.record.metrics.get(TRUTH)
         if self.video is None:
@@ -94,17 +95,23 @@ class RunSource:
 
 @dataclass(frozen=True)
 class Footage:
-    """Frames of the sequence by their pose index in the trajectory. Unreadable frames are missing."""
+    """Frames of the sequence; the keys are indices of poses in the trajectory. Unreadable frames are missing."""
 
-    camera: Camera  # of the images
+    camera: Camera  # camera of the images
     images: Mapping[int, UInt8]  # (H, W, 3) RGB
     frames: Mapping[int, int]  # frame numbers in the sequence
-    true_positions: Mapping[int, Float64]  # (3,) m, ground-truth positions of frames with a ground-truth pose
-    clarity: Mapping[int, float]  # in [MIN_CLARITY, 1], 1 = at least as sharp as the median
+    true_positions: Mapping[int, Float64]  # (3,) m, ground-truth camera positions; missing without a ground-truth pose
+    clarity: Mapping[int, float]  # sharpness in [MIN_CLARITY, 1], 1 = at least the median sharpness
 
     @classmethod
     def of(cls, source: RunSource, chosen: Sequence[int], camera: Camera) -> Footage:
-        """Return the readable frames of the chosen poses."""
+        """Return the readable frames of the chosen poses.
+
+        Args:
+            source: Sequence of the run.
+            chosen: Indices of poses in the trajectory.
+            camera: Camera of the sequence.
+        """
         small = camera.scaled(min(1.0, MAX_WIDTH / camera.width))
         images, frames, positions, sharpness = {}, {}, {}, {}
         for k in chosen:
@@ -123,15 +130,20 @@ class Footage:
 
 @dataclass(frozen=True)
 class TruePath:
-    """The ground-truth camera path, aligned rigidly with the trajectory as for the ATE."""
+    """The ground-truth camera path, rigidly aligned with the trajectory as for the ATE."""
 
-    chosen: list[int]  # indices of n poses of the trajectory
+    chosen: list[int]  # indices of n poses in the trajectory
     positions: Float64  # (n, 3) m, in the world frame of the map
     errors: Float64  # (n,) m, distances to the positions of the trajectory
 
     @classmethod
     def of(cls, poses: Float64, true_positions: Mapping[int, Float64]) -> TruePath | None:
-        """Return the aligned path of ground-truth positions (3,), m, by pose index; None for fewer than three."""
+        """Return the aligned ground-truth path; None for fewer than three positions.
+
+        Args:
+            poses: (P, 4, 4) T_world_camera of the trajectory.
+            true_positions: Ground-truth camera position (3,), m, by index of the pose in the trajectory.
+        """
         chosen = sorted(true_positions)
         if len(chosen) < 3:
             return None
@@ -139,6 +151,9 @@ class TruePath:
         try:
             R, t = umeyama(true, estimated)
         except np.linalg.LinAlgError as error:
-            raise DataError(f"ground truth: expected poses alignable with the trajectory, got {error}") from error
+            raise DataError(
+                "ground truth: expected poses with a rigid alignment to the trajectory, "
+                f"got {len(chosen)} poses without one; check the ground-truth poses of the dataset"
+            ) from error
         aligned = true @ R.T + t
         return cls(chosen, aligned, np.linalg.norm(aligned - estimated, axis=1))

@@ -14,22 +14,22 @@ from framework.exporting.upright_room import plain_name, upright
 
 MAX_BYTES = 9_500_000  # maximum size of the file, bytes, for mobile browsers
 BYTES_OF_VERTEX, BYTES_OF_TRIANGLE = 24, 12  # position, color, first view; three indices
-MAX_TRIANGLES = 300_000  # 7 MB together with their vertices
-NOT_GEOMETRY = 200_000  # bytes for names and nodes
-FIRST_SEEN = "_FIRST_SEEN"
+MAX_TRIANGLES = 300_000  # maximum number of triangles; together with their vertices, they have about 7 MB
+NOT_GEOMETRY = 200_000  # bytes reserved for names and nodes
+FIRST_SEEN = "_FIRST_SEEN"  # name of the vertex attribute
 
 
 def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str], up: Float64) -> bytes:
     """Return the map as binary glTF 2.0, unlit, with the attribute `_FIRST_SEEN`.
 
-    Vertices have the coordinates of the map; the matrix of each node rotates them upright. Extras contain the id and
-    the class. The file of a `light_enough` mesh has at most MAX_BYTES.
+    The vertices have world coordinates; the matrix of each node rotates them upright. The extras of an object's node
+    contain its id and class. The file of a `light_enough` mesh has at most MAX_BYTES bytes.
 
     Args:
         mesh: Mesh of the map.
         first_seen: (V,) in [0, 1], fraction of the sequence before the first view of each vertex.
-        names: Class by id, for the objects with a node.
-        up: (3,) unit vector in the world frame.
+        names: Class name by id, for the objects with a node.
+        up: (3,) unit vector opposite to gravity, world frame.
     """
     labels = np.where(np.isin(mesh.instance_ids, list(names)), mesh.instance_ids, 0).astype(np.int32)
     of_triangle = triangle_labels(mesh.triangles, labels)
@@ -47,5 +47,5 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
 
 
 def light_enough(mesh: InstanceMesh, most_bytes: int = MAX_BYTES) -> InstanceMesh:
-    """Return the mesh, decimated so that its file has at most `most_bytes` bytes."""
+    """Return the mesh, decimated so that its GLB file has at most `most_bytes` bytes."""
     return clustered(mesh, most_bytes - NOT_GEOMETRY, BYTES_OF_VERTEX, BYTES_OF_TRIANGLE)

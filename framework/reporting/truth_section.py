@@ -1,4 +1,4 @@
-"""Comparison of a run's objects with the ground truth: metrics and galleries of missed, wrong and correct objects."""
+"""Comparison of a run's objects with the ground truth: metrics, and galleries of missed, wrong and correct objects."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ METRICS = {
 }
 GROUPS = {
     Outcome.WRONG_CLASS: ("Wrong class", "IoU of at least 0.5 with a ground-truth object of another class"),
-    Outcome.FALSE: ("False positives", "IoU below 0.5 with every ground-truth object, or a duplicate"),
+    Outcome.FALSE: ("False positives", "IoU below 0.5 with every ground-truth object, or duplicate of another object"),
     Outcome.RIGHT: ("Correct", "same class and an IoU of at least 0.5"),
     Outcome.IGNORED: ("Ignored", "in unlabeled regions, or of a class that is not evaluated"),
 }
@@ -49,10 +49,10 @@ class Card:
     """One object of a gallery."""
 
     class_name: str
-    confidence: str
+    confidence: str  # "" = missed ground-truth object
     note: str
     picture: Picture | None
-    id: int | None  # object selected by a click
+    id: int | None  # id of the object that a click selects, None = none
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ class Gallery:
 
 @dataclass(frozen=True)
 class TruthCheck:
-    """The outcome of every object, and the missed ground-truth objects."""
+    """The outcome of each object, and the missed ground-truth objects."""
 
-    judgments: Mapping[int, Judgment]  # by object
+    judgments: Mapping[int, Judgment]  # by object id
     missed: list[Card]
 
     @classmethod
@@ -153,7 +153,7 @@ def _card(one: StoredInstance, judgment: Judgment, picture: Picture | None) -> C
     notes = {
         Outcome.RIGHT: f"IoU {judgment.iou:.2f}",
         Outcome.WRONG_CLASS: f"truth: {near}, IoU {judgment.iou:.2f}",
-        Outcome.FALSE: f"nearest: {near}, IoU {judgment.iou:.2f}" if judgment.iou else "no overlap",
+        Outcome.FALSE: f"best overlap: {near}, IoU {judgment.iou:.2f}" if judgment.iou else "no overlap",
         Outcome.IGNORED: f"on {near}",
     }
     return Card(one.class_name, f"{one.confidence:.2f}", notes[judgment.outcome], picture, one.id)

@@ -12,26 +12,26 @@ from framework.data import Bool, Camera, Float32, Float64, InstanceMesh, Int32
 from framework.geometry import inverse
 from framework.rendering.rasterizer import Rasterizer
 
-LOOKS = 80  # maximum number of rendered poses of a trajectory
-LOOK_WIDTH = 200  # px, of the rendered images
+LOOKS = 80  # maximum number of poses at which the map is rendered
+LOOK_WIDTH = 200  # px, width of the rendered images
 TOLERANCE, TOLERANCE_PER_DEPTH = (
     0.05,
     0.03,
-)  # m and relative to depth: vertices farther behind the rendered depth are hidden
-NOT_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # Kinect, used if the camera is unknown
+)  # m, and relative to the depth: vertices farther behind the rendered depth are hidden
+NOT_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # nominal Kinect, used if the camera is unknown
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """Views of a mesh with V vertices from n poses of the trajectory."""
+    """Visibility of a mesh with V vertices from n poses of the trajectory."""
 
     chosen: list[int]  # indices of the poses
-    first_seen: Int32  # (V,) index into `chosen`; n = never seen
-    best: Mapping[int, int]  # index of the pose with the best view, by label; unseen labels are missing
+    first_seen: Int32  # (V,) index into `chosen` of the first pose with a view of each vertex; n = never visible
+    best: Mapping[int, int]  # index of the pose with the best view, by label; labels without a view are missing
 
     @property
     def growth(self) -> Float64:
-        """Fraction (n,) of all seen vertices up to each pose."""
+        """Fraction (n,), in [0, 1], of the visible vertices that are visible from this or an earlier pose."""
         counts = np.bincount(self.first_seen, minlength=len(self.chosen) + 1)[: len(self.chosen)]
         return np.asarray(np.cumsum(counts) / max(1, counts.sum()))
 
@@ -44,14 +44,14 @@ def spread_out(count: int, most: int = LOOKS) -> list[int]:
 def sightings(
     mesh: InstanceMesh, labels: Int32, poses: Float64, camera: Camera, clarity: Mapping[int, float]
 ) -> Sightings:
-    """Return the views of a mesh, rendered at an evenly spaced subset of the poses (P, 4, 4).
+    """Return the visibility of a mesh, which is rendered at evenly spaced poses.
 
     Args:
         mesh: Mesh of the map.
-        labels: (V,) labels of the vertices, 0 = none.
+        labels: (V,) object labels of the vertices, 0 = none.
         poses: (P, 4, 4) T_world_camera.
         camera: Camera of the sequence.
-        clarity: Sharpness of the image in [0, 1], by pose; 1 if missing.
+        clarity: Sharpness of the image in [0, 1], by index of the pose; 1 if missing.
     """
     chosen = spread_out(len(poses))
     small = camera.scaled(LOOK_WIDTH / camera.width)
@@ -77,7 +77,14 @@ def sightings(
 
 
 def _seen(vertices: Float32, T_world_camera: Float64, camera: Camera, depth: Float32) -> tuple[Bool, Bool]:
-    """Return two masks (V,) of the vertices inside the image and of the visible vertices, given its depth (H, W) m."""
+    """Return the mask (V,) of the vertices inside the image, and the mask (V,) of the visible vertices.
+
+    Args:
+        vertices: (V, 3) m, world frame.
+        T_world_camera: (4, 4) camera pose.
+        camera: Camera of the depth image.
+        depth: (H, W) m along z, 0 = no surface.
+    """
     T_camera_world = inverse(T_world_camera).astype(np.float32)
     x, y, z = T_camera_world[:3, :3] @ vertices.T + T_camera_world[:3, 3:]
     ahead = np.maximum(z, 1e-6)

@@ -65,7 +65,7 @@ def cupboard(rng: Rng) -> Group:
 
 
 def kitchen(rng: Rng) -> Group:
-    """Return a kitchen group with objects on top of the refrigerator."""
+    """Return a kitchen group with an object on top of the refrigerator."""
     group = kitchen_group(rng)
     fridge = next(piece for piece in group.pieces if piece.kind == "refrigerator")
     strew_on(group, fridge, rng, small_things.some(rng, small_things.ON_TOPS, 1))
@@ -114,7 +114,7 @@ SCENES: Mapping[str, SceneSpec] = {
         {"bed": 1, "chair": 3, "dining table": 1, "tv": 1, "toilet": 1, "backpack": 2, "book": 4},
     ),
     "one_room": SceneSpec(
-        "one-room flat with a cluttered bed and a cluttered couch",
+        "one-room apartment with a cluttered bed and a cluttered couch",
         (cluttered_bed_group, cluttered_couch_group, partial(desk_row, count=1), toilet_group, shelf),
         {"bed": 1, "couch": 1, "dining table": 2, "chair": 1, "toilet": 1, "backpack": 3, "book": 6},
     ),
@@ -144,8 +144,8 @@ class Scene:
 def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: float) -> Scene:
     """Return the candidate scene with the best visibility of its objects in `frames` frames.
 
-    `stream` is the seed of the random numbers. `stride` is the camera speed, as in walk.plan_path. Raises DataError if
-    no candidate has space for the furniture and the camera path.
+    `stream` is the seed of the random numbers. `stride` is the camera speed relative to the recommended speed, as in
+    walk.plan_path. Raises DataError if no candidate has space for the furniture and the camera path.
     """
     best: Scene | None = None
     most_shown = (-1.0, -1.0)
@@ -165,7 +165,10 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: floa
 
 
 def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[Scene, tuple[float, float]]:
-    """Return a random scene, and the fractions of its classes and of its objects that are visible in enough views."""
+    """Return a random scene, and the fractions of its classes and of its objects that are visible.
+
+    An object counts as visible if it is visible in at least a fraction LONG_SEEN of the scored views.
+    """
     room = furnish_scene(spec, rng)
     surfaces = room.surfaces
     caster = RayCaster(surfaces.vertices, surfaces.triangles)

@@ -25,7 +25,7 @@ TRIES = 50  # number of candidate positions of each group
 GROWTH = (1.0, 1.06, 1.12, 1.2, 1.3, 1.4, 1.5)  # scale factors of the side lengths of candidate rooms
 WALK_RADIUS = 1.3  # m, minimum radius of the free circle for a camera path
 HEAD_ROOM = 1.9  # m, minimum height of the base of objects that do not block the camera path
-CONTACT = 0.003  # m, gap between the boxes of touching objects on the floor
+CONTACT = 0.003  # m, gap between an object on the floor and the furniture that it touches
 PLACES = 60  # number of candidate positions of each object on the floor
 ON_FLOOR = 0.05  # m, maximum height of the base of objects on the floor
 NO_HOSTS = ("door", "window", "rug")  # kinds of furniture without objects next to them
@@ -39,7 +39,7 @@ class Layout:
     width: float  # m, along x
     depth: float  # m, along y
     pieces: list[Furniture]  # objects in the room frame: x, y along the walls, z up, origin at the center of the floor
-    free: Float64  # (rows along y, columns along x) distance (m) of each floor CELL to furniture or walls
+    free: Float64  # (rows along y, columns along x) m, distance from each floor cell to the nearest furniture or wall
 
 
 def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout:
@@ -112,9 +112,9 @@ def _try_layout(
 
 
 def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
-    """Return the pose of a group at a wall, offset by `along` m from the middle of the wall.
+    """Return the pose of a group at a wall of a room of `width` x `depth` m.
 
-    `wall` is 0 for the wall at -y, 1 at +x, 2 at +y, and 3 at -x.
+    The group is `along` m from the middle of the wall. `wall` is 0 for the wall at -y, 1 at +x, 2 at +y, and 3 at -x.
     """
     if wall == 0:
         return along, -depth / 2, 0.0
@@ -126,7 +126,7 @@ def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
 
 
 def _turned_boxes(boxes: Float64, quarters: int, place: Place) -> Float64:
-    """Return boxes (N, 2, 3) after quarter turns and a translation."""
+    """Return the boxes (N, 2, 3), m, rotated about z by `quarters` quarter turns and then moved to x, y of `place`."""
     R = np.rint(axis_rotation("z", quarters * np.pi / 2))
     corners = boxes @ R.T + np.array([place[0], place[1], 0.0])
     return np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
@@ -144,7 +144,11 @@ def _inside(boxes: Float64, width: float, depth: float) -> bool:
 
 
 def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
-    """Return a lower bound of the distance (m) of each CELL (rows along y, columns along x) to boxes and walls."""
+    """Return a lower bound of the distance, m, from each floor cell to the nearest box or wall.
+
+    The grid has one row per CELL along y and one column per CELL along x. The room has `width` x `depth` m, and `boxes`
+    are (N, 2, 3), m.
+    """
     rows, columns = int(depth / CELL), int(width / CELL)
     free = np.zeros((rows + 2, columns + 2), np.uint8)
     free[1:-1, 1:-1] = 1
@@ -190,7 +194,10 @@ def _with_thing(layout: Layout, thing: Furniture, rng: Rng) -> Layout:
 
 
 def _against(host: Float64, thing: Furniture, rng: Rng) -> Furniture:
-    """Return `thing` at a random side of the box `host` (2, 3), with its center within the length of the side."""
+    """Return `thing`, placed on the floor at a random side of the box `host` (2, 3), m.
+
+    The center of `thing` is not past the ends of the side.
+    """
     turned = thing.placed(0, 0, 0, np.pi / 2 * int(rng.integers(4)))
     low, high = turned.bounds()
     axis, sign = int(rng.integers(2)), (-1 if rng.uniform() < 0.5 else 1)

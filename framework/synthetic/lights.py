@@ -1,4 +1,4 @@
-"""Baked light of vertices: direct light with soft shadows from lamps and windows, and three diffuse bounces.
+"""Light baked into vertices: direct light with soft shadows from lamps and windows, and three diffuse bounces.
 
 Light is static and surfaces are Lambertian, as assumed by photometric tracking. All vertices gather light along the
 same directions to avoid noise between neighbors.
@@ -16,10 +16,10 @@ from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.shading_kernels import gather_light
 from framework.synthetic.surfaces import Surfaces
 
-GATHER_DIRECTIONS = 48  # rays per vertex for light from other surfaces
-BOUNCES = 3
+GATHER_DIRECTIONS = 48  # number of rays per vertex for light from other surfaces
+BOUNCES = 3  # number of diffuse bounces
 LIFT = 4e-3  # m, height of the ray origins above the surface
-CHUNK = 8192  # vertices per chunk, to limit memory
+CHUNK = 8192  # number of vertices per chunk, to limit memory
 WALL_BRIGHTNESS = 0.60  # mean irradiance of floor, walls and ceiling after exposure, with headroom for bright areas
 
 
@@ -28,12 +28,19 @@ class Lamp:
     """Sample points of one light source."""
 
     points: Float64  # (S, 3) m
-    normals: Float64  # (S, 3) unit vectors, 0 = emission in all directions
-    power: Color  # linear RGB, total of the lamp
+    normals: Float64  # (S, 3) unit vectors in the direction of emission; zero vector = emission in all directions
+    power: Color  # linear RGB, total power of the lamp
 
 
 def globe(center: Float64, radius: float, power: Color, samples: int = 16) -> Lamp:
-    """Return a spherical lamp with emission in all directions."""
+    """Return a spherical lamp that emits in all directions.
+
+    Args:
+        center: (3,) m.
+        radius: Radius of the sphere in m.
+        power: Total power, linear RGB.
+        samples: Number of sample points.
+    """
     k = np.arange(samples) + 0.5  # on a Fibonacci sphere
     z, angle = 1 - 2 * k / samples, np.pi * (1 + 5**0.5) * k
     r = np.sqrt(1 - z * z)
@@ -42,7 +49,16 @@ def globe(center: Float64, radius: float, power: Color, samples: int = 16) -> La
 
 
 def rectangle(corner: Float64, along: Float64, up: Float64, normal: Float64, power: Color, side: int = 5) -> Lamp:
-    """Return a rectangular lamp, such as a window, with the edges `along` and `up` (3,), m."""
+    """Return a rectangular lamp, such as a window.
+
+    Args:
+        corner: (3,) m, one corner of the rectangle.
+        along: (3,) m, first edge from the corner.
+        up: (3,) m, second edge from the corner.
+        normal: (3,) unit vector in the direction of emission.
+        power: Total power, linear RGB.
+        side: Number of sample points along each edge.
+    """
     f = (np.arange(side) + 0.5) / side
     s, t = np.meshgrid(f, f)
     points = corner + s.reshape(-1, 1) * along + t.reshape(-1, 1) * up
@@ -50,7 +66,11 @@ def rectangle(corner: Float64, along: Float64, up: Float64, normal: Float64, pow
 
 
 def bake(surfaces: Surfaces, caster: RayCaster, lamps: list[Lamp]) -> Float32:
-    """Return the irradiance (V, 3) of vertices, scaled to a mean of WALL_BRIGHTNESS on floor, walls and ceiling."""
+    """Return the irradiance (V, 3), linear RGB, of the vertices under all lamps.
+
+    It is scaled so that its mean on floor, walls and ceiling is WALL_BRIGHTNESS. `caster` contains the triangles of
+    `surfaces`.
+    """
     origins = surfaces.vertices + np.float32(LIFT) * surfaces.normals
     direct = np.zeros((len(origins), 3))
     for begin in range(0, len(origins), CHUNK):
@@ -82,7 +102,10 @@ def _direct(origins: Float32, normals: Float32, caster: RayCaster, lamp: Lamp) -
 
 
 def _gather(origins: Float32, normals: Float32, caster: RayCaster) -> tuple[Int32, Float32]:
-    """Return the triangles (V, D) visible from each vertex, -1 = none, and barycentric weights (V, D, 2)."""
+    """Return the triangle (V, D) visible from each vertex in D directions, and the barycentric weights (V, D, 2).
+
+    The triangle is -1 in directions without a surface. The weights belong to the second and third vertex.
+    """
     local = _cosine_directions(GATHER_DIRECTIONS)
     triangle = np.empty((len(origins), len(local)), np.int32)
     uv = np.empty((*triangle.shape, 2), np.float32)
@@ -102,7 +125,7 @@ def _gather(origins: Float32, normals: Float32, caster: RayCaster) -> tuple[Int3
 
 
 def _cosine_directions(count: int) -> Float64:
-    """Return cosine-distributed directions (D, 3) about +z (Malley's method)."""
+    """Return `count` cosine-distributed directions (D, 3), unit vectors about +z (Malley's method)."""
     k = np.arange(count) + 0.5
     r, angle = np.sqrt(k / count), np.pi * (1 + 5**0.5) * k
     return np.stack([r * np.cos(angle), r * np.sin(angle), np.sqrt(1 - r * r)], axis=1)

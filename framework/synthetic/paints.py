@@ -27,7 +27,7 @@ WALLS: tuple[Color, ...] = (
     (0.87, 0.84, 0.77), (0.78, 0.84, 0.85), (0.83, 0.86, 0.78), (0.90, 0.80, 0.72), (0.82, 0.80, 0.86),
 )  # fmt: skip
 
-DARKEST = 0.35  # mean sRGB value; darker surfaces absorb the infrared light of a projector
+DARKEST = 0.35  # mean sRGB value below which a surface absorbs the infrared light of a projector
 ABSORBED = 0.8  # fraction of the depth readings lost on a black surface
 MATTE_SCREEN = 0.75  # `dark` of a matte screen
 POLISHED, GLAZED = 0.7, 0.5  # `shiny` of metal and of ceramics
@@ -156,7 +156,10 @@ def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Materi
 
 
 def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
-    """Return a painting or screen of `width` x `height` m; half of the screens are glossy and give no readings."""
+    """Return the material of a picture of `width` x `height` m, such as a painting or a screen.
+
+    Half of the screens are glossy and give no depth readings. `emission` is the emitted light, as in Material.
+    """
     first, second, seed = vivid(rng), vivid(rng), new_seed(rng)
     dark = (1.0, MATTE_SCREEN)[seed % 2] if texture is Texture.SCREEN else 0.0
     return Material(texture, first, second, 0.1, (width, height), seed, emission, dark)

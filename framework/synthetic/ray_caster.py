@@ -32,7 +32,7 @@ class RayCaster:
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
         import open3d as o3d
 
-        # the tree is built in one thread, so that ties between triangles are deterministic
+        # Embree's tree is built in one thread, so that the choice between equally distant triangles is deterministic
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(
             _tensor(np.ascontiguousarray(vertices, np.float32)), _tensor(np.ascontiguousarray(triangles, np.uint32))
@@ -45,7 +45,10 @@ class RayCaster:
         return RayHits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
 
     def occluded(self, origins: Float32, ends: Float32) -> Bool:
-        """Return a mask (...) of the point pairs (..., 3), m, with a surface in between; end points are excluded."""
+        """Return the mask (...) of the pairs of points with a surface between them.
+
+        `origins` and `ends` are (..., 3), m. Surfaces at these points do not count.
+        """
         rays = np.concatenate([origins, ends - origins], axis=-1).astype(np.float32)
         return np.asarray(self._scene.test_occlusions(_tensor(rays), 1e-3, 0.999, get_num_threads()).numpy())
 

@@ -78,18 +78,18 @@ class Renderer:
         return Rendering(to_srgb(light), depth, _ids_of(self.surfaces, triangle), incidence, unread)
 
     def depth_and_ids(self, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Return only the exact depth (H, W) m and the instance ids (H, W)."""
+        """Return only the exact depth (H, W), m along z, and the instance ids (H, W); both are 0 without a surface."""
         buffer = self._rasterizer.draw(camera, T_world_camera)
         return buffer.depth, _ids_of(self.surfaces, buffer.triangle)
 
 
 def cast_ids(surfaces: Surfaces, caster: RayCaster, camera: Camera, T_world_camera: Float64) -> Int32:
-    """Return instance ids (H, W) from ray casting, which is faster than a Renderer for small images."""
+    """Return the instance ids (H, W), 0 = none, from ray casting, which is faster than a Renderer for small images."""
     return _ids_of(surfaces, caster.cast(image_rays(camera, T_world_camera)).triangle)
 
 
 def _ids_of(surfaces: Surfaces, triangle: Int32) -> Int32:
-    """Return the instance ids (H, W) of triangles (H, W), 0 for NO_TRIANGLE (-1)."""
+    """Return the instance ids (H, W) of the triangles with the indices `triangle` (H, W), 0 for NO_TRIANGLE (-1)."""
     return np.append(surfaces.instance_ids, np.int32(0))[triangle]
 
 

@@ -68,10 +68,14 @@ class DepthSensor:
         rng: np.random.Generator,
         unread: Float32 | None = None,
     ) -> Float32:
-        """Return simulated depth readings (H, W) m of the exact `depth` (H, W) m; 0 = no reading.
+        """Return the simulated depth readings (H, W), m along z; 0 = no reading.
 
-        `incidence`: (H, W), cosines of the angles of incidence. `unread`: (H, W), fraction of readings lost in patches
-        on dark and shiny materials; None = no loss.
+        Args:
+            depth: (H, W) m along z, exact depth, 0 = no surface.
+            incidence: (H, W) cosine of the angle of incidence.
+            camera: Camera of the depth image.
+            rng: Random generator of the noise.
+            unread: (H, W) fraction of the readings lost in patches on dark and shiny materials; None = no loss.
         """
         if self.noise == 0 or self.kind is SensorKind.EXACT:
             return np.where(depth <= self.max_range, depth, np.float32(0))
@@ -94,7 +98,7 @@ class DepthSensor:
 
 
 def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
-    """Return `color` (H, W, 3) with the image noise of a camera in indoor light, scaled by `noise`."""
+    """Return `color` (H, W, 3), RGB, with the image noise of a camera in indoor light; `noise` scales it, 0 = none."""
     if noise == 0:
         return color
     noisy = np.empty_like(color)

@@ -1,4 +1,4 @@
-"""Kernels of rgbd_camera.py, in single precision."""
+"""Numba kernels of rgbd_camera.py, in single precision."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from framework.data import Bool, Float32, UInt8, UInt16
 from framework.sensors.noise_models import FLOOR, DepthNoise
 from framework.sensors.noise_models_kernels import axial_sigma_at_angle
 
-MIN_RANGE = 0.4  # m
+MIN_RANGE = 0.4  # m, minimum depth of a reading
 EDGE_JUMP = 0.05  # minimum relative step of depth at an edge, where the sensor's correlation window fails
 EDGE_DROP = 0.5  # probability of no reading next to such a step
-GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # rad, incidence at the start and end of the loss
-QUANTILE_BITS = 12  # bits of a normal error: 2^QUANTILE_BITS equally likely values, up to 3.7 standard deviations
-SPARE_BITS = 16 - QUANTILE_BITS
-MAX_SAMPLES = 9  # blur samples along the path of a pixel; more samples make no visible difference
+# rad, angles of incidence at which the first readings and all readings are lost
+GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)
+QUANTILE_BITS = 12  # random bits per normal error: 2^QUANTILE_BITS equally likely values, up to 3.7 standard deviations
+SPARE_BITS = 16 - QUANTILE_BITS  # unused bits of a 16-bit random number
+MAX_SAMPLES = 9  # maximum number of samples along the path of a pixel; more samples make no visible difference
 SHARP = np.float32(0.5)  # px, minimum path length for blur
 
 
 @njit(cache=True, nogil=True)
 def depth_step(z: np.float32, steps_depth: np.float32) -> np.float32:
-    """Return the quantization step (m) of depth at depth z (m).
+    """Return the quantization step of depth, m, at depth z (m).
 
     `steps_depth`: m, product of depth and disparity in quantization steps; 0 = constant steps of depth.
     """
@@ -51,12 +52,20 @@ def read_depth(
     max_range: np.float32,
     reading: Float32,
 ) -> None:
-    """Write the depth readings (H, W) m to `reading`; pixels without a reading remain unchanged.
+    """Write the depth readings, m along z, to `reading`; pixels without a reading remain unchanged.
 
-    `depth`: (H, W) m. `theta`: (H, W) rad, angle of incidence. `random`: (H, W, 4) random bits for the loss of a
-    reading, the lateral error along y and x, and the axial error. `normal`: (N,) normal_quantiles. `lateral_sigma`: px.
-    `disparity_scale`: px m, product of disparity and depth. `steps_depth`: see `depth_step`. `model`: noise model,
-    scaled by `noise`.
+    Args:
+        depth: (H, W) m along z, exact depth, 0 = no surface.
+        theta: (H, W) rad, angle of incidence.
+        random: (H, W, 4) random bits for the loss of a reading, the lateral error along y and x, and the axial error.
+        normal: (N,) quantiles from `normal_quantiles`.
+        noise: Scale of the noise model, 1 = as measured.
+        lateral_sigma: Standard deviation of the lateral error, px.
+        disparity_scale: Product of disparity and depth, px m.
+        steps_depth: Product of depth and disparity in quantization steps, m; see `depth_step`.
+        model: Model of the axial noise.
+        max_range: Maximum depth of a reading, m.
+        reading: (H, W) output.
     """
     height, width = depth.shape
     near_edge = _near_edge(depth)
@@ -95,11 +104,12 @@ def read_depth(
 def drop_patches(
     unread: Float32, field: Float32, cell: np.float32, normal: Float32, largest_loss: np.float32, reading: Float32
 ) -> None:
-    """Remove a fraction `largest_loss` * `unread` (H, W) of the readings (H, W), in patches.
+    """Remove a fraction `largest_loss` * `unread` (H, W) of the readings `reading` (H, W), in patches.
 
     A reading is lost if a smooth random field is below the quantile of the fraction. The field interpolates the
     normally distributed numbers `field` (R, C), which are `cell` px apart. The interpolated value is divided by the
-    norm of the weights and is therefore normally distributed in each pixel, too.
+    norm of the weights, so it is also normally distributed in each pixel. `normal` (N,) contains the quantiles from
+    `normal_quantiles`.
     """
     one, count = np.float32(1), np.float32(len(normal))
     for v in range(reading.shape[0]):
@@ -122,7 +132,7 @@ def drop_patches(
 
 @njit(cache=True, nogil=True)
 def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> np.float32:
-    """Return the depth (m) of a pixel, or of the pixel at the offset (dv, du) px if it is across a depth edge.
+    """Return the depth, m, at the offset (dv, du) px if a depth edge lies in between, otherwise the pixel's own depth.
 
     The offset is rounded. Smooth surfaces have no lateral error, because the axial noise includes the entire measured
     deviation.
@@ -154,7 +164,12 @@ def _near_edge(depth: Float32) -> Bool:
 def add_noise(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, noisy: UInt8) -> None:
     """Write `color` (N,) with normally distributed noise to `noisy` (N,), rounded.
 
-    `random`: (N,) random bits. `normal`: normal_quantiles. `sigma`: standard deviation, gray levels.
+    Args:
+        color: (N,) values of all channels.
+        random: (N,) random bits.
+        normal: Quantiles from `normal_quantiles`.
+        sigma: Standard deviation, gray levels from 0 to 255.
+        noisy: (N,) output.
     """
     for n in range(len(color)):
         value = np.rint(np.float32(color[n]) + sigma * normal[random[n] >> SPARE_BITS])
@@ -165,9 +180,17 @@ def add_noise(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, 
 def blur(
     color: UInt8, depth: Float32, K: Float32, T_open_camera: Float32, T_close_camera: Float32, picture: UInt8
 ) -> None:
-    """Write `color` (H, W, 3) with motion blur to `picture`: the mean of up to MAX_SAMPLES samples for each pixel.
+    """Write `color` with motion blur to `picture`: the mean of up to MAX_SAMPLES samples for each pixel.
 
-    The samples are evenly spaced along the path of the pixel during the exposure. `K`: (fx, fy, cx, cy) px.
+    The samples are evenly spaced along the path of the pixel during the exposure.
+
+    Args:
+        color: (H, W, 3) RGB.
+        depth: (H, W) m along z, 0 = no blur.
+        K: (4,) fx, fy, cx, cy, px.
+        T_open_camera: (4, 4) transform from the color camera to the camera at the start of the exposure.
+        T_close_camera: (4, 4) transform from the color camera to the camera at the end of the exposure.
+        picture: (H, W, 3) output, RGB.
     """
     height, width = depth.shape
     for v in range(height):
@@ -203,9 +226,10 @@ def blur(
 
 @njit(cache=True, nogil=True, inline="always")
 def _reprojected(T, K, u, v, z):
-    """Return the coordinates (px) of pixel u, v at depth z (m) after the transform T (4, 4) to another camera.
+    """Return the image coordinates u, v, px, in another camera of the point at pixel u, v with depth z (m).
 
-    Returns u, v if z is 0 or the point is behind the other camera.
+    T (4, 4) transforms points to the frame of the other camera. If z is 0 or the point is behind the other camera,
+    return u, v unchanged.
     """
     px, py = (np.float32(u) - K[2]) / K[0] * z, (np.float32(v) - K[3]) / K[1] * z
     z_other = T[2, 0] * px + T[2, 1] * py + T[2, 2] * z + T[2, 3]

@@ -22,7 +22,7 @@ from framework.synthetic.lights import Lamp, globe, rectangle
 from framework.synthetic.paints import Material, Texture
 from framework.synthetic.surfaces import Surfaces, assemble
 
-HEIGHT = 2.55  # m, of the ceiling
+HEIGHT = 2.55  # m, height of the ceiling
 WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear RGB of lamps and daylight
 
 
@@ -154,7 +154,10 @@ def _lamps(pieces: list[Furniture]) -> list[Lamp]:
 
 
 def _daylight(low: Float64, high: Float64) -> Lamp:
-    """Return the daylight of a window with the bounds `low` and `high` (3,), m, emitted between its curtains."""
+    """Return the daylight that enters between the curtains of a window.
+
+    `low` and `high` (3,), m, are the corners of the window's bounding box.
+    """
     thin = int(np.argmin((high - low)[:2]))
     wide = 1 - thin
     normal = np.zeros(3)

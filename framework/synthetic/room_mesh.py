@@ -11,7 +11,7 @@ from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.surfaces import Surfaces
 
-ON_SURFACE = 1.001  # maximum distance of a ray hit in vertex distances; above 1 to include the vertex's own surface
+ON_SURFACE = 1.001  # maximum distance of a hit, relative to the vertex; above 1 to include the vertex's own surface
 LONGEST_EDGE = 0.02  # m, maximum edge length of the mesh
 
 
@@ -24,7 +24,7 @@ class RoomMesh:
     instance_ids: Int32  # (V,), 0 = floor, wall or ceiling
 
     def only(self, kept: Bool) -> RoomMesh:
-        """Return the mesh of the vertices in the mask `kept` (V,), in order, and the triangles between them."""
+        """Return the mesh of the vertices in the mask `kept` (V,), in order, with the triangles between them."""
         number = np.cumsum(kept, dtype=np.int32) - 1
         triangles = self.triangles[kept[self.triangles].all(axis=1)]
         return RoomMesh(self.vertices[kept], number[triangles], self.instance_ids[kept])
@@ -76,7 +76,7 @@ def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
 def _welded(mesh: RoomMesh) -> RoomMesh:
     """Return the mesh with coincident vertices of each instance merged, and without degenerate triangles."""
     rows = np.empty((len(mesh.vertices), 4), np.int32)
-    rows[:, :3] = (mesh.vertices + np.float32(0)).view(np.int32)  # turns -0 into 0
+    rows[:, :3] = (mesh.vertices + np.float32(0)).view(np.int32)  # converts -0 to 0
     rows[:, 3] = mesh.instance_ids
     order = np.lexsort(rows.T)
     new = np.ones(len(rows), np.bool_)
@@ -99,10 +99,16 @@ def seen_from(
     reach: tuple[float, float],
     unreadable: Bool,
 ) -> Bool:
-    """Return a mask (V,) of the visible vertices: in view from a pose, not occluded, at a depth within `reach`, m.
+    """Return the mask (V,) of the visible vertices: in view from a pose, not occluded, at a depth within `reach`.
 
-    `unreadable` is a mask (F,) of the caster's triangles without depth readings. Vertices on or closely behind these
-    triangles count as occluded.
+    Args:
+        vertices: (V, 3) m, world frame.
+        caster: Ray caster of the surfaces.
+        camera: Camera of all poses.
+        poses: (4, 4) T_world_camera of each view.
+        reach: Minimum and maximum depth in m.
+        unreadable: (F,) mask of the caster's triangles without depth readings. Vertices on or closely behind these
+            triangles count as occluded.
     """
     seen = np.zeros(len(vertices), np.bool_)
     for T_world_camera in poses:
@@ -119,7 +125,10 @@ def seen_from(
 def _in_view(
     vertices: Float32, skip: Bool, camera: Camera, T_world_camera: Float64, reach: tuple[float, float]
 ) -> Int64:
-    """Return the indices (N,) of the vertices in view, occluded or not, except the vertices in the mask `skip` (V,)."""
+    """Return the indices (N,) of the vertices in view, occluded or not, except the vertices in the mask `skip` (V,).
+
+    `reach` contains the minimum and maximum depth, m.
+    """
     index = np.flatnonzero(~skip)
     dx, dy, dz = vertices[index].T - T_world_camera[:3, 3:]
     x, y, z = (R[0] * dx + R[1] * dy + R[2] * dz for R in T_world_camera[:3, :3].T)

@@ -73,7 +73,10 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Benchmar
 
 
 def _begin(root: Path, recording: BenchmarkSettings) -> None:
-    """Write the files common to all scenes. Raises ConfigError for a folder with other content."""
+    """Write the files common to all scenes.
+
+    Raises ConfigError for a folder with other content, and DataError for a damaged file.
+    """
     made_by = root / MADE_BY
     wanted = {"generation": GENERATION, **asdict(recording)}
     if made_by.exists():
@@ -86,7 +89,7 @@ def _begin(root: Path, recording: BenchmarkSettings) -> None:
         if isinstance(found, dict) and "haste" in found:  # earlier name of camera_speed
             found["camera_speed"] = found.pop("haste")
         if found != wanted:
-            raise ConfigError(f"{root}: expected rooms with the parameters {wanted}, got {found}; set another folder")
+            raise ConfigError(f"{root}: expected scenes with the parameters {wanted}, got {found}; set another folder")
     elif root.exists() and (not root.is_dir() or any(root.iterdir())):
         found = f"a folder with {next(iter(root.iterdir())).name}" if root.is_dir() else "a file"
         raise ConfigError(
@@ -101,7 +104,7 @@ def _begin(root: Path, recording: BenchmarkSettings) -> None:
 
 
 class _Scene:
-    """Missing files of one scene. The trajectory is written last: a scene with a trajectory is complete."""
+    """The missing files of one scene. The trajectory is written last: a scene with a trajectory is complete."""
 
     def __init__(self, folder: Path, spec: SceneSpec, recording: BenchmarkSettings) -> None:
         self.folder, self.spec = folder, spec
@@ -134,7 +137,10 @@ class _Scene:
 
 
 def _choose(scenes: list[_Scene], last: _Scene | None) -> _Scene | None:
-    """Return the next scene of a process: its `last` scene, an unstarted scene, or the scene with the most tasks."""
+    """Return the next scene for a process, or None if no task can start.
+
+    In order of preference, this is its `last` scene, an unstarted scene, or the scene with the most remaining tasks.
+    """
     if last is not None and last.ready:
         return last
     ready = [scene for scene in scenes if scene.ready]

@@ -1,6 +1,6 @@
 """Scene of the synthetic benchmark as a recording in SceneNN's format.
 
-The world frame of SceneNN is y-up and the room is z-up, so all output is rotated by a quarter turn about x.
+The world frame of SceneNN has y up and the room has z up, so all output is rotated by a quarter turn about x.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from framework.synthetic.room_mesh import visible_mesh
 from framework.synthetic.walk import FRAME_RATE
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
-GENERATION = 3  # version of the generated rooms; increment it after a change to prevent a mix of versions
+GENERATION = 3  # version of the generated rooms; increment it after a change, so that no folder mixes versions
 ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrinsic/asus.ini
-NOISE, MAX_RANGE = 1.0, 6.0  # noise of the sensor, 1 = Kinect v1; range of the sensor, m
+NOISE, MAX_RANGE = 1.0, 6.0  # scale of the sensor noise, 1 = Kinect v1; maximum depth of the sensor, m
 EXPOSURE = 1 / 60  # s, exposure of color images, centered at the pose; typical for indoor light
-TRUTH_VIEWS = 60  # maximum number of frames for the labeled mesh; neighboring frames have nearly the same view
+TRUTH_VIEWS = 60  # maximum number of frames for the labeled mesh; views of neighboring frames are nearly equal
 MAX_CAMERA_SPEED = 5.0  # maximum camera speed relative to the recommended speed; about 2.2 m/s
 LARGEST_ID = 934338  # largest label in SceneNN; labels are unordered
 PNG = (
@@ -64,7 +64,7 @@ _NYU_CLASSES = {
     "table lamp": "lamp",
     "window": "window",
 }
-"""NYU classes of clutter. Other objects have a text, but no nyu_class, as in SceneNN."""
+"""NYU class by kind of clutter. Other clutter has a text, but no nyu_class, as in SceneNN."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class BenchmarkSettings:
     frames: int = 120  # number of frames of each scene
     rate: float = 10.0  # Hz, frame rate; a low rate limits redundant frames
     width: int = 640  # px; the height is 3/4 of the width
-    camera_speed: float = 2.0  # relative to the recommended speed; higher values give fewer views and more blur
+    camera_speed: float = 2.0  # relative to the recommended speed; higher speeds result in fewer views and more blur
 
     def __post_init__(self) -> None:
         for name, lowest in (("seed", 0), ("frames", 1), ("width", 16)):
@@ -94,7 +94,7 @@ class BenchmarkSettings:
 
     @property
     def stride(self) -> float:
-        """Camera motion per frame, in frames of a path at the recommended speed and FRAME_RATE."""
+        """Camera motion per frame, relative to the motion per frame at the recommended speed and FRAME_RATE."""
         return self.camera_speed * FRAME_RATE / self.rate
 
     @property
@@ -141,7 +141,7 @@ class SceneNNScene:
         _write_png(color_file, cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
 
     def write_truth(self) -> int:
-        """Write the labeled mesh and its labels; return 0, the number of written frames."""
+        """Write the labeled mesh and its annotation; return 0, the number of written frames."""
         frames, name = self.recording.frames, self.folder.name
         every = -(-frames // TRUTH_VIEWS)
         views = (self.path.pose(index) for index in range(0, frames, every))
@@ -153,7 +153,12 @@ class SceneNNScene:
         return 0
 
     def _annotated(self, vertices: Float32, instance_ids: Int32) -> list[Annotated]:
-        """Return the annotated objects in the mesh, sorted by label; `vertices` (V, 3) m are y-up."""
+        """Return the annotated objects in the mesh, sorted by label.
+
+        Args:
+            vertices: (V, 3) m, world frame of SceneNN.
+            instance_ids: (V,) 0 = none.
+        """
         annotated = []
         for instance, piece in self.room.objects[1:]:
             points = vertices[instance_ids == instance].astype(np.float64)
@@ -191,7 +196,7 @@ def frame_files(folder: Path, index: int) -> tuple[Path, Path]:
 
 
 def trajectory_file(folder: Path) -> Path:
-    """Return the path of the trajectory."""
+    """Return the trajectory file of a scene."""
     return folder / "trajectory.log"
 
 

@@ -1,4 +1,4 @@
-"""Synthetic sequence: a seeded, furnished room, rendered frame by frame in memory, with complete ground truth."""
+"""Synthetic sequence: a random furnished room, rendered frame by frame in memory, with complete ground truth."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from framework.synthetic.walk import FRAME_RATE, plan_path
 MAX_FRAMES = 10**6  # nine hours at 30 Hz
 MAX_SIDE = 5792  # px, maximum width and height; its square is MAX_PIXELS
 FOCAL_LENGTH = 525.0 / 640  # fraction of the image width, as in the color camera of a Kinect
-TRUTH_VIEWS = 60  # maximum number of frames for the ground-truth surface; neighboring frames have nearly the same view
+TRUTH_VIEWS = 60  # maximum number of frames for the ground-truth surface; views of neighboring frames are nearly equal
 
 
 @dataclass
 class Synthetic(RGBDSequence):
-    """A hand-held camera path through a furnished room; `room.surfaces` is its exact geometry.
+    """RGB-D sequence of a hand-held camera in a furnished room; `room.surfaces` is the exact geometry of the room.
 
     Frames are bit-identical for equal parameters, in any order and from any thread.
     """
@@ -116,11 +116,17 @@ class Synthetic(RGBDSequence):
         )
 
     def exact_view(self, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Return the exact depth (H, W) m and the instance ids (H, W) at the pose T_world_camera (4, 4)."""
+        """Return the exact depth (H, W), m along z, and the instance ids (H, W) at T_world_camera (4, 4).
+
+        Both are 0 for pixels without a surface.
+        """
         return self._renderer.depth_and_ids(self.camera, T_world_camera)
 
     def scene_truth(self) -> SceneTruth:
-        """Return the labeled surface within the range of the sensor, from the exact depth of the selected frames."""
+        """Return the labeled surface points within the range of the sensor.
+
+        They are fused from the exact depth of at most about TRUTH_VIEWS of the selected frames.
+        """
         every = max(1, -(-len(self._chosen) // TRUTH_VIEWS))
         chosen = sorted({*self._chosen[::every], self._chosen[-1]})
         return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.ground_truth_spacing)

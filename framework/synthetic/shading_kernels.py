@@ -1,4 +1,4 @@
-"""Kernels of lights.py and renderer.py."""
+"""Numba kernels of lights.py and renderer.py."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from framework.synthetic.texture_kernels import surface_color
 
 EDGE_STEP = 0.04  # minimum relative depth step at an edge
 WHITE = 2.2  # linear light of full white; lamps and windows may saturate
-GLANCED_OFF = np.float32(np.deg2rad(60.0))  # rad, incidence at which a mirror loses all readings
-GRAZING = np.float32(0.05)  # lower limit of the cosine of incidence for the footprint of a pixel
+GLANCED_OFF = np.float32(np.deg2rad(60.0))  # rad, angle of incidence from which a mirror loses all readings
+GRAZING = np.float32(0.05)  # lower limit of the cosine of the angle of incidence for the footprint of a pixel
 
 
 class LitSurfaces(NamedTuple):
@@ -26,7 +26,7 @@ class LitSurfaces(NamedTuple):
     triangles: Int32  # (F, 3) vertex indices
     normals: Float32  # (F, 3) unit vectors, toward either side
     materials: Int32  # (F,) rows of the table
-    parts: Int32  # (F,) part of each triangle
+    parts: Int32  # (F,) index of each triangle's part
     table: Float32  # (M, 14), see paints.material_table
 
 
@@ -44,9 +44,17 @@ class Viewpoint(NamedTuple):
 def gather_light(
     triangle: Int32, uv: Float32, triangles: Int32, materials: Int32, reflectance: Float32, irradiance: Float32
 ) -> Float32:
-    """Return the mean reflected light (V, 3) of the points visible from each vertex.
+    """Return the mean reflected light (V, 3), linear RGB, of the points visible from each vertex.
 
     For cosine-distributed rays, this is the irradiance of the vertex.
+
+    Args:
+        triangle: (V, D) triangle visible from each vertex in D directions, -1 = none.
+        uv: (V, D, 2) barycentric weights of the second and third vertex.
+        triangles: (F, 3) vertex indices.
+        materials: (F,) rows of `reflectance`.
+        reflectance: (M, 3) linear RGB.
+        irradiance: (V, 3) linear RGB.
     """
     out = np.zeros((len(triangle), 3), np.float32)
     for v in range(len(triangle)):
@@ -70,7 +78,17 @@ def gather_light(
 def shade(
     s: LitSurfaces, view: Viewpoint, triangle: Int32, depth: Float32, uv: Float32, light: Float32, incidence: Float32
 ) -> None:
-    """Write the linear light (H, W, 3) and the cosine of incidence (H, W) of each pixel; 0 without a surface."""
+    """Write the light and the cosine of the angle of incidence of each pixel; both are 0 without a surface.
+
+    Args:
+        s: Surfaces in view.
+        view: Camera.
+        triangle: (H, W) visible triangle, NO_TRIANGLE = none.
+        depth: (H, W) m along z.
+        uv: (H, W, 2) barycentric weights of the second and third vertex.
+        light: (H, W, 3) output, linear RGB.
+        incidence: (H, W) output, cosine of the angle of incidence.
+    """
     texture, irradiance, triangles, normals, materials, _, table = s
     fx = np.float32(view.fx)
     for v in range(triangle.shape[0]):
@@ -88,7 +106,17 @@ def shade(
 
 @njit(cache=True, nogil=True)
 def lose_readings(materials: Int32, table: Float32, triangle: Int32, incidence: Float32, lost: Float32) -> None:
-    """Write the fraction (H, W) of lost readings: dark + (1 - dark) * shiny * slant of the surface."""
+    """Write the fraction of lost depth readings to `lost`: dark + (1 - dark) * shiny * slant.
+
+    The slant of a surface is 0 at perpendicular incidence and 1 from an angle of incidence of GLANCED_OFF on.
+
+    Args:
+        materials: (F,) rows of `table`.
+        table: (M, 14) see paints.material_table.
+        triangle: (H, W) visible triangle, NO_TRIANGLE = none.
+        incidence: (H, W) cosine of the angle of incidence.
+        lost: (H, W) output in [0, 1].
+    """
     one = np.float32(1)
     mirrored_away = one - np.cos(GLANCED_OFF)
     for v in range(triangle.shape[0]):
@@ -114,9 +142,10 @@ def _cosine(view, normals, f, u, v):
 
 @njit(cache=True, nogil=True, inline="always")
 def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, cosine):
-    """Return the emitted and reflected linear RGB light at a point of triangle f with the barycentric weights b, c.
+    """Return the emitted and reflected light, linear RGB, at a point of triangle f.
 
-    `pixel`: m, width of a pixel at the point.
+    b and c are the barycentric weights of the second and third vertex. `pixel` is the width of a pixel at the point, m.
+    `cosine` is the cosine of the angle of incidence.
     """
     i, j, k = triangles[f, 0], triangles[f, 1], triangles[f, 2]
     a = np.float32(1) - b - c
@@ -140,7 +169,13 @@ def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, 
 
 @njit(cache=True, nogil=True)
 def find_edges(triangle: Int32, parts: Int32, depth: Float32) -> Bool:
-    """Return a mask (H, W) of the pixels on both sides of a border between two parts or of a depth step."""
+    """Return the mask (H, W) of the pixels on both sides of a border between two parts or of a depth step.
+
+    Args:
+        triangle: (H, W) visible triangle, NO_TRIANGLE = none.
+        parts: (F,) index of each triangle's part.
+        depth: (H, W) m along z.
+    """
     height, width = depth.shape
     edge = np.zeros((height, width), np.bool_)
     for v in range(height):
@@ -170,11 +205,22 @@ def smooth_edges(
     depth: Float32,
     light: Float32,
 ) -> None:
-    """Write the mean of the samples of the pixels u, v (N,) to `light` (H, W, 3); each sample is clipped to WHITE.
+    """Write the mean light of several samples to the N pixels u, v of `light`; each sample is clipped to WHITE.
 
-    `triangle`, `distance` (N, S) and `uv` (N, S, 2): intersections of the samples at `offsets` (S, 2) px from the pixel
-    center. `own`: (H, W), triangle of each pixel. A sample has the light of the center if its triangle is on the
-    same part and its depth is close to `depth` (H, W).
+    A sample gets the light of the pixel center if it is on the same part and at a similar depth.
+
+    Args:
+        s: Surfaces in view.
+        view: Camera.
+        u: (N,) columns of the pixels.
+        v: (N,) rows of the pixels.
+        offsets: (S, 2) px, offsets u, v of the samples from the pixel center.
+        triangle: (N, S) visible triangle of each sample, NO_TRIANGLE = none.
+        distance: (N, S) m along z, depth of each sample.
+        uv: (N, S, 2) barycentric weights of the second and third vertex.
+        own: (H, W) visible triangle at the pixel center, NO_TRIANGLE = none.
+        depth: (H, W) m along z, depth at the pixel center.
+        light: (H, W, 3) linear RGB, input and output.
     """
     texture, irradiance, triangles, normals, materials, parts, table = s
     white, fx = np.float32(WHITE), np.float32(view.fx)
@@ -199,7 +245,13 @@ def smooth_edges(
 
 @njit(cache=True, nogil=True)
 def apply_tone_curve(light: Float32, curve: UInt8, color: UInt8) -> None:
-    """Write the nearest entry of the tone curve for each value of `light` (N,), clipped to [0, WHITE]."""
+    """Write the nearest entry of the tone curve `curve` for each value of `light` to `color`.
+
+    Args:
+        light: (N,) linear light; values are clipped to [0, WHITE].
+        curve: (K,) sRGB values at K evenly spaced values of light from 0 to WHITE.
+        color: (N,) output, sRGB from 0 to 255.
+    """
     white, entries = np.float32(WHITE), np.float32((len(curve) - 1) / WHITE)
     for n in range(len(light)):
         index = min(max(light[n], np.float32(0)), white) * entries

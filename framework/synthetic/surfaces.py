@@ -1,4 +1,4 @@
-"""Arrays of a furnished room's triangles for ray casting and shading."""
+"""The triangles of a furnished room as arrays for ray casting and shading."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Surfaces:
     triangles: Int32  # (F, 3) vertex indices
     instance_ids: Int32  # (F,), 0 = floor, wall or ceiling
     materials: Int32  # (F,) rows of material_table
-    parts: Int32  # (F,) part of each triangle; images have edges between parts
+    parts: Int32  # (F,) index of each triangle's part; edges between parts are antialiased
     material_table: Float32  # (M, 14), see paints.material_table
     class_names: Mapping[int, str | None]  # instance id -> COCO class; None = clutter
 

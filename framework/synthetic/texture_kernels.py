@@ -4,7 +4,8 @@ They need no image files, have no seams, and have sufficient gradients for photo
 fabric, paint, metal) use all three texture coordinates. Planar textures (planks, tiles, rug, painting) use the first
 two. Detail below the size of a pixel is faded out to prevent flicker between frames.
 
-Lengths are in m unless stated otherwise. `footprint` is the size of a pixel on the surface.
+Lengths are in m unless stated otherwise. `footprint` is the size of a pixel on the surface. A *color mix* of 0 is the
+first color of the material, and a color mix of 1 is the second color. A *brightness factor* scales the mixed color.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from numba import njit
 from framework.data import Float32
 from framework.synthetic.paints import Texture
 
-# Integers, because numba compares plain integers.
+# The textures as plain integers, which kernels can compare.
 PAINT, WOOD, FABRIC, STRIPES, PLANKS, TILES, RUG, PAINTING = (int(texture) for texture in list(Texture)[:8])
 SCREEN, METAL, BOOK, SKY, WALLPAPER, LEAF, CHECKS, PAGES = (int(texture) for texture in list(Texture)[8:])
 
-# Odd 64-bit constants to distribute lattice coordinates and seeds over all bits.
+# Odd 64-bit constants that distribute lattice coordinates and seeds over all bits of a hash.
 STEP_X, STEP_Y = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
 STEP_Z, STEP_SEED = np.uint64(0x165667B19E3779F9), np.uint64(0x27D4EB2F165667C5)
 
@@ -35,7 +36,7 @@ def _mixed(h: np.uint64) -> float:
 
 @njit(cache=True, nogil=True)
 def _lattice(i: int, j: int, k: int, seed: int) -> float:
-    """Return a pseudorandom number in [0, 1) for a lattice point."""
+    """Return a pseudorandom number in [0, 1) for the lattice point (i, j, k)."""
     h = np.uint64(i) * STEP_X ^ np.uint64(j) * STEP_Y ^ np.uint64(k) * STEP_Z ^ np.uint64(seed) * STEP_SEED
     return float(_mixed(h))
 
@@ -64,7 +65,11 @@ def _visible(wavelength: float, footprint: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, footprint: float, seed: int) -> float:
-    """Return a sum of noise octaves, in [-1, 1]. The wavelength halves per octave; invisible octaves are omitted."""
+    """Return a sum of noise octaves, in [-1, 1], at the point (x, y, z).
+
+    `wavelength` is the wavelength of the first octave. It is halved for each further octave. Octaves that are too fine
+    for a pixel are omitted.
+    """
     value, amplitude, total = 0.0, 1.0, 0.0
     x, y, z = x / wavelength, y / wavelength, z / wavelength
     for octave in range(octaves):
@@ -80,7 +85,7 @@ def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, foot
 
 @njit(cache=True, nogil=True)
 def _step(low: float, high: float, x: float) -> float:
-    """Return a smooth step from 0 at `low` to 1 at `high`."""
+    """Return the value at x of a smooth step from 0 at `low` to 1 at `high`."""
     t = min(1.0, max(0.0, (x - low) / (high - low)))
     return t * t * (3 - 2 * t)
 
@@ -106,7 +111,10 @@ def _within(x: float, low: float, high: float, soft: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: int) -> float:
-    """Return the color mix of wood grain along x: growth rings distorted by noise, and fibers."""
+    """Return the color mix of wood with its grain along x: growth rings distorted by noise, and fibers.
+
+    `scale` is the spacing of the rings.
+    """
     bend = 2.2 * _noise(0.9 * x, 5 * y, 5 * z, seed)
     rings = 0.5 + 0.5 * float(np.sin(2 * np.pi * (0.7 * (y + 0.6 * z) / scale + bend)))
     mix = 0.3 + 0.45 * rings * _visible(scale, footprint)
@@ -120,7 +128,10 @@ def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: in
 
 @njit(cache=True, nogil=True)
 def _landscape(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """Return the color of a painting: a sunset over three ranges of hills in the two colors of the material."""
+    """Return the linear RGB color of a painting: a sunset over three ranges of hills in the material's two colors.
+
+    The painting covers u and v in [0, 1]. `row` is the row of the material table.
+    """
     sun_u, sun_v = 0.25 + 0.5 * _lattice(1, 2, 3, seed), 0.6 + 0.15 * _lattice(3, 2, 1, seed)
     glow = np.exp(-8 * ((u - sun_u) ** 2 + (v - sun_v) ** 2))
     disc = 1 - _step(0.055, 0.07, np.sqrt((u - sun_u) ** 2 + 0.6 * (v - sun_v) ** 2))
@@ -181,7 +192,10 @@ def _rug(x: float, y: float, scale: float, width: float, height: float, footprin
 
 @njit(cache=True, nogil=True)
 def _book(u: float, v: float, soft: float) -> float:
-    """Return the color mix of a book cover over [0, 1]^2: a frame, a title in several lines and an emblem."""
+    """Return the color mix of a book cover: a frame, a title in several lines and an emblem.
+
+    The cover has u and v in [0, 1]. `soft` is the width of the transitions, relative to the cover.
+    """
     frame = _within(u, 0.07, 0.93, soft) * _within(v, 0.05, 0.95, soft)
     inner = _within(u, 0.10, 0.90, soft) * _within(v, 0.07, 0.93, soft)
     lines = _within(u, 0.18, 0.82, soft) * _within(v, 0.62, 0.86, soft) * _line(v * 12.5, 0.5, 12.5 * soft)
@@ -205,7 +219,7 @@ def _wallpaper(x: float, y: float, scale: float, footprint: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _sky(u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """Return the color of the view through a window: clouds, with trees below."""
+    """Return the linear RGB color of the view through a window, with u and v in [0, 1]: clouds, with trees below."""
     line = 0.30 + 0.22 * _noise(5 * u, 0.5, 0.5, seed) + 0.08 * _noise(23 * u, 0.5, 0.5, seed)
     tree = 1 - _step(line - 0.02, line + 0.02, v)
     leaf = 0.45 + 0.4 * _noise(40 * u, 40 * v, 0.0, seed)
@@ -219,7 +233,7 @@ def _sky(u: float, v: float, seed: int) -> tuple[float, float, float]:
 
 @njit(cache=True, nogil=True)
 def _screen(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """Return the color of a television screen: a landscape with a caption."""
+    """Return the linear RGB color of a television screen, with u and v in [0, 1]: a landscape with a caption."""
     r, g, b = _landscape(row, u, v, seed)
     caption = 1.0 if (0.07 < v < 0.16 and 0.06 < u < 0.55) else 0.0
     return r * (1 - caption) + 0.02 * caption, g * (1 - caption) + 0.05 * caption, b * (1 - caption) + 0.35 * caption
@@ -227,7 +241,10 @@ def _screen(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, 
 
 @njit(cache=True, nogil=True)
 def surface_color(row, x, y, z, footprint):
-    """Return the linear color of material `row` (14,), see paints.material_table, at texture coordinates x, y, z."""
+    """Return the linear RGB color of a material at the texture coordinates x, y, z (m).
+
+    `row` (14,) is the row of the material in paints.material_table.
+    """
     kind, scale, width, height, seed = int(row[0]), float(row[7]), float(row[8]), float(row[9]), int(row[10])
     if kind == PAINTING:
         return _landscape(row, x / width, y / height, seed)

@@ -25,8 +25,8 @@ PHASES = 48  # number of positions on the ellipse for the visibility score
 class CameraPath:
     """A smooth closed path, traversed at constant phase speed."""
 
-    center: Float64  # (2,) m
-    radii: Float64  # (2,) m
+    center: Float64  # (2,) m, x y in the world frame
+    radii: Float64  # (2,) m, along x and y
     height: float  # m, mean height
     start: float  # rad, phase of the first frame
     turn: int  # 1 = counter-clockwise as seen from above, -1 = clockwise
@@ -42,7 +42,10 @@ class CameraPath:
         return look(position[0], float(yaw[0]), float(pitch[0]), float(roll[0]))
 
     def _state(self, phase: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-        """Return position (N, 3) m and yaw, pitch, roll (N,) rad; integer harmonics close the path."""
+        """Return the positions (N, 3), m, and the yaw, pitch and roll angles (N,), rad, at the phases (N,), rad.
+
+        The hand motion consists of integer harmonics, so that the path is closed.
+        """
         a, b, c, d = self.sway
         position = np.empty((len(phase), 3))
         position[:, 0] = self.center[0] + self.radii[0] * np.cos(phase)
@@ -57,7 +60,7 @@ class CameraPath:
 
 
 class LabelView(Protocol):
-    """Renderer of small images (H, W) of instance ids."""
+    """Function that renders a small image (H, W) of instance ids, 0 = none."""
 
     def __call__(self, T_world_camera: Float64) -> Int32: ...
 
@@ -65,10 +68,17 @@ class LabelView(Protocol):
 def plan_path(
     layout: Layout, frames: int, labels: LabelView, wanted: set[int], rng: np.random.Generator, stride: float = 1.0
 ) -> CameraPath:
-    """Return the path with the best visibility of the `wanted` instances in `frames` frames.
+    """Return the path with the best visibility of the wanted instances.
 
-    `stride` is the camera speed as a multiple of the recommended speed, which is limited by MAX_SPEED and MAX_TURN.
     Raises DataError if the free floor is too small.
+
+    Args:
+        layout: Layout of the room.
+        frames: Number of frames of the path.
+        labels: Function that renders the instance ids at a pose.
+        wanted: Ids of the wanted instances.
+        rng: Random generator.
+        stride: Camera speed, relative to the recommended speed. MAX_SPEED and MAX_TURN limit the recommended speed.
     """
     center, radii = _widest_ellipse(layout)
     turn = 1 if rng.uniform() < 0.5 else -1
@@ -79,7 +89,10 @@ def plan_path(
 
 
 def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
-    """Return the center (2,) and radii (2,), m, of the largest ellipse with radii in RADII at the minimum DISTANCE."""
+    """Return the center (2,) and the radii (2,), m, of the largest ellipse above free floor.
+
+    The radii are values of RADII. The distance from the ellipse to furniture and walls is at least DISTANCE.
+    """
     angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
     free, width, depth = layout.free, layout.width, layout.depth
     rows, columns = free.shape
@@ -115,9 +128,9 @@ def _allowed_phase_speed(path: CameraPath) -> float:
 
 
 def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[int]) -> float:
-    """Return the start phase (rad) with the most visible wanted instances over `sweep` rad.
+    """Return the start phase, rad, from which the largest number of wanted instances is visible along `sweep` rad.
 
-    The number of visible pixels breaks ties.
+    If several start phases have the same number of instances, the number of visible pixels decides.
     """
     phases = 2 * np.pi * np.arange(PHASES) / PHASES
     ids = sorted(wanted)
@@ -133,7 +146,10 @@ def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[i
 
 
 def look(position: Float64, yaw: float, pitch: float, roll: float) -> Float64:
-    """Return T_world_camera (4, 4) at `position` (3,), m, with angles in rad; world z is up, yaw 0 faces +x."""
+    """Return T_world_camera (4, 4) of a camera at `position` (3,), m; angles are in rad.
+
+    In the world frame, z is up. A camera with a yaw of 0 faces +x.
+    """
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     down = np.cross(forward, right)

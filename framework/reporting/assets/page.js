@@ -1,11 +1,11 @@
 "use strict";
 
-// Connects the parts of a page: the map, the side panel, the table and the buttons.
+// Connects the parts of a page: map, side panel, object table and buttons.
 
 const report = JSON.parse(document.getElementById("report-data").textContent);
 const byId = (id) => document.getElementById(id);
 
-/** Returns an element with text or child elements. Texts from run directories are never parsed as markup. */
+/** Returns an HTML element with texts or child elements. Texts are never parsed as markup. */
 function made(name, css, ...children) {
   const element = document.createElement(name);
   if (css) element.className = css;
@@ -141,10 +141,10 @@ class Page {
     const likely = this.table.rows.filter((row) => Number(row.dataset.confidence) >= this.confidence).length;
     byId("count").textContent = words
       ? `${shown} of ${this.table.rows.length} objects`
-      : `${likely} with a confidence of ${this.confidence.toFixed(2)} or more; the others are dimmed`;
+      : `${likely} objects with a confidence of at least ${this.confidence.toFixed(2)}; the other rows are dimmed`;
   }
 
-  /** Selects an object, or none, in the map, the table and the panel. */
+  /** Selects an object, or clears the selection (null), in the map, the table and the panel. */
   choose(id, { fly = false } = {}) {
     if (!this.objects.has(id) && this.objects.size) id = null;
     this.chosen = id;

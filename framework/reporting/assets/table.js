@@ -1,6 +1,6 @@
 "use strict";
 
-// A table with sortable columns, selectable rows and a search filter.
+// Object table with sortable columns, selectable rows and a search filter.
 
 class ObjectTable {
   constructor(table, onChoose) {
@@ -25,7 +25,7 @@ class ObjectTable {
     });
   }
 
-  /** Sorts by a column: numbers in descending order, words in ascending order. A second call reverses the order. */
+  /** Sorts by a column: numbers in descending order, texts in ascending order. Another call reverses the order. */
   sort(column) {
     const head = this.heads[column];
     const numeric = head.classList.contains("number");
@@ -40,7 +40,7 @@ class ObjectTable {
     this.body.append(...this.rows);
   }
 
-  /** Hides rows that do not match the search, dims rows below the confidence, and returns the number of shown rows. */
+  /** Hides rows that do not match the search text, and dims rows below the confidence. Returns the number of shown rows. */
   filter(words, confidence) {
     let shown = 0;
     for (const row of this.rows) {

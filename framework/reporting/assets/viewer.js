@@ -42,18 +42,18 @@ const FRAGMENT_SHADER = `
   }`;
 
 const FLIGHT_MS = 600;
-const FADED = 0.62; // fading of unselected objects during a selection
-const PATH_WIDTH = 0.0022; // relative to the distance of the initial view
-const PATH_SIDES = 6;
+const FADED = 0.62; // fraction of the background color in unselected objects while an object is selected
+const PATH_WIDTH = 0.0022; // radius of the path's tube, relative to the distance from camera to target in the initial view
+const PATH_SIDES = 6; // number of sides of the path's tube
 const CLICK_PX = 5; // maximum movement of the pointer during a click
 
 class MapViewer {
-  /** Shows maps in `canvas`. Calls `onChoose` with the id of a clicked object, or null. */
+  /** Shows maps in `canvas`. Calls `onChoose` with the id of a clicked object, or with null for the background. */
   constructor(canvas, onChoose) {
     this.canvas = canvas;
     this.onChoose = onChoose;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
-    this.renderer.outputColorSpace = "srgb-linear"; // the shader encodes its output
+    this.renderer.outputColorSpace = "srgb-linear"; // the fragment shader already writes sRGB values
     this.camera = new THREE.PerspectiveCamera(32, 1, 0.02, 500);
     this.controls = new THREE.OrbitControls(this.camera, canvas);
     this.controls.enableDamping = true;
@@ -72,7 +72,7 @@ class MapViewer {
     this.listenForClicks();
   }
 
-  /** Reads a GLB (ArrayBuffer) and adds it as a map for `show`. */
+  /** Adds the map in a GLB file (ArrayBuffer), with the map's data in the page, for `show`. */
   async add(content, data) {
     const { scene } = await new THREE.GLTFLoader().parseAsync(content, "");
     const map = { group: new THREE.Group(), data, parts: new Map(), path: pathTube(data) };
@@ -92,7 +92,7 @@ class MapViewer {
     this.maps.push(map);
   }
 
-  /** Shows one of the maps; the camera keeps its pose or moves to the initial view of the map. */
+  /** Shows the map with this index. The camera moves to the initial view of the map, except with `keepView`. */
   show(number, { keepView = false } = {}) {
     if (this.shown) this.scene.remove(this.shown.group);
     this.shown = this.maps[number];
@@ -107,7 +107,7 @@ class MapViewer {
     this.flight = null;
     this.camera.up.set(...up);
     this.camera.fov = fov;
-    // OrbitControls reads the up direction only in its constructor
+    // OrbitControls reads the up direction only in its constructor, so new controls are needed
     this.controls.dispose();
     this.controls = new THREE.OrbitControls(this.camera, this.canvas);
     this.controls.enableDamping = true;
@@ -131,7 +131,7 @@ class MapViewer {
     this.paint();
   }
 
-  /** Moves the camera to an object. */
+  /** Moves the camera smoothly to an object. */
   flyTo(id) {
     const part = this.shown.parts.get(id);
     if (!part) return;
@@ -233,7 +233,7 @@ class MapViewer {
     this.draw();
   }
 
-  /** Returns the id of the frontmost likely object at a window position, or null. */
+  /** Returns the id of the object at a position of the browser window, px; null for the background or unlikely objects. */
   objectAt(x, y) {
     const { left, top, width, height } = this.canvas.getBoundingClientRect();
     const place = new THREE.Vector2((2 * (x - left)) / width - 1, 1 - (2 * (y - top)) / height);
@@ -264,7 +264,7 @@ function material() {
   });
 }
 
-/** Returns the camera path as a tube with colors from blue (start) to orange (end). */
+/** Returns the camera path as a tube, colored from blue (start) to orange (end); null for fewer than two points. */
 function pathTube({ path, eye, target }) {
   if (path.length < 2) return null;
   const curve = new THREE.CatmullRomCurve3(path.map((point) => new THREE.Vector3(...point)));
@@ -288,7 +288,7 @@ function rgb(hex) {
 
 function styleColor(name) { return getComputedStyle(document.documentElement).getPropertyValue(name).trim(); }
 
-/** Returns a GLB (ArrayBuffer) of the page, which stores it as base64 of gzip. */
+/** Returns the GLB file (ArrayBuffer) in a script element of the page: base64-encoded and gzip-compressed. */
 async function unpacked(element) {
   const bytes = Uint8Array.from(atob(element.textContent), (letter) => letter.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));

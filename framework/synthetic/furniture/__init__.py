@@ -1,1 +1,1 @@
-"""Furniture and furniture groups."""
+"""Furniture and furniture groups of synthetic scenes."""

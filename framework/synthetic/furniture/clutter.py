@@ -116,7 +116,7 @@ def _glowing(rng: Rng) -> Material:
 
 
 def plant(rng: Rng) -> Furniture:
-    """Return a pot with broad leaves."""
+    """Return a potted plant with broad leaves."""
     piece = Furniture("plant")
     pot = paints.paint(rng, paints.pick(rng, ((0.70, 0.38, 0.26), (0.85, 0.84, 0.80), (0.30, 0.36, 0.42))))
     green = Material(Texture.LEAF, (0.16, 0.36, 0.14), (0.36, 0.55, 0.22), seed=paints.new_seed(rng))
@@ -143,7 +143,7 @@ def plant(rng: Rng) -> Furniture:
 
 
 def carton(rng: Rng) -> Furniture:
-    """Return a random carton."""
+    """Return a random cardboard box with packing tape."""
     piece = Furniture("cardboard box")
     x, y, z = rng.uniform(0.32, 0.5), rng.uniform(0.28, 0.4), rng.uniform(0.25, 0.4)
     board = Material(Texture.FABRIC, (0.72, 0.56, 0.38), (0.64, 0.48, 0.31), 0.15, seed=paints.new_seed(rng))
@@ -262,7 +262,7 @@ def rug(rng: Rng, width: float, depth: float) -> Furniture:
 
 
 def partition(rng: Rng) -> Furniture:
-    """Return a tiled half-height wall next to a toilet."""
+    """Return a half-height tiled partition wall for a toilet."""
     piece = Furniture("partition")
     tile = Material(Texture.TILES, (0.72, 0.82, 0.84), (0.55, 0.56, 0.56), 0.15, seed=paints.new_seed(rng))
     piece.add(rounded_box(0.09, 0.62, 0.95, 0.004).flat(1, 2), tile, z=0.475)
@@ -308,7 +308,7 @@ def clothes(rng: Rng) -> Furniture:
 
 
 def _crumpled(sheet: Solid, rng: Rng, height: float, fringe: float) -> Solid:
-    """Return the sheet with creases up to `height` m high, and its border displaced by up to `fringe` m."""
+    """Return the sheet with creases up to `height` m high and horizontal displacements up to `fringe` m."""
     a, b, c, d = rng.uniform(0, 2 * np.pi, 4)
 
     def crumple(p: Float64) -> Float64:

@@ -17,8 +17,8 @@ BACKREST = 0.50  # m, distance from the wall to the free part of a couch
 BORDER = 0.06  # m, empty border of a bed or couch
 ARM = 0.24  # m, maximum width of a couch arm
 SINK = 0.012  # m, depth to which objects sink into soft surfaces
-PLACES = 60  # number of candidate positions of each scattered object
-TOUCHING = (0.001, 0.005)  # m, range of the gap between touching neighbors, below sensor resolution
+PLACES = 60  # maximum number of candidate positions of each scattered object
+TOUCHING = (0.001, 0.005)  # m, range of the gap between touching objects, below the resolution of the sensor
 LADEN_CHAIRS = 0.5  # probability of an object on a chair of a row
 SEAT = 0.19  # m, distance from the front of a chair to the middle of its seat
 LEATHER_COUCHES = 0.3  # fraction of the couches that have black leather
@@ -48,7 +48,7 @@ def cluttered_bed_group(rng: Rng) -> Group:
 
 
 def cluttered_couch_group(rng: Rng) -> Group:
-    """Return a couch with cushions, a blanket, a bag and books, and a cluttered coffee table that touches it."""
+    """Return a couch with cushions, a blanket, a bag and books, and a cluttered coffee table that touches the couch."""
     group = cluttered_couch(rng)
     front = float(group.pieces[0].bounds()[1][1])
     table = tabletops.coffee_table(rng)
@@ -100,10 +100,10 @@ def _clutter_couch(group: Group, rng: Rng) -> None:
 def _scatter(
     group: Group, lying: list[Furniture], low: Float64, high: Float64, rng: Rng, things: list[Furniture]
 ) -> None:
-    """Place `things` on the first object of `lying`, between the corners `low` and `high` (2,), m.
+    """Place `things` on the first object of `lying`, in the area from the corner `low` to the corner `high` (2,), m.
 
-    The objects overlap only with blankets. Objects without a free position are omitted. The other objects of `lying`
-    are obstacles.
+    The other objects of `lying` are obstacles. Placed objects may overlap blankets, but not other objects. Objects
+    without a free position are omitted.
     """
     lying = [*lying]
     in_the_way = [np.stack(piece.bounds()) for piece in lying[1:]]
@@ -121,9 +121,10 @@ def _scatter(
 
 
 def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Furniture:
-    """Return `thing` with a random rotation and a random position between the corners `low` and `high` (2,), m.
+    """Return `thing` with a random rotation about z and a random position.
 
-    An object larger than the area is centered.
+    The position is in the area from the corner `low` to the corner `high` (2,), m. An object larger than the area is
+    centered.
     """
     turned = thing.placed(0.0, 0.0, 0.0, np.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.3, 0.3))
     turned_low, turned_high = turned.bounds()
@@ -134,19 +135,19 @@ def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Fu
 
 
 def _overlap(box: Float64, other: Float64) -> bool:
-    """Return True if two boxes (2, 3) overlap, as seen from above."""
+    """Return True if two boxes (2, 3), m, overlap as seen from above."""
     return bool((np.minimum(box[1], other[1])[:2] > np.maximum(box[0], other[0])[:2]).all())
 
 
 def _height(pieces: list[Furniture], low: Float64, high: Float64) -> float:
-    """Return the height (m) of the top surface of the objects between the corners `low` and `high` (2,), m."""
+    """Return the height, m, of the highest vertex of the objects in the area from `low` to `high` (2,), m."""
     vertices = np.concatenate([solid.vertices for piece in pieces for solid, _ in piece.parts])
     within = ((vertices[:, :2] >= low) & (vertices[:, :2] <= high)).all(axis=1)
     return float(vertices[within, 2].max())
 
 
 def chair_row(rng: Rng, count: int) -> Group:
-    """Return a row of identical, touching chairs along the wall, some with objects on them."""
+    """Return a row of `count` identical, touching chairs along the wall, some with objects on them."""
     group = Group("chair row")
     chair = seating.chair(rng)
     pitch = size(chair)[0] + _touch(rng)
@@ -170,7 +171,7 @@ def _lay_on_seat(group: Group, chair: Furniture, thing: Furniture) -> None:
 
 
 def desk_row(rng: Rng, count: int) -> Group:
-    """Return a row of identical, touching desks with identical office chairs and different objects."""
+    """Return a row of `count` identical, touching desks with identical office chairs and different objects."""
     group = Group("desk row")
     desk, chair = tabletops.desk(rng), seating.office_chair(rng)
     pitch = size(desk)[0] + _touch(rng)
@@ -183,7 +184,7 @@ def desk_row(rng: Rng, count: int) -> Group:
 
 
 def laid_table_group(rng: Rng) -> Group:
-    """Return a long table with many objects, two identical adjacent chairs, and one or two chairs at its ends."""
+    """Return a long table with many objects, two adjacent chairs, and one or two chairs at its ends, all identical."""
     group = Group("dining")
     table = tabletops.long_table(rng)
     table = group.add(table, y=against_wall(table))
@@ -201,7 +202,7 @@ def laid_table_group(rng: Rng) -> Group:
 
 
 def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Furniture:
-    """Push a chair under a table until its back or arms touch the table, add it to the group and return it.
+    """Add a chair that is pushed under a table until its back or arms touch the table, and return it.
 
     The table faces +y. The chair is offset by `x` m from the middle of the table.
     """
@@ -213,7 +214,7 @@ def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Fu
 
 
 def _between(piece: Furniture, bottom: float, top: float) -> Float64:
-    """Return the vertices (N, 3), m, of an object at heights from `bottom` to `top` m, with a margin of SPACING."""
+    """Return the vertices (N, 3), m, of an object at heights from `bottom` to `top` m, with a margin of SPACING m."""
     solids = [solid.vertices for solid, _ in piece.parts]
     reaching = [v for v in solids if v[:, 2].max() > bottom and v[:, 2].min() < top]
     sections = [v[(v[:, 2] > bottom - SPACING) & (v[:, 2] < top + SPACING)] for v in reaching]
@@ -254,7 +255,7 @@ def board_group(rng: Rng) -> Group:
 
 
 def laden(name: str, support: Furniture, rng: Rng) -> Group:
-    """Return a group of objects on top of `support` (a cupboard or another tall object)."""
+    """Return a group of `support`, such as a cupboard or another tall object, with objects on top."""
     group = single(name, support)
     strew_on(group, group.pieces[0], rng, small_things.some(rng, small_things.ON_TOPS, 2))
     return group

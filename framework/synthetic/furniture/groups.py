@@ -15,12 +15,12 @@ from framework.synthetic.furniture.piece import Furniture, Rng
 
 Place = tuple[float, float, float]  # x, y (m) and angle (rad, counter-clockwise from above)
 
-WALL_GAP = 0.015  # m, between a wall and adjacent furniture
+WALL_GAP = 0.015  # m, gap between a wall and adjacent furniture
 
 
 @dataclass
 class Group:
-    """Objects in a common frame."""
+    """Furniture and objects in a common frame."""
 
     name: str
     pieces: list[Furniture] = field(default_factory=list)
@@ -56,13 +56,16 @@ def on_top(piece: Furniture) -> float:
 
 
 def size(piece: Furniture) -> Float64:
-    """Return the size (3,) of an object, m."""
+    """Return the size (3,), m, of an object's axis-aligned box."""
     low, high = piece.bounds()
     return high - low
 
 
 def next_to(piece: Furniture, other: Furniture, side: int, gap: float) -> float:
-    """Return the x offset (m) that places `piece` next to `other`, `gap` m away: at +x (side 1) or -x (side -1)."""
+    """Return the x offset (m) that places `piece` next to `other` with a gap of `gap` m.
+
+    The piece is on the +x side (`side` = 1) or on the -x side (`side` = -1).
+    """
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
     return float(other_high[0] + gap - low[0] if side > 0 else other_low[0] - gap - high[0])
 

@@ -18,7 +18,7 @@ class Furniture:
     """One object, composed of solid parts with one material each."""
 
     kind: str  # readable name, such as "office chair"
-    class_name: str | None = None  # COCO name; None = not evaluated
+    class_name: str | None = None  # COCO class; None = not evaluated
     parts: list[tuple[Solid, Material]] = field(default_factory=list)
 
     def add(self, solid: Solid, material: Material, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> None:
@@ -36,7 +36,7 @@ class Furniture:
             self.add(solid, material, *corner)
 
     def bounds(self) -> tuple[Float64, Float64]:
-        """Return the lower and upper corner (3,) of the axis-aligned box, m."""
+        """Return the lower and the upper corner (3,) of the axis-aligned bounding box, m."""
         lows = np.array([solid.vertices.min(axis=0) for solid, _ in self.parts])
         highs = np.array([solid.vertices.max(axis=0) for solid, _ in self.parts])
         return lows.min(axis=0), highs.max(axis=0)

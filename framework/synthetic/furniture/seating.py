@@ -143,7 +143,7 @@ def bare_couch(rng: Rng) -> Furniture:
 
 
 def _couch_body(rng: Rng) -> tuple[Furniture, float, float, float]:
-    """Return a couch without pillows, and its width, its depth and the width of an arm in m."""
+    """Return a couch without pillows, and its width, its depth and the width of its arms, m."""
     piece = Furniture("couch", "couch")
     cover, feet = paints.cloth(rng), paints.wood(rng)
     seats = int(rng.integers(2, 4))

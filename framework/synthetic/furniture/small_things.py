@@ -147,5 +147,5 @@ ON_TOPS: tuple[MakeThing, ...] = (clutter.carton, clutter.throw_cushion, basket,
 
 
 def some(rng: Rng, makers: tuple[MakeThing, ...], count: int) -> list[Furniture]:
-    """Return `count` objects, each created by a random function of `makers`."""
+    """Return `count` objects, each created by a randomly selected function of `makers`."""
     return [makers[int(rng.integers(len(makers)))](rng) for _ in range(count)]

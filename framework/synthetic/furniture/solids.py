@@ -2,6 +2,8 @@
 
 A shape is at the origin, with z up and lengths in meters. Its texture coordinates are its initial 3D coordinates in
 meters, so that a solid texture moves with the shape. Faces are subdivided, because light is baked into the vertices.
+`segments` is the number of subdivisions of a rounded edge or of a circumference. `spacing` is the maximum distance
+between adjacent vertices on flat faces, m.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ class Solid:
         return replace(self, vertices=_turn(R, self.vertices), normals=_turn(R, self.normals))
 
     def deformed(self, shape: Callable[[Float64], Float64]) -> Solid:
-        """Return a copy with `shape` applied to the vertices (V, 3) and recomputed normals."""
+        """Return a copy with `shape` applied to the vertices (V, 3), m, and with recomputed normals."""
         vertices = shape(self.vertices.copy())
         return replace(self, vertices=vertices, normals=smooth_normals(vertices, self.triangles))
 
@@ -51,7 +53,7 @@ class Solid:
 
 
 def axis_rotation(axis: str, angle: float) -> Float64:
-    """Return the rotation (3, 3) by `angle` rad about the axis x, y or z."""
+    """Return the rotation matrix (3, 3) by `angle` rad about the axis x, y or z."""
     c, s = np.cos(angle), np.sin(angle)
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
@@ -112,12 +114,15 @@ def rounded_box(
 
 
 def _grain_first(vertices: Float64, size: Float64) -> Float64:
-    """Return texture coordinates with the longest side first, so that wood grain runs along a board."""
+    """Return the texture coordinates (V, 3), m: the vertices, with the axis of the longest side first.
+
+    Wood grain therefore runs along a board. `size` (3,) are the side lengths, m.
+    """
     return vertices[:, np.argsort(-size, kind="stable")]
 
 
 def cushion(x: float, y: float, z: float, plump: float = 0.5) -> Solid:
-    """Return a pillow with side lengths x, y, z m; `plump` is the fraction by which it is thinner at the seam."""
+    """Return a pillow with side lengths x, y, z m; at the seam, its thickness is reduced by the fraction `plump`."""
     box = rounded_box(x, y, z, radius=0.45 * z, segments=4, spacing=min(x, y) / 9)
 
     def swell(p: Float64) -> Float64:
@@ -132,14 +137,14 @@ def cushion(x: float, y: float, z: float, plump: float = 0.5) -> Solid:
 
 @dataclass(frozen=True)
 class Section:
-    """A horizontal section of a loft at height z: a superellipse |x/a|^n + |y/b|^n = 1, moved to the center (x, y)."""
+    """A horizontal section of a loft: the superellipse |x/a|^n + |y/b|^n = 1, moved to the center (x, y)."""
 
-    z: float  # m
+    z: float  # m, height of the section
     a: float  # m, half width along x
     b: float  # m, half width along y
-    x: float = 0.0  # m, of the center
-    y: float = 0.0  # m, of the center
-    n: float = 2.0  # 2 = ellipse, larger = closer to a rectangle
+    x: float = 0.0  # m, coordinate of the center
+    y: float = 0.0  # m, coordinate of the center
+    n: float = 2.0  # exponent; 2 = ellipse, larger = closer to a rectangle
     front: float = 1.0  # scale of the half with positive y, for egg shapes
 
 
@@ -188,19 +193,19 @@ def lathe(profile: Sequence[tuple[float, float]], segments: int = 24, spacing: f
 
 
 def cylinder(radius: float, height: float, top_radius: float | None = None, segments: int = 20) -> Solid:
-    """Return a cylinder or cone frustum standing on z = 0."""
+    """Return a cylinder or a conical frustum on z = 0, lengths in m; `top_radius` None = `radius`."""
     top = radius if top_radius is None else top_radius
     return lathe([(0.0, radius), (height, top)], segments)
 
 
 def leg(thickness: float, height: float, taper: float = 0.7) -> Solid:
-    """Return a tapered square leg standing on z = 0, thicker at the top."""
+    """Return a square leg on z = 0 that is `thickness` m wide at the top and `taper` times as wide at the bottom."""
     a = thickness / 2
     return loft([Section(0.0, taper * a, taper * a, n=8), Section(height, a, a, n=8)], segments=16)
 
 
 def tube(points: Sequence[tuple[float, float, float]] | Float64, radius: float, segments: int = 10) -> Solid:
-    """Return a round rod along a polyline (N, 3), smoothed by a Catmull-Rom spline at bends."""
+    """Return a round rod of `radius` m along a polyline (N, 3), m, whose bends are smoothed by a Catmull-Rom spline."""
     path = _spline(np.asarray(points, np.float64))
     tangents = np.gradient(path, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
@@ -230,7 +235,7 @@ def _spline(points: Float64) -> Float64:
 
 
 def panel(width: float, height: float, spacing: float = 0.1) -> Solid:
-    """Return a flat rectangle in the plane y = 0 that faces +y.
+    """Return a flat rectangle of `width` x `height` m in the plane y = 0 that faces +y.
 
     Its texture coordinates are (s, t, 0) in meters from the lower left corner.
     """
@@ -244,7 +249,7 @@ def panel(width: float, height: float, spacing: float = 0.1) -> Solid:
 
 
 def grid_triangles(rows: int, columns: int, flip: bool) -> Int32:
-    """Return two triangles for each cell of a (rows, columns) grid of vertices; `flip` reverses their orientation."""
+    """Return the triangles (F, 3) of a grid of rows x columns vertices, two per cell; `flip` reverses their winding."""
     index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
     triangles = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)

@@ -89,7 +89,7 @@ def test_write_scenes_writes_common_files(root: Path) -> None:
 )
 def test_write_scenes_other_parameters_raise(root: Path, other: BenchmarkSettings) -> None:
     before = times(root)
-    with pytest.raises(ConfigError, match=r"expected rooms with the parameters .*; set another folder"):
+    with pytest.raises(ConfigError, match=r"expected scenes with the parameters .*; set another folder"):
         write_scenes(root, SPECS, other, jobs=1)
     assert times(root) == before
 

@@ -67,7 +67,7 @@ def test_report_of_run_is_one_reproducible_page(stored: Path, command) -> None:
     metrics = json.loads((stored / "metrics.json").read_text())
     assert "corner_room" in message
     assert f"AP50 {metrics['instances.ap50']:.2f}" in message
-    assert f"likely, of {metrics['instances.count']}" in message
+    assert f"of {metrics['instances.count']}; confidence ≥ 0.3" in message
     for heading in ("Map", "Objects", "Ground truth", "Trajectory", "Mapping progress", "Stage times", "Provenance"):
         assert heading in message
     assert before.count(b"data:image/webp") > 3, "expected images of objects, mapping progress and overview.png"
@@ -211,7 +211,7 @@ def test_report_url_is_percent_encoded(stored: Path, command) -> None:
 
 
 def test_report_invalid_or_repeated_run_is_refused(stored: Path, command, tmp_path: Path) -> None:
-    assert "expected a run directory, got no" in command(tmp_path)[2]
+    assert "expected a run directory with metrics.json or" in command(tmp_path)[2]
     assert "expected each run once" in command(stored, stored.parent / "." / "first")[2]
 
 
