@@ -51,7 +51,7 @@ def test_detection_cache_unpack_speed(benchmark: BenchmarkFixture) -> None:
     benchmark(unpack, pack(ellipses()), COCO)
 
 
-def test_detection_cache_second_run_detects_nothing(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path) -> None:
+def test_detection_cache_second_run_skips_detection(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path) -> None:
     """A network runs on a real video; a second run reads all detections from the cache."""
     data = shared / "data" / "redkitchen"
     if not data.is_dir():

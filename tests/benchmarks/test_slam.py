@@ -121,7 +121,7 @@ def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: st
     )
 
 
-def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
+def test_slam_long_path_has_constant_speed(benchmark, tables) -> None:
     """Map 2,000 frames in eight identical rooms, and compare the times of early and late frames.
 
     From frame 1300 on, five rooms from the start, a second loop maps the start of the path in alternation with the

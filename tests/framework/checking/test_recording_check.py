@@ -206,7 +206,7 @@ def test_recording_check_reports_unregistered_depth(zoom: float, x: float, y: fl
         assert found_y == pytest.approx(-100 * y / 640, abs=0.4)
 
 
-def test_recording_check_half_frame_color_offset_is_note() -> None:
+def test_recording_check_half_frame_color_delay_gives_note() -> None:
     """The desk begins with a rotation of 20 px per frame. A Kinect captures color and depth at different times."""
     [expected] = [
         finding for finding in check(replace(DESK, stop=6), FARTHEST).findings if finding.subject == "color and depth"

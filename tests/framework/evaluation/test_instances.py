@@ -358,7 +358,7 @@ def test_label_transfer_distance_limit_is_inclusive(transfer):
     assert evaluate(moved, truth, transfer=transfer, max_distance=below).best_ious == {1: 0.0}
 
 
-def test_evaluate_judge_outcomes_match_counts():
+def test_judge_outcomes_match_evaluation_counts():
     """The predictions are correct, a duplicate, of another class, on an unknown instance, and on no instance."""
     names = {1: "chair", 2: "bed", 3: "chair", 4: None, 5: "book"}
     truth = scene([(1, 120), (2, 100), (3, 100), (4, 100), (5, 100), (0, 100)], names)

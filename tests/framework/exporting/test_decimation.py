@@ -63,7 +63,7 @@ def test_decimation_keeps_small_mesh_unchanged() -> None:
     assert areas(light.vertices, light.triangles).sum() == areas(mesh.vertices, mesh.triangles).sum()
 
 
-def test_decimation_clustered_reduces_soup_to_size_limit() -> None:
+def test_decimation_by_clustering_limits_size_of_triangle_soup() -> None:
     mesh = wavy_plane()
     corners = mesh.triangles.ravel()
     triangles = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)

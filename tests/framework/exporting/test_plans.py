@@ -234,7 +234,7 @@ def test_relations_stacked_object_is_on_object_below(tmp_path: Path) -> None:
     assert expected(found, 3) == [("on", 2)]
 
 
-def test_relations_objects_on_same_table_are_next_to(tmp_path: Path) -> None:
+def test_relations_objects_on_same_table_are_next_to_each_other(tmp_path: Path) -> None:
     things = {
         "dining table": TABLE,
         "book": [(1.0, 1.2, 0.75, 1.2, 1.4, 0.79)],
@@ -257,7 +257,7 @@ CUPBOARD: list[Block] = [
 ]
 
 
-def test_relations_objects_inside_container_are_in(tmp_path: Path) -> None:
+def test_relations_objects_inside_container_have_relation_in(tmp_path: Path) -> None:
     box: list[Block] = [
         (2.6, 0.6, 0.0, 3.2, 1.2, 0.02),
         (2.6, 0.6, 0.0, 2.62, 1.2, 0.5),

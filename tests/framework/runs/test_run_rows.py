@@ -190,7 +190,7 @@ def test_rows_average_over_any_parameter() -> None:
 
 
 @pytest.mark.parametrize("backwards", [False, True])
-def test_rows_use_latest_record_of_run(backwards: bool) -> None:
+def test_rows_use_latest_outputs_of_run(backwards: bool) -> None:
     records = [record({"seed": 0}, ap, written) for ap, written in ((0.1, 1.0), (0.9, 2.0))]
     [one] = rows_of(records[::-1] if backwards else records, ["seed"])
     assert one.mean(AP).value == 0.9

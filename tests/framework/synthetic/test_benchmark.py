@@ -174,7 +174,7 @@ def test_strew_places_objects_in_contact_and_keeps_walkway(seed: int) -> None:
         assert (np.abs(np.stack(thing.bounds())[:, :2]) < half).all()
 
 
-def test_planned_walk_views_target_class() -> None:
+def test_planned_path_views_target_class() -> None:
     scene = plan_scene(SceneSpec("bathroom", (toilet_group,), {"toilet": 1}), [0, 0], 60, 1.0)
     toilet = next(piece for _, piece in scene.room.objects if piece.class_name == "toilet")
     middle = sum(toilet.bounds()) / 2

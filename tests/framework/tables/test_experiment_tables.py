@@ -112,7 +112,7 @@ def test_table_notes_list_missing_runs(sweep: Path) -> None:
     assert "- Code: 1234567 (4 runs), 89abcde (1 run)." in lines
 
 
-def test_table_notes_list_requested_runs_without_record(sweep: Path) -> None:
+def test_table_notes_list_requested_runs_without_outputs(sweep: Path) -> None:
     asked = {"sweeper": {"params": {"row": "${all_of:${rows}}", "seed": 0}}, "overrides": {"task": ["seed=range(0,5)"]}}
     config = {"table": TABLE, "rows": ROWS, "hydra": asked}
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))

@@ -232,7 +232,7 @@ def test_sequence_groups_table_has_expected_lines(sweep: Path) -> None:
     assert second[2] == "| Prior (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
 
 
-def test_table_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
+def test_table_bold_mean_ignores_rows_with_fewer_sequences(sweep: Path) -> None:
     """The best tracked row has fewer sequences than the rows with given poses."""
     experiment(sweep, BY)
     for row, scene, value in (
@@ -252,7 +252,7 @@ def test_table_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
 
 
 @pytest.mark.parametrize("table", [ACROSS, BY])
-def test_table_bold_mean_is_among_equal_run_counts(sweep: Path, table: dict[str, Any]) -> None:
+def test_table_bold_mean_ignores_rows_with_fewer_runs(sweep: Path, table: dict[str, Any]) -> None:
     """A mean of fewer runs is marked, even if all sequences are present."""
     experiment(sweep, table)
     for path in sweep.glob("*row=other,seed=1*/metrics.json"):

@@ -430,7 +430,7 @@ def test_voxel_hashing_icp_tracks_slow_motion() -> None:
 
 
 @pytest.mark.parametrize(("step", "held"), [(0.0005, True), (0.002, False)])
-def test_voxel_hashing_icp_holds_only_small_uncertain_motion(step: float, held: bool) -> None:
+def test_voxel_hashing_icp_keeps_pose_for_small_uncertain_motion(step: float, held: bool) -> None:
     """Along a wall with little texture, the uncertainty may exceed the motion of a moving camera."""
     tracker = VoxelHashingIcp()
     tracker._T_world_last = moved(1.0)

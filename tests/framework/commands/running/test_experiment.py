@@ -227,12 +227,12 @@ def test_experiment_on_synthetic_scenes_simulates_detector(experiment: str) -> N
 
 
 @pytest.mark.parametrize(("sequences", "stop"), [("benchmark", 40), ("scenenn", 1000)])
-def test_experiment_progress_stop_depends_on_sequence_length(sequences: str, stop: int) -> None:
+def test_figure4_progress_stop_frame_depends_on_sequences(sequences: str, stop: int) -> None:
     config, _ = composed(["experiment=figure4_progress", f"sequences={sequences}", "row=third"])
     assert config.dataset.stop == stop
 
 
-def test_experiment_ranks_folder_names_sequences_and_detector() -> None:
+def test_ranks_folder_name_contains_sequences_and_detector() -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         asked = compose(
             "config",

@@ -54,7 +54,7 @@ def test_run_truncated_output_file_is_detected(tmp_path: Path) -> None:
         whole_files(tmp_path)
 
 
-def test_run_killed_at_random_moment_leaves_valid_record(tmp_path: Path) -> None:
+def test_run_killed_at_random_time_leaves_valid_outputs(tmp_path: Path) -> None:
     chosen = random.Random(19)
     place, undisturbed = tmp_path / "run", tmp_path / "undisturbed"
     arguments = (*SHORT, f"hydra.run.dir={place}")

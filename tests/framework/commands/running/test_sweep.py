@@ -194,7 +194,7 @@ def test_sweep_without_experiment_is_resumed(tmp_path: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_sweep_over_neutral_settings_has_separate_folders(tmp_path: Path) -> None:
+def test_sweep_over_settings_without_effect_has_separate_folders(tmp_path: Path) -> None:
     """A sweep that times these settings needs them in its directory names. Workers use the same names."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     _, first = swept(tmp_path, "threads=1,2", "prefetch=0")
@@ -232,7 +232,7 @@ ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=10000
         pytest.param(signal.SIGINT, False, 1, "1,2", 1, marks=pytest.mark.acceptance),  # joblib starts no worker
     ],
 )
-def test_sweep_signal_leaves_partial_record_of_active_runs(
+def test_sweep_signal_leaves_partial_outputs_of_active_runs(
     tmp_path: Path, signal_sent: signal.Signals, all_at_once: bool, n_jobs: int, seeds: str, at_work: int
 ) -> None:
     """A terminal sends Ctrl-C to the workers as well; `kill` signals only the main process."""

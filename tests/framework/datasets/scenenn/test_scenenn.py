@@ -220,7 +220,7 @@ def test_scenenn_annotation_release_is_reported(root: Path) -> None:
     assert SceneNN(root, "016").annotation == "not named"
 
 
-def test_scenenn_intrinsics_select_file_and_sensor(root: Path) -> None:
+def test_scenenn_intrinsics_parameter_selects_file_and_sensor(root: Path) -> None:
     assert SceneNN(root, "016")[0].sensor is SensorKind.KINECT_V1
     with pytest.raises(DataError, match=r"kinect2\.ini"):
         SceneNN(root, "016", intrinsics=SceneNNIntrinsics.KINECT2)

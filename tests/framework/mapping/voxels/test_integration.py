@@ -215,7 +215,7 @@ def test_integration_does_not_average_color_of_free_space() -> None:
     assert np.abs(channels(packed[packed > 0]) - 200).max() <= 0.25
 
 
-def test_integration_replaces_outdated_colors_at_next_observation() -> None:
+def test_integration_next_observation_replaces_outdated_color() -> None:
     """The first colors are replaced at the first later observation, which is averaged with those after it."""
     integrator = new_integrator()
     wall = np.full(CAMERA.shape, 1.5, np.float32)
