@@ -99,7 +99,7 @@ def _render(
     color: UInt8,
     ids: Int32,
 ) -> None:
-    """Render depth along z, color and instance ids of every pixel, in closed form."""
+    """Render depth along z, m, color and instance ids of every pixel, in closed form."""
     ox, oy, oz = np.float32(T[0, 3]), np.float32(T[1, 3]), np.float32(T[2, 3])
     for v in prange(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -136,7 +136,7 @@ def _render(
 
 @njit(cache=True, nogil=True)
 def _entry(box, begin, ox, oy, oz, dx, dy, dz):
-    """Return the ray parameter where a ray enters a box of the room that starts at x = `begin`; infinite = missed."""
+    """Return the ray parameter where a ray enters a box of the room that starts at x = `begin`, m; inf = no hit."""
     near, far = np.float32(1e-3), np.float32(np.inf)
     for axis in range(3):
         o = ox - begin if axis == 0 else (oy if axis == 1 else oz)
@@ -152,7 +152,7 @@ def _entry(box, begin, ox, oy, oz, dx, dy, dz):
 
 @njit(cache=True, nogil=True)
 def _paint(x, y, z, box, out):
-    """Write the color of a periodic solid texture, which is equal in all rooms and differs between boxes."""
+    """Write the color at a point, m, of a solid texture that repeats in each room and differs between boxes."""
     x -= LENGTH * np.floor(x / LENGTH)  # a room contains a whole number of waves along x
     turn = np.float32(2 * np.pi / LENGTH)
     one = np.sin(6 * turn * x + 5 * y + 3 * z + box)

@@ -38,7 +38,7 @@ def ellipses() -> Detections:
     return Detections(masks, tight_boxes(masks), np.linspace(1, 0, OBJECTS, dtype=np.float32), rows, COCO)
 
 
-@pytest.mark.parametrize("reads", [("color",), FRAME_FIELDS], ids=["color", "everything"])
+@pytest.mark.parametrize("reads", [("color",), FRAME_FIELDS], ids=["color", "all_fields"])
 def test_detection_cache_frame_hash_speed(benchmark: BenchmarkFixture, reads: tuple[str, ...]) -> None:
     benchmark(frame_hash, noise(), reads)
 

@@ -13,7 +13,7 @@ def test_room_row_frames_repeat_after_one_room() -> None:
     assert (now.color != later.color).mean() < 0.001
     seen, seen_later = (set(np.unique(f.truth.instance_ids).tolist()) - {0} for f in (now, later))
     assert len(seen) >= 3
-    assert {i + len(OBJECTS) for i in seen} == seen_later, "the same objects and additional ones"
+    assert {i + len(OBJECTS) for i in seen} == seen_later, "expected the same objects in the next room"
     assert all(walk.class_names[i] == walk.class_names[i + len(OBJECTS)] for i in seen)
     step = pose_at(80 + FRAMES_A_ROOM)[:3, 3] - pose_at(80)[:3, 3]
     np.testing.assert_allclose(step, (LENGTH, 0, 0), atol=1e-9)

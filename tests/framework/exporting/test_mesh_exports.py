@@ -250,7 +250,7 @@ def test_convex_hull_faces_outward() -> None:
 
 
 def test_glb_normals_of_degenerate_triangles_have_unit_length(room: UprightRoom) -> None:
-    """The Khronos glTF validator requires unit normals for triangles without area, too."""
+    """The Khronos glTF validator requires unit normals even for triangles without area."""
     mesh = replace(room.mesh, vertices=room.mesh.vertices.copy())
     own = room.objects[1].vertices
     mesh.vertices[own[:50]] = mesh.vertices[own[0]]

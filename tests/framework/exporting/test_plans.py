@@ -53,7 +53,7 @@ def high(room: UprightRoom) -> Plan:
 
 
 def at(found: Plan, x: float, y: float) -> tuple[bool, bool]:
-    """Return whether the position x, y (m) is occupied, and whether it is free."""
+    """Return the values of the masks `occupied` and `free` at x, y, m."""
     [[row, column]] = found.cells(np.array([[x + OFF, y + OFF]]))
     return bool(found.occupied[row, column]), bool(found.free[row, column])
 

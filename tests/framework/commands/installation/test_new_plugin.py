@@ -128,7 +128,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def copy_kernels(site: Path) -> None:
-    """Copy the numba cache of the checkout to the installed files, with the file times that numba checks."""
+    """Copy the numba cache of the checkout to the installed files, with the modification times that numba checks."""
     for path in (CHECKOUT / "framework").rglob("*.py"):
         shutil.copystat(path, site / path.relative_to(CHECKOUT))
     for path in (CHECKOUT / "framework").rglob("*.nb[ic]"):

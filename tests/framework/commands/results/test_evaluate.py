@@ -85,7 +85,7 @@ def test_evaluate_unchanged_run_keeps_exact_metrics(stored: Path, command) -> No
     assert after == before | CODE
     assert [key for key in after if key not in CODE] == list(before)
     assert (stored / "metrics.json").stat().st_mtime_ns == time, (
-        "expected an unchanged modification time: tables use the latest record of a run"
+        "expected an unchanged modification time: tables use the latest outputs of a run"
     )
     assert command(stored) == (0, f"{stored}: unchanged\n", "")
     assert metrics_of(stored) == after

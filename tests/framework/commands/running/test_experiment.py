@@ -140,7 +140,7 @@ def test_experiment_rows_compose_with_every_preset(experiment: str, preset: str 
         config, choices = composed([*asked, f"row={row}"])
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
-        if list(rows[row]) != ["preset=default"]:  # this row may equal a row without a tracker
+        if list(rows[row]) != ["preset=default"]:  # the config of this row may equal that of another row
             hashes[row] = config_hash({str(key): value for key, value in resolved.items()})
         for interface in (PoseTracker, ClusterRefiner, MapFuser):
             build(interface, config[stage_of(interface)])
@@ -201,7 +201,7 @@ def test_preset_default_changes_nothing() -> None:
 
 @pytest.mark.parametrize("experiment", ["table1_runtime", "table2_class_ap", "table3_map", "figure3_stage_times"])
 def test_sequences_of_scenenn_select_real_data_settings(experiment: str) -> None:
-    """The settings are a network for real images, no rendered ground truth, the paper's sequences and a new folder."""
+    """They use a network for real images, no rendered ground truth, the paper's sequences and a separate folder."""
     overrides = [f"experiment={experiment}", "sequences=scenenn", "dataset.root=DIR"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         asked = compose("config", overrides=overrides, return_hydra_config=True)

@@ -32,7 +32,7 @@ LONGEST_WAIT_S = 1.2  # maximum wait before a kill; mapping takes about 0.5 s, s
 
 
 def whole_files(place: Path) -> set[str]:
-    """Return the names of the output files in a run directory. Raises DataError for a truncated file."""
+    """Return the names of the output files in a run directory. Raise DataError for a truncated file."""
     read = {
         "trajectory.txt": read_tum,
         "timings.csv": read_timings,

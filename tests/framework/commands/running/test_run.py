@@ -100,7 +100,7 @@ def test_run_stage_error_leaves_partial_outputs(tmp_path: Path, kind: str, messa
     assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json"}
     left = figures(place)
     assert message in str(left["partial"])
-    assert left["frames"] in (3, 4)  # a detector error is before the frame is counted, a mask error after
+    assert left["frames"] in (3, 4)  # a detector error occurs before the frame is counted, a mask error afterwards
     assert len((place / "trajectory.txt").read_text().splitlines()) in (3, 4)
 
 

@@ -247,7 +247,7 @@ def test_scannet_truth_matches_labeled_mesh(tmp_path: Path, write: Writer) -> No
 
 
 def test_scannet_missing_label_table_changes_annotation_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Without the table, the same map has other metrics. Result tables must keep both apart."""
+    """The label table affects the metrics of a map, so result tables must not mix runs with and without it."""
     as_sens(tmp_path / SCENE, shots())
     write_labels(tmp_path / SCENE)
     (tmp_path / "scannetv2-labels.combined.tsv").unlink()

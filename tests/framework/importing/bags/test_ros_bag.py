@@ -189,7 +189,7 @@ def test_ros_bag_realsense_depth_is_registered_to_color(tmp_path: Path) -> None:
     bag = BagWriter(ros1=True)
     add_realsense(bag, DEPTH_CAMERA)
     assert not imported(bag.write(tmp_path / "recorded.bag"), tmp_path / "out")
-    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)  # depth moves to the nearest pixel
+    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)  # registration moves depth to the nearest pixel
     assert json.loads((tmp_path / "out/camera.json").read_text())["sensor"] == "REALSENSE_D435"
 
 

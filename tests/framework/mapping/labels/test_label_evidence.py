@@ -26,7 +26,7 @@ def test_label_update_matches_full_recursion_if_labels_fit(seed: int, labels: in
     rng = np.random.default_rng(seed)
     classes = labels  # every class is named
     evidence = blank()
-    instance_log = np.zeros(labels + 1)  # [0]: every other instance
+    instance_log = np.zeros(labels + 1)  # [0]: all other instances together
     class_log = np.zeros(classes)
     for _ in range(20):
         instance = int(rng.integers(1, labels + 1))

@@ -216,7 +216,7 @@ def test_integration_does_not_average_color_of_free_space() -> None:
 
 
 def test_integration_next_observation_replaces_outdated_color() -> None:
-    """The first colors are replaced at the first later observation, which is averaged with those after it."""
+    """The next observation replaces an outdated color; later observations are averaged with the new color."""
     integrator = new_integrator()
     wall = np.full(CAMERA.shape, 1.5, np.float32)
     wall[:, CAMERA.width // 2 :] = 0  # seen by the first frames only
@@ -275,7 +275,7 @@ def test_integration_averages_noise() -> None:
 
 
 def test_integration_removes_objects_seen_through() -> None:
-    """A removed sphere disappears from the map after the wall behind it was visible often enough."""
+    """A removed sphere disappears from the map after the wall behind it has been observed in enough frames."""
     scene, empty = room(), room()
     empty.spheres = []
     integrator = new_integrator()

@@ -45,7 +45,7 @@ def grid_of(distance: np.ndarray, blocks: np.ndarray, origin: tuple[int, int, in
 
 
 def slow_surface_nets(stored: np.ndarray, most_jump: float) -> tuple[dict, set]:
-    """Compute surface nets by definition: the vertex of each cell, voxels, and the quads as tuples of cells."""
+    """Return the vertex of each cell, in voxels, and the quads as tuples of cells, as surface nets define them."""
     corners = np.array(list(itertools.product((0, 1), repeat=3)))
     vertices = {}
     for cell in itertools.product(*(range(n - 1) for n in stored.shape)):

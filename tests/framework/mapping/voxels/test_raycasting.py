@@ -129,7 +129,7 @@ def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
 
 @pytest.mark.parametrize("sparse", ["every pixel", "every fourth column", "one in ten"])
 def test_raycast_near_sensor_depth_finds_surface(sparse: str) -> None:
-    """The surface is also found at pixels between the coarse rays."""
+    """The surface is found at every pixel with sensor depth, including those between the coarse rays."""
     voxels = mapped(room(), [pose()])
     T = pose(0.1, -0.05, 0.1, (0.05, 0.1, 0.0))
     exhaustive = every_ray(voxels, T)
