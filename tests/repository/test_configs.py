@@ -71,11 +71,11 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
 def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
-    """Variants may differ. Values that the user must set have no default in the file and in the class."""
+    """Variants may differ. Values that the user must set have no default in either the file or the class."""
     path = CONF / stage / f"{name}.yaml"
     own = OmegaConf.load(path)
-    is_variant = "_target_" not in own  # of the option that it inherits
-    assert not is_variant or re.match(r"# (?!@)\S", path.read_text()), "the first line states what the variant changes"
+    is_variant = "_target_" not in own  # a variant of the option that it inherits
+    assert not is_variant or re.match(r"# (?!@)\S", path.read_text()), "expected a comment on the variant in line 1"
     node = registered.composed(stage, name)[stage]
     plugin_class = find_class(GROUPS[stage], node["_target_"])
     links = plugin_fields(plugin_class)
@@ -100,7 +100,7 @@ def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
     }
     assert set(differing) == (set(own) - {"defaults"} if is_variant else set()), differing
     of_the_run = {key for key in node if OmegaConf.is_interpolation(node, key)}
-    assert of_the_run <= {"seed", "device"}, "other keys need values of the run"
+    assert of_the_run <= {"seed", "device"}, "expected references only to seed and device, which each run sets"
 
 
 def test_schedule_and_table_yaml_equal_class_defaults() -> None:

@@ -121,7 +121,7 @@ def test_ranks_run_interval_reflects_seed_noise(tmp_path: Path) -> None:
     one, same = experiment(tmp_path / "one", steady), experiment(tmp_path / "same", steady)
     assert agreement([one, same]).over_runs == (1, 1)
     noisy = experiment(tmp_path / "noisy", {"a": (0.9, 0.4, 0.9), "b": (0.5, 0.8, 0.5), "c": (0.1, 0.2, 0.1)})
-    # means: a 0.73, b 0.6; if the second seed dominates, b is first, and rho of 1 2 3 and 2 1 3 is 0.5
+    # means: a 0.73, b 0.6; b is first in samples with mostly the second seed; rho of 1 2 3 and 2 1 3 is 0.5
     found = agreement([one, noisy])
     assert (found.rho, *found.over_runs) == pytest.approx((1, 0.5, 1))
     # b is first only if the last seed is drawn four times: 1 sample in 256, which is outside of the interval

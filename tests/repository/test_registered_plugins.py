@@ -88,7 +88,7 @@ def come(video: LiveVideo) -> Iterator[Frame]:
     with closing(video.frames()) as readers:
         message = time.monotonic()
         for reader in readers:
-            assert time.monotonic() - message < 1, "about 10 times per second are expected"
+            assert time.monotonic() - message < 1, "expected None about 10 times per second"
             if reader is not None:
                 yield reader()
             message = time.monotonic()

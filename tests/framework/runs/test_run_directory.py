@@ -49,7 +49,7 @@ Run = Callable[..., RunResult]
 
 @pytest.fixture
 def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunRecord:
-    """Begin a run directory; the overview image is replaced, because it has its own tests."""
+    """Begin a run directory. Its overview image is a placeholder, because other tests cover the image."""
     monkeypatch.setattr(run_directory, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
     return RunRecord.begin(tmp_path / "run", CONFIG, CHOICES)
 
@@ -352,7 +352,7 @@ def test_code_version_of_installed_package_is_unknown(tmp_path: Path, monkeypatc
 
 
 def read_ply(path: Path) -> InstanceMesh:
-    """Return the mesh of a PLY file, read as its header declares."""
+    """Return the mesh of a PLY file, read by the element counts and types in its header."""
     content = path.read_bytes()
     header, _, body = content.partition(b"end_header\n")
     lines = header.decode().splitlines()

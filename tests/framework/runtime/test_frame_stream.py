@@ -31,7 +31,7 @@ from tests.support.scenes.corner_room import (
 )
 
 PATIENCE_S = 10.0
-SLOW_S = 0.03  # duration of a stage that is too slow for the video
+SLOW_S = 0.03  # duration of a stage that is too slow for the video, s
 
 
 @dataclass
@@ -54,7 +54,7 @@ class Handed(LiveVideo):
 
     def come(self, *numbers: int) -> None:
         self.coming.extend(numbers)
-        for _ in range(3):  # iterations of the listener; the last one is complete
+        for _ in range(3):  # iterations of the listener; at least the last one begins after the numbers are added
             while self.asked.acquire(blocking=False):
                 pass
             assert self.asked.acquire(timeout=PATIENCE_S)

@@ -199,9 +199,9 @@ def measure_unread(unread, noise=1.0, seed=0):
 
 
 def slow_loss(unread, noise, seed):
-    """Return the mask (H, W) of dropped pixels: normalized, interpolated Gaussian noise below a quantile."""
+    """Return the mask (H, W) of dropped pixels, where normalized, interpolated Gaussian noise is below a quantile."""
     rng = np.random.default_rng([seed])
-    random_bits((*FRONT.shape, 4), rng)  # the sensor's own dropout uses the first numbers
+    random_bits((*FRONT.shape, 4), rng)  # the sensor's own dropout uses these numbers
     cell = PATCH * CAMERA.width / 640
     rows, columns = (int(side / cell) + 2 for side in FRONT.shape)
     nodes = normal_quantiles()[random_bits((rows, columns), rng) >> 4].astype(float)

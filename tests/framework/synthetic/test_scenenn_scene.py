@@ -130,7 +130,7 @@ def test_scenenn_scene_depth_in_millimeters_matches_mesh(scene: SceneNNScene, me
     read = (depth_mm > 0) & (hits.triangle != NO_TRIANGLE)
     error = np.abs(depth_mm[read] - 1000 * hits.distance[read])
     assert read.mean() > 0.6
-    assert np.median(error / (hits.distance[read] ** 2)) < 3.0, "mm at 1 m; noise is quadratic in depth"
+    assert np.median(error / (hits.distance[read] ** 2)) < 3.0, "mm at 1 m; noise increases with the squared depth"
     color = read_color(color_file)
     assert color.shape == (*scene.camera.shape, 3)
     assert color.std() > 10

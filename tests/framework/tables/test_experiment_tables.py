@@ -88,7 +88,7 @@ def test_table_difference_error_is_over_scenes(tmp_path: Path) -> None:
             run(tmp_path, row, seed, ap, 1.0, scene=scene)
     text = write_tables(tmp_path)
     lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert "| other | 6 | +0.200 ± 0.100 |" in lines  # the error over six runs would be 0.045: significant
+    assert "| other | 6 | +0.200 ± 0.100 |" in lines  # an error over six runs would be 0.045
     assert "paired by seed, scene: mean ± standard error over the values of scene, after averaging" in text
     with (tmp_path / "table.csv").open() as file:
         _, other = csv.DictReader(file)

@@ -139,7 +139,7 @@ def test_sequence_columns_table_has_published_rows(sweep: Path) -> None:
 
 @pytest.mark.parametrize("table", [ACROSS | {"published": "table3"}, BY | {"published": "table2"}])
 def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: dict[str, Any]) -> None:
-    """Sequences that only the publication has get no columns or groups."""
+    """Sequences that occur only in the publication get no columns or groups."""
     experiment(sweep, table)
     run(sweep, "ours", "016", 2, release="synthetic 1, seed 0, 240 frames", **{AP50: 0.5})
     text = write_tables(sweep)
@@ -188,7 +188,7 @@ def test_table_tracked_row_needs_tracked_baseline(sweep: Path) -> None:
 def test_table_separates_other_data_and_annotations(
     sweep: Path, changed: dict[str, Any], usual: str, other: str, annotation: str
 ) -> None:
-    """Runs with different data or annotations are neither averaged nor compared."""
+    """Runs on different data or with different annotations are neither averaged nor compared."""
     for path in sweep.glob("*row=other*/metrics.json"):
         path.unlink()
     run(sweep, "ours", "078", 0, **{AP50: 0.9}, **changed)
@@ -253,7 +253,7 @@ def test_table_bold_mean_ignores_rows_with_fewer_sequences(sweep: Path) -> None:
 
 @pytest.mark.parametrize("table", [ACROSS, BY])
 def test_table_bold_mean_ignores_rows_with_fewer_runs(sweep: Path, table: dict[str, Any]) -> None:
-    """A mean of fewer runs is marked, even if all sequences are present."""
+    """A mean of fewer runs is marked with its number of runs, even if all sequences are present."""
     experiment(sweep, table)
     for path in sweep.glob("*row=other,seed=1*/metrics.json"):
         path.unlink()

@@ -129,7 +129,7 @@ def test_keyframes_add_waits_only_for_relevant_features() -> None:
     assert not may_end.is_set(), "near the pending keyframe, add does not wait"
     threading.Timer(0.1, may_end.set).start()
     keyframes.add(papered_frame(pose(0.1)), pose(0.1))
-    assert may_end.is_set(), "here the result depends on the pending features"
+    assert may_end.is_set(), "at 0.1 m, the result depends on the pending features"
     assert len(keyframes) == 1
 
 

@@ -18,7 +18,7 @@ from tests.support import registered
 
 pytestmark = pytest.mark.integration
 
-ROOMS = 2_000_000  # seed of rooms that are neither training rooms nor held-out rooms
+ROOMS = 2_000_000  # seed; its rooms are neither training rooms nor held-out rooms
 MAX_BYTES = 20 << 20
 
 

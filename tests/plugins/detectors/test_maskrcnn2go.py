@@ -82,7 +82,7 @@ def test_maskrcnn2go_mask_of_bed_overlaps_ground_truth(detector):
             if score > 0.7 and COCO[row.argmax()] == "bed":
                 ious.append(max((mask & (ids == i)).sum() / (mask | (ids == i)).sum() for i in beds))
     assert len(ious) >= 5
-    assert np.median(ious) > 0.7  # the pillows on a bed have their own labels
+    assert np.median(ious) > 0.7  # pillows have their own labels and are not part of the bed
 
 
 def test_maskrcnn2go_mask_grids_match_full_graph():

@@ -42,12 +42,12 @@ def picture(shape: tuple[int, int]) -> Frame:
 
 
 class Saying:
-    """Replacement of OWLv2 that returns given boxes, px, with given probabilities of the queries."""
+    """Replacement for OWLv2 that returns given boxes, px, with given probabilities of the queries."""
 
     dtype = torch.float32
 
     def __init__(self, shape: tuple[int, int], boxes: list[list[float]], probabilities: list[list[float]]) -> None:
-        # Fractions of the square that has the image at its upper left.
+        # fractions of the padded square, with the image at its upper left
         shares = (torch.tensor(boxes) + 0.5) / max(shape)
         centers = (shares[:, :2] + shares[:, 2:]) / 2
         self.boxes = torch.cat([centers, shares[:, 2:] - shares[:, :2]], dim=1)[None]
@@ -59,7 +59,7 @@ class Saying:
 
 
 class Filling:
-    """Replacement of SAM that fills the prompted box."""
+    """Replacement for SAM that fills the prompted box."""
 
     dtype = torch.float32
 

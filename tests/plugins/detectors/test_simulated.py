@@ -113,7 +113,7 @@ def test_simulated_split_object_gives_two_parts_at_split_rate():
     detections = replace(PERFECT, split_rate=1.0).detect(frame())
     assert len(detections) == 8
     assert (detections.masks.sum(axis=0) == np.isin(IDS, (5, 6, 9, 12))).all()
-    assert detections.scores.max() < 0.7  # about half of the object each
+    assert detections.scores.max() < 0.7  # each part covers about half of the object
     rate = np.mean([len(replace(PERFECT, split_rate=0.25).detect(frame(k))) - 4 for k in range(200)]) / 4
     assert rate == pytest.approx(0.25, abs=0.05)
 
@@ -240,8 +240,8 @@ def test_simulated_false_positives_have_given_rate_and_score():
 
 THING = np.zeros((120, 160), np.int32)
 THING[20:60, 20:60] = 5  # a chair
-THING[20:50, 60:90] = 31  # a thing that touches it
-THING[80:110, 20:50] = 32  # one that touches nothing
+THING[20:50, 60:90] = 31  # an object without a class that touches the chair
+THING[80:110, 20:50] = 32  # an object without a class that touches no other object
 ROOM = FrameTruth(THING, {5: "chair", **dict.fromkeys(range(31, 200))})
 
 

@@ -99,7 +99,7 @@ def test_with_embeddings_frame_interval_sets_embedded_frames(siglip: Path) -> No
 
 
 def test_with_embeddings_contrast_controls_background(siglip: Path) -> None:
-    """With contrast 0, only the object affects the embedding; with contrast 1, the background does, too."""
+    """With contrast 0, only the object affects the embedding; with contrast 1, the background affects it, too."""
     plain, other = picture(), picture()
     inside = Blocks().detect(plain).masks[0]
     other.color[~inside] = 255 - other.color[~inside]

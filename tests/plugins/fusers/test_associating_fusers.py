@@ -85,7 +85,7 @@ def test_fuser_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frame
     for k in range(4, 12):
         fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.5])
     [instance] = fuser.scene.instances().values()
-    assert instance.observations == 12, "a frame that saw both halves counts once"
+    assert instance.observations == 12, "a frame with both halves counts once"
     assert set(np.unique(fuser.scene.mesh().instance_ids)) == {0, instance.id}
 
 
@@ -254,10 +254,10 @@ def test_fuser_floored_distribution_is_positive_and_normalized() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lying_on", "same_class", "keeps"), [(0.6, False, True), (1.0, False, False), (0.6, True, False)]
+    ("support_overlap", "same_class", "keeps"), [(0.6, False, True), (1.0, False, False), (0.6, True, False)]
 )
 def test_fuser_supported_object_keeps_voxels_under_larger_mask(
-    lying_on: float, same_class: bool, keeps: bool, frames: list[Frame]
+    support_overlap: float, same_class: bool, keeps: bool, frames: list[Frame]
 ) -> None:
     """The object is confirmed; later only the desk is detected, with a mask that covers the object.
 
@@ -267,7 +267,7 @@ def test_fuser_supported_object_keeps_voxels_under_larger_mask(
         BayesianTsdf,
         voxel_size=0.02,
         max_depth=4.0,
-        support_overlap=lying_on,
+        support_overlap=support_overlap,
         occlusion_area_ratio=0.0,
         merge_agreement=1.0,
     )

@@ -204,7 +204,7 @@ def test_class_only_detected_spheres_are_instances(mapped: SemanticMap) -> None:
 
 
 def test_class_only_score_is_probability_of_best_class(frames: list[Frame]) -> None:
-    """The best class has 0.7, so the background has more than half with score 0.33, and a seventh with 0.6."""
+    """The best class has probability 0.7. The background has more than 1/2 for score 0.33, and 1/7 for score 0.6."""
     for score, label in ((0.33, -1), (0.6, 0)):
         fuser = new_fuser()
         fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [score])

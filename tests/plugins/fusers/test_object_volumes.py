@@ -99,20 +99,20 @@ def test_object_volumes_statistics_include_all_volumes(mapped: ObjectVolumes) ->
     scene = mapped.scene
     objects = sum(volume.block_count for volume in scene.volumes.values())
     assert scene.statistics.voxels == 512 * (scene.background.voxels.block_count + objects)
-    per_object_voxel = 8 + 4  # bytes of a grid and of the two counts
+    per_object_voxel = 8 + 4  # bytes per voxel: grid and two counts
     assert scene.statistics.bytes > 8 * 512 * scene.background.voxels.block_count + per_object_voxel * 512 * objects
     assert 0 < objects < scene.background.voxels.block_count
 
 
 def share_of_the_room(fuser: ObjectVolumes) -> float:
-    """Return the fraction of the first object's vertices that are more than a voxel from all boxes."""
+    """Return the fraction of the first object's vertices that are within a voxel of the room, but not of a box."""
     mesh = fuser.scene.mesh()
     points = mesh.vertices[mesh.instance_ids == 1].astype(np.float64)
     return float((BOXES.owners(points, VOXEL) == 0).mean())
 
 
 def test_object_volumes_remove_single_but_not_constant_bleed() -> None:
-    """The camera moves little, so with constant bleed the same voxels are always under the mask."""
+    """The camera moves only a little, so with constant bleed, the mask always covers the same voxels."""
     once, always = new_fuser(), new_fuser()
     for k, frame in enumerate(pan(0.1)):
         mask = masks_of(frame)[0]

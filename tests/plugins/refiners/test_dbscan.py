@@ -55,7 +55,7 @@ def test_dbscan_keeps_largest_component_with_border(seed):
 
 
 def test_dbscan_eps_increases_with_depth():
-    """The points are 5 cm apart on a line at 2 m."""
+    """The points are 5 cm apart on a line at a depth of 2 m, except for one gap of 11 cm."""
     line = np.stack([np.arange(20) * 0.05, np.zeros(20), np.full(20, 2.0)], axis=1)
     line[12:, 0] += 0.06
     for slope, kept in ((0.01, 12), (0.05, 20)):
@@ -64,7 +64,7 @@ def test_dbscan_eps_increases_with_depth():
 
 
 def test_dbscan_skipped_points_join_nearby_samples():
-    """The two plates have different sizes; with a stride, skipped pixels are assigned like nearby samples."""
+    """Of two plates, the larger is kept; with a stride, skipped pixels are assigned like nearby samples."""
     v, u = np.mgrid[:60, :90]
     plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.3)], axis=-1).reshape(-1, 3)
     clusters = clusters_of(plates)

@@ -131,7 +131,7 @@ def test_voxel_hashing_icp_relocalizes_or_is_lost_after_jump() -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, 0.1])
 def test_voxel_hashing_icp_does_not_depend_on_feature_timing(seconds: float) -> None:
-    """Doubtful and lost frames need keyframes while the worker thread is still extracting one."""
+    """Doubtful and lost frames need keyframes while the worker thread is still extracting features."""
     path = [exp_se3(np.array([0.03 * k - 0.3, 0, 0, 0, 0.01 * k, 0])) for k in range(24)]
     for k in (8, 16, 17):
         path[k] = path[k] @ exp_se3(np.array([0, 0, -0.4, 0, 0.3, 0]))
@@ -326,7 +326,7 @@ def test_voxel_hashing_icp_is_lost_after_bad_final_step(monkeypatch: pytest.Monk
 
 
 def aligned(T_world_camera: np.ndarray, agreement: float = 0.85, behind: float = 0.05) -> Alignment:
-    """Return an alignment with imperfect agreement, as for an inexact camera or a wrong pose."""
+    """Return an alignment with imperfect agreement, as caused by inexact intrinsics or a wrong pose."""
     return Alignment(T_world_camera, 0.7, agreement, behind, agreement / (1 - behind), "", "85% agree")
 
 
@@ -348,9 +348,9 @@ def test_voxel_hashing_icp_steady_motion_needs_less_agreement(
         tracker, "_align", lambda *_: (a := aligned(next(ends))) and (a._replace(doubt="") if perfect.pop(0) else a)
     )
     lost = [tracker.track(frame, fuser.scene).lost for frame in frames[1 : STEADY + 4]]
-    assert not any(lost), "the prediction was correct before"
+    assert not any(lost), "the predictions were correct until now"
     monkeypatch.setattr(tracker, "_align", lambda *_: aligned(tracker._T_world_last @ moved(0.2)))
-    assert tracker.track(frames[-2], fuser.scene).lost, "20 cm from the prediction"
+    assert tracker.track(frames[-2], fuser.scene).lost, "the pose is 20 cm from the prediction"
     for worse in (aligned(tracker._T_world_last, agreement=0.7), aligned(tracker._T_world_last, 0.8, behind=0.15)):
         tracker._lost_frames, tracker._steady_frames = 0, STEADY
         monkeypatch.setattr(tracker, "_align", lambda *_, worse=worse: worse)
@@ -368,7 +368,7 @@ def test_voxel_hashing_icp_uses_features_until_motion_is_steady(monkeypatch: pyt
 
 
 def test_voxel_hashing_icp_features_reject_contradicting_pose(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All points agree with the map, but features give a position 30 cm away, from where alignment diverges."""
+    """All points agree with the map, but features give a position 30 cm away, from which the alignment diverges."""
     frames = [room().frame(walk(1)[0], k) for k in range(2)]
     tracker = VoxelHashingIcp(finest_scale=1.0)
     fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)

@@ -106,7 +106,7 @@ def test_paper_tracker_uses_no_features(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def hidden_frames() -> list[Frame]:
-    """Return a walk with random depth in half of the last view."""
+    """Return frames along a path, the last one with random depth in half of the image."""
     frames = walked(8)
     frames[-1].depth[:, :80] = np.random.default_rng(0).uniform(0.5, 4, (120, 80))
     return frames

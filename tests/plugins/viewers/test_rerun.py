@@ -168,7 +168,7 @@ def test_rerun_camera_has_pose_and_intrinsics(recorded: Path) -> None:
     np.testing.assert_allclose(camera["Transform3D:translation"][0], pose_at(5)[:3, 3], atol=1e-6)
     assert camera["Pinhole:resolution"][0] == [CAMERA.width, CAMERA.height]
     K = np.array(camera["Pinhole:image_from_camera"][0]).reshape(3, 3).T
-    np.testing.assert_allclose(K, [[90, 0, 48], [0, 90, 36], [0, 0, 1]])  # rerun's pixel centers are at half-integers
+    np.testing.assert_allclose(K, [[90, 0, 48], [0, 90, 36], [0, 0, 1]])  # rerun: pixel centers at half-integers
 
 
 def test_rerun_viewer_does_not_change_result(tmp_path: Path) -> None:
@@ -299,7 +299,7 @@ def test_rerun_occupied_port_raises(tmp_path: Path) -> None:
 
 
 def listening() -> set[str]:
-    """Return where this process listens, as ADDRESS:PORT in the hexadecimal format of /proc."""
+    """Return the addresses on which this process listens, as hexadecimal ADDRESS:PORT in the format of /proc."""
     own = {str(file.readlink()) for file in list(Path("/proc/self/fd").iterdir()) if file.is_symlink()}
     lines = [line.split() for table in ("tcp", "tcp6") for line in Path("/proc/net", table).read_text().splitlines()]
     return {line[1] for line in lines if line[3] == "0A" and f"socket:[{line[9]}]" in own}
