@@ -56,7 +56,7 @@ class Open3DSlam:
         return pose
 
     def track(self) -> Pose:
-        """Return the pose of the loaded frame relative to the last rendered view."""
+        """Return the pose of the loaded frame, tracked against the last rendered view."""
         if not self._frames:
             return Pose(self._T_world_camera)
         try:

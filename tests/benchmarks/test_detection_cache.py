@@ -29,7 +29,7 @@ def noise() -> Frame:
 
 
 def ellipses() -> Detections:
-    """Return detections of ellipses of 60 to 260 px."""
+    """Return detections whose masks are ellipses with axes of 60 to 260 px."""
     random = np.random.default_rng(0)
     v, u = np.ogrid[:480, :640]
     half, center = random.uniform(30, 130, (OBJECTS, 2)), random.uniform(0, (640, 480), (OBJECTS, 2))

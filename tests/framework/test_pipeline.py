@@ -345,7 +345,7 @@ def test_pipeline_runs_outside_main_thread(room: CornerRoom) -> None:
 
 @dataclass
 class _InPairs(SphereDetector):
-    """Detector whose detections wait for each other in pairs; their number must be even."""
+    """Detector whose calls wait for each other in pairs; the number of calls must be even."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

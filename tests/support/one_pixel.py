@@ -30,7 +30,7 @@ def measured(
     absence: float,
     last_id: int,
 ) -> Measurement:
-    """Return clusters that all cover the only pixel."""
+    """Return clusters that all cover the only pixel, each with an instance, a score and a class distribution."""
     message = np.flatnonzero(ids).astype(np.int32)
     matched = np.zeros(last_id + 1, np.bool_)
     matched[ids] = True

@@ -25,7 +25,7 @@ def one_voxel(classes: int) -> ClassEvidence:
 
 
 def masks_of(log_ratio: np.ndarray, frame: int = 0) -> MaskClasses:
-    """Return N masks with these log ratios (N, C) of their classes, one pixel each, in one row of pixels."""
+    """Return N one-pixel masks in one image row, with these log ratios (N, C) of their classes."""
     n, c = log_ratio.shape
     clusters = PointClusters(
         np.zeros((n, 3), np.float32),

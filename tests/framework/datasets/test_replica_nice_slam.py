@@ -26,7 +26,7 @@ def write_camera(root: Path, **changes: Any) -> None:
 
 
 def pose_at(k: int) -> np.ndarray:
-    """Return a pose away from the origin, rotated to the right about the vertical axis of the camera."""
+    """Return T_world_camera of frame k, away from the origin and rotated to the right about the camera's y axis."""
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = Rotation.from_rotvec([0, 0.3 * k, 0]).as_matrix()
     T_world_camera[:3, 3] = 1, 2, 0.1 * k

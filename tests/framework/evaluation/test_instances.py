@@ -349,7 +349,7 @@ def test_label_transfers_differ_with_vertex_density():
 
 @pytest.mark.parametrize("transfer", Transfer)
 def test_label_transfer_distance_limit_is_inclusive(transfer):
-    """The distance of 5/64 m is exact in floating point; it is the hypotenuse of 3/64 m and 4/64 m."""
+    """The distance of 5/64 m is exact in floating point; it is the hypotenuse for legs of 3/64 m and 4/64 m."""
     truth = scene([(1, 100)], {1: "chair"})
     moved = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
     moved = replace(moved, points_world=moved.points_world + np.float32([0, 3 / 64, 4 / 64]))

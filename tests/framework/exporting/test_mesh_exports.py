@@ -333,7 +333,7 @@ def test_export_escapes_invalid_unicode_class_names(tmp_path: Path) -> None:
 
 
 def test_exported_instance_colors_match_overview(tmp_path: Path) -> None:
-    """An object has the same color in each file, also if another object is unlikely or not exported."""
+    """An object has the same color in each file, even if another object is unlikely or not exported."""
     run = ExportedRoom().write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())
     entries[0]["confidence"] = 0.1

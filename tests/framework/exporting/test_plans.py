@@ -344,7 +344,7 @@ def test_rooms_wide_opening_does_not_separate(tmp_path: Path) -> None:
 
 
 def by_hand(text: str) -> Plan:
-    """Return a plan with cells of 0.5 m: # wall, . free, o occupied, unknown elsewhere."""
+    """Return a plan with cells of 0.5 m from text: # = wall, . = free, o = occupied, space = unknown."""
     rows = np.array([list(row) for row in text.split("\n")])[::-1]
     free, wall, occupied = rows == ".", rows == "#", rows == "o"
     return Plan(0.5, np.zeros(2), occupied | wall, free, free, wall, np.zeros(rows.shape, np.int32))

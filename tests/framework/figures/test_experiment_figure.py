@@ -37,7 +37,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def list_objects(directory: Path, class_name: str, vertices: list[int]) -> None:
-    """Write an instances.json with one object per entry of `vertices`, the number of its vertices."""
+    """Write an instances.json with one object for each vertex count in `vertices`."""
     expected = {"class": class_name, "confidence": 0.9, "class_probabilities": {class_name: 1.0}, "observations": 5}
     box = {"center": [0, 0, 0], "extent": [1, 1, 1], "rotation": np.eye(3).tolist()}
     expected |= {"first_frame": 0, "last_frame": 9, "centroid": [0, 0, 0], "obb": box}

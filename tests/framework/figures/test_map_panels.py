@@ -29,7 +29,7 @@ def stored(ids: Mapping[int, int]) -> StoredMap:
 
 
 def hue(color: np.ndarray) -> np.ndarray:
-    """Return the direction of an RGB color; its length, the brightness, depends on the lighting."""
+    """Return the unit vector (3,) of an RGB color minus its smallest channel; it is independent of the lighting."""
     direction = color - color.min()
     return direction / np.linalg.norm(direction)
 

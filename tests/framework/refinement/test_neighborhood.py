@@ -147,7 +147,7 @@ def test_neighborhood_matches_back_projection_and_distances():
 
 
 def _chamfer_reference(mask: np.ndarray) -> np.ndarray:
-    """Return the 3-4 chamfer distance (H, W), px / 3, from a mask, by relaxation until convergence."""
+    """Return the 3-4 chamfer distance (H, W) from a mask, in thirds of a pixel, by relaxation until convergence."""
     distance = np.where(mask, 0, 10**6)
     while True:
         padded = np.pad(distance, 1, constant_values=10**6)

@@ -233,7 +233,7 @@ def test_sequence_groups_table_has_expected_lines(sweep: Path) -> None:
 
 
 def test_table_bold_mean_ignores_rows_with_fewer_sequences(sweep: Path) -> None:
-    """The best tracked row has fewer sequences than the rows with given poses."""
+    """Of the tracked rows, the one with the highest mean has only one sequence; the others have two."""
     experiment(sweep, BY)
     for row, scene, value in (
         ("ours", "011", 0.2),

@@ -74,7 +74,7 @@ class Dropping(ClusterRefiner):
 
 @dataclass
 class Writing(PoseTracker):
-    """Tracker that starts at an arbitrary pose and, if `writes`, changes the map."""
+    """Tracker that returns a fixed, wrong pose and, if `writes`, changes the map."""
 
     writes: bool = False
 

@@ -311,7 +311,7 @@ def test_linear_weights_require_matching_normals_for_color() -> None:
 
 @pytest.mark.parametrize("kind", SensorKind)
 def test_geometric_weight_is_inverse_variance_of_sensor(kind: SensorKind) -> None:
-    """At the true pose, each matched point adds (n / sigma)^2 to the information of a translation."""
+    """At the true pose, each matched point with normal n adds (n / sigma)^2 to the information of a translation."""
     frame = WALL.frame(T_VIEW)
     model, intensities = model_of(WALL)
     level = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3, kind)[0]

@@ -34,7 +34,7 @@ def frame_at(t: float, delay: float, index: int = 0) -> Frame:
 
 
 def error(frame: Frame, expected: np.ndarray) -> float:
-    """Return the mean color difference, in gray levels, inside the border, where color is missing."""
+    """Return the mean color difference, in gray levels, excluding the border, where color is missing."""
     inner = np.s_[12:-12, 12:-12]
     return float(np.abs(frame.color[inner].astype(float) - expected[inner]).mean())
 

@@ -115,7 +115,7 @@ def test_mask_rcnn_sides_default_to_network_settings(path):
 def known_object(folder, monkeypatch, extent, resized):
     """Return a detector that resizes images to a short side of `resized` px and detects one chair.
 
-    `extent` is the box x1 y1 x2 y2 of the chair, px of an image of 160x120 px.
+    `extent` is the box x1 y1 x2 y2 of the chair, px, in an image of 160x120 px.
     """
     network = tiny_network(replace(TINY, short_side=resized, long_side=4 * resized))
     for parameter in network.roi_heads.parameters():

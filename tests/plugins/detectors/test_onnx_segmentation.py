@@ -27,7 +27,7 @@ def frame():
 def outputs(objectness=False, transposed=False):
     """Return the outputs for a cup in the left half of its box and a chair in the lower half of its box.
 
-    The prototypes are linear in the pixel.
+    The prototypes are linear in the pixel coordinates.
     """
     cells = SIZE // CELL
     prototypes = np.stack(

@@ -127,7 +127,7 @@ def slow_distributions(
 ) -> tuple[Float64, Float64] | None:
     """Return the class and instance distributions of a voxel, by eqs. (6) to (8) in float64; instance 0 = none.
 
-    Return None if it depends on rounding which pixel sees the voxel or whether it is near the surface.
+    Return None if rounding determines which pixel sees the voxel, or that the voxel is near the surface.
     """
     assert frame.T_world_camera is not None
     x, y, z = (inverse(frame.T_world_camera) @ [*position, 1.0])[:3]

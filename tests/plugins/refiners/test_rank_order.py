@@ -49,7 +49,7 @@ def test_rank_order_separated_blobs_split_at_any_scale(scale):
 
 
 def test_rank_order_skipped_points_join_nearest_sample():
-    """Of 5400 points of two plates at most 200 are sampled, one per pixel block; others join the nearest sample."""
+    """Of the 5400 points of two plates, at most 200 are sampled, one per pixel block; others join the nearest one."""
     v, u = np.mgrid[:60, :90]
     rng = np.random.default_rng(0)
     plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.5)], axis=-1).reshape(-1, 3)

@@ -137,7 +137,7 @@ def elsewhere() -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def clean_error(frames: list[Frame], surface: Surface) -> tuple[float, float]:
-    """Return the error of the map without bad frames."""
+    """Return the errors of the map without bad frames, as defined by `Surface.error`."""
     return surface.error(run(VoxelHashingIcp(), [*frames[:60], *frames[60:5:-1]])[1])
 
 

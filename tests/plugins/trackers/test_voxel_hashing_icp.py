@@ -481,7 +481,7 @@ def test_voxel_hashing_icp_lost_reason_names_scattered_depth() -> None:
 
 
 def coarse(frame: Frame) -> Frame:
-    """Return the frame with depth in steps of 3.92 cm, as in 8 bits."""
+    """Return the frame with depth in steps of 3.92 cm, as in 8 bits over a range of 10 m."""
     steps = (np.floor(frame.depth / 0.0392) + 0.5) * 0.0392
     return dataclasses.replace(frame, depth=np.where(frame.depth > 0, steps, 0).astype(np.float32))
 

@@ -101,7 +101,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def stages_timed(milliseconds: Sequence[float]) -> list[str]:
-    """Return the stages with a finite time; there is one value per stage of the legend."""
+    """Return the stages with a finite time; `milliseconds` has one value per stage of the legend."""
     return [stage for stage, time in zip(STAGE_COLORS, milliseconds, strict=True) if np.isfinite(time)]
 
 

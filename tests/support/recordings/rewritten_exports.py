@@ -25,7 +25,7 @@ class Surgery:
         self._names = 0
 
     def add(self, kind: str, *inputs: str | np.ndarray[Any, Any], outputs: int = 1, **attributes: Any) -> Any:
-        """Add a node; array inputs become constants. Returns the names of its outputs."""
+        """Add a node; array inputs become constants. Return the names of its outputs."""
         names = [self._constant(one) if isinstance(one, np.ndarray) else one for one in inputs]
         made = [self._name() for _ in range(outputs)]
         self.graph.node.append(helper.make_node(kind, names, made, **attributes))

@@ -52,7 +52,7 @@ def faces(block: Block, inward: bool = False) -> tuple[np.ndarray, np.ndarray]:
 
 
 def look_about(places: Sequence[tuple[float, float, float]], n: int = 12) -> Float64:
-    """Return the poses T_room_camera (F, 4, 4) of cameras at `places` (m) that look in all directions and down."""
+    """Return T_room_camera (F, 4, 4) of cameras at `places` (m), in `n` directions and at three downward angles."""
     poses = []
     for place in places:
         for angle in np.linspace(0, 2 * np.pi, n, endpoint=False):

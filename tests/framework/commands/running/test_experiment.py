@@ -111,7 +111,7 @@ def test_experiment_table_has_one_column_per_sequence(tmp_path: Path) -> None:
 
 
 def composed(overrides: list[str], *directories: Path) -> tuple[DictConfig, Any]:
-    """Return the config and the choices by group of a job, as in a sweep."""
+    """Return the config of a sweep job, and its chosen option in each config group."""
     with initialize_config_dir(str(directories[0] if directories else CONF), version_base="1.3"):
         config = compose("config", overrides=overrides, return_hydra_config=True)
         HydraConfig.instance().set_config(config)

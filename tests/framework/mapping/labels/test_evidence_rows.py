@@ -81,7 +81,7 @@ def at_pixel(block: int, *voxels: int) -> SeenBlocks:
 
 
 def seen_at(blocks: Int32, pixels: Int32) -> SeenBlocks:
-    """Return the seen blocks of a frame; `pixels` (A, 512) see their voxels, -1 = far from the surface."""
+    """Return the seen blocks of a frame; `pixels` (A, 512) are those that see the voxels, -1 = far from the surface."""
     block, voxel = np.nonzero(pixels >= 0)
     count = np.bincount(block, minlength=len(blocks))
     return SeenBlocks(

@@ -41,7 +41,7 @@ def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) ->
 
 
 def test_integration_of_one_frame_matches_reference() -> None:
-    """The reference computes every voxel of the active blocks in double precision and plain numpy."""
+    """The reference computes every voxel of the active blocks with plain NumPy in double precision."""
     frame = room().frame(pose(0.1, -0.05, 0.0, (0.1, -0.2, 0.05)))
     integrator = new_integrator()
     active, near_pixel = seen_by(integrator, frame, frame.T_world_camera)
@@ -252,7 +252,7 @@ def test_integration_limits_weight_to_maximum() -> None:
 
 
 def test_integration_averages_noise() -> None:
-    """After 40 frames with 10 mm noise, noise of about 10 / sqrt(40) mm remains in voxels near the surface."""
+    """After 40 frames with noise of 10 mm, voxels near the surface have noise of about 10 / sqrt(40) mm."""
     frame = room().frame(pose())
     integrator = new_integrator()
     rng = np.random.default_rng(0)

@@ -22,7 +22,7 @@ def blobs(seed: int, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sklearn_from(points: np.ndarray, labels: np.ndarray, iterations: int, floor: float = 0.0) -> GaussianMixture:
-    """Return scikit-learn's mixture started from the M-step of `labels`."""
+    """Return scikit-learn's mixture, initialized by an M-step from `labels`."""
     covariances = np.array([np.cov(points[labels == j].T, bias=True) for j in range(4)], np.float64)
     reference = GaussianMixture(
         4,

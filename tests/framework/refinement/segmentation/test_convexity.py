@@ -56,7 +56,7 @@ def noisy(depth: np.ndarray, noise: float) -> np.ndarray:
 
 
 def main_segment(labels: np.ndarray, region: np.ndarray) -> tuple[int, float, float]:
-    """Return the largest segment in a region, its fraction of the region, and the fraction of it inside the region."""
+    """Return the segment that covers most of a region, the covered fraction of the region, and that of the segment."""
     label = np.bincount(labels[region] + 1).argmax() - 1
     both = ((labels == label) & region).sum()
     return int(label), both / region.sum(), both / (labels == label).sum()
