@@ -49,7 +49,7 @@ FIELDS = ("masks", "boxes", "scores", "class_probabilities")
 
 @dataclass
 class Noise(Detector):
-    """Detector that returns random masks, seeded with the color image and the parameter, and counts its calls."""
+    """Detector that returns random masks, seeded with the color image and `strength`, and counts its calls."""
 
     strength: float = 1.0
     broken_at: int = -1
