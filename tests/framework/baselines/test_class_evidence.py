@@ -62,7 +62,7 @@ def test_class_evidence_few_classes_are_exact() -> None:
     assert evidence.masked[0, 0] == 30
 
 
-def test_class_evidence_late_class_includes_earlier_masks() -> None:
+def test_class_evidence_of_later_class_includes_earlier_masks() -> None:
     """Each mask has its own log ratios for 8 of 14 classes and an equal log ratio for the others."""
     rng = np.random.default_rng(1)
     message = np.full((20, 14), -3.0)

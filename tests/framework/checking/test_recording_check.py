@@ -160,7 +160,7 @@ def test_recording_check_reports_clock_delay_in_two_units(tmp_path: Path) -> Non
     assert "3 frames late (0.096 s)" in fault.text
 
 
-def test_recording_check_unrelated_poses_fit_in_no_axes(tmp_path: Path) -> None:
+def test_recording_check_unrelated_poses_fit_no_convention(tmp_path: Path) -> None:
     turned = iter(range(1000))
 
     def another(_: Float64) -> Float64:

@@ -210,7 +210,7 @@ def test_label_transfer_to_map_counts_map_vertices():
     assert evaluate(twice, truth, transfer=Transfer.TO_MAP).best_ious[1] == pytest.approx(100 / 120)
 
 
-def test_evaluate_empty_map_or_truth_is_handled():
+def test_evaluate_empty_map_has_zero_scores_and_empty_truth_none():
     truth = scene([(1, 100)], {1: "chair"})
     empty = PredictedInstances(
         np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.int64), np.zeros(0), ()

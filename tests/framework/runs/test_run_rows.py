@@ -201,7 +201,7 @@ def test_rows_ignore_table_and_debug_settings() -> None:
     assert list(names(records)) == ["all runs"]
 
 
-def test_rows_of_presets_have_their_own_names() -> None:
+def test_rows_of_presets_have_distinct_names() -> None:
     records = [
         record({"row": "default", "seed": 0, "tracker": {"scale": 0.5}}, tracker="icp", refiner="chain", fuser="tsdf"),
         record({"row": "paper", "seed": 0, "tracker": {"scale": 1}}, tracker="paper", refiner="tree", fuser="tsdf"),

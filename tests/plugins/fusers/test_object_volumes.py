@@ -224,7 +224,7 @@ def test_object_volumes_probabilities_are_mean_of_detections(frames: list[Frame]
     assert set(mesh.class_ids[mesh.instance_ids == 1]) == {1}
 
 
-def test_object_volumes_unconfirmed_is_removed_when_visible(frames: list[Frame]) -> None:
+def test_object_volumes_unconfirmed_object_in_view_is_removed(frames: list[Frame]) -> None:
     """After 1 detection and n misses, the probability of existence is 2 / (3 + n), below 0.1 for n >= 18."""
     frame, fuser = frames[0], new_fuser(min_observations=1)
     wall = np.zeros(CAMERA.shape, np.bool_)

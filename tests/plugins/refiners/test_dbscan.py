@@ -84,7 +84,7 @@ def test_dbscan_weights_sampled_points_for_skipped_points():
         assert len(refiner.refine(clusters_of(plate), FRAME).pixels) == kept, "at most 5 samples are within eps"
 
 
-def test_dbscan_first_of_two_equal_components_stays():
+def test_dbscan_first_of_two_equal_components_is_kept():
     rng = np.random.default_rng(0)
     ball = rng.normal(0, 0.01, (50, 3))
     for offset in (1.0, -1.0):
@@ -111,7 +111,7 @@ def test_dbscan_degenerate_clusters_are_valid():
     assert len(Dbscan(eps=0.001, eps_per_depth=0, min_points=1, stride=1).refine(clusters_of(far), FRAME).pixels) == 1
 
 
-def test_dbscan_unassigned_points_stay():
+def test_dbscan_keeps_unassigned_points():
     clusters = clusters_of(blobs(0))
     cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, 0).astype(np.int32)
     refined = Dbscan(stride=1).refine(replace(clusters, cluster=cluster), FRAME)

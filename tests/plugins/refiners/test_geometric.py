@@ -108,7 +108,7 @@ def test_geometric_does_not_claim_segment_below_min_overlap(min_overlap, claimed
     assert len(refined) == 1
 
 
-def test_geometric_unassigned_points_stay():
+def test_geometric_keeps_unassigned_points():
     depth, ids = table()
     frame = frame_of(depth)
     before = lifted((ids == 1)[None], frame)

@@ -136,7 +136,7 @@ def test_gmm_frame_point_assignment_matches_reference(levels: int, children: int
 
 
 @pytest.mark.parametrize("treatment", ForeignPoints)
-def test_gmm_frame_foreign_points_move_drop_or_stay(treatment: ForeignPoints) -> None:
+def test_gmm_frame_foreign_points_are_moved_dropped_or_kept(treatment: ForeignPoints) -> None:
     points, masks, _ = three_objects(2)
     clusters = clusters_of(points, masks, (0.9, 0.8, 0.7))
     expected = slow_masks(GmmFrame(), points, masks, 3)

@@ -111,7 +111,7 @@ def test_gmm_tree_cluster_with_too_few_points_is_unchanged():
     assert len(GmmTree(min_node=10**6).refine(few, sparse).pixels) == len(few.pixels), "a tree without a node"
 
 
-def test_gmm_tree_unassigned_points_stay():
+def test_gmm_tree_keeps_unassigned_points():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids > 0, 8)[None], frame)

@@ -204,7 +204,7 @@ def test_plane_removal_small_plane_is_not_structure():
         assert len(strict.refine(clusters, frame).pixels) == len(clusters.pixels)
 
 
-def test_plane_removal_unassigned_points_stay():
+def test_plane_removal_keeps_unassigned_points():
     frame, ids = scene(BOX)
     clusters = lifted(frame, bleeding(ids == 1), np.zeros_like(ids, bool))
     cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, clusters.cluster).astype(np.int32)

@@ -160,7 +160,7 @@ def test_shrinking_refiner_keeps_cluster_with_too_few_points(make):
     assert len(make().refine(box, lonely).pixels) == (ids == 1).sum(), "a ring without depth"
 
 
-def test_shrinking_refiner_unassigned_points_stay():
+def test_shrinking_refiner_keeps_unassigned_points():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids == 1, 8)[None], frame)

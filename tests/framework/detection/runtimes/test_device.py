@@ -9,7 +9,7 @@ from framework.detection.runtimes.device import one_torch_thread
 PATIENCE_S = 10.0
 
 
-def test_one_torch_thread_overlapping_uses_restore_count():
+def test_one_torch_thread_in_two_threads_restores_thread_count():
     """A thread that uses torch for the first time gets the last count that any thread has set."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)

@@ -207,7 +207,7 @@ def test_mixture_tree_cut_matches_slow_reference():
     assert not mixture_tree.cut(np.ones((50, 3), np.float32), np.array([0, 50]), 8).any(), "equal points are not cut"
 
 
-def test_mixture_tree_degenerate_sets_are_handled():
+def test_mixture_tree_degenerate_sets_have_at_most_one_node():
     points = np.concatenate([np.ones((40, 3)), surface(0, 200), np.zeros((1, 3))]).astype(np.float32)
     starts = np.array([0, 0, 40, 240, 241])
     tree = grown(points, starts, levels=2)
