@@ -208,11 +208,11 @@ def test_recording_check_reports_unregistered_depth(zoom: float, x: float, y: fl
 
 def test_recording_check_half_frame_color_delay_gives_note() -> None:
     """The desk begins with a rotation of 20 px per frame. A Kinect captures color and depth at different times."""
-    [expected] = [
+    [note] = [
         finding for finding in check(replace(DESK, stop=6), FARTHEST).findings if finding.subject == "color and depth"
     ]
-    assert expected.verdict is Verdict.NOTE
-    assert "with an image motion of" in expected.text
+    assert note.verdict is Verdict.NOTE
+    assert "with an image motion of" in note.text
 
 
 @dataclass

@@ -132,9 +132,9 @@ def test_export_facing_aligns_box_with_room_x_axis(degrees: float, yaw: float, s
 
 def test_glb_nodes_have_object_metadata(room: UprightRoom) -> None:
     found = header(glb(parts(room)))
-    message = {node["name"]: node.get("extras") for node in found["nodes"]}
-    assert message["cube_2"] == {"id": 2, "class": "cube", "probability": pytest.approx(0.9), "confidence": 0.8}
-    assert not message["room"]
+    extras = {node["name"]: node.get("extras") for node in found["nodes"]}
+    assert extras["cube_2"] == {"id": 2, "class": "cube", "probability": pytest.approx(0.9), "confidence": 0.8}
+    assert not extras["room"]
     assert found["asset"]["version"] == "2.0"
     assert found["extensionsUsed"] == ["KHR_materials_unlit"]
     materials = [found["materials"][mesh["primitives"][0]["material"]] for mesh in found["meshes"]]

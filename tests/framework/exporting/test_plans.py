@@ -144,24 +144,24 @@ def test_plan_looked_through_excludes_occluded_points(room: UprightRoom) -> None
 def test_ros_map_matches_map_server_thresholds(run: Path, low: Plan, tmp_path: Path) -> None:
     written = export(run, [ExportFormat.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION, robot_height=0.5))
     assert [path.name for path in written] == ["floor_plan.png", "floor_plan.geojson", "map.pgm", "map.yaml"]
-    message = yaml.safe_load((tmp_path / "map.yaml").read_text())
-    image = Image.open(tmp_path / message["image"])
+    header = yaml.safe_load((tmp_path / "map.yaml").read_text())
+    image = Image.open(tmp_path / header["image"])
     assert (image.format, image.mode, image.size) == ("PPM", "L", (43, 33))
     gray = np.asarray(image)
     np.testing.assert_array_equal(gray, levels(low))
     # map_server: p = (255 - gray) / 255; occupied above one threshold, free below the other
     p = (255 - gray.astype(float)) / 255
-    assert {level: bool(p[gray == level].max() < message["free_thresh"]) for level in (FREE, UNKNOWN, OCCUPIED)} == {
+    assert {level: bool(p[gray == level].max() < header["free_thresh"]) for level in (FREE, UNKNOWN, OCCUPIED)} == {
         FREE: True,
         UNKNOWN: False,
         OCCUPIED: False,
     }
-    assert (p[gray == OCCUPIED] > message["occupied_thresh"]).all()
-    assert (p[gray == UNKNOWN] < message["occupied_thresh"]).all()
+    assert (p[gray == OCCUPIED] > header["occupied_thresh"]).all()
+    assert (p[gray == UNKNOWN] < header["occupied_thresh"]).all()
     # the pixel of a table leg, from the origin at the lower left corner
-    x, y, turn = message["origin"]
+    x, y, turn = header["origin"]
     assert turn == 0
-    column, row = int((0.825 + OFF - x) / message["resolution"]), int((1.025 + OFF - y) / message["resolution"])
+    column, row = int((0.825 + OFF - x) / header["resolution"]), int((1.025 + OFF - y) / header["resolution"])
     assert gray[len(gray) - 1 - row, column] == OCCUPIED
 
 

@@ -237,10 +237,10 @@ def test_figures_command_prints_paths_and_errors(
     monkeypatch.setattr(sys, "argv", ["figures", str(maps), str(maps / "nowhere")])
     with pytest.raises(SystemExit) as ended:
         figures.main()
-    message = capsys.readouterr()
+    printed = capsys.readouterr()
     assert ended.value.code == 1
-    assert message.out.splitlines() == [str(maps / "figure.png"), str(maps / "figure.pdf")]
-    assert message.err.splitlines()[-1] == f"error: {maps / 'nowhere'}: expected a folder of runs, got no folder"
+    assert printed.out.splitlines() == [str(maps / "figure.png"), str(maps / "figure.pdf")]
+    assert printed.err.splitlines()[-1] == f"error: {maps / 'nowhere'}: expected a folder of runs, got no folder"
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError("a worker failed"), KeyboardInterrupt()])

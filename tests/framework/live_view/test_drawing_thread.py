@@ -112,8 +112,8 @@ def test_drawing_thread_draw_error_is_logged_once(room: CornerRoom, caplog: pyte
         background.skip("a fault")
         time.sleep(0.02)
     background.end()
-    expected = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
-    assert expected == ["viewer: disabled after an error; the run continues: [Errno 28] No space left on device"]
+    logged = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    assert logged == ["viewer: disabled after an error; the run continues: [Errno 28] No space left on device"]
     assert book.closed
 
 
@@ -126,8 +126,8 @@ def test_drawing_thread_close_error_is_logged_once(
     )
     background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
     background.end()
-    [expected] = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
-    assert ("No space left" if fails else "the writer's thread has ended") in expected
+    [logged] = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    assert ("No space left" if fails else "the writer's thread has ended") in logged
 
 
 def test_drawing_thread_map_error_does_not_end_run(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:

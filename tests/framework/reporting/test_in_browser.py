@@ -99,7 +99,7 @@ def test_report_click_on_object_shows_details(pages: list[Path], opened: Any, tm
     first = page.evaluate("report.objects[0]")
     page.mouse.click(*page.evaluate(PLACE_OF, first["id"]))
     panel = page.inner_text("#panel")
-    for output in (
+    for text in (
         first["class"],
         first["size"],
         first["place"],
@@ -107,7 +107,7 @@ def test_report_click_on_object_shows_details(pages: list[Path], opened: Any, tm
         "Class probabilities",
         "Truth",
     ):
-        assert output in panel
+        assert text in panel
     assert page.locator("#panel img").count() == 1
     row = page.locator(f"tr[data-id='{first['id']}']")
     assert row.get_attribute("aria-selected") == "true"

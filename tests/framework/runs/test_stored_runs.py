@@ -160,9 +160,9 @@ def test_is_recorded_other_code_is_true_with_warning(
 ) -> None:
     write(directory, config_hash=config_hash(CONFIG), **theirs)
     assert is_recorded(directory, OmegaConf.create(CONFIG))
-    [expected] = caplog.records
-    assert expected.levelno == logging.WARNING
-    assert "the current commit is abcdef0" in expected.getMessage()
+    [record] = caplog.records
+    assert record.levelno == logging.WARNING
+    assert "the current commit is abcdef0" in record.getMessage()
 
 
 SETTINGS = {"threads": 4, "prefetch": 2, "detection_cache": "off"}

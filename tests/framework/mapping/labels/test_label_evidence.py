@@ -169,13 +169,13 @@ def test_sum_rule_counts_observations() -> None:
 
 def test_compact_scores_saturate_without_wrapping() -> None:
     evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
-    message = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(max_score=MAX_SCORE)
+    measurement = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(max_score=MAX_SCORE)
     relative = np.zeros((2, 6))
     relative[:, 2], relative[:, 3] = MAX_CLUSTER_SCORE, -MAX_CLUSTER_SCORE
-    bits = (message.class_scores & ALL_NAMED).astype(np.uint8)
+    bits = (measurement.class_scores & ALL_NAMED).astype(np.uint8)
     for _ in range(40):
         update_voxel(
-            evidence, 0, message._replace(class_scores=pack_class_scores(relative, 1, bits, np.int32)), COVERED
+            evidence, 0, measurement._replace(class_scores=pack_class_scores(relative, 1, bits, np.int32)), COVERED
         )
     assert evidence.class_value[0, :2].tolist() == [MAX_SCORE, -MAX_SCORE]
     assert best_class(evidence, 0) == 2
@@ -188,11 +188,11 @@ def test_most_likely_class_is_stable_over_repetition(classes: int, best: float) 
     p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
     relative, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
     evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
-    message = measured([1], [0.9], p, 1.0, 1)._replace(
+    measurement = measured([1], [0.9], p, 1.0, 1)._replace(
         class_scores=pack_class_scores(relative, 64, bits, np.int32), named_classes=named, max_score=MAX_SCORE
     )
     for _ in range(1000):
-        update_voxel(evidence, 0, message, COVERED)
+        update_voxel(evidence, 0, measurement, COVERED)
         assert best_class(evidence, 0) == classes - 1
 
 
