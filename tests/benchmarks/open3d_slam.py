@@ -96,15 +96,15 @@ class Open3DSlam:
     @property
     def bytes_used(self) -> int:
         """Return the size of the blocks in use, bytes."""
-        return int(self._model.get_hashmap().size()) * self._bytes_a_block
+        return int(self._model.get_hashmap().size()) * self._bytes_per_block
 
     @property
     def bytes_allocated(self) -> int:
         """Return the size of all allocated blocks, bytes."""
-        return int(self._model.get_hashmap().capacity()) * self._bytes_a_block
+        return int(self._model.get_hashmap().capacity()) * self._bytes_per_block
 
     @property
-    def _bytes_a_block(self) -> int:
+    def _bytes_per_block(self) -> int:
         grid = self._model.voxel_grid
         arrays = [grid.attribute(name) for name in ("tsdf", "weight", "color")]
         return sum(array[0].num_elements() * array.dtype.byte_size() for array in arrays)

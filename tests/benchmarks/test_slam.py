@@ -26,22 +26,22 @@ from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
 from tests.benchmarks.comparison import NOTHING, Table, mib, ms, times
 from tests.benchmarks.open3d_slam import Method, Open3DSlam
 from tests.benchmarks.recordings import Recording, furnished_room, red_kitchen
-from tests.benchmarks.room_row import FRAMES_A_ROOM, LENGTH, RoomRow
+from tests.benchmarks.room_row import FRAMES_PER_ROOM, LENGTH, RoomRow
 from tests.benchmarks.slam_loop import RENDERING, SlamLoop, seconds
 
 VOXEL_SIZES = (0.01, 0.02)  # m
 TURN = 10  # frames
-FIRST, LAST = 20, 80  # frames in [FIRST, LAST) are evaluated; before, caches are cold
+FIRST, LAST = 20, 80  # frames in [FIRST, LAST) are evaluated; caches are cold before
 TARGETS = {  # speedup over Open3D
     "redkitchen": {"whole loop": ">= 6", "integrate": ">= 3.5", "render full image": ">= 3"},
     "synthetic room": {"whole loop": ">= 5", "integrate": ">= 4", "render full image": ">= 3"},
 }
 TARGETS_AT = 0.01  # m, voxel size of the targets
-FRAMES = 2000  # frames
+FRAMES = 2000  # number of frames of the long path
 WARM = 10  # number of warm-up frames
 EARLY, LATE = (WARM, 700), (WARM + 1300, FRAMES)  # compared frames: a third each, a whole number of rooms apart
 SECOND_START = LATE[0] - EARLY[0]
-assert SECOND_START % FRAMES_A_ROOM == 0, "expected a distance of whole rooms"
+assert SECOND_START % FRAMES_PER_ROOM == 0, "expected a distance of whole rooms"
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +154,7 @@ def test_slam_long_path_has_constant_speed(benchmark, tables) -> None:
     record_frame()
     drift = np.linalg.norm((inverse(path[FRAMES - 1].T_world_camera) @ long.poses[-1].T_world_camera)[:3, 3])
     lost = long.lost
-    for k in range(FRAMES - 2, FRAMES - FRAMES_A_ROOM, -1):  # back through the last room, which is already mapped
+    for k in range(FRAMES - 2, FRAMES - FRAMES_PER_ROOM, -1):  # back through the last room, which is already mapped
         long(path[k], detector.detect(path[k]))
 
     early, late, small_map = (
@@ -167,7 +167,7 @@ def test_slam_long_path_has_constant_speed(benchmark, tables) -> None:
     worst = [max(spent["long"][slice(*window)]) for window in (EARLY, LATE, (WARM, FRAMES))]
     percentile = float(np.quantile(spent["long"][WARM:], 0.999))
     table = Table(
-        f"Long path: {FRAMES} frames, {FRAMES / FRAMES_A_ROOM:.1f} rooms, 640x480, 1 cm voxels",
+        f"Long path: {FRAMES} frames, {FRAMES / FRAMES_PER_ROOM:.1f} rooms, 640x480, 1 cm voxels",
         ["", *(f"frames {begin} to {end}" for begin, end in (EARLY, LATE)), "ratio", "target"],
         [
             ["track + fuse, ms, median; alternating with a small map", ms(small_map), ms(late),
@@ -188,7 +188,7 @@ def test_slam_long_path_has_constant_speed(benchmark, tables) -> None:
             f"Map growth on the way back in the last room: {100 * (after[1] / at_2000[1] - 1):.1f} % in voxels and "
             f"{100 * (after[0] / at_2000[0] - 1):.1f} % in bytes.",
             f"Lost: {lost} of {FRAMES}, and {long.lost - lost} on the way back. Drift after "
-            f"{LENGTH * FRAMES / FRAMES_A_ROOM:.0f} m: {1e3 * drift:.0f} mm. {len(scene.instance_ids())} instances.",
+            f"{LENGTH * FRAMES / FRAMES_PER_ROOM:.0f} m: {1e3 * drift:.0f} mm. {len(scene.instance_ids())} instances.",
         ],
     )  # fmt: skip
     tables.append(table)

@@ -36,16 +36,16 @@ def test_option_composes_and_builds(stage: str, name: str, ready: Callable[..., 
     assert isinstance(ready(stage, name), GROUPS[stage])
 
 
-NEEDY = {  # the first parameter that the user must set, by option
+REQUIRED = {  # the first parameter that the user must set, by option
     key: asked[0]
     for key, option in registered.OPTION.items()
     if (asked := [parameter.name for parameter in option.parameters if parameter.default == "???"])
 }
 
 
-@pytest.mark.parametrize(("stage", "name"), NEEDY)
+@pytest.mark.parametrize(("stage", "name"), REQUIRED)
 def test_option_missing_required_parameter_or_file_raises(stage: str, name: str) -> None:
-    key = f"{stage}.{NEEDY[stage, name]}"
+    key = f"{stage}.{REQUIRED[stage, name]}"
     with pytest.raises(ConfigError, match=rf"expected a value for .*, got none; set .*{key}"):
         registered.built(stage, name)
     with pytest.raises(DataError, match="/nowhere"):
@@ -86,7 +86,7 @@ def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
         )
         for link in [shown] if one else node[key]:
             found = node[key] if one else node[key][link]
-            assert found == registered.composed(stage, link)[stage], "a link equals the option of its name"
+            assert found == registered.composed(stage, link)[stage], "expected the link to equal the option of its name"
     fields = [field for name, (field, _) in parameter_fields(plugin_class).items() if name not in links]
     asked = [field.name for field in fields if OmegaConf.is_missing(node, field.name)]
     answered = set(own) if is_variant else set()  # desk sets the path of its frames

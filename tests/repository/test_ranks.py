@@ -112,7 +112,7 @@ def test_ranks_row_interval_is_bootstrap_over_rows(tmp_path: Path) -> None:
     low, high = np.quantile([spearmanr(ours[k], theirs[k]).statistic for k in drawn], [0.025, 0.975])
     assert found.over_rows == pytest.approx((low, high), abs=0.05)
     assert found.over_rows[0] < found.rho < found.over_rows[1]
-    assert np.isnan(found.over_runs).all(), "one run gives no interval"
+    assert np.isnan(found.over_runs).all(), "expected no interval for one run"
 
 
 def test_ranks_run_interval_reflects_seed_noise(tmp_path: Path) -> None:
@@ -174,7 +174,7 @@ def test_ranks_of_several_metrics_are_written_to_files(places: list[Path], tmp_p
     text = write_ranks(places, [AP50, IOU], out)
     assert (out / "ranks.md").read_text() == text
     assert text.count("\n## ") == 2
-    assert "| rooms, flat | 4 | – | – | – |" in lines_of(text), "equal rows have no ranking"
+    assert "| rooms, flat | 4 | – | – | – |" in lines_of(text), "expected no ranking of equal rows"
     with (out / "ranks.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == 2 * 4 * 4

@@ -87,7 +87,7 @@ def test_drawing_thread_does_not_block_and_draws_newest_image(room: CornerRoom) 
         time.sleep(0.001)
     for frame in list(room)[1:]:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
-    assert not book.notes, "all frames are queued, and none is drawn"
+    assert not book.notes, "expected all frames in the queue and none drawn"
     going_on.set()
     background.end()
     assert [picture.frame.index for picture in book.pictures] == [0, 5]

@@ -132,7 +132,7 @@ def test_overview_shows_colors_left_and_instances_right(tmp_path: Path) -> None:
         shown = np.median(right[where], axis=0)
         hue = shown / np.linalg.norm(shown) @ (color / np.linalg.norm(color))
         assert hue > 0.98
-    assert np.ptp(np.median(right[~red & ~blue], axis=0)) < 12, "the background is gray"
+    assert np.ptp(np.median(right[~red & ~blue], axis=0)) < 12, "expected a gray background"
 
 
 def test_overview_unlisted_ids_are_background() -> None:

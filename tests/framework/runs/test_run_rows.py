@@ -76,7 +76,9 @@ def test_is_not_zero_matches_paired_t_test() -> None:
 def test_is_not_zero_is_false_for_equal_differences() -> None:
     """Equal differences have no spread, so their significance is undefined."""
     assert not Mean.of([2.0, 2.0]).is_not_zero
-    assert not Mean.of([0.7 - 0.6, 0.2 - 0.1]).is_not_zero, "the differences are equal except for rounding"
+    assert not Mean.of([0.7 - 0.6, 0.2 - 0.1]).is_not_zero, (
+        "expected no significance: the differences are equal except for rounding"
+    )
 
 
 def test_rows_keep_experiment_order_and_sort_seeds() -> None:
@@ -144,7 +146,9 @@ def test_row_names_include_undeclared_parameter_differences() -> None:
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.frames=8", "b, dataset.frames=16"]
     changes["b"].append("dataset=other")
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a", "b"]
-    assert [row.name for row in rows_of(records, ["seed"])] == ["a", "b"], "the overrides of the rows are unknown"
+    assert [row.name for row in rows_of(records, ["seed"])] == ["a", "b"], (
+        "expected the names of the rows, whose overrides are unknown"
+    )
 
 
 def test_rows_without_experiment_are_split_by_scene() -> None:

@@ -188,7 +188,7 @@ def test_table_on_scenenn_has_published_run_times(sweep: Path, annotation: str |
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert lines[2] == "| row | runs | Hz | refinement (ms) | frames lost | poses |"
     assert "| the paper (published) | – | 10.8 | not known | – | tracked |" in lines
-    assert "Voxblox++ (published)" not in text, "a row without values is omitted"
+    assert "Voxblox++ (published)" not in text, "expected no row without values"
     assert "- Published, the paper: DDNS 2020, article 2528954; all components on every frame of 640x480" in text
     unknown = [line for line in lines if "Published results not looked up" in line]
     assert unknown == [
@@ -255,7 +255,7 @@ def test_table_unknown_metric_is_dash(sweep: Path) -> None:
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": TABLE | {"columns": ["no.such"]}, "rows": ROWS}))
     text = write_tables(sweep)
     assert "| identity |    3 |       – | ground_truth |" in text
-    assert "- Metrics in no run: no.such." in text, "it may be misspelled"
+    assert "- Metrics in no run: no.such." in text, "expected a note on the column, which may be misspelled"
 
 
 def test_table_without_experiment_has_available_columns(tmp_path: Path) -> None:
@@ -272,7 +272,7 @@ def test_table_without_experiment_has_available_columns(tmp_path: Path) -> None:
         "- Omitted columns without values: AP50, AP50 agnostic, AP25, AP, mean IoU (only with ground-truth instances); "
     )
     assert [line for line in lines if "Omitted" in line] == [absent + f"instances, {FUSER_HEADS}."]
-    assert "transfer" not in text, "nothing was compared with ground-truth instances"
+    assert "transfer" not in text, "expected no note on the transfer without ground-truth instances"
     assert "ap50" not in (tmp_path / "table.csv").read_text()
 
 

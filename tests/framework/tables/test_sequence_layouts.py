@@ -126,7 +126,7 @@ def test_sequence_columns_table_has_published_rows(sweep: Path) -> None:
     )
     found, missing = "**0.700 ± 0.141** | 0.400 ± 0.141 |", " ".join(["missing |"] * 8)
     assert first[2] == f"| ours | ground truth | made up | {found} {missing} **0.550 ± 0.000 (2 of 10)** |"
-    assert len(first) == 6, "systems without published values have no line"
+    assert len(first) == 6, "expected no line for systems without published values"
     assert first[-1] == (
         "| Voxblox++ with Detectron2 panoptic (published) | ground truth | not known "
         "| 0.655 | 0.033 | 0.676 | 0.269 | 0.517 | 0.325 | 0.299 | – | 0.190 | – | – |"

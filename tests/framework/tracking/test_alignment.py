@@ -61,7 +61,7 @@ def test_color_alignment_at_true_pose_has_zero_step(level: int) -> None:
     T = pose(0.03, -0.02, 0.01, (0.01, 0.02, -0.01))
     xi, equations = step(WALL, WALL.frame(T), level, inverse(T_VIEW) @ T, COLOR)
     assert equations.matched > 0.5 * CAMERA.width * CAMERA.height / 4**level
-    assert np.abs(xi[:2] + 1.5 * np.array([xi[4], -xi[3]])).max() < 2e-3, "shift on the wall, m"
+    assert np.abs(xi[:2] + 1.5 * np.array([xi[4], -xi[3]])).max() < 2e-3, "expected a shift on the wall below 2 mm"
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
@@ -86,7 +86,9 @@ def test_color_alignment_compensates_exposure_change() -> None:
     _, second = step(WALL, brighter, 0, truth, COLOR, first.brightness)
     _, alike = step(WALL, darker, 0, truth, COLOR, plain.brightness)
     assert second.brightness == first.brightness
-    assert second.matched == pytest.approx(alike.matched, rel=0.01), "a uniform brightness change is no outlier"
+    assert second.matched == pytest.approx(alike.matched, rel=0.01), (
+        "expected the same matches: a uniform brightness change is no outlier"
+    )
     np.testing.assert_allclose(second.A, alike.A, rtol=0.05, atol=0.01 * np.abs(alike.A).max())
 
 
@@ -133,7 +135,7 @@ def test_smoothed_normals_allow_motion_along_wall(level: int) -> None:
         return float(xi[0] / 0.02)
 
     assert share_found(lambda model: model) == pytest.approx(1, abs=0.02)
-    assert share_found(with_noisy_normals) < 0.8, "noisy normals shorten the step"
+    assert share_found(with_noisy_normals) < 0.8, "expected a shorter step with noisy normals"
     assert share_found(lambda model: smoothed(with_noisy_normals(model), level)) == pytest.approx(1, abs=0.1)
 
 

@@ -27,7 +27,7 @@ def test_anchor_match_assigns_object_background_or_ignored() -> None:
 def test_anchor_match_each_object_assigns_best_box() -> None:
     iou = torch.tensor([[0.2, 0.0], [0.1, 0.0], [0.0, 0.0]])
     assert match(iou, 0.7, 0.3, each_object=True).tolist() == [0, BACKGROUND, BACKGROUND], (
-        "no box for an object without overlap"
+        "expected no box for an object without overlap"
     )
 
 

@@ -65,7 +65,7 @@ def best_scores(detections):
 def test_maskrcnn2go_detects_expected_objects_in_real_images(detector, scene, index, expected):
     found = best_scores(detector.detect(shared_picture(scene, index)))
     missing = {name: score for name, score in expected.items() if found.get(name, 0) < score}
-    assert not missing, f"found only {found}"
+    assert not missing, f"expected {expected}, got {found}"
 
 
 def test_maskrcnn2go_mask_of_bed_overlaps_ground_truth(detector):

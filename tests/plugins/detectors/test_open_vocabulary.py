@@ -95,7 +95,7 @@ def test_open_vocabulary_pads_image_with_gray_at_lower_right(owlv2: Path) -> Non
     record.dtype = torch.float32
     boxes._network = record
     boxes(np.full((32, 64, 3), 255, np.uint8))
-    assert (seen[0][0, :, :31] > 1.5).all(), "white"
+    assert (seen[0][0, :, :31] > 1.5).all(), "expected a white image"
     np.testing.assert_allclose(seen[0][0, 0, 33:], (128 / 255 - 0.48145466) / 0.26862954, atol=1e-5)
 
 
@@ -129,7 +129,7 @@ def test_open_vocabulary_masks_lie_in_prompt_boxes(sam: Path, shape: tuple[int, 
     expected = np.zeros((2, *shape), np.bool_)
     expected[0, 20:50, 10:30] = expected[1, :10, :60] = True
     overlap = (found & expected).sum(axis=(1, 2)) / (found | expected).sum(axis=(1, 2))
-    assert (overlap > 0.9).all(), "equal except for rounding to the grid"
+    assert (overlap > 0.9).all(), "expected equal masks except for rounding to the grid"
     for mask, wanted in zip(found, expected, strict=True):
         center, middle = (np.argwhere(area).mean(axis=0) for area in (mask, wanted))
         np.testing.assert_allclose(center, middle, atol=0.5)

@@ -125,7 +125,7 @@ def test_with_embeddings_crop_is_padded_square_around_box() -> None:
     mask[:] = False
     mask[0, :4, :4] = True
     [corner] = square_crops(color, mask, 8, 2.0)
-    assert (corner[:2] == 0).all(), "0 outside the image"
+    assert (corner[:2] == 0).all(), "expected 0 outside the image"
     assert (corner[2:6, 2:6, 3] == 255).all()
     assert not square_crops(color, np.zeros((1, 40, 60), np.bool_), 8, 1.5).any()
 

@@ -169,7 +169,7 @@ def test_paper_fuser_recursions_agree_with_slow_reference(
         masks = [whole[0] | whole[1], np.roll(whole[1], k, axis=0), whole[2]]  # two overlap; the last one is too weak
         seen.append(masks)
         fuse_masks(fuser, dataclasses.replace(frame, index=k), masks, SCORES, PROBABILITIES)
-    assert any((matches.instance_ids == 0).any() for matches in found.matches), "some mask is unmatched"
+    assert any((matches.instance_ids == 0).any() for matches in found.matches), "expected an unmatched mask"
     evidence, scale = fuser.scene.labels.evidence, fuser.scene.labels.score_scale
     voxels, positions = labeled_voxels(fuser.scene)
     compared = np.random.default_rng(0).permutation(len(voxels))[:2000]

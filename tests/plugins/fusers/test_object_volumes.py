@@ -74,7 +74,9 @@ def test_object_volumes_each_box_is_one_instance(mapped: ObjectVolumes) -> None:
     for key, instance in instances.items():
         points = mesh.vertices[instance.vertices].astype(np.float64)
         owners = BOXES.owners(points, VOXEL / 2)
-        assert np.isin(owners, (key, -1)).mean() > 0.97, "-1 = where the box touches the floor"
+        assert np.isin(owners, (key, -1)).mean() > 0.97, (
+            "expected vertices of the box, or where it touches the floor (-1)"
+        )
         assert (owners == key).sum() > 300
 
 
@@ -119,7 +121,7 @@ def test_object_volumes_remove_single_but_not_constant_bleed() -> None:
         fuse(once, frame, [bled(mask, 12) if k == 3 else mask])
         fuse(always, frame, [bled(mask, 12)])
     assert share_of_the_room(once) < 0.02
-    assert share_of_the_room(always) > 0.2, "a known weakness: constant errors are not removed"
+    assert share_of_the_room(always) > 0.2, "expected the known weakness: constant errors are not removed"
 
 
 def test_object_volumes_remove_bled_voxels_after_unmasked_view(frames: list[Frame]) -> None:
@@ -198,7 +200,9 @@ def test_object_volumes_two_detections_are_one_observation(frames: list[Frame]) 
     (record,) = fuser.scene.table.records.values()
     assert (record.observations, record.detections, record.visible) == (2, 3, 2)
     counts = fuser.scene.volumes[1].arrays()
-    assert (counts["foreground"][counts["foreground"] > 0] == 2).mean() > 0.95, "each voxel counts once per frame"
+    assert (counts["foreground"][counts["foreground"] > 0] == 2).mean() > 0.95, (
+        "expected each voxel to count once per frame"
+    )
 
 
 def test_object_volumes_weak_or_far_detection_creates_no_object(frames: list[Frame]) -> None:
@@ -234,7 +238,7 @@ def test_object_volumes_unconfirmed_object_in_view_is_removed(frames: list[Frame
     elsewhere = replace(frame, depth=np.zeros_like(frame.depth))
     for k in range(30):
         fuse(fuser, replace(elsewhere, index=1 + k), [])
-    assert set(fuser.scene.instances()) == {1}, "the region is unobserved"
+    assert set(fuser.scene.instances()) == {1}, "expected the object: its region is unobserved"
     for k in range(17):
         fuse(fuser, replace(frame, index=31 + k), [])
     assert set(fuser.scene.instances()) == {1}
@@ -243,7 +247,7 @@ def test_object_volumes_unconfirmed_object_in_view_is_removed(frames: list[Frame
     assert not fuser.scene.volumes
     assert (fuser.scene.mesh().instance_ids == 0).all()
     fuse(fuser, replace(frame, index=49), [wall])
-    assert set(fuser.scene.table.records) == {2}, "ids are not reused"
+    assert set(fuser.scene.table.records) == {2}, "expected a new id"
 
 
 def test_object_volumes_below_min_area_are_excluded(frames: list[Frame]) -> None:

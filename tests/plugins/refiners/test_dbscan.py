@@ -81,7 +81,9 @@ def test_dbscan_weights_sampled_points_for_skipped_points():
     plate[-90:, 1] += 0.5  # the last row is removed: it contains no sample
     for eps, min_points, kept in ((0.035, 9 * 3, 59 * 90), (0.035, 9 * 5 + 1, 60 * 90)):
         refiner = Dbscan(eps=eps, eps_per_depth=0.0, min_points=min_points, stride=1, max_points=600)
-        assert len(refiner.refine(clusters_of(plate), FRAME).pixels) == kept, "at most 5 samples are within eps"
+        assert len(refiner.refine(clusters_of(plate), FRAME).pixels) == kept, (
+            "expected the weights of at most 5 samples within eps"
+        )
 
 
 def test_dbscan_first_of_two_equal_components_is_kept():

@@ -175,7 +175,7 @@ def test_gmm_frame_small_cluster_is_dropped() -> None:
     for min_points, left in ((10, {0, 1, 2}), (30, {0, 2})):
         refined = GmmFrame(min_points=min_points, foreign_points=ForeignPoints.STAY).refine(clusters, FRAME)
         assert set(np.unique(refined.cluster)) == left
-        assert len(refined) == 3, "cluster k is detection k"
+        assert len(refined) == 3, "expected one cluster per detection"
 
 
 def test_gmm_frame_k_means_start_differs_but_finds_objects() -> None:

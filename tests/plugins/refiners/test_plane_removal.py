@@ -126,7 +126,7 @@ def test_plane_removal_keeps_plane_with_most_cluster_points():
     assert cup.sum() > 0.8 * (ids == 2).sum()
     assert not cup[ids == 1].any()
     assert refined.structure is not None
-    assert not refined.structure[ids == 1].any(), "points kept by an object are not structure"
+    assert not refined.structure[ids == 1].any(), "expected no structure in points that an object keeps"
     half = (ids == 1) & (np.cumsum(ids == 1).reshape(ids.shape) <= 0.49 * (ids == 1).sum())
     [left] = masks_of(PlaneRemoval(min_area=0.3).refine(lifted(frame, half), frame))
     assert not left.any()

@@ -55,7 +55,9 @@ def test_open3d_odometry_recovers_known_motion(frames: list[Frame], parameters: 
     assert not any(pose.lost for pose in poses)
     for pose, frame in zip(poses, frames, strict=True):
         assert_near(pose, frame, meters)
-    assert np.linalg.norm(poses[-1].T_world_camera[:3, 3] - poses[0].T_world_camera[:3, 3]) > 0.05, "the camera moved"
+    assert np.linalg.norm(poses[-1].T_world_camera[:3, 3] - poses[0].T_world_camera[:3, 3]) > 0.05, (
+        "expected a camera that moved"
+    )
 
 
 @pytest.mark.parametrize(("parameters", "meters"), BEST)

@@ -93,7 +93,7 @@ def test_tracking_with_color_is_not_less_accurate(shared_data: Path) -> None:
     frames = list(RgbdFolder(shared_data / "redkitchen", stop=80, stride=2))
     truth = [f.T_world_camera for f in frames]
     both, alone = (evaluate(truth, run(VoxelHashingIcp(color_weight=w), frames)[0]) for w in (0.1, 0.0))
-    assert both.frames == len(frames), "no frame is lost"
+    assert both.frames == len(frames), "expected no lost frame"
     assert both.ate_rmse_m < 0.015
     assert both.ate_rmse_m < alone.ate_rmse_m + 0.001
 
@@ -167,7 +167,9 @@ def assert_unharmed(
     off = drifts(poses, shown)
     worst = np.nanargmax(off)
     assert off[worst] < WRONG, f"frame {worst}: expected an error below {WRONG} m or a lost pose, got {off[worst]:.3f}"
-    assert not np.isnan(off[-10:]).any(), f"lost in the mapped area: {poses[-1].reason}"
+    assert not np.isnan(off[-10:]).any(), (
+        f"expected tracked frames in the mapped area, got lost frames: {poses[-1].reason}"
+    )
     assert error[0] < clean[0] + 0.1 * VOXEL
     assert error[1] < clean[1] + 0.02
 
@@ -231,7 +233,7 @@ def test_tracking_of_sparse_video_is_accurate() -> None:
     assert not any(p.lost for p in poses)
     assert drifts(poses, sparse).max() < WRONG / 2
     alone, _ = run(VoxelHashingIcp(relocalize=False), sparse[:4])
-    assert any(p.lost for p in alone), "alignment without features is lost"
+    assert any(p.lost for p in alone), "expected lost frames without features"
 
 
 BALL = (np.array([-1.2, 0.8, 2.2]), 0.25)

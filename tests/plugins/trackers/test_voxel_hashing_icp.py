@@ -52,7 +52,7 @@ def test_voxel_hashing_icp_recovers_known_motion(color_weight: float) -> None:
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=color_weight), frames)
     assert not any(pose.lost for pose in poses)
     worst = max(drift(pose, frame) for pose, frame in zip(poses, frames, strict=True))
-    assert worst[0] < 0.004, "a fifth of a voxel"
+    assert worst[0] < 0.004, "expected errors below a fifth of a voxel"
     assert drift(poses[-1], frames[-1])[1] < 0.003
 
 
@@ -74,7 +74,7 @@ def test_voxel_hashing_icp_color_determines_motion_along_wall() -> None:
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], frames[-1])[0] < 0.01
     alone, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=0.0), frames)
-    assert any(pose.lost for pose in alone), "geometry alone does not determine the motion"
+    assert any(pose.lost for pose in alone), "expected lost frames: geometry alone does not determine the motion"
 
 
 def enlarged(frame: Frame, scale: float) -> Frame:
@@ -348,9 +348,9 @@ def test_voxel_hashing_icp_steady_motion_needs_less_agreement(
         tracker, "_align", lambda *_: (a := aligned(next(ends))) and (a._replace(doubt="") if perfect.pop(0) else a)
     )
     lost = [tracker.track(frame, fuser.scene).lost for frame in frames[1 : STEADY + 4]]
-    assert not any(lost), "the predictions were correct until now"
+    assert not any(lost), "expected no lost frame while the predictions are correct"
     monkeypatch.setattr(tracker, "_align", lambda *_: aligned(tracker._T_world_last @ moved(0.2)))
-    assert tracker.track(frames[-2], fuser.scene).lost, "the pose is 20 cm from the prediction"
+    assert tracker.track(frames[-2], fuser.scene).lost, "expected a lost frame 20 cm from the prediction"
     for worse in (aligned(tracker._T_world_last, agreement=0.7), aligned(tracker._T_world_last, 0.8, behind=0.15)):
         tracker._lost_frames, tracker._steady_frames = 0, STEADY
         monkeypatch.setattr(tracker, "_align", lambda *_, worse=worse: worse)
@@ -445,7 +445,7 @@ def test_voxel_hashing_icp_covariance_matches_errors() -> None:
     frames = noisy(0.004, 30)
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert poses[0].covariance is not None
-    assert not poses[0].covariance.any(), "the first pose defines the world"
+    assert not poses[0].covariance.any(), "expected no uncertainty of the first pose, which defines the world"
     squares = []
     for (a, b), (q_a, q_b) in zip(pairwise(poses[5:]), pairwise(frames[5:]), strict=True):
         E = inverse(inverse(q_a.T_world_camera) @ q_b.T_world_camera) @ inverse(a.T_world_camera) @ b.T_world_camera
@@ -499,8 +499,10 @@ def test_voxel_hashing_icp_tracks_coarse_depth_without_normals(monkeypatch: pyte
     monkeypatch.setattr(VoxelHashingIcp, "_align", recorded)
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert not any(pose.lost for pose in poses)
-    assert max(drift(pose, frame)[0] for pose, frame in zip(poses, frames, strict=True)) < 0.0392, "one depth step"
+    assert max(drift(pose, frame)[0] for pose, frame in zip(poses, frames, strict=True)) < 0.0392, (
+        "expected errors below one depth step"
+    )
     without_normals, matched[:] = np.mean(matched), []
     monkeypatch.setattr(voxel_hashing_icp, "is_coarse", lambda *_, **__: False)
     run(VoxelHashingIcp(finest_scale=1.0), frames)
-    assert np.mean(matched) < 0.9 * without_normals, "normals of steps do not match those of the surface"
+    assert np.mean(matched) < 0.9 * without_normals, "expected fewer matches with normals, which depth steps distort"

@@ -46,7 +46,9 @@ def test_evidence_merge_adds_evidence_and_keeps_best_first(
     found = dict(zip(rows.evidence.instance_ids[0].tolist(), rows.evidence.instance_value[0].tolist(), strict=True))
     assert found == dict(zip(merged_ids, merged_logs, strict=True))
     assert rows.evidence.instance_ids[0, 0] == merged_ids[0]
-    assert ((rows.evidence.instance_ids[0] > 0) == (np.array(merged_ids) > 0)).all(), "the used slots come first"
+    assert ((rows.evidence.instance_ids[0] > 0) == (np.array(merged_ids) > 0)).all(), (
+        "expected the used slots before the empty slots"
+    )
 
 
 @pytest.mark.parametrize("count", [1, 511, 512, 513, 2000])
@@ -104,7 +106,7 @@ def test_evidence_rows_allocate_only_labeled_voxels() -> None:
         assert rows.voxels.grid.label_row[:2].tolist() == [-1, 0]
         assert best_class(rows.evidence, rows.evidence.labeled[0, 7]) == 2
         rows.update(at_pixel(0, 3), voted([0], [1.0], [3], Combine.SUM))
-        assert (rows.row_count, rows.voxel_count) == (1, 1), "a cluster without an instance allocates nothing"
+        assert (rows.row_count, rows.voxel_count) == (1, 1), "expected no allocation for a cluster without an instance"
         assert len(rows.in_use().class_ids) == 1
 
 

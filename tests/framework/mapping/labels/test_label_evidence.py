@@ -91,7 +91,7 @@ def test_label_update_absence_counts_only_if_detected() -> None:
     assert float(evidence.instance_value[0, 0]) == np.float32(before + np.log(0.5))
     for _ in range(10):
         update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)
-    assert best_instance(evidence, 0) == 0, "unnamed instances are more likely"
+    assert best_instance(evidence, 0) == 0, "expected no instance: unnamed instances are more likely"
 
 
 def test_label_update_without_instance_adds_no_evidence() -> None:
@@ -114,7 +114,7 @@ def test_named_classes_are_relative_to_mean_of_unnamed_classes() -> None:
 def test_label_slots_replace_least_likely_label_if_full() -> None:
     labels, logs = np.arange(1, 5, dtype=np.int32), np.float32([4, 1, 2, 3])
     assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5), Combine.SUM, np.float32(9)) == 1
-    assert labels.tolist() == [1, 2, 3, 4], "the new label is the least likely"
+    assert labels.tolist() == [1, 2, 3, 4], "expected no change: the new label is the least likely"
     assert add_evidence(labels, logs, 0, np.int32(9), np.float32(1.5), Combine.SUM, np.float32(9)) == 1
     assert dict(zip(labels.tolist(), logs.tolist(), strict=True)) == {1: 4, 9: 1.5, 3: 2, 4: 3}
 
@@ -127,7 +127,9 @@ def test_best_counted_instance_skips_uncounted_instances() -> None:
     counts[1] = False
     assert best_counted_instance(evidence, 0, counts) == 3
     counts[[3, 5]] = False
-    assert best_counted_instance(evidence, 0, counts) == 0, "unnamed instances are more likely than 2"
+    assert best_counted_instance(evidence, 0, counts) == 0, (
+        "expected no instance: unnamed instances are more likely than 2"
+    )
 
 
 SEEN = [([1], [0.9], [2]), ([2], [0.4], [3]), ([2], [0.5], [3]), ([3], [0.6], [2])]
@@ -163,7 +165,7 @@ def test_sum_rule_counts_observations() -> None:
     for _ in range(3):
         assert update_voxel(evidence, 0, voted([7], [1.0], [2], Combine.SUM), COVERED) == 0
     assert evidence.instance_value[0].tolist() == [3, 0, 0, 0]
-    assert evidence.class_value[0, 0] == 300, "an observation is 100 stored units"
+    assert evidence.class_value[0, 0] == 300, "expected 100 stored units per observation"
     assert evidence.class_ids[0].tolist() == [2, *[NO_CLASS] * (CLASS_SLOTS - 1)]
 
 

@@ -108,7 +108,9 @@ def test_integration_allocates_blocks_near_surface() -> None:
     surface = np.stack([(u - CAMERA.cx) / CAMERA.fx * d, (v - CAMERA.cy) / CAMERA.fy * d, d], axis=-1)
     blocks = {tuple(c) for c in integrator.voxels.grid.block_coords[: integrator.voxels.block_count]}
     wanted = {tuple(c) for c in np.floor(surface / (8 * VOXEL)).astype(int)}
-    assert len(wanted - blocks) <= 0.02 * len(wanted), "only blocks seen by fewer pixels than the stride may be missed"
+    assert len(wanted - blocks) <= 0.02 * len(wanted), (
+        "expected only blocks seen by fewer pixels than the stride to be missing"
+    )
 
 
 def test_integration_rounding_averages_are_unbiased() -> None:
