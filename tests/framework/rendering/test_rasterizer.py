@@ -34,7 +34,7 @@ def met_by_rays(caster: RayCaster, triangles: np.ndarray, T: np.ndarray, du: flo
     return np.where(hits.triangle == NO_TRIANGLE, -1, corner)
 
 
-def assert_sees_what_rays_meet(vertices: np.ndarray, triangles: np.ndarray, T: np.ndarray) -> None:
+def assert_equals_ray_casting(vertices: np.ndarray, triangles: np.ndarray, T: np.ndarray) -> None:
     caster = RayCaster(vertices, triangles)
     around = [met_by_rays(caster, triangles, T, du, dv) for du in (-ASIDE, ASIDE) for dv in (-ASIDE, ASIDE)]
     sure = np.all([a == around[0] for a in around], axis=0)
@@ -55,7 +55,7 @@ def test_rasterizer_matches_ray_casting(size: float, count: int, seed: int) -> N
     """Some triangles are small, and some extend from in front of the camera to behind it; poses are random."""
     rng = np.random.default_rng([seed, count])
     vertices, triangles = random_triangles(rng, size, count)
-    assert_sees_what_rays_meet(vertices, triangles, exp_se3(rng.normal(0, 1, 6)))
+    assert_equals_ray_casting(vertices, triangles, exp_se3(rng.normal(0, 1, 6)))
 
 
 @pytest.mark.parametrize("size", [0.2, 3.0])

@@ -102,7 +102,7 @@ def test_frozen_garbage_collector_is_restored() -> None:
         gc.unfreeze()
 
 
-WITHOUT_A_PLACE = """
+WITHOUT_CACHE_FOLDER = """
 import os
 os.access = lambda *_: False
 from framework.runtime.process_settings import set_environment
@@ -115,7 +115,7 @@ from framework import geometry
 def test_numba_cache_is_temporary_without_writable_folder(tmp_path: Path) -> None:
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
     environment["PYTHONPATH"] = str(CHECKOUT)
-    line = [sys.executable, "-c", WITHOUT_A_PLACE]
+    line = [sys.executable, "-c", WITHOUT_CACHE_FOLDER]
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     folder, was_there = done.stdout.split()

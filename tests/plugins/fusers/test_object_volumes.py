@@ -106,7 +106,7 @@ def test_object_volumes_statistics_include_all_volumes(mapped: ObjectVolumes) ->
     assert 0 < objects < scene.background.voxels.block_count
 
 
-def share_of_the_room(fuser: ObjectVolumes) -> float:
+def room_fraction(fuser: ObjectVolumes) -> float:
     """Return the fraction of the first object's vertices that are within a voxel of the room, but not of a box."""
     mesh = fuser.scene.mesh()
     points = mesh.vertices[mesh.instance_ids == 1].astype(np.float64)
@@ -120,8 +120,8 @@ def test_object_volumes_remove_single_but_not_constant_bleed() -> None:
         mask = masks_of(frame)[0]
         fuse(once, frame, [bled(mask, 12) if k == 3 else mask])
         fuse(always, frame, [bled(mask, 12)])
-    assert share_of_the_room(once) < 0.02
-    assert share_of_the_room(always) > 0.2, "expected the known weakness: constant errors are not removed"
+    assert room_fraction(once) < 0.02
+    assert room_fraction(always) > 0.2, "expected the known weakness: constant errors are not removed"
 
 
 def test_object_volumes_remove_bled_voxels_after_unmasked_view(frames: list[Frame]) -> None:
@@ -129,9 +129,9 @@ def test_object_volumes_remove_bled_voxels_after_unmasked_view(frames: list[Fram
     frame, fuser = frames[0], new_fuser(min_observations=1)
     mask = masks_of(frame)[0]
     fuse(fuser, frame, [bled(mask, 12)])
-    assert share_of_the_room(fuser) > 0.2
+    assert room_fraction(fuser) > 0.2
     fuse(fuser, replace(frame, index=1), [mask])
-    assert share_of_the_room(fuser) < 0.02
+    assert room_fraction(fuser) < 0.02
 
 
 def test_object_volumes_change_only_when_detected(frames: list[Frame]) -> None:

@@ -160,7 +160,7 @@ def garbage(frame: Frame) -> Frame:
     )
 
 
-def assert_unharmed(
+def assert_robust(
     poses: list[Pose], shown: list[Frame], error: tuple[float, float], clean: tuple[float, float]
 ) -> None:
     """Check that wrong poses are lost, the last poses are correct, and the map is as accurate as without bad frames."""
@@ -194,7 +194,7 @@ def test_tracking_of_bad_frames_is_lost_and_keeps_map_accurate(
     shown = there_and_back(frames, 25, [spoilt(f) for f in frames[25 : 25 + count]], 25 + count)
     poses, scene = run(VoxelHashingIcp(), shown)
     assert all(p.lost for p in poses[25 : 25 + count])
-    assert_unharmed(poses, shown, surface.error(scene), clean_error)
+    assert_robust(poses, shown, surface.error(scene), clean_error)
 
 
 def test_tracking_after_cut_to_other_room_is_lost_and_keeps_map(
@@ -204,7 +204,7 @@ def test_tracking_after_cut_to_other_room_is_lost_and_keeps_map(
     shown = there_and_back(frames, 25, bad, 28)
     poses, scene = run(VoxelHashingIcp(), shown)
     assert all(p.lost for p in poses[25:28])
-    assert_unharmed(poses, shown, surface.error(scene), clean_error)
+    assert_robust(poses, shown, surface.error(scene), clean_error)
 
 
 @pytest.mark.parametrize("missing", [3, 5, 20, 40])
@@ -212,7 +212,7 @@ def test_tracking_after_jump_is_accurate_or_lost(missing: int, frames: list[Fram
     """The missing frames cause jumps of 4, 9, 30 and 58 cm, and of 2, 5, 17 and 33 degrees."""
     shown = there_and_back(frames, 25, [], 25 + missing)
     poses, scene = run(VoxelHashingIcp(), shown)
-    assert_unharmed(poses, shown, surface.error(scene), clean_error)
+    assert_robust(poses, shown, surface.error(scene), clean_error)
 
 
 def test_tracking_after_jump_in_real_video_is_accurate_or_lost(shared_data: Path) -> None:

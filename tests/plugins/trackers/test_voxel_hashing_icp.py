@@ -246,16 +246,16 @@ def test_voxel_hashing_icp_implausible_step_is_lost(bound: dict[str, float]) -> 
     assert np.array_equal(poses[1].T_world_camera, poses[0].T_world_camera)
 
 
-def spoilt_beginnings() -> dict[str, np.ndarray]:
+def unusable_first_frames() -> dict[str, np.ndarray]:
     corner = np.zeros(CAMERA.shape, np.float32)
     corner[:10, :10] = 1.0
     return {"nothing": np.zeros_like(corner), "a corner": corner, "out of range": np.full_like(corner, 9.0)}
 
 
-@pytest.mark.parametrize("name", spoilt_beginnings())
+@pytest.mark.parametrize("name", unusable_first_frames())
 def test_voxel_hashing_icp_starts_after_unusable_first_frame(name: str) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
-    frames[0] = dataclasses.replace(frames[0], depth=spoilt_beginnings()[name])
+    frames[0] = dataclasses.replace(frames[0], depth=unusable_first_frames()[name])
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert poses[0].lost
     assert poses[0].reason
