@@ -16,40 +16,41 @@ import pytest
 
 import tests.support.cores  # isort: skip; sets variables that numba reads when it is loaded
 
-pytest.register_assert_rewrite("framework.testing")  # before they are loaded
+pytest.register_assert_rewrite("framework.testing")  # before the import of these modules
 
 import tests.support.cached_lights  # noqa: E402, F401
 from framework.config import composition  # noqa: E402
 from tests.support.scenes.corner_room import CornerRoom  # noqa: E402
 
 os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # tests never download weights, 180 MB
-hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)  # a busy machine must not fail a test
+# with a deadline, tests would fail on a busy machine
+hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("tests")
 CHECKOUT = Path(__file__).resolve().parent.parent
 
-# processes inherit ignored signals: SIGINT of background jobs, and SIGHUP of nohup
+# a process inherits ignored signals: SIGINT in a background job, and SIGHUP under nohup
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
-LANES = ("unit", "integration", "acceptance")
+MARKERS = ("unit", "integration", "acceptance")
 INTEGRATION_FIXTURES = {"shared", "shared_data", "benchmark"}
 SLOW_UNIT_TEST = 2.0  # s
 
 
-@pytest.hookimpl(tryfirst=True)  # before -m deselects
+@pytest.hookimpl(tryfirst=True)  # before -m deselects tests
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark every test that has no lane: integration if it uses real data or benchmarks, else unit."""
+    """Mark every test without a marker: integration if it uses real data or is a benchmark, otherwise unit."""
     for item in items:
-        if not any(item.get_closest_marker(lane) for lane in LANES):
+        if not any(item.get_closest_marker(marker) for marker in MARKERS):
             fixtures = INTEGRATION_FIXTURES & set(getattr(item, "fixturenames", ()))
             item.add_marker("integration" if fixtures else "unit")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """List unit tests that are too slow for their lane."""
+    """List the unit tests that take longer than SLOW_UNIT_TEST."""
     reports = [report for report in terminalreporter.stats.get("passed", []) if "unit" in report.keywords]
     for report in sorted(reports, key=lambda report: -report.duration):
         if report.duration > SLOW_UNIT_TEST:

@@ -3,7 +3,7 @@
     python -m tests.same_results BEFORE AFTER
 
 Runs are paired by their path below BEFORE and AFTER. Each pair is compared by its files, the arrays of its NPZ files,
-its metrics and its config. Metrics of the machine and of the code are left out. Old config keys are translated to their
+its metrics and its config. Metrics of the machine and of the code are ignored. Old config keys are translated to their
 new names. Keys that only one of the two configs has are listed and not compared. The exit status is 1 if a run differs.
 """
 

@@ -20,7 +20,7 @@ PIPELINE = ("framework", "plugins", "conf", "tests/acceptance")
 
 @functools.cache
 def mapped(*overrides: str) -> dict[str, Any]:
-    """Map a sequence and return its metrics. Measurements in one process share equal runs."""
+    """Map a sequence and return its metrics. Measurements in one process share the metrics of equal overrides."""
     with tempfile.TemporaryDirectory() as directory:
         command = [sys.executable, "-m", "framework", *overrides, f"hydra.run.dir={directory}/run"]
         subprocess.run(command, cwd=CHECKOUT, check=True)
@@ -29,7 +29,7 @@ def mapped(*overrides: str) -> dict[str, Any]:
 
 
 def failures(*arguments: str, **variables: str) -> Measured:
-    """Run tests; the value is the exit status of pytest, which is 0 if all pass."""
+    """Run pytest with arguments; the measured value is its exit status, which is 0 if all tests pass."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", *arguments]
     status = subprocess.run(command, cwd=CHECKOUT, env=os.environ | variables, check=False).returncode
     return status, status == 0

@@ -27,7 +27,7 @@ class Measurement:
     """One acceptance criterion."""
 
     name: str
-    bound: str  # with unit, for the page
+    bound: str  # text for the page, with unit
     paths: Sequence[str]  # the code that the value depends on, relative to the checkout
     measure: Callable[[], Measured]
 
@@ -46,7 +46,7 @@ def measurement(bound: str, *paths: str) -> Callable[[Callable[[], Measured]], C
 
 
 def read_rows(page: Path = PAGE) -> dict[str, list[str]]:
-    """Return the cells of each measurement, by name."""
+    """Return the table cells of each measurement on the page, by name."""
     if not page.exists():
         return {}
     rows = [
@@ -61,7 +61,7 @@ def write_rows(rows: dict[str, list[str]], page: Path = PAGE) -> None:
 
 
 def is_current(row: Sequence[str], paths: Sequence[str]) -> bool:
-    """Return True if the measured code is the same as at the measured commit."""
+    """Return True if the code at `paths` has not changed since the commit in the row."""
     commit = row[COLUMNS.index("commit")]
     if commit.endswith("+"):  # measured with uncommitted changes
         return False
@@ -69,7 +69,7 @@ def is_current(row: Sequence[str], paths: Sequence[str]) -> bool:
 
 
 def measure(chosen: Measurement) -> list[str]:
-    """Run a measurement and return its row."""
+    """Run a measurement and return its row for the page."""
     commit = _git("rev-parse", "--short", "HEAD") + "+" * bool(_git("status", "--porcelain", "--", *chosen.paths))
     begin = time.monotonic()
     value, met = chosen.measure()

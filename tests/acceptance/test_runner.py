@@ -14,6 +14,6 @@ def test_acceptance_page_round_trip_keeps_rows(tmp_path: Path) -> None:
     assert read_rows(tmp_path / "page.md") == {"kitchen_ate": ROW}
 
 
-def test_acceptance_row_of_unknown_or_changed_code_is_outdated() -> None:
+def test_acceptance_row_of_unknown_or_dirty_commit_is_outdated() -> None:
     assert not is_current(ROW, ["framework"])
     assert not is_current([*ROW[:4], "abc1234+", *ROW[5:]], ["framework"])

@@ -47,5 +47,5 @@ def mib(count: float) -> str:
 
 
 def times(theirs: float, ours: float) -> str:
-    """Return the speedup of ours over theirs."""
+    """Return the ratio of the two times as text: the speedup of ours over theirs."""
     return f"{theirs / ours:.1f}" if ours else NOTHING

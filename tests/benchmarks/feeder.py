@@ -1,7 +1,7 @@
-"""`python -m tests.benchmarks.feeder SOURCE TARGET FRAMES HZ`: copy an RGB-D folder frame by frame, like a camera.
+"""Copy an RGB-D folder frame by frame, like a camera: `python -m tests.benchmarks.feeder SOURCE TARGET FRAMES HZ`.
 
 The frames of the source are played forward and backward. Each file is written atomically. TARGET/feeder.csv contains
-the time of each frame.
+the index of each frame and its Unix time, s.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from framework.datasets.frames.numbered_images import numbered_images
 
 
 def feed(source: Path, target: Path, frames: int, hz: float) -> None:
-    """Write camera.json, each frame at its time, and finally the file `end`."""
+    """Write camera.json, then `frames` frames at `hz` Hz, and finally the file `end`."""
     color = list(numbered_images(source / "color", (".jpg", ".png")).values())
     depth = list(numbered_images(source / "depth", (".png",)).values())
     there = []

@@ -14,7 +14,7 @@ MIN_DEPTH, MAX_DEPTH = 0.1, 5.0  # m; MAX_DEPTH equals that of our fuser
 MAX_DEPTH_DIFFERENCE = 0.07  # m, the default
 TRUNCATION = 8.0  # voxels, the default
 BLOCK = 16  # voxels per side, as in the example
-BLOCKS = {0.01: 16_000, 0.02: 4_000}  # by voxel size, m: capacity for all benchmarks
+BLOCKS = {0.01: 16_000, 0.02: 4_000}  # capacity by voxel size, m; sufficient for all benchmarks
 
 
 class Open3DSlam:
@@ -56,7 +56,7 @@ class Open3DSlam:
         return pose
 
     def track(self) -> Pose:
-        """Return the pose of the loaded frame relative to the last rendered view."""
+        """Return the pose of the loaded frame, tracked against the last rendered view."""
         if not self._frames:
             return Pose(self._T_world_camera)
         try:
@@ -95,23 +95,23 @@ class Open3DSlam:
 
     @property
     def bytes_used(self) -> int:
-        """Return the size of the blocks in use."""
-        return int(self._model.get_hashmap().size()) * self._bytes_a_block
+        """Return the size of the blocks in use, bytes."""
+        return int(self._model.get_hashmap().size()) * self._bytes_per_block
 
     @property
     def bytes_allocated(self) -> int:
-        """Return the size of all allocated blocks."""
-        return int(self._model.get_hashmap().capacity()) * self._bytes_a_block
+        """Return the size of all allocated blocks, bytes."""
+        return int(self._model.get_hashmap().capacity()) * self._bytes_per_block
 
     @property
-    def _bytes_a_block(self) -> int:
+    def _bytes_per_block(self) -> int:
         grid = self._model.voxel_grid
         arrays = [grid.attribute(name) for name in ("tsdf", "weight", "color")]
         return sum(array[0].num_elements() * array.dtype.byte_size() for array in arrays)
 
 
 def _rigid(T: Float64) -> Float64:
-    """Remove the rounding error of a product of many transforms."""
+    """Return T with an exact rotation; a product of many transforms accumulates rounding errors."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = U @ Vt, T[:3, 3]

@@ -14,12 +14,12 @@ from numba import njit, prange
 from framework.data import Camera, Float32, Float64, Frame, FrameTruth, Int32, UInt8
 from framework.interfaces import RGBDSequence
 
-FRAMES_A_ROOM = 260  # 1.5 cm per frame
+FRAMES_PER_ROOM = 260  # 1.5 cm per frame
 LENGTH, HALF_WIDTH, HEIGHT = 3.9, 2.0, 2.6  # m, of a room
 WALL = 0.06  # m, half the thickness of the wall between two rooms
 DOOR = (0.6, 2.1)  # m, half the width and the height
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-EYE = 1.4  # m, height of the camera
+CAMERA_HEIGHT = 1.4  # m, above the floor
 PAN = np.deg2rad(35.0)  # rad, maximum angle to the left and to the right
 PITCH = np.deg2rad(12.0)  # rad, mean downward angle
 
@@ -55,7 +55,7 @@ class RoomRow(RGBDSequence):
 
     def __post_init__(self) -> None:
         self.camera, self.name = CAMERA, "row of rooms"
-        rooms = self.frames // FRAMES_A_ROOM + 4  # from the room behind the camera to the last visible one
+        rooms = self.frames // FRAMES_PER_ROOM + 4  # from the room behind the camera to the last visible one
         self.class_names = {r * len(OBJECTS) + k: name for r in range(rooms) for k, name in enumerate(OBJECTS, start=1)}
 
     def __len__(self) -> int:
@@ -72,16 +72,16 @@ class RoomRow(RGBDSequence):
 
 def pose_at(k: int) -> Float64:
     """Return T_world_camera of frame k; the path leads through the doors, and the camera turns left and right."""
-    phase = 2 * np.pi * k / FRAMES_A_ROOM
+    phase = 2 * np.pi * k / FRAMES_PER_ROOM
     yaw, pitch = PAN * np.sin(phase), -PITCH + np.deg2rad(2.0) * np.sin(3 * phase)
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     T = np.eye(4)
     T[:3, 0], T[:3, 1], T[:3, 2] = right, np.cross(forward, right), forward
     T[:3, 3] = (
-        LENGTH * (k / FRAMES_A_ROOM + 0.5),
+        LENGTH * (k / FRAMES_PER_ROOM + 0.5),
         0.15 * np.sin(2 * phase),
-        EYE + 0.03 * np.sin(5 * phase),
+        CAMERA_HEIGHT + 0.03 * np.sin(5 * phase),
     )
     return T
 
@@ -99,7 +99,7 @@ def _render(
     color: UInt8,
     ids: Int32,
 ) -> None:
-    """Render depth along z, color and instance ids of every pixel, in closed form."""
+    """Render depth along z, m, color and instance ids of every pixel, in closed form."""
     ox, oy, oz = np.float32(T[0, 3]), np.float32(T[1, 3]), np.float32(T[2, 3])
     for v in prange(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -136,7 +136,7 @@ def _render(
 
 @njit(cache=True, nogil=True)
 def _entry(box, begin, ox, oy, oz, dx, dy, dz):
-    """Return the ray parameter where a ray enters a box of the room that starts at x = `begin`; infinite = missed."""
+    """Return the ray parameter where a ray enters a box of the room that starts at x = `begin`, m; inf = no hit."""
     near, far = np.float32(1e-3), np.float32(np.inf)
     for axis in range(3):
         o = ox - begin if axis == 0 else (oy if axis == 1 else oz)
@@ -152,7 +152,7 @@ def _entry(box, begin, ox, oy, oz, dx, dy, dz):
 
 @njit(cache=True, nogil=True)
 def _paint(x, y, z, box, out):
-    """Write the color of a periodic solid texture, which is equal in all rooms and differs between boxes."""
+    """Write the color at a point, m, of a solid texture that repeats in each room and differs between boxes."""
     x -= LENGTH * np.floor(x / LENGTH)  # a room contains a whole number of waves along x
     turn = np.float32(2 * np.pi / LENGTH)
     one = np.sin(6 * turn * x + 5 * y + 3 * z + box)

@@ -14,7 +14,7 @@ RENDERING = "render for tracking"  # included in track
 
 
 def seconds(step: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """Return the duration of a step and its result."""
+    """Return the duration of a step, s, and its result."""
     begin = time.perf_counter()
     answer = step(*arguments)
     return time.perf_counter() - begin, answer

@@ -1,4 +1,4 @@
-"""Detectors and the loop on CUDA, compared with the CPU: `python -m pytest tests/benchmarks -k cuda` prints the tables.
+"""Detectors and SLAM on CUDA, compared with the CPU: `python -m pytest tests/benchmarks -k cuda` prints the tables.
 
 docs/results/cuda.md has the results. No time is asserted.
 """
@@ -35,7 +35,7 @@ from tests.support import registered
 DEVICE = "cuda"
 IMAGES, WARM_UP = 40, 10  # per detector and device
 LONGEST = 6.0  # s per detector and device; the warm-up takes at most a quarter of it
-MATCH = 0.5  # lowest mask IoU of two detections of one object
+MATCH = 0.5  # minimum mask IoU of two detections of one object
 VOXEL_SIZE = 0.01  # m
 TURN, FIRST, LAST = 10, 20, 80  # frames per turn; frames in [FIRST, LAST) are evaluated
 WEIGHTS = {"onnx_segmentation": "yolo11n_seg/yolo11n_seg.onnx", "onnx_boxes": "yolox_nano/yolox_nano.onnx"}
@@ -100,7 +100,7 @@ def tables_of_detectors(tables: list[Table]) -> tuple[Table, Table]:
 
 
 def settings(option: str) -> Iterator[tuple[str, list[str]]]:
-    """Return the name and the overrides of each device and precision; float32 on the CPU is first."""
+    """Yield the name and the overrides of each device and precision; float32 on the CPU is first."""
     parameters = registered.composed("detector", option).detector
     integers = ["detector.int8=false"] * ("int8" in parameters)
     yield "CPU, float32", ["device=cpu", *integers]
@@ -112,7 +112,7 @@ def settings(option: str) -> Iterator[tuple[str, list[str]]]:
 
 
 def run(detector: Any, frames: Sequence[Frame]) -> tuple[list[float], list[Detections]]:
-    """Return the times, s, and the detections of all images. Detections are on the CPU, so CUDA is synchronized."""
+    """Return the time, s, and the detections of each image. Detections are on the CPU, so CUDA is synchronized."""
     began = time.perf_counter()
     for frame in frames[:WARM_UP]:
         detector.detect(frame)

@@ -29,7 +29,7 @@ def noise() -> Frame:
 
 
 def ellipses() -> Detections:
-    """Return detections of ellipses of 60 to 260 px."""
+    """Return detections whose masks are ellipses with axes of 60 to 260 px."""
     random = np.random.default_rng(0)
     v, u = np.ogrid[:480, :640]
     half, center = random.uniform(30, 130, (OBJECTS, 2)), random.uniform(0, (640, 480), (OBJECTS, 2))
@@ -38,7 +38,7 @@ def ellipses() -> Detections:
     return Detections(masks, tight_boxes(masks), np.linspace(1, 0, OBJECTS, dtype=np.float32), rows, COCO)
 
 
-@pytest.mark.parametrize("reads", [("color",), FRAME_FIELDS], ids=["color", "everything"])
+@pytest.mark.parametrize("reads", [("color",), FRAME_FIELDS], ids=["color", "all_fields"])
 def test_detection_cache_frame_hash_speed(benchmark: BenchmarkFixture, reads: tuple[str, ...]) -> None:
     benchmark(frame_hash, noise(), reads)
 
@@ -51,7 +51,7 @@ def test_detection_cache_unpack_speed(benchmark: BenchmarkFixture) -> None:
     benchmark(unpack, pack(ellipses()), COCO)
 
 
-def test_detection_cache_second_run_detects_nothing(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path) -> None:
+def test_detection_cache_second_run_skips_detection(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path) -> None:
     """A network runs on a real video; a second run reads all detections from the cache."""
     data = shared / "data" / "redkitchen"
     if not data.is_dir():

@@ -40,7 +40,7 @@ MASKS = 20  # detections that random networks return
 
 
 def random_mask_rcnn(backbone: str, folder: Path) -> list[str]:
-    """Return the overrides for a network of the published architecture that assigns everything to the first class."""
+    """Return the overrides for a network of the published architecture that assigns every object to the first class."""
     torch.manual_seed(0)
     network = MaskRCNN(Architecture(COCO, ResNetShape(backbone)))
     with torch.no_grad():
@@ -74,7 +74,7 @@ MASK2FORMER = partial(
 
 
 def rf_detr_seg(side: int, windows: int) -> Callable[[Path], list[str]]:
-    """Return the writer of a network with the settings of Nano (312 px, one window) or Small (384 px, two windows)."""
+    """Return a function that writes a network like Nano (312 px, one window) or Small (384 px, two windows)."""
     backbone = {
         "model_type": "rf_detr_dinov2", "hidden_size": 384, "num_attention_heads": 6, "image_size": side,
         "patch_size": 12, "num_windows": windows, "out_features": ["stage3", "stage6", "stage9", "stage12"],
@@ -97,14 +97,14 @@ RANDOM: dict[str, tuple[str, Callable[[Path], list[str]]]] = {
 class Measured:
     """Measured values of a detector."""
 
-    seconds: list[float]  # per image
-    detections: float  # mean per image
-    mib: float  # increase of the peak memory of the process
-    fault: str = ""  # reason if it cannot run
+    seconds: list[float]  # s, per image
+    detections: float  # mean number per image
+    mib: float  # increase of the peak memory of the process, MiB
+    fault: str = ""  # reason why the detector cannot run; "" = it ran
 
 
 def measure(name: str, overrides: list[str], frames: list[Frame]) -> Measured:
-    """Build detector=`name` and run it on frames."""
+    """Build detector=`name`, run it on the frames, and return the measured values."""
     torch.set_num_threads(THREADS)
     Path("/proc/self/clear_refs").write_text("5")  # reset the peak, which a new process inherits
     before = peak_kib()
@@ -126,7 +126,7 @@ def measure(name: str, overrides: list[str], frames: list[Frame]) -> Measured:
 
 
 def peak_kib() -> int:
-    """Return the peak memory of this process on Linux."""
+    """Return the peak memory of this process on Linux, KiB."""
     [line] = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
     return int(line.split()[1])
 

@@ -1,4 +1,4 @@
-"""Cost of instances per frame: ten masks at 640x480, and a 1 cm map that already contains them.
+"""Time per frame for instances: ten masks at 640x480, and a 1 cm map that already contains their objects.
 
 Run with `python -m pytest tests/benchmarks/test_instances.py`; test_refiners.py measures refinement.
 """
@@ -19,7 +19,7 @@ from tests.benchmarks.test_refiners import MASKS, ten_masks
 
 @pytest.fixture(scope="module")
 def mapped() -> tuple[BayesianTsdf, Frame, Pose, PointClusters]:
-    """Return the fuser after five frames, the last frame, its pose, and unrefined clusters of 80 classes."""
+    """Return the fuser after five frames, the last frame, its pose, and its unrefined clusters with 80 classes."""
     clusters, frame = ten_masks()
     probabilities = np.random.default_rng(0).dirichlet(np.full(len(COCO), 0.1), MASKS).astype(np.float32)
     clusters = dataclasses.replace(clusters, class_probabilities=probabilities, classes=COCO)

@@ -1,7 +1,8 @@
 """Latency and dropped frames of a live run: `python -m pytest tests/benchmarks -k live`.
 
 Another process writes real frames into a folder at 15 Hz, and a run with the default stages at 1 cm maps them.
-INSTANCEMAP_LIVE_FRAMES=2000 plays the 300 frames of the video forward and backward.
+INSTANCEMAP_LIVE_FRAMES sets the number of frames, for example 2000: the 300 frames of the video are played forward and
+backward.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ WARM_S = 10.0  # after this time, kernels are loaded and caches are warm
 
 
 def resident(process: subprocess.Popen[str]) -> int:
-    """Return the resident memory in bytes."""
+    """Return the resident memory of a process, bytes."""
     pages = Path(f"/proc/{process.pid}/statm").read_text().split()[1]
     return int(pages) * os.sysconf("SC_PAGE_SIZE")
 

@@ -36,7 +36,7 @@ CAMERA = Camera(640, 480, 540.0, 540.0, 319.5, 239.5)
 
 
 def ten_masks() -> tuple[PointClusters, Frame]:
-    """Return the clusters and the noisy frame of ten ellipsoids of 30 to 100 px; masks bleed by 8 px onto a wall."""
+    """Return clusters and the noisy frame of ten ellipsoids of 30 to 100 px; masks extend 8 px onto the wall."""
     rng = np.random.default_rng(0)
     v, u = np.mgrid[:480, :640]
     depth = 2.5 + 0.001 * u
@@ -55,7 +55,7 @@ def ten_masks() -> tuple[PointClusters, Frame]:
 
 
 def default_chain() -> Chain:
-    """Return the links of conf/refiner/chain.yaml, whose budget is 10 ms in total on 2 cores."""
+    """Return the refiner of conf/refiner/chain.yaml. Its time budget is 10 ms on 2 cores."""
     return Chain({"plane_removal": PlaneRemoval(), "gmm_em": GmmEm(), "connected": Connected()})
 
 
@@ -88,11 +88,11 @@ def test_refine_ten_masks_speed(benchmark, refiner: ClusterRefiner):
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_gmm_em_agrees_with_scikit_learn_and_is_faster(benchmark):
-    """With the same points, start and iterations, the log-likelihoods agree; times are compared."""
+    """With the same points, initial labels and iterations, the log-likelihoods agree; times are compared."""
     iterations, components = 8, 8
     clusters, frame = ten_masks()
     sample = surroundings(clusters, frame, Ring()).sampled(1000)
-    # a start without empty groups, which scikit-learn rejects
+    # initial labels without empty groups, which scikit-learn rejects
     labels = (np.arange(len(sample.points_camera)) * 7 // 3 % components).astype(np.int32)
 
     def ours() -> Mixtures:
@@ -133,7 +133,7 @@ def test_gmm_em_agrees_with_scikit_learn_and_is_faster(benchmark):
 
 @pytest.mark.parametrize(("levels", "components"), [(2, 64), (3, 512)])
 def test_gmm_tree_fit_is_faster_than_flat_mixture(benchmark, levels: int, components: int):
-    """Both use the same number of Gaussians, start, iterations and points of ten masks."""
+    """Both use the points of ten masks, the same number of Gaussians and iterations, and the same initialization."""
     clusters, frame = ten_masks()
     sample = surroundings(clusters, frame, Ring()).sampled(10_000)
     points, starts = sample.points_camera, sample.starts

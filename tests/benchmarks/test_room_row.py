@@ -3,24 +3,24 @@
 import numpy as np
 
 from framework.geometry import back_project, inverse, project, transform
-from tests.benchmarks.room_row import CAMERA, FRAMES_A_ROOM, LENGTH, OBJECTS, RoomRow, pose_at
+from tests.benchmarks.room_row import CAMERA, FRAMES_PER_ROOM, LENGTH, OBJECTS, RoomRow, pose_at
 
 
 def test_room_row_frames_repeat_after_one_room() -> None:
-    walk = RoomRow(FRAMES_A_ROOM + 100)
-    now, later = walk[80], walk[80 + FRAMES_A_ROOM]
+    walk = RoomRow(FRAMES_PER_ROOM + 100)
+    now, later = walk[80], walk[80 + FRAMES_PER_ROOM]
     np.testing.assert_allclose(now.depth, later.depth, atol=1e-4)
     assert (now.color != later.color).mean() < 0.001
     seen, seen_later = (set(np.unique(f.truth.instance_ids).tolist()) - {0} for f in (now, later))
     assert len(seen) >= 3
-    assert {i + len(OBJECTS) for i in seen} == seen_later, "the same objects and additional ones"
+    assert {i + len(OBJECTS) for i in seen} == seen_later, "expected the same objects in the next room"
     assert all(walk.class_names[i] == walk.class_names[i + len(OBJECTS)] for i in seen)
-    step = pose_at(80 + FRAMES_A_ROOM)[:3, 3] - pose_at(80)[:3, 3]
+    step = pose_at(80 + FRAMES_PER_ROOM)[:3, 3] - pose_at(80)[:3, 3]
     np.testing.assert_allclose(step, (LENGTH, 0, 0), atol=1e-9)
 
 
 def test_room_row_nearby_frames_show_same_surface() -> None:
-    """Points of one frame lie on the surface of the next frame, except occluded points."""
+    """Points of one frame lie on the surface in a later frame, except where they are occluded."""
     walk = RoomRow(100)
     one, other = walk[60], walk[64]
     v, u = (x.ravel() for x in np.mgrid[: CAMERA.height, : CAMERA.width])

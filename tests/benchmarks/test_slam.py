@@ -26,22 +26,22 @@ from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
 from tests.benchmarks.comparison import NOTHING, Table, mib, ms, times
 from tests.benchmarks.open3d_slam import Method, Open3DSlam
 from tests.benchmarks.recordings import Recording, furnished_room, red_kitchen
-from tests.benchmarks.room_row import FRAMES_A_ROOM, LENGTH, RoomRow
+from tests.benchmarks.room_row import FRAMES_PER_ROOM, LENGTH, RoomRow
 from tests.benchmarks.slam_loop import RENDERING, SlamLoop, seconds
 
 VOXEL_SIZES = (0.01, 0.02)  # m
 TURN = 10  # frames
-FIRST, LAST = 20, 80  # frames in [FIRST, LAST) are evaluated; before, caches are cold
+FIRST, LAST = 20, 80  # frames in [FIRST, LAST) are evaluated; caches are cold before
 TARGETS = {  # speedup over Open3D
     "redkitchen": {"whole loop": ">= 6", "integrate": ">= 3.5", "render full image": ">= 3"},
     "synthetic room": {"whole loop": ">= 5", "integrate": ">= 4", "render full image": ">= 3"},
 }
 TARGETS_AT = 0.01  # m, voxel size of the targets
-WALK = 2000  # frames
+FRAMES = 2000  # number of frames of the long path
 WARM = 10  # number of warm-up frames
-EARLY, LATE = (WARM, 700), (WARM + 1300, WALK)  # compared frames: a third each, a whole number of rooms apart
+EARLY, LATE = (WARM, 700), (WARM + 1300, FRAMES)  # compared frames: a third each, a whole number of rooms apart
 SECOND_START = LATE[0] - EARLY[0]
-assert SECOND_START % FRAMES_A_ROOM == 0, "both views show the same images"
+assert SECOND_START % FRAMES_PER_ROOM == 0, "expected a distance of whole rooms"
 
 
 @pytest.fixture(scope="module")
@@ -64,15 +64,15 @@ def compiled() -> None:
 def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: str, voxel_size: float) -> None:
     """pytest-benchmark times our loop with lifting; the setup of each round passes the frame to Open3D."""
     recording = recordings[name]
-    duel = Duel(
+    runs = AlternatingRuns(
         recording,
         SlamLoop(VoxelHashingIcp(), assemble(BayesianTsdf, voxel_size=voxel_size)),
         Open3DSlam(recording.frames[0], voxel_size),
     )
-    benchmark.pedantic(duel.ours, setup=duel.begin_frame, rounds=LAST - FIRST, warmup_rounds=FIRST)
-    duel.finish_frame()
-    medians = duel.quantiles(0.5)
-    scene, theirs = duel.ours.fuser.scene, duel.theirs
+    benchmark.pedantic(runs.ours, setup=runs.begin_frame, rounds=LAST - FIRST, warmup_rounds=FIRST)
+    runs.finish_frame()
+    medians = runs.quantiles(0.5)
+    scene, theirs = runs.ours.fuser.scene, runs.theirs
     table = Table(
         f"{name}, {100 * voxel_size:.0f} cm voxels",
         ["median, ms per frame", "ours", "Open3D", "speedup", "target", "speedup at the 10th percentile"],
@@ -85,14 +85,14 @@ def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: st
                 TARGETS[name].get(row, NOTHING) if voxel_size == TARGETS_AT else NOTHING,
                 times(quick_t, quick_o),
             ]
-            for (row, (o, t)), (quick_o, quick_t) in zip(medians.items(), duel.quantiles(0.1).values(), strict=True)
+            for (row, (o, t)), (quick_o, quick_t) in zip(medians.items(), runs.quantiles(0.1).values(), strict=True)
         ],
         [
             f"Frames {FIRST} to {LAST - 1} of {LAST}; both alternate every {TURN} frames in one process. "
             f"Open3D has no labels, ours has {np.mean([len(d) for d in recording.detections]):.1f} masks per frame. "
-            f"Lost frames of ours: {duel.ours.lost}.",
+            f"Lost frames of ours: {runs.ours.lost}.",
             "Other load on the machine affects the 10th percentiles less than the medians.",
-            f"The whole loop excludes lifting of masks to points, {ms(duel.lifting())} ms in ours, and detection and "
+            f"The whole loop excludes lifting of masks to points, {ms(runs.lifting())} ms in ours, and detection and "
             "refinement, which are other stages.",
         ],
     )
@@ -117,23 +117,23 @@ def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: st
         bytes_ours=scene.statistics.bytes,
         bytes_open3d_used=theirs.bytes_used,
         bytes_open3d_allocated=theirs.bytes_allocated,
-        lost=duel.ours.lost,
+        lost=runs.ours.lost,
     )
 
 
-def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
+def test_slam_long_path_has_constant_speed(benchmark, tables) -> None:
     """Map 2,000 frames in eight identical rooms, and compare the times of early and late frames.
 
     From frame 1300 on, five rooms from the start, a second loop maps the start of the path in alternation with the
     first loop. It gets the same images at the same time and has a small map. pytest-benchmark times the first loop.
     """
-    walk, detector = RoomRow(WALK), GroundTruthDetector()
+    path, detector = RoomRow(FRAMES), GroundTruthDetector()
     long, short = (SlamLoop(VoxelHashingIcp(), BayesianTsdf()) for _ in range(2))
     spent: dict[str, list[float]] = {"long": [], "short": []}  # s, of track and fuse in each frame
-    size = []  # bytes and voxels of the long map after each frame, and of its labels
+    size = []  # bytes and voxels of the map of `long` after each frame, then those of its labels
     scene = long.fuser.scene
 
-    def keep_books() -> None:
+    def record_frame() -> None:
         if long.poses:
             spent["long"].append(long.seconds["track"] + long.seconds["fuse"])
             size.append(
@@ -141,21 +141,21 @@ def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
             )
 
     def begin_frame() -> tuple[tuple[Frame, Detections], dict[str, Any]]:
-        keep_books()
+        record_frame()
         k = len(long.poses)
         if k >= SECOND_START:
-            frame = walk[k - SECOND_START]
+            frame = path[k - SECOND_START]
             short(frame, detector.detect(frame))
             spent["short"].append(short.seconds["track"] + short.seconds["fuse"])
-        return (frame := walk[k], detector.detect(frame)), {}
+        return (frame := path[k], detector.detect(frame)), {}
 
     with frozen_garbage_collector():  # as in a run
-        benchmark.pedantic(long, setup=begin_frame, rounds=WALK)
-    keep_books()
-    drift = np.linalg.norm((inverse(walk[WALK - 1].T_world_camera) @ long.poses[-1].T_world_camera)[:3, 3])
+        benchmark.pedantic(long, setup=begin_frame, rounds=FRAMES)
+    record_frame()
+    drift = np.linalg.norm((inverse(path[FRAMES - 1].T_world_camera) @ long.poses[-1].T_world_camera)[:3, 3])
     lost = long.lost
-    for k in range(WALK - 2, WALK - FRAMES_A_ROOM, -1):  # back through the last room, which is already mapped
-        long(walk[k], detector.detect(walk[k]))
+    for k in range(FRAMES - 2, FRAMES - FRAMES_PER_ROOM, -1):  # back through the last room, which is already mapped
+        long(path[k], detector.detect(path[k]))
 
     early, late, small_map = (
         float(np.median(spent[who][slice(*window)]))
@@ -164,10 +164,10 @@ def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
     at_700, at_2000, after = size[EARLY[1] - 1], size[-1], (scene.statistics.bytes, scene.statistics.voxels)
     grown = [(size[end - 1][1] - size[begin - 1][1]) / (end - begin) for begin, end in (EARLY, LATE)]
     usual = float(np.median(spent["long"][WARM:]))
-    worst = [max(spent["long"][slice(*window)]) for window in (EARLY, LATE, (WARM, WALK))]
+    worst = [max(spent["long"][slice(*window)]) for window in (EARLY, LATE, (WARM, FRAMES))]
     percentile = float(np.quantile(spent["long"][WARM:], 0.999))
     table = Table(
-        f"Long path: {WALK} frames, {WALK / FRAMES_A_ROOM:.1f} rooms, 640x480, 1 cm voxels",
+        f"Long path: {FRAMES} frames, {FRAMES / FRAMES_PER_ROOM:.1f} rooms, 640x480, 1 cm voxels",
         ["", *(f"frames {begin} to {end}" for begin, end in (EARLY, LATE)), "ratio", "target"],
         [
             ["track + fuse, ms, median; alternating with a small map", ms(small_map), ms(late),
@@ -187,8 +187,8 @@ def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
             f"{percentile / usual:.2f} times the median or more. Other load on the machine also delays frames.",
             f"Map growth on the way back in the last room: {100 * (after[1] / at_2000[1] - 1):.1f} % in voxels and "
             f"{100 * (after[0] / at_2000[0] - 1):.1f} % in bytes.",
-            f"Lost: {lost} of {WALK}, and {long.lost - lost} on the way back. Drift after "
-            f"{LENGTH * WALK / FRAMES_A_ROOM:.0f} m: {1e3 * drift:.0f} mm. {len(scene.instance_ids())} instances.",
+            f"Lost: {lost} of {FRAMES}, and {long.lost - lost} on the way back. Drift after "
+            f"{LENGTH * FRAMES / FRAMES_PER_ROOM:.0f} m: {1e3 * drift:.0f} mm. {len(scene.instance_ids())} instances.",
         ],
     )  # fmt: skip
     tables.append(table)
@@ -201,7 +201,7 @@ def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
 
 
 @pytest.fixture(scope="module")
-def walks(shared: Path) -> dict[str, list[Frame]]:
+def videos(shared: Path) -> dict[str, list[Frame]]:
     """Return two videos for accuracy: 300 real frames, and 200 frames without noise."""
     return {
         "redkitchen": list(RgbdFolder(shared / "data" / "redkitchen", stop=300)),
@@ -234,9 +234,9 @@ ACCURACY = {("redkitchen", "voxel_hashing_icp"): "ATE <= 25", ("room without noi
 
 @pytest.mark.parametrize("tracker", TRACKERS)
 @pytest.mark.parametrize("video", ["redkitchen", "room without noise"])
-def test_slam_trajectory_error(benchmark, walks, trajectories, video: str, tracker: str) -> None:
+def test_slam_trajectory_error(benchmark, videos, trajectories, video: str, tracker: str) -> None:
     """Measure tracking and mapping without labels."""
-    frames = walks[video]
+    frames = videos[video]
     slam = TRACKERS[tracker](frames[0])
     nothing = Detections.none(frames[0].camera.shape, ("thing",))
 
@@ -254,17 +254,17 @@ def test_slam_trajectory_error(benchmark, walks, trajectories, video: str, track
     benchmark.extra_info.update(ate_rmse_m=error.ate_rmse_m, end_drift_m=end, lost=lost, frames=len(frames))
 
 
-class Duel:
-    """Comparison of both systems on the same frames, alternating every TURN frames.
+class AlternatingRuns:
+    """Runs of both systems on the same frames, alternating every TURN frames.
 
-    Other load on the machine affects both equally, and caches are mostly warm for each system.
+    Other load on the machine affects both systems equally, and caches are mostly warm for each of them.
     """
 
     def __init__(self, recording: Recording, ours: SlamLoop, theirs: Open3DSlam) -> None:
         self.recording = recording
         self.ours = ours
         self.theirs = theirs
-        # s, of ours and of Open3D in each frame
+        # times, s, of our loop and of Open3D in each frame, by row of the table
         self._measured: dict[str, list[tuple[float, float]]] = defaultdict(list)
         self._lifting: list[float] = []
         self._their_seconds: list[dict[str, float]] = []  # s, of the steps of each frame
@@ -286,7 +286,7 @@ class Duel:
         self._their_seconds.append({step.__name__: seconds(step)[0] for step in steps})
 
     def finish_frame(self) -> None:
-        """After our loop, render the view for viewers and record the times."""
+        """Render the full image as for a viewer after our loop, and store the times of both systems."""
         full, _ = seconds(self.ours.render_all, self.recording.frames[self._frame])
         o, t = self.ours.seconds, self._their_seconds[self._frame]
         for row, pair in {
@@ -300,7 +300,7 @@ class Duel:
         self._lifting.append(o["lift"])
 
     def quantiles(self, q: float) -> dict[str, Float64]:
-        """Return the quantiles (2,), s, of ours and of Open3D, by row."""
+        """Return the quantile `q` of the times (2,), s, of our loop and of Open3D, by row of the table."""
         return {row: np.quantile(pairs[FIRST:], q, axis=0) for row, pairs in self._measured.items()}
 
     def lifting(self) -> float:

@@ -142,7 +142,7 @@ def test_mapper_pickle_round_trip_continues_mapping(room: CornerRoom, fuser: str
     mapper = Mapper(*STAGES, f"fuser={fuser}")
     mapper.add(room[0])
     pickled = pickle.dumps(mapper)
-    assert len(pickled) < 20e6, "reserved memory is not pickled"
+    assert len(pickled) < 20e6, "expected a pickle without reserved memory"
     copied = pickle.loads(pickled)
     for one in (mapper, copied):
         one.add(room[1])

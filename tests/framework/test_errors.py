@@ -24,7 +24,7 @@ def test_error_message_is_shortened_and_escaped(given: str) -> None:
     assert message.isprintable()
     assert len(message) <= 1000
     assert message.startswith("detector.label_space: there is no ")
-    assert str(ConfigError(message)) == message, "escaping twice changes nothing"
+    assert str(ConfigError(message)) == message, "expected no change by a second escape"
     assert one_line(ValueError(given)).isprintable()
     assert message.encode()
 

@@ -94,7 +94,7 @@ def test_principal_point_is_pixel_center() -> None:
 
 @pytest.mark.parametrize("factor", [0.5, 0.25, 2.0])
 def test_scaled_camera_keeps_rays(factor: float) -> None:
-    """Pixel k of the half image covers pixels 2k and 2k + 1, and its ray is their mean."""
+    """At half the size, pixel k covers pixels 2k and 2k + 1, and its ray is the mean of theirs."""
     scaled = CAMERA.scaled(factor)
     point = np.array([[0.3, -0.2, 1.5]])
     full, resized = geometry.project(CAMERA, point) + 0.5, geometry.project(scaled, point) + 0.5

@@ -129,7 +129,7 @@ def test_module_search_path_excludes_working_folder(
     monkeypatch.chdir(CHECKOUT)
     monkeypatch.setattr(sys, "path", [str(CHECKOUT)])
     leave_working_folder([])
-    assert sys.path == [str(CHECKOUT)], "the project folder is kept"
+    assert sys.path == [str(CHECKOUT)], "expected only the project folder"
 
 
 def test_run_directory_creation_error_is_one_line(tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_sweep_continues_after_failed_job(tmp_path: Path) -> None:
     assert "'many'" in (jobs[2] / "instancemap.log").read_text()
     assert done.stdout.splitlines()[-1] == "table.md, table.tex, table.csv"
     assert (tmp_path / "table.md").read_text() in done.stdout
-    assert done.stderr.count("overview.png, mesh.ply, instances.json") == 2, "one line per run"
+    assert done.stderr.count("overview.png, mesh.ply, instances.json") == 2, "expected one line per run"
 
 
 def test_sweep_rejects_misspelled_name_before_first_job(tmp_path: Path) -> None:

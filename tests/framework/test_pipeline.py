@@ -287,7 +287,7 @@ def test_run_to_any_end_keeps_map_after_keyframes_error(room: CornerRoom) -> Non
     assert (result.frames, len(result.tracked)) == (6, 6)
     assert len(mapped(result).vertices) > 0
     result = pipeline(tracker=FailsOnceOnKeyframes(), fuser=_Fails()).run_to_any_end(room)
-    assert "40 GiB" in str(result.stopped_by), "the first error is reported"
+    assert "40 GiB" in str(result.stopped_by), "expected the first error"
 
 
 @PREFETCH
@@ -345,7 +345,7 @@ def test_pipeline_runs_outside_main_thread(room: CornerRoom) -> None:
 
 @dataclass
 class _InPairs(SphereDetector):
-    """Detector whose detections wait for each other in pairs; their number must be even."""
+    """Detector whose calls wait for each other in pairs; the number of calls must be even."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -365,8 +365,8 @@ class _OneReader(CornerRoom):
         self.slow_s, self._next, self._reading = 0.005, 0, threading.Lock()
 
     def __getitem__(self, k: int) -> Frame:
-        assert self._reading.acquire(blocking=False), "concurrent reads"
-        assert k == self._next, "not in order"
+        assert self._reading.acquire(blocking=False), "expected one read at a time"
+        assert k == self._next, "expected reads in order"
         self._next += 1
         try:
             return super().__getitem__(k)
@@ -489,9 +489,9 @@ def test_viewer_failure_does_not_affect_run(
     monkeypatch.setattr(listener, verb, fails)
     result = pipeline(prefetch, viewer=listener).run_to_any_end(CornerRoom(unreadable=1))
     assert (result.frames, result.frames_skipped, result.stopped_by) == (6, 1, None)
-    expected = [record.message for record in caplog.records if "viewer" in record.message]
-    assert expected == ["viewer: disabled after an error; the run continues: no screen any more"]
-    assert calls == [verb], "it is not called again"
+    logged = [record.message for record in caplog.records if "viewer" in record.message]
+    assert logged == ["viewer: disabled after an error; the run continues: no screen any more"]
+    assert calls == [verb], "expected no second call"
     assert verb == "end" or listener.calls[-1] == "end"
 
 

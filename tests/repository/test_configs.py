@@ -36,16 +36,16 @@ def test_option_composes_and_builds(stage: str, name: str, ready: Callable[..., 
     assert isinstance(ready(stage, name), GROUPS[stage])
 
 
-NEEDY = {  # the first parameter that the user must set, by option
+REQUIRED = {  # the first parameter that the user must set, by option
     key: asked[0]
     for key, option in registered.OPTION.items()
     if (asked := [parameter.name for parameter in option.parameters if parameter.default == "???"])
 }
 
 
-@pytest.mark.parametrize(("stage", "name"), NEEDY)
+@pytest.mark.parametrize(("stage", "name"), REQUIRED)
 def test_option_missing_required_parameter_or_file_raises(stage: str, name: str) -> None:
-    key = f"{stage}.{NEEDY[stage, name]}"
+    key = f"{stage}.{REQUIRED[stage, name]}"
     with pytest.raises(ConfigError, match=rf"expected a value for .*, got none; set .*{key}"):
         registered.built(stage, name)
     with pytest.raises(DataError, match="/nowhere"):
@@ -71,11 +71,11 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
 def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
-    """Variants may differ. Values that the user must set have no default in the file and in the class."""
+    """Variants may differ. Values that the user must set have no default in either the file or the class."""
     path = CONF / stage / f"{name}.yaml"
     own = OmegaConf.load(path)
-    is_variant = "_target_" not in own  # of the option that it inherits
-    assert not is_variant or re.match(r"# (?!@)\S", path.read_text()), "the first line states what the variant changes"
+    is_variant = "_target_" not in own  # a variant of the option that it inherits
+    assert not is_variant or re.match(r"# (?!@)\S", path.read_text()), "expected a comment on the variant in line 1"
     node = registered.composed(stage, name)[stage]
     plugin_class = find_class(GROUPS[stage], node["_target_"])
     links = plugin_fields(plugin_class)
@@ -86,7 +86,7 @@ def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
         )
         for link in [shown] if one else node[key]:
             found = node[key] if one else node[key][link]
-            assert found == registered.composed(stage, link)[stage], "a link equals the option of its name"
+            assert found == registered.composed(stage, link)[stage], "expected the link to equal the option of its name"
     fields = [field for name, (field, _) in parameter_fields(plugin_class).items() if name not in links]
     asked = [field.name for field in fields if OmegaConf.is_missing(node, field.name)]
     answered = set(own) if is_variant else set()  # desk sets the path of its frames
@@ -100,7 +100,7 @@ def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
     }
     assert set(differing) == (set(own) - {"defaults"} if is_variant else set()), differing
     of_the_run = {key for key in node if OmegaConf.is_interpolation(node, key)}
-    assert of_the_run <= {"seed", "device"}, "other keys need values of the run"
+    assert of_the_run <= {"seed", "device"}, "expected references only to seed and device, which each run sets"
 
 
 def test_schedule_and_table_yaml_equal_class_defaults() -> None:

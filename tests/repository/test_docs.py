@@ -46,10 +46,10 @@ def test_page_links_resolve(name: str) -> None:
     here = CHECKOUT / name
     for path, anchor in LINK.findall(CODE.sub("", LINKING[name])):
         target = (here.parent / path).resolve() if path else here
-        assert target.is_relative_to(CHECKOUT), f"{path} is outside of the project"
-        assert target.exists(), f"{path} does not exist"
+        assert target.is_relative_to(CHECKOUT), f"expected a link inside the project, got {path}"
+        assert target.exists(), f"expected an existing file, got {path}"
         if anchor:
-            assert anchor in anchors(target.read_text()), f"{path} has no heading #{anchor}"
+            assert anchor in anchors(target.read_text()), f"{path}: expected a heading #{anchor}, got none"
 
 
 def option_names(stage: str) -> list[str]:
@@ -114,7 +114,9 @@ def test_project_files_are_pages_with_valid_links(built: Path) -> None:
         page = (built / f"{name}.html").read_text()
         assert len(page) > 10_000
         for target in re.findall(r'<a class="reference (?:internal|download internal)"[^>]*? href="([^"#]+)', page):
-            assert (built / name).parent.joinpath(target).resolve().exists(), f"{name}: {target}"
+            assert (built / name).parent.joinpath(target).resolve().exists(), (
+                f"{name}: expected an existing file, got {target}"
+            )
 
 
 def test_citation_file_has_required_keys() -> None:

@@ -53,4 +53,4 @@ def test_ground_truth_masks_give_accurate_instances(sequence: Synthetic) -> None
     assert metrics["instances.ap50"] > 0.9
     assert metrics["instances.mean_iou"] > 0.8
     exact = sequence.room.surfaces
-    assert len(np.unique(exact.instance_ids)) > 8, "the room is furnished"
+    assert len(np.unique(exact.instance_ids)) > 8, "expected a furnished room"

@@ -82,7 +82,7 @@ def imported(tree: ast.AST) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "imports are absolute"
+            assert node.level == 0, "expected an absolute import"
             whole = node.module in ("framework", "plugins")
             yield from (f"{node.module}.{alias.name}" for alias in node.names) if whole else [str(node.module)]
 
@@ -103,12 +103,12 @@ def test_module_imports_only_lower_layers(path: Path) -> None:
     name = name_of(path)
     for module in imported(parsed(path)):
         if name.startswith("framework"):
-            assert not module.startswith("plugins"), f"{name} imports {module}: framework never imports plugins"
+            assert not module.startswith("plugins"), f"{name}: expected no import of a plugin, got {module}"
         if name.startswith("framework.") and module.startswith("framework."):
             above = LAYER[part_of(module)] > LAYER[part_of(name)]
-            assert not above, f"{name} imports {module}, which is in a higher layer"
+            assert not above, f"{name}: expected imports of lower layers, got {module}"
         if name.startswith("plugins.") and module.startswith("plugins."):
-            assert module == name, f"{name} imports {module}: plugins never import each other"
+            assert module == name, f"{name}: expected no import of another plugin, got {module}"
 
 
 def test_layers_cover_all_packages() -> None:
@@ -174,7 +174,7 @@ def test_test_folders_mirror_package(package: str) -> None:
 @pytest.mark.parametrize("path", MODULES, ids=name_of)
 def test_optional_libraries_are_imported_lazily(path: Path) -> None:
     heavy = {module.split(".")[0] for module in at_module_level(parsed(path))} & OPTIONAL
-    assert not heavy, f"{name_of(path)} imports {', '.join(heavy)} at module level"
+    assert not heavy, f"{name_of(path)}: expected imports inside functions, got {', '.join(heavy)} at module level"
 
 
 def test_test_folders_are_not_packages() -> None:

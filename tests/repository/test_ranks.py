@@ -112,7 +112,7 @@ def test_ranks_row_interval_is_bootstrap_over_rows(tmp_path: Path) -> None:
     low, high = np.quantile([spearmanr(ours[k], theirs[k]).statistic for k in drawn], [0.025, 0.975])
     assert found.over_rows == pytest.approx((low, high), abs=0.05)
     assert found.over_rows[0] < found.rho < found.over_rows[1]
-    assert np.isnan(found.over_runs).all(), "one run gives no interval"
+    assert np.isnan(found.over_runs).all(), "expected no interval for one run"
 
 
 def test_ranks_run_interval_reflects_seed_noise(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_ranks_run_interval_reflects_seed_noise(tmp_path: Path) -> None:
     one, same = experiment(tmp_path / "one", steady), experiment(tmp_path / "same", steady)
     assert agreement([one, same]).over_runs == (1, 1)
     noisy = experiment(tmp_path / "noisy", {"a": (0.9, 0.4, 0.9), "b": (0.5, 0.8, 0.5), "c": (0.1, 0.2, 0.1)})
-    # means: a 0.73, b 0.6; if the second seed dominates, b is first, and rho of 1 2 3 and 2 1 3 is 0.5
+    # means: a 0.73, b 0.6; b is first in samples with mostly the second seed; rho of 1 2 3 and 2 1 3 is 0.5
     found = agreement([one, noisy])
     assert (found.rho, *found.over_runs) == pytest.approx((1, 0.5, 1))
     # b is first only if the last seed is drawn four times: 1 sample in 256, which is outside of the interval
@@ -174,7 +174,7 @@ def test_ranks_of_several_metrics_are_written_to_files(places: list[Path], tmp_p
     text = write_ranks(places, [AP50, IOU], out)
     assert (out / "ranks.md").read_text() == text
     assert text.count("\n## ") == 2
-    assert "| rooms, flat | 4 | – | – | – |" in lines_of(text), "equal rows have no ranking"
+    assert "| rooms, flat | 4 | – | – | – |" in lines_of(text), "expected no ranking of equal rows"
     with (out / "ranks.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == 2 * 4 * 4

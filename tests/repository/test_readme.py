@@ -171,7 +171,7 @@ RUNNABLE = {  # arguments appended to each command, so that it takes seconds
     "python -m framework new-plugin refiner my_refiner": [],
 }
 COPY_POSES = "open('FILE', 'w').write(open('DIR/poses.txt').read())"
-LEFT_BEHIND = [
+EXPECTED_FILES = [
     "detections.json",
     "refinement.png",
     "instancemap-my-refiner/pyproject.toml",
@@ -214,7 +214,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_documented_commands_write_expected_files(ran: Path) -> None:
     assert set(RUNNABLE) - {DEFAULTS} <= set(LINES)
-    assert not [name for name in LEFT_BEHIND if not (ran / name).exists()]
+    assert not [name for name in EXPECTED_FILES if not (ran / name).exists()]
     assert len(list((ran / "outputs" / "table3_map").glob("*/metrics.json"))) == 3
     assert list(ran.glob("instancemap/detections/*/*.detections"))
     assert (ran / "outputs" / "check.png").exists()

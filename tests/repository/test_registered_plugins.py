@@ -86,12 +86,12 @@ def video(request: pytest.FixtureRequest, ready: Ready, monkeypatch: pytest.Monk
 def come(video: LiveVideo) -> Iterator[Frame]:
     """Yield the frames of a live video after checking that it yields None while it waits for a frame."""
     with closing(video.frames()) as readers:
-        message = time.monotonic()
+        yielded = time.monotonic()
         for reader in readers:
-            assert time.monotonic() - message < 1, "about 10 times per second are expected"
+            assert time.monotonic() - yielded < 1, "expected None about 10 times per second"
             if reader is not None:
                 yield reader()
-            message = time.monotonic()
+            yielded = time.monotonic()
 
 
 def test_live_video_yields_current_frames_in_order(video: LiveVideo) -> None:

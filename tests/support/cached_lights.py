@@ -24,7 +24,7 @@ FOLDER = CHECKOUT / ".pytest_cache" / "lights"
 
 
 def bake(surfaces: Surfaces, caster: RayCaster, lamps: list[Lamp]) -> Float32:
-    """Return the result of `lights.bake`, from the cache if it is stored there."""
+    """Return the irradiance (V, 3) from `lights.bake`, or from the cache if it is stored there."""
     content = sha256(_code())
     arrays = [surfaces.vertices, surfaces.normals, surfaces.triangles, surfaces.materials, surfaces.material_table]
     arrays += [surfaces.instance_ids, *(a for lamp in lamps for a in (lamp.points, lamp.normals, np.array(lamp.power)))]

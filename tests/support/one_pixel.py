@@ -30,15 +30,15 @@ def measured(
     absence: float,
     last_id: int,
 ) -> Measurement:
-    """Return clusters that all cover the only pixel."""
-    message = np.flatnonzero(ids).astype(np.int32)
+    """Return a measurement of clusters on the only pixel, each with an instance, a score and a class distribution."""
+    clusters = np.flatnonzero(ids).astype(np.int32)
     matched = np.zeros(last_id + 1, np.bool_)
     matched[ids] = True
     relative, named, bits = named_classes(np.log(distributions), logarithmic=True)
     return Measurement(
         np.full((1, 1), COVERED),
-        np.array([0, 0, len(message)], np.int32),
-        message,
+        np.array([0, 0, len(clusters)], np.int32),
+        clusters,
         np.array(ids, np.int32),
         np.log(np.array(scores) / FLOOR).astype(np.float32),
         np.float32(np.log(absence)),
@@ -51,7 +51,7 @@ def measured(
 
 
 def voted(ids: list[int], weights: list[float], classes: list[int], combine: Combine, number: int = 6) -> Measurement:
-    """Return clusters that cover the only pixel, each with an instance and a class, for a non-Bayesian label rule."""
+    """Return a measurement of clusters on the only pixel, each with an instance and a class, for non-Bayesian rules."""
     evidence = np.zeros((len(ids), number))
     evidence[np.arange(len(ids)), classes] = weights
     relative, named, bits = named_classes(evidence, logarithmic=False)

@@ -122,7 +122,7 @@ def _mask_rcnn(folder: Path) -> list[str]:
 
 
 def _onnx_boxes(folder: Path) -> list[str]:
-    """Write a network that returns two boxes of 16 px in 32 px, in YOLOX cells: 4 x 4, 2 x 2 and 1."""
+    """Write a network with an input of 32x32 px and two boxes of 16 px, in YOLOX's grids of 4x4, 2x2 and 1x1 cells."""
     pytest.importorskip("onnx")
     from tests.support.networks.tiny_networks import constant_network
 

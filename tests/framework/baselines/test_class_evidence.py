@@ -25,7 +25,7 @@ def one_voxel(classes: int) -> ClassEvidence:
 
 
 def masks_of(log_ratio: np.ndarray, frame: int = 0) -> MaskClasses:
-    """Return N masks with these log ratios (N, C) of their classes, one pixel each, in one row of pixels."""
+    """Return N one-pixel masks in one image row, with these log ratios (N, C) of their classes."""
     n, c = log_ratio.shape
     clusters = PointClusters(
         np.zeros((n, 3), np.float32),
@@ -54,23 +54,23 @@ def sums(evidence: ClassEvidence, classes: int) -> np.ndarray:
 
 def test_class_evidence_few_classes_are_exact() -> None:
     rng = np.random.default_rng(0)
-    message = rng.normal(0, 2, (30, 5))
-    masks, evidence = masks_of(message), one_voxel(5)
+    log_ratios = rng.normal(0, 2, (30, 5))
+    masks, evidence = masks_of(log_ratios), one_voxel(5)
     assert sum(observe(evidence, masks, k) for k in range(30)) == 0
-    np.testing.assert_allclose(sums(evidence, 5), message.sum(axis=0), atol=1e-4)
-    assert evidence.class_ids[0, 0, 0] == message.sum(axis=0).argmax()
+    np.testing.assert_allclose(sums(evidence, 5), log_ratios.sum(axis=0), atol=1e-4)
+    assert evidence.class_ids[0, 0, 0] == log_ratios.sum(axis=0).argmax()
     assert evidence.masked[0, 0] == 30
 
 
-def test_class_evidence_late_class_includes_earlier_masks() -> None:
+def test_class_evidence_of_later_class_includes_earlier_masks() -> None:
     """Each mask has its own log ratios for 8 of 14 classes and an equal log ratio for the others."""
     rng = np.random.default_rng(1)
-    message = np.full((20, 14), -3.0)
-    for row in message:
+    log_ratios = np.full((20, 14), -3.0)
+    for row in log_ratios:
         row[rng.choice(14, NEW_CLASSES, replace=False)] = rng.normal(0, 1, NEW_CLASSES)
-    masks, evidence = masks_of(message), one_voxel(14)
+    masks, evidence = masks_of(log_ratios), one_voxel(14)
     assert sum(observe(evidence, masks, k) for k in range(20)) == 0
-    np.testing.assert_allclose(sums(evidence, 14), message.sum(axis=0), atol=1e-4)
+    np.testing.assert_allclose(sums(evidence, 14), log_ratios.sum(axis=0), atol=1e-4)
 
 
 def test_class_evidence_full_voxel_drops_least_likely_class() -> None:

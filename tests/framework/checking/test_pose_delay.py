@@ -17,10 +17,10 @@ from framework.geometry import exp_se3, inverse, project, transform
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 BLANK = np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32)
 FRAMES = 80
-AS_IT_IS = (PoseFit(PoseReading(), 1.0, np.zeros(0)),)
+IDENTITY_FIT = (PoseFit(PoseReading(), 1.0, np.zeros(0)),)
 
 
-def trembling_walk() -> list[Float64]:
+def uneven_path() -> list[Float64]:
     """Return the poses of a camera whose velocity changes from frame to frame."""
     chosen = np.random.default_rng(0)
     poses = [np.eye(4)]
@@ -29,7 +29,7 @@ def trembling_walk() -> list[Float64]:
     return poses
 
 
-def even_walk() -> list[Float64]:
+def uniform_path() -> list[Float64]:
     """Return the poses of a camera whose velocity is constant."""
     return [exp_se3(k * np.array([0.01, 0.0, 0.005, 0.0, 0.01, 0.0])) for k in range(FRAMES)]
 
@@ -57,12 +57,12 @@ def late(poses: Sequence[Float64], frames: int) -> list[Float64 | None]:
 
 def found(poses: Sequence[Float64], frames: int, noise: float = 0.0) -> PoseDelay | None:
     stored = late(poses, frames)
-    return find_delay(pairs_of(poses, stored, noise), stored, AS_IT_IS)
+    return find_delay(pairs_of(poses, stored, noise), stored, IDENTITY_FIT)
 
 
 @pytest.mark.parametrize("frames", [-MAX_DELAY, -3, -1, 1, 2, 5, MAX_DELAY])
 def test_pose_delay_is_found_without_residual_error(frames: int) -> None:
-    delay = found(trembling_walk(), frames)
+    delay = found(uneven_path(), frames)
     assert delay is not None
     assert (delay.frames, delay.alike) == (frames, ())
     assert delay.delayed_error == pytest.approx(0, abs=1e-3)
@@ -72,48 +72,48 @@ def test_pose_delay_is_found_without_residual_error(frames: int) -> None:
 
 def test_pose_delay_of_correct_poses_and_noisy_points_is_none() -> None:
     for noise in (0.0, 1.0, 5.0):
-        assert found(trembling_walk(), 0, noise) is None
+        assert found(uneven_path(), 0, noise) is None
 
 
 @pytest.mark.parametrize("frames", [-2, 1, 3])
 def test_pose_delay_in_uniform_motion_is_undetectable(frames: int) -> None:
-    assert found(even_walk(), frames, 0.5) is None
+    assert found(uniform_path(), frames, 0.5) is None
 
 
 def test_pose_delay_beyond_search_range_is_not_reported() -> None:
     for frames in (MAX_DELAY + 1, MAX_DELAY + 2):
-        assert found(trembling_walk(), frames) is None
+        assert found(uneven_path(), frames) is None
 
 
 def test_pose_delay_of_unrelated_poses_is_none() -> None:
     other = [exp_se3(np.array([0, 0, 0, 0, 0, 0.5 * k])) for k in range(FRAMES)]
-    assert find_delay(pairs_of(trembling_walk(), other), other, AS_IT_IS) is None
+    assert find_delay(pairs_of(uneven_path(), other), other, IDENTITY_FIT) is None
 
 
 def test_pose_delay_skips_pairs_without_neighboring_poses() -> None:
-    poses = trembling_walk()
+    poses = uneven_path()
     stored = late(poses, 2)
     pairs = pairs_of(poses, stored)
     stored[40] = None
-    delay = find_delay(pairs, stored, AS_IT_IS)
+    delay = find_delay(pairs, stored, IDENTITY_FIT)
     assert delay is not None
     assert (delay.frames, delay.pairs < len(pairs)) == (2, True)
-    assert find_delay(pairs, stored[:20], AS_IT_IS) is None
-    assert find_delay(pairs, [], AS_IT_IS) is None
+    assert find_delay(pairs, stored[:20], IDENTITY_FIT) is None
+    assert find_delay(pairs, [], IDENTITY_FIT) is None
 
 
 def test_pose_delay_is_found_in_best_fitting_axes() -> None:
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    poses = trembling_walk()
+    poses = uneven_path()
     stored = [None if T is None else T @ flip for T in late(poses, 3)]
     opengl = PoseFit(PoseReading(camera_axes=CameraAxes.OPENGL), 1.0, np.zeros(0))
-    delay = find_delay(pairs_of(poses, stored), stored, (*AS_IT_IS, opengl))
+    delay = find_delay(pairs_of(poses, stored), stored, (*IDENTITY_FIT, opengl))
     assert delay is not None
     assert delay.frames == 3
 
 
 def test_delayed_returns_pairs_with_matching_poses() -> None:
-    poses = trembling_walk()
+    poses = uneven_path()
     stored = late(poses, -2)
     for pair in pairs_of(poses, stored):
         meant = delayed(pair, stored, -2)

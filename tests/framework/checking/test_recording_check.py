@@ -160,7 +160,7 @@ def test_recording_check_reports_clock_delay_in_two_units(tmp_path: Path) -> Non
     assert "3 frames late (0.096 s)" in fault.text
 
 
-def test_recording_check_unrelated_poses_fit_in_no_axes(tmp_path: Path) -> None:
+def test_recording_check_unrelated_poses_fit_no_convention(tmp_path: Path) -> None:
     turned = iter(range(1000))
 
     def another(_: Float64) -> Float64:
@@ -206,13 +206,13 @@ def test_recording_check_reports_unregistered_depth(zoom: float, x: float, y: fl
         assert found_y == pytest.approx(-100 * y / 640, abs=0.4)
 
 
-def test_recording_check_half_frame_color_offset_is_note() -> None:
+def test_recording_check_half_frame_color_delay_gives_note() -> None:
     """The desk begins with a rotation of 20 px per frame. A Kinect captures color and depth at different times."""
-    [expected] = [
+    [note] = [
         finding for finding in check(replace(DESK, stop=6), FARTHEST).findings if finding.subject == "color and depth"
     ]
-    assert expected.verdict is Verdict.NOTE
-    assert "with an image motion of" in expected.text
+    assert note.verdict is Verdict.NOTE
+    assert "with an image motion of" in note.text
 
 
 @dataclass

@@ -65,7 +65,7 @@ def option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def line_of(option: Path, content: bytes) -> str:
-    """Return the error line of the option; "" if it was built. Fails for any other outcome."""
+    """Return the error line of the option; "" if it was built. Fail for any other outcome."""
     option.write_bytes(content)
     began = time.process_time()
     try:

@@ -38,7 +38,7 @@ VGA = (480, 640)
 KINECT = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # default intrinsics of OpenNI
 KITCHEN = "redkitchen/seq-01"
 FREIBURG1_RPY = "rgbd_dataset_freiburg1_rpy"
-GAP = (1305031244.897635, 1305031244.997688)  # times of the color images with depth and without pose, s
+GAP = (1305031244.897635, 1305031244.997688)  # times of the color images with depth but without a pose, s
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +280,7 @@ def test_tum_is_mapped(originals: Path) -> None:
 
 
 def around_the_gap(originals: Path, folder: Path) -> TumRgbd:
-    """Return the frames around the gap of motion capture, with their times and poses but other images."""
+    """Return the frames around a gap in the motion capture, with their times and poses but with other images."""
     source = originals / "tum_rgbd" / FREIBURG1_RPY
     target = folder / FREIBURG1_RPY
     target.mkdir()
@@ -309,7 +309,7 @@ def test_tum_frames_in_motion_capture_gap_are_skipped(
     expected = f"2 of {len(times)} frames skipped because they have no pose; the first: frame {times.index(GAP[0])}"
     assert [message.startswith(expected) for message in output] == [True, True]
     for ours, theirs in zip(results[GroundTruth].tracked, results[TrajectoryFile].tracked, strict=True):
-        # one interpolates; the other uses the nearest pose, up to 20 ms away at 0.3 m/s
+        # one run interpolates poses; the other uses the nearest pose, up to 20 ms away at 0.3 m/s
         np.testing.assert_allclose(ours.pose.T_world_camera[:3, 3], theirs.pose.T_world_camera[:3, 3], atol=0.01)
 
 

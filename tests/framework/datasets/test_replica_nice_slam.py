@@ -26,7 +26,7 @@ def write_camera(root: Path, **changes: Any) -> None:
 
 
 def pose_at(k: int) -> np.ndarray:
-    """Return a pose away from the origin, rotated to the right about the vertical axis of the camera."""
+    """Return T_world_camera of frame k, away from the origin and rotated to the right about the camera's y axis."""
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = Rotation.from_rotvec([0, 0.3 * k, 0]).as_matrix()
     T_world_camera[:3, 3] = 1, 2, 0.1 * k
@@ -70,7 +70,7 @@ def test_replica_recording_is_mapped(root: Path) -> None:
     for k, points in enumerate(np.split(points_world, FRAMES)):
         R, center = pose_at(k)[:3, :3], pose_at(k)[:3, 3]
         np.testing.assert_allclose((points - center) @ R[:, 2], 2, atol=1e-5)  # all are 2 m in front of the camera
-        assert (points[0] - center) @ R[:, 1] < 0 < (points[-1] - center) @ R[:, 1]  # the first row is above
+        assert (points[0] - center) @ R[:, 1] < 0 < (points[-1] - center) @ R[:, 1]  # the y axis points down the image
 
 
 def test_replica_partial_recording_keeps_matching_poses(root: Path) -> None:

@@ -97,7 +97,7 @@ def test_detect_layout_detections_have_one_class_each(unit, count):
 
 
 @pytest.mark.parametrize("count", [0, 30])
-def test_detect_layout_without_detections_defers_unit(count):
+def test_detect_layout_without_detections_defers_box_unit(count):
     """After suppression there are no rows, or rows of zeros."""
     layout, output = seen(np.zeros((1, count, 6 + MASKS)))
     assert layout.suppressed

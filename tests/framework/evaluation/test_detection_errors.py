@@ -69,7 +69,7 @@ def test_detection_errors_of_oversized_mask_lower_iou() -> None:
     assert table["correct class"] == 0.5
 
 
-def test_detection_errors_split_object_is_no_false_detection() -> None:
+def test_detection_errors_split_object_has_no_false_positive() -> None:
     halves = detections((CHAIR, 0, 0.8), (block(0, 30, 20, 30), 1, 0.7), (block(20, 30, 20, 30), 1, 0.6))
     table = counted(halves)
     assert table["objects with several detections"] == 0.5

@@ -210,7 +210,7 @@ def test_label_transfer_to_map_counts_map_vertices():
     assert evaluate(twice, truth, transfer=Transfer.TO_MAP).best_ious[1] == pytest.approx(100 / 120)
 
 
-def test_evaluate_empty_map_or_truth_is_handled():
+def test_evaluate_empty_map_has_zero_scores_and_empty_truth_none():
     truth = scene([(1, 100)], {1: "chair"})
     empty = PredictedInstances(
         np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.int64), np.zeros(0), ()
@@ -349,7 +349,7 @@ def test_label_transfers_differ_with_vertex_density():
 
 @pytest.mark.parametrize("transfer", Transfer)
 def test_label_transfer_distance_limit_is_inclusive(transfer):
-    """The distance of 5/64 m is exact in floating point; it is the hypotenuse of 3/64 m and 4/64 m."""
+    """The distance of 5/64 m is exact in floating point; it is the hypotenuse for legs of 3/64 m and 4/64 m."""
     truth = scene([(1, 100)], {1: "chair"})
     moved = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
     moved = replace(moved, points_world=moved.points_world + np.float32([0, 3 / 64, 4 / 64]))
@@ -358,7 +358,7 @@ def test_label_transfer_distance_limit_is_inclusive(transfer):
     assert evaluate(moved, truth, transfer=transfer, max_distance=below).best_ious == {1: 0.0}
 
 
-def test_evaluate_judge_outcomes_match_counts():
+def test_judge_outcomes_match_evaluation_counts():
     """The predictions are correct, a duplicate, of another class, on an unknown instance, and on no instance."""
     names = {1: "chair", 2: "bed", 3: "chair", 4: None, 5: "book"}
     truth = scene([(1, 120), (2, 100), (3, 100), (4, 100), (5, 100), (0, 100)], names)

@@ -75,7 +75,7 @@ def test_trajectory_error_without_pose_pairs_is_empty():
 
 
 def test_trajectory_errors_match_evo():
-    metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed: errors were not compared with it")
+    metrics = pytest.importorskip("evo.core.metrics", reason="requires evo")
     from evo.core.trajectory import PosePath3D
 
     true = walk(50, seed=1)

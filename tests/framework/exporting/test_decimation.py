@@ -63,7 +63,7 @@ def test_decimation_keeps_small_mesh_unchanged() -> None:
     assert areas(light.vertices, light.triangles).sum() == areas(mesh.vertices, mesh.triangles).sum()
 
 
-def test_decimation_clustered_reduces_soup_to_size_limit() -> None:
+def test_decimation_by_clustering_limits_size_of_triangle_soup() -> None:
     mesh = wavy_plane()
     corners = mesh.triangles.ravel()
     triangles = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
@@ -82,7 +82,7 @@ def test_decimation_clustered_reduces_soup_to_size_limit() -> None:
 
 
 def test_decimation_of_flat_surface_keeps_color_pattern() -> None:
-    """The plane is a checkerboard. Decimation by geometry alone would color only 0.85 of the area correctly."""
+    """The plane is a checkerboard. Decimation by geometry alone would color only 85 % of the area correctly."""
     mesh = wavy_plane(101)
     x, y, _ = mesh.vertices.T
     white = (np.floor(5 * x) + np.floor(5 * y)) % 2 == 0

@@ -116,7 +116,7 @@ def test_export_triangles_between_objects_belong_to_room(room: UprightRoom) -> N
     halves = replace(room, mesh=mesh, objects=objects_of(mesh, two))
     found = parts(halves)
     seams = len(found[0].mesh.triangles)
-    assert seams >= 2 * (4 * 3 / 0.1)  # across floor and ceiling, at least
+    assert seams >= 2 * (4 * 3 / 0.1)  # at least those across floor and ceiling
     assert sum(len(part.mesh.triangles) for part in found) == len(mesh.triangles)
     assert (surface_points(halves, 1.0).owner == 0).sum() == seams
 
@@ -132,9 +132,9 @@ def test_export_facing_aligns_box_with_room_x_axis(degrees: float, yaw: float, s
 
 def test_glb_nodes_have_object_metadata(room: UprightRoom) -> None:
     found = header(glb(parts(room)))
-    message = {node["name"]: node.get("extras") for node in found["nodes"]}
-    assert message["cube_2"] == {"id": 2, "class": "cube", "probability": pytest.approx(0.9), "confidence": 0.8}
-    assert not message["room"]
+    extras = {node["name"]: node.get("extras") for node in found["nodes"]}
+    assert extras["cube_2"] == {"id": 2, "class": "cube", "probability": pytest.approx(0.9), "confidence": 0.8}
+    assert not extras["room"]
     assert found["asset"]["version"] == "2.0"
     assert found["extensionsUsed"] == ["KHR_materials_unlit"]
     materials = [found["materials"][mesh["primitives"][0]["material"]] for mesh in found["meshes"]]
@@ -250,7 +250,7 @@ def test_convex_hull_faces_outward() -> None:
 
 
 def test_glb_normals_of_degenerate_triangles_have_unit_length(room: UprightRoom) -> None:
-    """The Khronos glTF validator requires unit normals for triangles without area, too."""
+    """The Khronos glTF validator requires unit normals even for triangles without area."""
     mesh = replace(room.mesh, vertices=room.mesh.vertices.copy())
     own = room.objects[1].vertices
     mesh.vertices[own[:50]] = mesh.vertices[own[0]]
@@ -333,7 +333,7 @@ def test_export_escapes_invalid_unicode_class_names(tmp_path: Path) -> None:
 
 
 def test_exported_instance_colors_match_overview(tmp_path: Path) -> None:
-    """An object has the same color in each file, also if another object is unlikely or not exported."""
+    """An object has the same color in each file, even if another object is unlikely or not exported."""
     run = ExportedRoom().write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())
     entries[0]["confidence"] = 0.1

@@ -53,7 +53,7 @@ def high(room: UprightRoom) -> Plan:
 
 
 def at(found: Plan, x: float, y: float) -> tuple[bool, bool]:
-    """Return whether the position x, y (m) is occupied, and whether it is free."""
+    """Return the values of the masks `occupied` and `free` at x, y, m."""
     [[row, column]] = found.cells(np.array([[x + OFF, y + OFF]]))
     return bool(found.occupied[row, column]), bool(found.free[row, column])
 
@@ -144,24 +144,24 @@ def test_plan_looked_through_excludes_occluded_points(room: UprightRoom) -> None
 def test_ros_map_matches_map_server_thresholds(run: Path, low: Plan, tmp_path: Path) -> None:
     written = export(run, [ExportFormat.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION, robot_height=0.5))
     assert [path.name for path in written] == ["floor_plan.png", "floor_plan.geojson", "map.pgm", "map.yaml"]
-    message = yaml.safe_load((tmp_path / "map.yaml").read_text())
-    image = Image.open(tmp_path / message["image"])
+    header = yaml.safe_load((tmp_path / "map.yaml").read_text())
+    image = Image.open(tmp_path / header["image"])
     assert (image.format, image.mode, image.size) == ("PPM", "L", (43, 33))
     gray = np.asarray(image)
     np.testing.assert_array_equal(gray, levels(low))
     # map_server: p = (255 - gray) / 255; occupied above one threshold, free below the other
     p = (255 - gray.astype(float)) / 255
-    assert {level: bool(p[gray == level].max() < message["free_thresh"]) for level in (FREE, UNKNOWN, OCCUPIED)} == {
+    assert {level: bool(p[gray == level].max() < header["free_thresh"]) for level in (FREE, UNKNOWN, OCCUPIED)} == {
         FREE: True,
         UNKNOWN: False,
         OCCUPIED: False,
     }
-    assert (p[gray == OCCUPIED] > message["occupied_thresh"]).all()
-    assert (p[gray == UNKNOWN] < message["occupied_thresh"]).all()
+    assert (p[gray == OCCUPIED] > header["occupied_thresh"]).all()
+    assert (p[gray == UNKNOWN] < header["occupied_thresh"]).all()
     # the pixel of a table leg, from the origin at the lower left corner
-    x, y, turn = message["origin"]
+    x, y, turn = header["origin"]
     assert turn == 0
-    column, row = int((0.825 + OFF - x) / message["resolution"]), int((1.025 + OFF - y) / message["resolution"])
+    column, row = int((0.825 + OFF - x) / header["resolution"]), int((1.025 + OFF - y) / header["resolution"])
     assert gray[len(gray) - 1 - row, column] == OCCUPIED
 
 
@@ -234,7 +234,7 @@ def test_relations_stacked_object_is_on_object_below(tmp_path: Path) -> None:
     assert expected(found, 3) == [("on", 2)]
 
 
-def test_relations_objects_on_same_table_are_next_to(tmp_path: Path) -> None:
+def test_relations_objects_on_same_table_are_next_to_each_other(tmp_path: Path) -> None:
     things = {
         "dining table": TABLE,
         "book": [(1.0, 1.2, 0.75, 1.2, 1.4, 0.79)],
@@ -257,7 +257,7 @@ CUPBOARD: list[Block] = [
 ]
 
 
-def test_relations_objects_inside_container_are_in(tmp_path: Path) -> None:
+def test_relations_objects_inside_container_have_relation_in(tmp_path: Path) -> None:
     box: list[Block] = [
         (2.6, 0.6, 0.0, 3.2, 1.2, 0.02),
         (2.6, 0.6, 0.0, 2.62, 1.2, 0.5),
@@ -344,7 +344,7 @@ def test_rooms_wide_opening_does_not_separate(tmp_path: Path) -> None:
 
 
 def by_hand(text: str) -> Plan:
-    """Return a plan with cells of 0.5 m: # wall, . free, o occupied, unknown elsewhere."""
+    """Return a plan with cells of 0.5 m from text: # = wall, . = free, o = occupied, space = unknown."""
     rows = np.array([list(row) for row in text.split("\n")])[::-1]
     free, wall, occupied = rows == ".", rows == "#", rows == "o"
     return Plan(0.5, np.zeros(2), occupied | wall, free, free, wall, np.zeros(rows.shape, np.int32))

@@ -1,4 +1,4 @@
-"""Tests of the figures of experiments: included runs, notes about missing runs, and the two files."""
+"""Tests of the figures of experiments: included runs, notes about missing runs, and the two output files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def list_objects(directory: Path, class_name: str, vertices: list[int]) -> None:
-    """Write an instances.json with one object per entry of `vertices`, the number of its vertices."""
+    """Write an instances.json with one object for each vertex count in `vertices`."""
     expected = {"class": class_name, "confidence": 0.9, "class_probabilities": {class_name: 1.0}, "observations": 5}
     box = {"center": [0, 0, 0], "extent": [1, 1, 1], "rotation": np.eye(3).tolist()}
     expected |= {"first_frame": 0, "last_frame": 9, "centroid": [0, 0, 0], "obb": box}
@@ -237,10 +237,10 @@ def test_figures_command_prints_paths_and_errors(
     monkeypatch.setattr(sys, "argv", ["figures", str(maps), str(maps / "nowhere")])
     with pytest.raises(SystemExit) as ended:
         figures.main()
-    message = capsys.readouterr()
+    printed = capsys.readouterr()
     assert ended.value.code == 1
-    assert message.out.splitlines() == [str(maps / "figure.png"), str(maps / "figure.pdf")]
-    assert message.err.splitlines()[-1] == f"error: {maps / 'nowhere'}: expected a folder of runs, got no folder"
+    assert printed.out.splitlines() == [str(maps / "figure.png"), str(maps / "figure.pdf")]
+    assert printed.err.splitlines()[-1] == f"error: {maps / 'nowhere'}: expected a folder of runs, got no folder"
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError("a worker failed"), KeyboardInterrupt()])

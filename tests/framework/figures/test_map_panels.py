@@ -29,7 +29,7 @@ def stored(ids: Mapping[int, int]) -> StoredMap:
 
 
 def hue(color: np.ndarray) -> np.ndarray:
-    """Return the direction of an RGB color; its length, the brightness, depends on the lighting."""
+    """Return the unit vector (3,) of an RGB color minus its smallest channel; it is independent of the lighting."""
     direction = color - color.min()
     return direction / np.linalg.norm(direction)
 
@@ -62,7 +62,7 @@ def test_panel_line_uses_same_object_color_in_all_columns(line: PanelLine) -> No
             np.testing.assert_allclose(panel.image[place], line.truth.image[place], atol=2)
     assert second is not None
     np.testing.assert_allclose(second.image[red], line.truth.image[red], atol=2)
-    assert np.ptp(second.image[blue].astype(int)) < 12, "missed objects are background"
+    assert np.ptp(second.image[blue].astype(int)) < 12, "expected missed objects in the background color"
     assert (np.abs(hue(line.truth.image[red].astype(float)) - hue(line.truth.image[blue].astype(float)))).max() > 0.3
 
 

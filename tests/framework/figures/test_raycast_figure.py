@@ -48,7 +48,7 @@ def test_raycast_page_labels_five_panels() -> None:
     page = raycast_page(wall(), NAMES, CENTERS, "kitchen, frame 7")
     assert {"depth", "normals", "vertices", "RGB", "object indices", "kitchen, frame 7"} <= set(titles(page))
     assert {"90% of the pixels are mapped", "2 objects"} <= set(titles(page))
-    assert len(page.figure.axes) == 5 + 1, "panels and colorbar"
+    assert len(page.figure.axes) == 5 + 1, "expected five panels and a colorbar"
     names = {text.get_text() for axes in page.figure.axes for text in axes.texts}
     assert names == {"3 chair", "12 cup"}
 
@@ -57,7 +57,7 @@ def test_raycast_page_colorbar_is_in_meters() -> None:
     view = wall()
     view.depth[:30] = np.where(view.depth[:30] > 0, 1.0, 0)
     [bar] = [axes for axes in raycast_page(view, NAMES, CENTERS, "").figure.axes if axes.get_title() == "m"]
-    assert bar.get_ylim() == (1.0, 2.0), "unmapped pixels have no depth"
+    assert bar.get_ylim() == (1.0, 2.0), "expected a range without unmapped pixels"
 
 
 def test_raycast_page_texts_fit_on_page() -> None:
@@ -76,7 +76,7 @@ def test_raycast_colors_match_geometry() -> None:
     view = wall()
     mapped = view.depth > 0
     assert np.abs(normal_colors(view)[mapped].astype(int) - (128, 128, 255)).max() <= 1, (
-        "normals point toward the camera"
+        "expected normals that point toward the camera"
     )
     positions = np.stack([view.depth, -view.depth, 0 * view.depth], axis=-1).astype(np.float64)
     colors = position_colors(positions, np.array([0.0, -2.0, 0.0]), np.array([4.0, 2.0, 0.0]))

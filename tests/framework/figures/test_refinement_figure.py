@@ -90,7 +90,7 @@ def test_cluster_marks_separate_dropped_and_added_pixels() -> None:
     a, b = box(frame, 0, 10, 0, 20), box(frame, 0, 10, 15, 30)
     grown = box(frame, 0, 14, 0, 15)
     marks = ClusterMarks.after(refined(frame, [a, b], [grown, b]))
-    assert not marks.dropped.any(), "columns 15 to 19 were already in the second cluster"
+    assert not marks.dropped.any(), "expected no dropped points: columns 15 to 19 were already in the second cluster"
     np.testing.assert_array_equal(marks.added, box(frame, 10, 14, 0, 15))
     marks = ClusterMarks.after(refined(frame, [a, b], [box(frame, 0, 10, 0, 5), b]))
     np.testing.assert_array_equal(marks.dropped, box(frame, 0, 10, 5, 15))
@@ -116,7 +116,7 @@ def test_cluster_marks_keep_colors_and_add_colors_for_parts() -> None:
     many = ClusterMarks.before(refined(frame, [a] * 100, [a] * 100)).colors.astype(int)
     assert many.shape == (100, 3)
     apart = np.abs(many - np.array(DROPPED)).sum(axis=1)
-    assert apart.min() > 100, "no pixel has the mark of dropped points"
+    assert apart.min() > 100, "expected no pixel with the mark of dropped points"
 
 
 def test_refinement_image_is_tinted_and_hatched() -> None:
@@ -126,7 +126,7 @@ def test_refinement_image_is_tinted_and_hatched() -> None:
     left, right = tinted(frame, before).astype(int), tinted(frame, after).astype(int)
     kept, other = np.s_[17:39, 17:31], np.s_[4:10, 50:60]
     np.testing.assert_array_equal(left[kept], right[kept])
-    assert np.ptp(left[other].reshape(-1, 3).mean(axis=0)) < 1, "gray stays gray"
+    assert np.ptp(left[other].reshape(-1, 3).mean(axis=0)) < 1, "expected unmarked pixels to stay gray"
     hue = left[kept].reshape(-1, 3).mean(axis=0) - left[kept].mean()
     color = before.colors[0] - before.colors[0].mean()
     assert hue @ color > 0.98 * np.linalg.norm(hue) * np.linalg.norm(color)
@@ -137,7 +137,7 @@ def test_refinement_image_is_tinted_and_hatched() -> None:
         lost = pixels(figure)[300:380, 340:460]
         hatched.append(((lost[..., 0] > 150) & (lost[..., 1] < 110)).mean())
     assert hatched[0] == 0
-    assert 0.1 < hatched[1] < 0.6, "stripes"
+    assert 0.1 < hatched[1] < 0.6, "expected stripes"
 
 
 def test_side_view_shows_depth_distances() -> None:
@@ -225,7 +225,7 @@ def test_refinement_figure_height_is_limited_for_many_clusters() -> None:
     stripes = [box(frame, k, k + 1, 4, 20) for k in range(30)]
     few = picture(refined(frame, stripes[:24], stripes[:24]), "all", "refiner=identity")
     many = picture(refined(frame, stripes, [*stripes, *stripes[:3]]), "all", "refiner=split")
-    assert many.shape == few.shape, "the number of table rows is limited"
+    assert many.shape == few.shape, "expected a limited number of table rows"
 
 
 def test_write_refinement_creates_complete_image(tmp_path: Path) -> None:

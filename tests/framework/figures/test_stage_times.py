@@ -38,7 +38,7 @@ def test_spread_keeps_label_order_distance_and_mean(places: list[float], gap: fl
     assert (np.diff(np.array(found)[order]) >= gap - 1e-9).all()
     if places:
         assert np.mean(found) == pytest.approx(np.mean(places), abs=1e-9)  # least-squares offsets sum to 0
-    assert np.abs(np.array(spread(found, gap)) - found).max(initial=0) < 1e-9, "distant labels are not moved"
+    assert np.abs(np.array(spread(found, gap)) - found).max(initial=0) < 1e-9, "expected distant labels at their places"
 
 
 def test_spread_moves_overlapping_labels_equally() -> None:

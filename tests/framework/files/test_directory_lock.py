@@ -99,7 +99,7 @@ def test_directory_lock_named_pipe_as_holder_file_raises(tmp_path: Path) -> None
     """Opening a pipe without a reader would block."""
     os.mkfifo(tmp_path / HOLDER)
     with pytest.raises(DataError, match=rf"{HOLDER}: expected a regular file, got a device, a pipe"), locked(tmp_path):
-        pytest.fail("the holder cannot be reported")
+        pytest.fail("expected an error before the lock is acquired")
 
 
 def test_directory_lock_invalid_holder_file_raises_in_use(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def test_path_hash_of_file_and_folder_matches_definition(tmp_path: Path) -> None
     assert path_hash(tmp_path) == hashlib.sha256(f"1:a:{of_file}".encode()).hexdigest()
 
 
-def test_truth_hash_matches_stored_records() -> None:
+def test_truth_hash_matches_stored_hash() -> None:
     points = np.array([[0, 0, 0], [1, 0, 0.5]], np.float32)
     ids = np.array([0, 3], np.int32)
     truth = SceneTruth(points, ids, {3: "chair"}, ("chair", "desk"))

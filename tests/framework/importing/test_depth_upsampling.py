@@ -75,7 +75,7 @@ def test_depth_upsampling_is_exact_on_planes_and_sharp_at_edges(factor: float) -
 
 
 def test_depth_upsampling_selects_surface_by_color_at_edge() -> None:
-    """The depth step is inside a coarse pixel: with the nearest depth it would move by up to half a coarse pixel."""
+    """The step is inside a coarse pixel. With the nearest depth, it would move by up to half a coarse pixel."""
     camera = Camera(40, 40, 40.0, 40.0, 19.5, 19.5)
     truth = np.where(np.arange(40) < 22, 1.0, 2.0)[None].repeat(40, axis=0)
     color = np.where(truth == 1, 40, 200)[..., None].repeat(3, axis=-1).astype(np.uint8)

@@ -50,7 +50,7 @@ def export(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 @settings(max_examples=EXAMPLES, deadline=None)
 @given(data=st.data())
-def test_import_fuzzed_export_works_or_raises_one_line_error(export: Path, data: st.DataObject) -> None:
+def test_import_fuzzed_export_is_read_or_raises_one_line_error(export: Path, data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as place:
         copy = Path(place) / export.name
         if export.is_dir():

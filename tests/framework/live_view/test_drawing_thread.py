@@ -21,7 +21,7 @@ EXACT = SphereDetector()
 
 
 @dataclass
-class Notebook:
+class RecordedDrawing:
     """Drawing that records its input; `draw_frames` waits for an event or fails if requested."""
 
     waits_for: threading.Event | None = None
@@ -60,7 +60,7 @@ def mapped(room: CornerRoom) -> GridMap:
 
 
 def test_drawing_thread_draws_all_frames_and_final_map(room: CornerRoom) -> None:
-    scene, book = mapped(room), Notebook()
+    scene, book = mapped(room), RecordedDrawing()
     background = DrawingThread(scene, book, frame_interval=1, map_interval=3600)
     for frame in room:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera, frame.index == 3), {"fusion": 1.5})
@@ -79,7 +79,7 @@ def test_drawing_thread_draws_all_frames_and_final_map(room: CornerRoom) -> None
 
 
 def test_drawing_thread_does_not_block_and_draws_newest_image(room: CornerRoom) -> None:
-    going_on, book = threading.Event(), Notebook()
+    going_on, book = threading.Event(), RecordedDrawing()
     book.waits_for = going_on
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
@@ -87,7 +87,7 @@ def test_drawing_thread_does_not_block_and_draws_newest_image(room: CornerRoom) 
         time.sleep(0.001)
     for frame in list(room)[1:]:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
-    assert not book.notes, "all frames are queued, and none is drawn"
+    assert not book.notes, "expected all frames in the queue and none drawn"
     going_on.set()
     background.end()
     assert [picture.frame.index for picture in book.pictures] == [0, 5]
@@ -96,7 +96,7 @@ def test_drawing_thread_does_not_block_and_draws_newest_image(room: CornerRoom) 
 
 @pytest.mark.parametrize("every", [2, 4])
 def test_drawing_thread_draws_images_at_frame_interval(room: CornerRoom, every: int) -> None:
-    book = Notebook()
+    book = RecordedDrawing()
     background = DrawingThread(mapped(room), book, every, map_interval=3600)
     for frame in room:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
@@ -105,15 +105,15 @@ def test_drawing_thread_draws_images_at_frame_interval(room: CornerRoom, every: 
 
 
 def test_drawing_thread_draw_error_is_logged_once(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
-    book = Notebook(fails=True)
+    book = RecordedDrawing(fails=True)
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     for frame in room:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
         background.skip("a fault")
         time.sleep(0.02)
     background.end()
-    expected = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
-    assert expected == ["viewer: disabled after an error; the run continues: [Errno 28] No space left on device"]
+    logged = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    assert logged == ["viewer: disabled after an error; the run continues: [Errno 28] No space left on device"]
     assert book.closed
 
 
@@ -122,12 +122,12 @@ def test_drawing_thread_close_error_is_logged_once(
     fails: bool, room: CornerRoom, caplog: pytest.LogCaptureFixture
 ) -> None:
     background = DrawingThread(
-        mapped(room), Notebook(fails=fails, fails_to_close=True), frame_interval=1, map_interval=3600
+        mapped(room), RecordedDrawing(fails=fails, fails_to_close=True), frame_interval=1, map_interval=3600
     )
     background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
     background.end()
-    [expected] = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
-    assert ("No space left" if fails else "the writer's thread has ended") in expected
+    [logged] = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    assert ("No space left" if fails else "the writer's thread has ended") in logged
 
 
 def test_drawing_thread_map_error_does_not_end_run(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
@@ -135,7 +135,7 @@ def test_drawing_thread_map_error_does_not_end_run(room: CornerRoom, caplog: pyt
         def mesh(self) -> None:  # type: ignore[override]
             raise MemoryError("Unable to allocate 40 GiB")
 
-    book = Notebook()
+    book = RecordedDrawing()
     background = DrawingThread(Broken(vertices=[np.zeros((1, 3))]), book, frame_interval=1, map_interval=3600)
     background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
     background.end()
@@ -145,7 +145,7 @@ def test_drawing_thread_map_error_does_not_end_run(room: CornerRoom, caplog: pyt
 
 def test_drawing_thread_draws_last_frame_without_successor(room: CornerRoom) -> None:
     """In a live stream there may be no next frame."""
-    book = Notebook()
+    book = RecordedDrawing()
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     for frame in room:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})

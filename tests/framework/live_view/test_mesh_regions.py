@@ -38,7 +38,9 @@ def test_mesh_regions_together_equal_mesh(side: float) -> None:
         first = part.vertices[part.triangles[:, 0]] / side
         assert (np.floor(first + 1e-6) <= region).any()
         assert ((first >= np.array(region) - 1e-5) & (first <= np.array(region) + 1 + 1e-5)).all()
-        assert np.unique(part.triangles).tolist() == list(range(len(part.vertices))), "every vertex is used"
+        assert np.unique(part.triangles).tolist() == list(range(len(part.vertices))), (
+            "expected triangles that use every vertex"
+        )
 
 
 def test_mesh_regions_support_bounding_box_of_over_65536_cubes() -> None:

@@ -162,7 +162,9 @@ def test_instance_map_excludes_instances_below_threshold(
     assert not loaded.mesh().instance_ids.any()
     assert (loaded.mesh().class_ids == -1).all()
     T = walk(12)[3]
-    assert loaded.render(room().frame(T).camera, T).instance_ids.any(), "association uses unconfirmed instances"
+    assert loaded.render(room().frame(T).camera, T).instance_ids.any(), (
+        "expected unconfirmed instances in the view, because association uses them"
+    )
 
 
 @pytest.mark.parametrize("points", [1, 2, 3])

@@ -76,7 +76,7 @@ def test_neighborhood_thread_schedule_balances_costs():
         assert len(starts) == threads + 1
         assert (starts[0], starts[-1]) == (0, len(costs))
         loads = [sum(costs[k] for k in order[a:b]) for a, b in pairwise(starts)]
-        assert max(loads) <= sum(costs) / threads + max(costs, default=0), "Graham's bound"
+        assert max(loads) <= sum(costs) / threads + max(costs, default=0), "expected a load within Graham's bound"
 
 
 def test_neighborhood_excludes_structure_from_ring_and_border():
@@ -95,7 +95,7 @@ def test_neighborhood_excludes_structure_from_ring_and_border():
         expected = np.concatenate([inside[own], -outside[ring]]) / 3
         np.testing.assert_allclose(found.depth_in_mask[part], expected, rtol=1e-6)
         assert (found.points_camera[part, 2] > 0).all()
-    assert (structure & in_a_mask & (frame.depth > 0)).any(), "some structure is in a mask"
+    assert (structure & in_a_mask & (frame.depth > 0)).any(), "expected some structure in a mask"
 
 
 def test_depth_in_mask_equals_chamfer_distance():
@@ -147,7 +147,7 @@ def test_neighborhood_matches_back_projection_and_distances():
 
 
 def _chamfer_reference(mask: np.ndarray) -> np.ndarray:
-    """Return the 3-4 chamfer distance (H, W), px / 3, from a mask, by relaxation until convergence."""
+    """Return the 3-4 chamfer distance (H, W) from a mask, in thirds of a pixel, by relaxation until convergence."""
     distance = np.where(mask, 0, 10**6)
     while True:
         padded = np.pad(distance, 1, constant_values=10**6)

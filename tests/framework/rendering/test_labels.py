@@ -67,7 +67,7 @@ def test_labels_of_many_objects_stay_inside_without_overlap(seed: int) -> None:
     for label in labels:
         if label.target is not None:
             u, v = (round(x) for x in label.target)
-            assert names[int(ids[v, u])] == label.text, "the line ends on the object"
+            assert names[int(ids[v, u])] == label.text, "expected a line that ends on the object"
 
 
 def test_place_labels_without_placeable_names_is_empty() -> None:

@@ -49,7 +49,7 @@ def test_object_colors_are_shared_only_by_matched_objects() -> None:
     first = colors.objects(ids((8, 40), (5, 40), (7, 20), (0, 20)), TRUE)
     second = colors.objects(ids((0, 10), (3, 30), (1, 40), (9, 20), (2, 20)), TRUE)
     assert (first[5], first[7]) == (second[1], second[9]) == (colors.true_objects[900000], colors.true_objects[20])
-    assert first[8] != second[3], "objects of different maps are distinct"
+    assert first[8] != second[3], "expected distinct colors for objects of different maps"
     clear = {tuple(color) for color in candidates(CLEAR).tolist()}
     color_of = {key: tuple(color.tolist()) for key, color in colors.color_of.items()}
     assert {color_of[first[5]], color_of[first[7]]} < clear

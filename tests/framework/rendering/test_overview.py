@@ -108,8 +108,8 @@ def test_best_view_looks_down_and_shows_objects() -> None:
     mesh, poses = furnished(), walk()
     surface = Surface(mesh.vertices, mesh.triangles)
     camera, T = best_view(surface, mesh.instance_ids, poses, 200, 150)
-    assert -0.9 < T[2, 2] < -0.5  # obliquely downward
-    assert T[2, 3] > 2.5  # from above the ceiling
+    assert -0.9 < T[2, 2] < -0.5  # looks obliquely downward
+    assert T[2, 3] > 2.5  # the camera is above the ceiling
     ids = FrontSides(surface, T[:3, 3]).seen_by(camera, T[:3, :3]).nearest(mesh.instance_ids)
     assert (ids == 1).sum() > 200
     assert (ids == 2).sum() > 200
@@ -132,7 +132,7 @@ def test_overview_shows_colors_left_and_instances_right(tmp_path: Path) -> None:
         shown = np.median(right[where], axis=0)
         hue = shown / np.linalg.norm(shown) @ (color / np.linalg.norm(color))
         assert hue > 0.98
-    assert np.ptp(np.median(right[~red & ~blue], axis=0)) < 12, "the background is gray"
+    assert np.ptp(np.median(right[~red & ~blue], axis=0)) < 12, "expected a gray background"
 
 
 def test_overview_unlisted_ids_are_background() -> None:

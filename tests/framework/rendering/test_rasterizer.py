@@ -16,11 +16,11 @@ from framework.synthetic.ray_caster import RayCaster, image_rays, pixel_rays
 from framework.synthetic.walk import look
 
 CAMERA = Camera(96, 64, 80.0, 85.0, 47.3, 31.1)
-ASIDE = 2e-3  # px: if rays this far apart meet the same vertex, the result does not depend on rounding
+ASIDE = 2e-3  # px; if rays at this distance from a pixel center hit the same vertex, rounding has no effect
 
 
 def drawn(vertices: np.ndarray, triangles: np.ndarray, T: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """Return the index (H, W) of the nearest vertex, -1 = no surface."""
+    """Return the index (H, W) of the vertex nearest to the surface point at each pixel; -1 = no surface."""
     numbered = np.arange(1, len(vertices) + 1, dtype=np.int32)
     return Rasterizer(vertices, triangles).draw(camera, T).nearest(triangles, numbered) - 1
 
@@ -34,7 +34,7 @@ def met_by_rays(caster: RayCaster, triangles: np.ndarray, T: np.ndarray, du: flo
     return np.where(hits.triangle == NO_TRIANGLE, -1, corner)
 
 
-def assert_sees_what_rays_meet(vertices: np.ndarray, triangles: np.ndarray, T: np.ndarray) -> None:
+def assert_equals_ray_casting(vertices: np.ndarray, triangles: np.ndarray, T: np.ndarray) -> None:
     caster = RayCaster(vertices, triangles)
     around = [met_by_rays(caster, triangles, T, du, dv) for du in (-ASIDE, ASIDE) for dv in (-ASIDE, ASIDE)]
     sure = np.all([a == around[0] for a in around], axis=0)
@@ -42,8 +42,8 @@ def assert_sees_what_rays_meet(vertices: np.ndarray, triangles: np.ndarray, T: n
     np.testing.assert_array_equal(drawn(vertices, triangles, T)[sure], around[0][sure])
 
 
-def confetti(rng: np.random.Generator, size: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices, m, and triangles of `count` random triangles of about `size` m around the origin."""
+def random_triangles(rng: np.random.Generator, size: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices, m, and triangles of `count` random triangles of about `size` m in a cube of 6 m."""
     centers = rng.uniform(-3, 3, (count, 1, 3))
     vertices = (centers + rng.normal(0, size, (count, 3, 3))).reshape(-1, 3).astype(np.float32)
     return vertices, np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
@@ -54,14 +54,14 @@ def confetti(rng: np.random.Generator, size: float, count: int) -> tuple[np.ndar
 def test_rasterizer_matches_ray_casting(size: float, count: int, seed: int) -> None:
     """Some triangles are small, and some extend from in front of the camera to behind it; poses are random."""
     rng = np.random.default_rng([seed, count])
-    vertices, triangles = confetti(rng, size, count)
-    assert_sees_what_rays_meet(vertices, triangles, exp_se3(rng.normal(0, 1, 6)))
+    vertices, triangles = random_triangles(rng, size, count)
+    assert_equals_ray_casting(vertices, triangles, exp_se3(rng.normal(0, 1, 6)))
 
 
 @pytest.mark.parametrize("size", [0.2, 3.0])
 def test_rasterizer_depth_and_weights_match_ray_casting(size: float) -> None:
     rng = np.random.default_rng(7)
-    vertices, triangles = confetti(rng, size, 400)
+    vertices, triangles = random_triangles(rng, size, 400)
     T = exp_se3(rng.normal(0, 1, 6))
     buffer = Rasterizer(vertices, triangles).draw(CAMERA, T)
     hits = RayCaster(vertices, triangles).cast(image_rays(CAMERA, T))
@@ -127,7 +127,7 @@ def test_rasterizer_ignores_degenerate_triangles() -> None:
 
 
 def test_rasterizer_is_thread_safe() -> None:
-    vertices, triangles = confetti(np.random.default_rng(0), 0.1, 3000)
+    vertices, triangles = random_triangles(np.random.default_rng(0), 0.1, 3000)
     rasterizer = Rasterizer(vertices, triangles)
     poses = [exp_se3(np.random.default_rng(k).normal(0, 1, 6)) for k in range(8)]
     alone = [rasterizer.draw(CAMERA, T) for T in poses]

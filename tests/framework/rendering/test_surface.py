@@ -12,7 +12,7 @@ from framework.rendering.surface import FrontSides, Hits, Surface
 from framework.rendering.viewpoint import looking
 
 CAMERA = Camera(48, 36, 40.0, 42.0, 23.5, 17.5)
-EYE, R = np.array([0.1, -0.2, -4.0]), looking(np.array([0.05, 0.1, 1.0]), np.array([0.0, -1, 0]))
+CENTER, R = np.array([0.1, -0.2, -4.0]), looking(np.array([0.05, 0.1, 1.0]), np.array([0.0, -1, 0]))
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def surface() -> Surface:
 
 @pytest.fixture(scope="module")
 def hits(surface: Surface) -> Hits:
-    return FrontSides(surface, EYE).seen_by(CAMERA, R)
+    return FrontSides(surface, CENTER).seen_by(CAMERA, R)
 
 
 def test_surface_normals_match_cross_products(surface: Surface) -> None:
@@ -48,7 +48,7 @@ def test_surface_hits_show_front_faces_with_exact_values(surface: Surface, hits:
             continue
         corners = hits.triangles[hits.buffer.triangle[v, u]]
         a, b, c = surface.vertices[corners]
-        assert np.cross(b - a, c - a) @ (a - EYE) < 0
+        assert np.cross(b - a, c - a) @ (a - CENTER) < 0
         weights = np.array([1 - hits.buffer.uv[v, u].sum(), *hits.buffer.uv[v, u]])
         assert nearest[v, u] == labels[corners[weights.argmax()]]
         np.testing.assert_allclose(interpolated[v, u], weights @ values[corners], atol=1e-5)
@@ -61,7 +61,7 @@ def test_surface_subsampled_hits_match_subsampled_camera(hits: Hits, n: int) -> 
     np.testing.assert_array_equal(some.depth, hits.depth[::n, ::n])
     np.testing.assert_array_equal(some.points_world, hits.points_world[::n, ::n])
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, EYE
+    T[:3, :3], T[:3, 3] = R, CENTER
     local = transform(inverse(T), some.points_world[some.seen].astype(np.float64))
     v, u = np.nonzero(some.seen)
     np.testing.assert_allclose(project(some.camera, local), np.stack([u, v], axis=-1), atol=1e-3)
@@ -71,6 +71,6 @@ def test_surface_subsampled_hits_match_subsampled_camera(hits: Hits, n: int) -> 
 def test_front_sides_hide_back_faces() -> None:
     front = Surface(np.array([[-9, -9, 0], [0, 9, 0], [9, -9, 0]], np.float32), np.array([[0, 1, 2]], np.int32))
     back = Surface(front.vertices, front.triangles[:, ::-1])
-    shown = [FrontSides(one, EYE).seen_by(CAMERA, np.eye(3)).buffer.triangle for one in (front, back)]
+    shown = [FrontSides(one, CENTER).seen_by(CAMERA, np.eye(3)).buffer.triangle for one in (front, back)]
     assert (shown[0] == 0).all()
     assert (shown[1] == NO_TRIANGLE).all()

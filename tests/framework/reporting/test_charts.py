@@ -51,7 +51,9 @@ def circle(radius: float) -> np.ndarray:
 def test_top_view_keeps_shapes_and_marks_lost_poses() -> None:
     picture, share = top_view([PlottedPath(circle(2.0), [5])], [circle(2.2)], [], UP)
     [mine], [true] = paths(picture, "chart-path"), paths(picture, "chart-true")
-    assert np.ptp(mine, axis=0) == pytest.approx(np.full(2, np.ptp(mine[:, 1])), rel=0.03), "a circle stays a circle"
+    assert np.ptp(mine, axis=0) == pytest.approx(np.full(2, np.ptp(mine[:, 1])), rel=0.03), (
+        "expected equal scales of both axes"
+    )
     assert np.ptp(true[:, 1]) / np.ptp(mine[:, 1]) == pytest.approx(1.1, rel=0.01)
     assert (true > 0).all()
     assert (true < [WIDTH, HEIGHT]).all()
@@ -68,7 +70,7 @@ def test_top_view_escapes_object_names() -> None:
     shape = shape[:4]
     sides = np.linalg.norm(shape - np.roll(shape, 1, axis=0), axis=1)  # rotated, so that the path is horizontal
     assert sorted(sides / sides.min()) == pytest.approx([1, 1, 2, 2], rel=0.01)
-    assert picture.count("&lt;cup&gt;") == 2, "tooltip and label"
+    assert picture.count("&lt;cup&gt;") == 2, "expected the name in the tooltip and in the label"
     assert share < 0.1
 
 

@@ -94,12 +94,12 @@ def colored(image: np.ndarray) -> float:
 def test_report_click_on_object_shows_details(pages: list[Path], opened: Any, tmp_path: Path) -> None:
     page = opened(pages[0])
     before = canvas(page)
-    assert len(np.unique(before.reshape(-1, 3), axis=0)) > 200, "the canvas is blank"
+    assert len(np.unique(before.reshape(-1, 3), axis=0)) > 200, "expected an image on the canvas"
     assert page.locator("#panel .details").count() == 0
     first = page.evaluate("report.objects[0]")
     page.mouse.click(*page.evaluate(PLACE_OF, first["id"]))
     panel = page.inner_text("#panel")
-    for output in (
+    for text in (
         first["class"],
         first["size"],
         first["place"],
@@ -107,11 +107,11 @@ def test_report_click_on_object_shows_details(pages: list[Path], opened: Any, tm
         "Class probabilities",
         "Truth",
     ):
-        assert output in panel
+        assert text in panel
     assert page.locator("#panel img").count() == 1
     row = page.locator(f"tr[data-id='{first['id']}']")
     assert row.get_attribute("aria-selected") == "true"
-    assert np.abs(canvas(page) - before).max() > 30, "nothing is highlighted"
+    assert np.abs(canvas(page) - before).max() > 30, "expected a highlighted object"
     page.screenshot(path=tmp_path / "chosen.png", full_page=True)
     assert (tmp_path / "chosen.png").stat().st_size > 50_000
     page.get_by_label("Clear selection").click()
@@ -127,7 +127,7 @@ def test_report_view_buttons_change_map_colors(pages: list[Path], opened: Any) -
     assert np.abs(instances - own).max() > 60
     page.locator("#confidence").fill("1")
     assert page.inner_text("#confidence-value") == "1.00"
-    assert colored(canvas(page)) < 0.5 * colored(instances), "no object has confidence 1"
+    assert colored(canvas(page)) < 0.5 * colored(instances), "expected paler colors: no object has confidence 1"
     page.get_by_role("button", name="Classes").click()
     assert page.locator("#legend button").count() == 0
     page.locator("#confidence").fill("0")
@@ -171,7 +171,7 @@ def test_report_table_is_sorted_searched_and_selected_by_keys(pages: list[Path],
     while page.evaluate("Boolean(window.report.viewer.flight)"):
         page.wait_for_timeout(50)
     after = page.evaluate("window.report.viewer.camera.position.toArray()")
-    assert np.linalg.norm(np.subtract(after, before)) > 0.05, "the camera does not move"
+    assert np.linalg.norm(np.subtract(after, before)) > 0.05, "expected the camera to move"
     page.locator("#search").fill(str(chosen))
     assert rows.count() >= 1
     page.locator("#search").fill("no such thing")

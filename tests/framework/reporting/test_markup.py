@@ -16,7 +16,7 @@ def hostile_page() -> str:
     return markup.page("comparison.html", HOSTILE, context, {"name": HOSTILE, "more": [1.5, None]}, ["H4sI"])
 
 
-def test_page_with_hostile_values_escapes_them() -> None:
+def test_page_escapes_hostile_values() -> None:
     page = hostile_page()
     assert page.count("<script>") == 1
     assert "<script>alert" not in page

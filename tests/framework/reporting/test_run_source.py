@@ -119,5 +119,5 @@ def test_true_path_is_aligned_to_trajectory() -> None:
     assert path.chosen == [0, 1, 3, 5]
     np.testing.assert_allclose(path.errors, 0, atol=1e-9)
     np.testing.assert_allclose(path.positions, poses[path.chosen, :3, 3], atol=1e-9)
-    assert np.abs(inverse(T_map_world)[:3, 3]).max() > 0.1, "the two worlds differ"
+    assert np.abs(inverse(T_map_world)[:3, 3]).max() > 0.1, "expected different world frames"
     assert TruePath.of(poses, {0: true[0][:3, 3], 1: true[1][:3, 3]}) is None

@@ -39,8 +39,8 @@ def test_scene_glb_has_one_node_with_class_per_object() -> None:
     assert set(scene.geometry) == {"room", "b_cup_b_5"}
     np.testing.assert_array_equal(scene.geometry["b_cup_b_5"].vertices, mesh.vertices[4:])
     tree, _ = tree_of(content)
-    message = {node["name"]: node.get("extras") for node in tree["nodes"] if "mesh" in node}
-    assert message == {"room": None, "b_cup_b_5": {"id": 5, "class": "<b>cup</b>"}}
+    extras = {node["name"]: node.get("extras") for node in tree["nodes"] if "mesh" in node}
+    assert extras == {"room": None, "b_cup_b_5": {"id": 5, "class": "<b>cup</b>"}}
     assert content == scene_glb(mesh, np.linspace(0, 1, 8, dtype=np.float32), {5: "<b>cup</b>"}, UP)
 
 

@@ -37,7 +37,9 @@ def test_sightings_first_seen_is_first_visible_pose() -> None:
     assert found.chosen == [0, 1, 2]
     assert (found.first_seen[x < -1.0 + half - 0.05] == 0).all()
     assert (found.first_seen[(x > -1.0 + half + 0.05) & (x < -0.2 + half - 0.05)] == 1).all()
-    assert (found.first_seen[x > 0.2 + half + 0.05] == 3).all(), "never visible"
+    assert (found.first_seen[x > 0.2 + half + 0.05] == 3).all(), (
+        "expected the number of poses, 3, for a vertex that is never visible"
+    )
     assert found.growth[-1] == 1
     assert (np.diff(found.growth) > 0).all()
 

@@ -32,7 +32,7 @@ def test_inputs_sha256_follows_symlinked_folders(tmp_path: Path) -> None:
     (tmp_path / "disk" / "0.png").write_bytes(b"new")
     assert inputs_sha256(config) != before
     (tmp_path / "disk" / "around").symlink_to(tmp_path / "root")
-    assert inputs_sha256(config) == inputs_sha256(config), "cyclic links are followed once"
+    assert inputs_sha256(config) == inputs_sha256(config), "expected a hash that follows cyclic links once"
 
 
 @pytest.mark.parametrize("scene", ["", "scene0000_00"])

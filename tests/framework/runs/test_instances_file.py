@@ -33,7 +33,7 @@ def mapped() -> GridMap:
 
 
 def nearly_equal(found: dict[int, Instance]) -> dict[int, Instance]:
-    """Return the instances with confidences and probabilities that are equal when rounded to six digits."""
+    """Return the instances with confidences and probabilities that differ only in their last bit."""
     confidences = {1: 1 / 3, 2: np.nextafter(1 / 3, 1)}
     even = np.float32(0.5)
     likely = np.array([np.nextafter(even, np.float32(0)), np.nextafter(even, np.float32(1))], np.float32)

@@ -49,7 +49,7 @@ Run = Callable[..., RunResult]
 
 @pytest.fixture
 def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunRecord:
-    """Begin a run directory; the overview image is replaced, because it has its own tests."""
+    """Begin a run directory. Its overview image is a placeholder, because other tests cover the image."""
     monkeypatch.setattr(run_directory, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
     return RunRecord.begin(tmp_path / "run", CONFIG, CHOICES)
 
@@ -63,7 +63,7 @@ def metrics_of(record: RunRecord, name: str = "metrics.json") -> dict[str, Any]:
     return metrics
 
 
-def test_record_contains_all_documented_files(record: RunRecord, room: CornerRoom) -> None:
+def test_run_directory_contains_all_documented_files(record: RunRecord, room: CornerRoom) -> None:
     record.write(room, mapped(room))
     assert sorted(path.name for path in record.directory.iterdir()) == [
         "config.yaml",
@@ -122,7 +122,7 @@ def test_instance_metrics_have_both_transfers_and_truth_release(
     assert metrics == to_truth
 
 
-def test_record_without_ground_truth_has_no_evaluation(record: RunRecord, room: CornerRoom) -> None:
+def test_run_directory_without_truth_has_no_evaluation(record: RunRecord, room: CornerRoom) -> None:
     result = mapped(room)
     untrue = [type(frame)(frame.index, frame.position, frame.timestamp, frame.pose, None) for frame in result.tracked]
     blind = RunResult(result.scene, 6, 0, tuple(untrue), result.timings, result.seconds)
@@ -132,7 +132,7 @@ def test_record_without_ground_truth_has_no_evaluation(record: RunRecord, room: 
     assert not [key for key in metrics if key.startswith(("trajectory.", "instances.ap"))]
 
 
-def test_record_failed_write_leaves_only_partial_metrics(
+def test_run_directory_failed_write_leaves_partial_metrics(
     record: RunRecord, room: CornerRoom, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full_disk(path: Path, *_: object) -> None:
@@ -144,7 +144,7 @@ def test_record_failed_write_leaves_only_partial_metrics(
     assert "no space" in metrics_of(record, "metrics.partial.json")["partial"]
 
 
-def test_record_with_unusable_truth_keeps_map_files(record: RunRecord, room: CornerRoom) -> None:
+def test_run_directory_with_unusable_truth_keeps_map_files(record: RunRecord, room: CornerRoom) -> None:
     def far_off() -> SceneTruth:
         raise DataError("ground truth: a point lies far off")
 
@@ -159,7 +159,7 @@ def test_record_with_unusable_truth_keeps_map_files(record: RunRecord, room: Cor
 
 
 @pytest.mark.parametrize("name", MAPPED)
-def test_record_blocked_file_leaves_other_files_written(record: RunRecord, room: CornerRoom, name: str) -> None:
+def test_run_directory_blocked_file_keeps_other_files(record: RunRecord, room: CornerRoom, name: str) -> None:
     (record.directory / name).mkdir()
     fault = record.write(room, mapped(room))
     assert name in str(fault)
@@ -167,7 +167,7 @@ def test_record_blocked_file_leaves_other_files_written(record: RunRecord, room:
     assert name in metrics_of(record, "metrics.partial.json")["partial"]
 
 
-def test_record_recreates_removed_directory(record: RunRecord, room: CornerRoom) -> None:
+def test_run_directory_removed_during_run_is_recreated(record: RunRecord, room: CornerRoom) -> None:
     config = (record.directory / "config.yaml").read_bytes()
     shutil.rmtree(record.directory)
     assert record.write(room, mapped(room)) is None
@@ -188,7 +188,7 @@ def test_rpe_ignores_steps_over_skipped_frames(room: CornerRoom) -> None:
     assert metrics["trajectory.rpe_rmse_m"] == pytest.approx(0.01)
 
 
-def test_record_of_stopped_run_has_partial_metrics(record: RunRecord, room: CornerRoom) -> None:
+def test_run_directory_of_stopped_run_has_partial_metrics(record: RunRecord, room: CornerRoom) -> None:
     result = mapped(room, capacity=2)
     assert isinstance(result.stopped_by, MapFullError)
     record.write(room, result)
@@ -198,19 +198,19 @@ def test_record_of_stopped_run_has_partial_metrics(record: RunRecord, room: Corn
     assert metrics["frames"] == 3
 
 
-def test_record_begin_removes_old_metrics(record: RunRecord) -> None:
+def test_run_directory_begin_removes_old_metrics(record: RunRecord) -> None:
     for name in ("metrics.json", "metrics.partial.json"):
         (record.directory / name).write_text("{}")
     RunRecord.begin(record.directory, CONFIG, CHOICES)
     assert [path.name for path in record.directory.iterdir()] == ["config.yaml"]
 
 
-def test_record_config_is_resolved(record: RunRecord) -> None:
+def test_run_directory_config_is_resolved(record: RunRecord) -> None:
     assert OmegaConf.load(record.directory / "config.yaml").fuser.seed == 3
     assert "${" not in (record.directory / "config.yaml").read_text()
 
 
-def test_record_mesh_file_matches_map_mesh(record: RunRecord, room: CornerRoom) -> None:
+def test_run_directory_mesh_file_matches_map_mesh(record: RunRecord, room: CornerRoom) -> None:
     result = mapped(room)
     record.write(room, result)
     assert_same(read_ply(record.directory / "mesh.ply"), result.scene.mesh())
@@ -261,7 +261,7 @@ def test_trajectory_file_omits_lost_frames(record: RunRecord, room: CornerRoom) 
     assert metrics_of(record)["frames_lost"] == 2
 
 
-def test_record_with_one_tracked_frame_is_written(record: RunRecord, room: CornerRoom) -> None:
+def test_run_directory_with_one_tracked_frame_is_written(record: RunRecord, room: CornerRoom) -> None:
     record.write(room, mapped(room, lost_from=1, lost_to=6))
     assert (metrics_of(record)["frames_lost"], metrics_of(record)["trajectory.ate_rmse_m"]) == (5, 0.0)
 
@@ -352,7 +352,7 @@ def test_code_version_of_installed_package_is_unknown(tmp_path: Path, monkeypatc
 
 
 def read_ply(path: Path) -> InstanceMesh:
-    """Return the mesh of a PLY file, read as its header declares."""
+    """Return the mesh of a PLY file, read by the element counts and types in its header."""
     content = path.read_bytes()
     header, _, body = content.partition(b"end_header\n")
     lines = header.decode().splitlines()

@@ -76,7 +76,9 @@ def test_is_not_zero_matches_paired_t_test() -> None:
 def test_is_not_zero_is_false_for_equal_differences() -> None:
     """Equal differences have no spread, so their significance is undefined."""
     assert not Mean.of([2.0, 2.0]).is_not_zero
-    assert not Mean.of([0.7 - 0.6, 0.2 - 0.1]).is_not_zero, "the differences are equal except for rounding"
+    assert not Mean.of([0.7 - 0.6, 0.2 - 0.1]).is_not_zero, (
+        "expected no significance: the differences are equal except for rounding"
+    )
 
 
 def test_rows_keep_experiment_order_and_sort_seeds() -> None:
@@ -144,7 +146,9 @@ def test_row_names_include_undeclared_parameter_differences() -> None:
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.frames=8", "b, dataset.frames=16"]
     changes["b"].append("dataset=other")
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a", "b"]
-    assert [row.name for row in rows_of(records, ["seed"])] == ["a", "b"], "the overrides of the rows are unknown"
+    assert [row.name for row in rows_of(records, ["seed"])] == ["a", "b"], (
+        "expected the names of the rows, whose overrides are unknown"
+    )
 
 
 def test_rows_without_experiment_are_split_by_scene() -> None:
@@ -190,7 +194,7 @@ def test_rows_average_over_any_parameter() -> None:
 
 
 @pytest.mark.parametrize("backwards", [False, True])
-def test_rows_use_latest_record_of_run(backwards: bool) -> None:
+def test_rows_use_latest_outputs_of_run(backwards: bool) -> None:
     records = [record({"seed": 0}, ap, written) for ap, written in ((0.1, 1.0), (0.9, 2.0))]
     [one] = rows_of(records[::-1] if backwards else records, ["seed"])
     assert one.mean(AP).value == 0.9
@@ -201,7 +205,7 @@ def test_rows_ignore_table_and_debug_settings() -> None:
     assert list(names(records)) == ["all runs"]
 
 
-def test_rows_of_presets_have_their_own_names() -> None:
+def test_rows_of_presets_have_distinct_names() -> None:
     records = [
         record({"row": "default", "seed": 0, "tracker": {"scale": 0.5}}, tracker="icp", refiner="chain", fuser="tsdf"),
         record({"row": "paper", "seed": 0, "tracker": {"scale": 1}}, tracker="paper", refiner="tree", fuser="tsdf"),

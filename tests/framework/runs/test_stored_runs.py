@@ -160,9 +160,9 @@ def test_is_recorded_other_code_is_true_with_warning(
 ) -> None:
     write(directory, config_hash=config_hash(CONFIG), **theirs)
     assert is_recorded(directory, OmegaConf.create(CONFIG))
-    [expected] = caplog.records
-    assert expected.levelno == logging.WARNING
-    assert "the current commit is abcdef0" in expected.getMessage()
+    [record] = caplog.records
+    assert record.levelno == logging.WARNING
+    assert "the current commit is abcdef0" in record.getMessage()
 
 
 SETTINGS = {"threads": 4, "prefetch": 2, "detection_cache": "off"}
@@ -233,7 +233,7 @@ def test_is_recorded_changed_weights_or_data_is_false(
     (data / "outputs").mkdir()
     (data / "outputs" / "table.md").write_text("of runs that were begun here")
     os.utime(weights, ns=(1, 1))
-    assert is_recorded(directory, OmegaConf.create(config)), "these changes do not affect the inputs"
+    assert is_recorded(directory, OmegaConf.create(config)), "expected no effect of these changes on the inputs"
 
 
 def test_is_recorded_without_inputs_hash_is_true(directory: Path, tmp_path: Path) -> None:

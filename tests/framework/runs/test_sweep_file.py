@@ -23,7 +23,7 @@ def test_requested_runs_command_line_overrides_experiment() -> None:
 def test_sweep_rows_resolves_interpolations() -> None:
     config = {"rows": {"third": ["dataset.stop=${sequences.in_progress}"], "whole": []}, "hydra": {"x": "${hydra:y}"}}
     assert sweep_rows(config | {"sequences": {"in_progress": 80}}) == {"third": ["dataset.stop=80"], "whole": []}
-    assert sweep_rows(config) == config["rows"], "unresolved values are unchanged"
+    assert sweep_rows(config) == config["rows"], "expected unchanged unresolved values"
     assert sweep_rows({}) == {}
     with pytest.raises(ConfigError, match="rows: expected names with overrides"):
         sweep_rows({"rows": ["a"]})

@@ -31,7 +31,7 @@ from tests.support.scenes.corner_room import (
 )
 
 PATIENCE_S = 10.0
-SLOW_S = 0.03  # duration of a stage that is too slow for the video
+SLOW_S = 0.03  # duration of a stage that is too slow for the video, s
 
 
 @dataclass
@@ -54,7 +54,7 @@ class Handed(LiveVideo):
 
     def come(self, *numbers: int) -> None:
         self.coming.extend(numbers)
-        for _ in range(3):  # iterations of the listener; the last one is complete
+        for _ in range(3):  # iterations of the listener; at least the last one begins after the numbers are added
             while self.asked.acquire(blocking=False):
                 pass
             assert self.asked.acquire(timeout=PATIENCE_S)
@@ -76,7 +76,7 @@ def test_live_frames_return_newest_and_count_dropped() -> None:
         video.come(4)
         video.come(5)
         video.over = True
-        assert (taken(stream), stream.dropped) == (5, 3), "the last frame is kept at the end of the video"
+        assert (taken(stream), stream.dropped) == (5, 3), "expected the last frame at the end of the video"
         assert taken(stream) is None
         assert taken(stream) is None
 
@@ -92,7 +92,7 @@ def test_live_frames_take_waits_for_frame_or_end() -> None:
         waiting.join(PATIENCE_S)
         assert found == [7, None]
         video.come(8)
-        assert taken(stream) is None, "frames after the end are not mapped"
+        assert taken(stream) is None, "expected no frame after the end"
 
 
 def test_live_frames_raise_video_error_after_last_frame() -> None:
@@ -153,7 +153,7 @@ def test_live_video_at_fast_rate_drops_and_counts_frames(prefetch: int, caplog: 
     assert result.frames < 40
     indices = [frame.index for frame in result.tracked]
     assert indices == sorted(set(indices))
-    assert indices[-1] == 59, "the last frame of the video is mapped"
+    assert indices[-1] == 59, "expected the last frame of the video"
     assert caplog.messages == [f"{result.live.frames_dropped} frames dropped because mapping fell behind"]
 
 

@@ -70,7 +70,7 @@ def test_turns_run_in_order_despite_exceptions() -> None:
 
     def work(number: int) -> None:
         with turns.turn(number):
-            assert inside.acquire(blocking=False), "two turns overlap"
+            assert inside.acquire(blocking=False), "expected one turn at a time"
             taken.append(number)
             time.sleep(0.001)
             inside.release()

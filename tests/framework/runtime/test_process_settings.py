@@ -87,7 +87,7 @@ print(torch.initial_seed())
 
 def test_frozen_garbage_collector_is_restored() -> None:
     with frozen_garbage_collector():
-        assert gc.get_freeze_count() > 10_000, "imported objects are frozen"
+        assert gc.get_freeze_count() > 10_000, "expected frozen imported objects"
         circle: list[object] = []
         circle.append(circle)
         del circle
@@ -97,12 +97,12 @@ def test_frozen_garbage_collector_is_restored() -> None:
     try:
         with frozen_garbage_collector():
             pass
-        assert gc.get_freeze_count() > 10_000, "the previous state is restored"
+        assert gc.get_freeze_count() > 10_000, "expected the previous state"
     finally:
         gc.unfreeze()
 
 
-WITHOUT_A_PLACE = """
+WITHOUT_CACHE_FOLDER = """
 import os
 os.access = lambda *_: False
 from framework.runtime.process_settings import set_environment
@@ -115,12 +115,12 @@ from framework import geometry
 def test_numba_cache_is_temporary_without_writable_folder(tmp_path: Path) -> None:
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
     environment["PYTHONPATH"] = str(CHECKOUT)
-    line = [sys.executable, "-c", WITHOUT_A_PLACE]
+    line = [sys.executable, "-c", WITHOUT_CACHE_FOLDER]
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     folder, was_there = done.stdout.split()
     assert was_there == "True"
-    assert not Path(folder).exists(), "the folder is removed at exit"
+    assert not Path(folder).exists(), "expected the folder to be removed at exit"
     given = subprocess.run(
         line, cwd=tmp_path, env=environment | {"NUMBA_CACHE_DIR": "given"}, capture_output=True, text=True, check=False
     )

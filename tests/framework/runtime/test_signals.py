@@ -32,7 +32,7 @@ def test_signals_deferred_first_waits_and_second_raises(
             signal.raise_signal(number)
         assert interruption.received is not None
         assert interruption.received.number == number
-        signal.raise_signal(number)  # between two steps no signal raises, so that no result is lost
+        signal.raise_signal(number)  # between two steps, a signal does not raise, so that no result is lost
         with pytest.raises(Interrupted) as second, interruption.second_ends_at_once("after the outputs are written"):
             signal.raise_signal(number)
         assert second.value.number == number

@@ -40,7 +40,9 @@ def classes_of(pieces) -> Counter:
 
 def test_benchmark_scenes_have_unique_names_and_repeated_classes() -> None:
     assert list(SCENES) == ROOMS
-    assert not any(name.isdigit() for name in SCENES), "numbers are sequences of SceneNN"
+    assert not any(name.isdigit() for name in SCENES), (
+        "expected names other than numbers, which are sequences of SceneNN"
+    )
     promised = Counter(name for spec in SCENES.values() for name in spec.holds)
     assert set(promised) == set(SCENENN_TO_COCO.values())
     assert min(promised.values()) >= 2
@@ -58,7 +60,7 @@ def test_benchmark_scene_has_declared_objects(name: str, seed: int) -> None:
 def test_furnish_scene_places_all_declared_objects(name: str) -> None:
     spec = SCENES[name]
     room = furnish_scene(spec, np.random.default_rng([ROOMS.index(name) % len(SEEDS), 1]))
-    assert room.layout.free.max() > 1.0, "space for the camera path"
+    assert room.layout.free.max() > 1.0, "expected space for the camera path"
     found = classes_of(piece for _, piece in room.objects)
     assert all(found[class_name] >= least for class_name, least in spec.holds.items())
     assert any(piece.kind == "door" for _, piece in room.objects)
@@ -73,7 +75,7 @@ def test_cluttered_groups_place_objects_on_furniture(make, seed: int) -> None:
     lying = [p for p, m in zip(others, middles, strict=True) if (m[:2] > low[:2]).all() and (m[:2] < high[:2]).all()]
     assert {"blanket", "cushion", "backpack"} <= {piece.kind for piece in lying}
     for piece in lying:
-        assert 0.35 < piece.bounds()[0][2] < 0.72, "it lies on the seat, the mattress or a blanket"
+        assert 0.35 < piece.bounds()[0][2] < 0.72, "expected an object on the seat, the mattress or a blanket"
 
 
 def gap(piece, other) -> float:
@@ -109,10 +111,10 @@ def test_benchmark_chairs_under_tables_do_not_intersect(make, seed: int) -> None
     for chair in under:
         at = points(chair)
         front = table.bounds()[1][1]
-        assert at[:, 1].min() < front - 0.05, "its seat is under the table"
+        assert at[:, 1].min() < front - 0.05, "expected the seat under the table"
         for board in boards:
             inside = ((at > board.min(axis=0)) & (at < board.max(axis=0))).all(axis=1)
-            assert not inside.any(), "the chair does not intersect the table"
+            assert not inside.any(), "expected no intersection of chair and table"
         top = boards[0]
         near = at[(at[:, 2] > top[:, 2].min() - 0.1) & (at[:, 2] < top[:, 2].max() + 0.1)]
         assert 0 <= near[:, 1].min() - front < 0.1
@@ -152,7 +154,7 @@ def test_book_row_places_upright_books_side_by_side() -> None:
     covers = [solid for solid, material in row.parts if material.texture is Texture.BOOK]
     middles = sorted(solid.vertices[:, 0].mean() for solid in covers)
     assert len(middles) >= 10
-    assert (np.diff(middles) > 0.0025).all(), "covers and pages alternate along the row"
+    assert (np.diff(middles) > 0.0025).all(), "expected covers and pages that alternate along the row"
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -167,14 +169,14 @@ def test_strew_places_objects_in_contact_and_keeps_walkway(seed: int) -> None:
     for k, thing in enumerate(new):
         others = [piece for piece in [*before, *new[:k]] if piece.kind != "rug"]
         gaps = [gap(thing, other) for other in others]
-        assert min(gaps) > -1e-3, "it does not intersect other objects"
-        assert min(gaps) < 2 * CONTACT, "it touches something"
-        assert -0.01 < thing.bounds()[0][2] < 0.02, "it stands on the floor or on a rug"
+        assert min(gaps) > -1e-3, "expected no intersection with other objects"
+        assert min(gaps) < 2 * CONTACT, "expected contact with another object"
+        assert -0.01 < thing.bounds()[0][2] < 0.02, "expected an object on the floor or on a rug"
         half = np.array([layout.width, layout.depth]) / 2
         assert (np.abs(np.stack(thing.bounds())[:, :2]) < half).all()
 
 
-def test_planned_walk_views_target_class() -> None:
+def test_planned_path_views_target_class() -> None:
     scene = plan_scene(SceneSpec("bathroom", (toilet_group,), {"toilet": 1}), [0, 0], 60, 1.0)
     toilet = next(piece for _, piece in scene.room.objects if piece.class_name == "toilet")
     middle = sum(toilet.bounds()) / 2

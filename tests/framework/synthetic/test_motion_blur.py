@@ -1,4 +1,4 @@
-"""Tests of motion blur: its length is the motion of a pixel, and zero for a still camera."""
+"""Tests of motion blur: its length is the displacement of a pixel, px, and zero for a static camera."""
 
 import numpy as np
 import pytest
@@ -43,8 +43,8 @@ def test_motion_blur_width_equals_pixel_displacement(path):
     between = np.flatnonzero((row > 0) & (row < 200))
     assert abs(len(between) - path) <= 1
     assert (np.diff(row) >= 0).all()
-    assert abs(between.mean() - 47.5) <= 0.5, "the blur is centered"
-    assert np.diff(row).max() < 1.5 * 200 / path, "the blur is uniform"
+    assert abs(between.mean() - 47.5) <= 0.5, "expected a centered blur"
+    assert np.diff(row).max() < 1.5 * 200 / path, "expected a uniform blur"
 
 
 def test_motion_blur_decreases_with_distance():

@@ -44,7 +44,7 @@ def test_renderer_depth_of_slanted_plane_is_exact():
     expected = n @ (wall.vertices[0] - T[:3, 3]) / (ray @ n)
     assert (picture.depth > 0).all()
     np.testing.assert_allclose(picture.depth, expected, rtol=2e-6)
-    shifted = np.abs(np.diff(expected, axis=1)).min() / 2  # effect of half a pixel
+    shifted = np.abs(np.diff(expected, axis=1)).min() / 2  # smallest depth change within half a pixel, m
     assert shifted > 50 * np.abs(picture.depth - expected).max()
     cosine = np.abs(ray @ n) / np.linalg.norm(ray, axis=-1)
     np.testing.assert_allclose(picture.incidence, cosine, atol=1e-5)

@@ -199,9 +199,9 @@ def measure_unread(unread, noise=1.0, seed=0):
 
 
 def slow_loss(unread, noise, seed):
-    """Return the mask (H, W) of dropped pixels: normalized, interpolated Gaussian noise below a quantile."""
+    """Return the mask (H, W) of dropped pixels, where normalized, interpolated Gaussian noise is below a quantile."""
     rng = np.random.default_rng([seed])
-    random_bits((*FRONT.shape, 4), rng)  # the sensor's own dropout uses the first numbers
+    random_bits((*FRONT.shape, 4), rng)  # the sensor's own dropout uses these numbers
     cell = PATCH * CAMERA.width / 640
     rows, columns = (int(side / cell) + 2 for side in FRONT.shape)
     nodes = normal_quantiles()[random_bits((rows, columns), rng) >> 4].astype(float)
@@ -221,7 +221,7 @@ def test_material_dropout_matches_slow_reference(noise):
         found = measure_unread(unread, noise, seed)
         expected = np.where(slow_loss(unread, noise, seed), 0, without)
         assert 0.2 < (expected > 0).mean() < 0.9
-        assert (found != expected).mean() < 1e-4, "except for rounding at the quantile"
+        assert (found != expected).mean() < 1e-4, "expected differences only by rounding at the quantile"
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
@@ -229,10 +229,10 @@ def test_material_dropout_has_given_rate_and_forms_patches(share):
     lost = np.array([measure_unread(share, seed=seed) == 0 for seed in range(20)])
     assert lost.mean() == pytest.approx(share, abs=0.02)
     equal_neighbors = (lost[:, :, 1:] == lost[:, :, :-1]).mean()
-    assert equal_neighbors > 1 - 0.3 * 2 * share * (1 - share), "neighbors are dropped together"
+    assert equal_neighbors > 1 - 0.3 * 2 * share * (1 - share), "expected neighbors to be dropped together"
 
 
 def test_material_dropout_removes_only_unreadable_surfaces():
     assert not measure_unread(1.0).any()
     np.testing.assert_array_equal(measure_unread(0.0), measure(np.full(FRONT.shape, 2.0)))
-    assert measure_unread(1.0, noise=0.0).all(), "without noise, depth is exact"
+    assert measure_unread(1.0, noise=0.0).all(), "expected no dropout without noise"

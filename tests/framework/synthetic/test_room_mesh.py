@@ -57,7 +57,7 @@ def test_tessellate_limits_edge_length_and_keeps_surface(longest):
     exact = surfaces.vertices[surfaces.triangles].astype(np.float64)
     assert area(corners_of(mesh)) == pytest.approx(area(exact), rel=1e-5)
     volume = np.einsum("fc,fc->f", corners_of(mesh)[:, 0], np.cross(*corners_of(mesh)[:, 1:].swapaxes(0, 1))).sum() / 6
-    assert volume > 0, "triangles are counterclockwise seen from outside"
+    assert volume > 0, "expected counterclockwise triangles, seen from outside"
 
 
 def test_tessellate_closed_body_stays_watertight():
@@ -131,7 +131,7 @@ def test_visible_mesh_excludes_screen_and_surface_behind_it():
     surfaces = assemble(objects)
     np.testing.assert_array_equal(surfaces.unreadable, surfaces.instance_ids == 1)
     mesh = visible_mesh(surfaces, RayCaster(surfaces.vertices, surfaces.triangles), CAMERA, [AHEAD], (0.4, 6.0), 0.05)
-    assert not mesh.instance_ids[mesh.triangles].any(), "only border points of the screen remain"
+    assert not mesh.instance_ids[mesh.triangles].any(), "expected only border points of the screen"
     across = np.abs(mesh.vertices[:, 1:]).max(axis=1)
     np.testing.assert_allclose(across[mesh.instance_ids == 1], 0.5, atol=1e-6)
     assert across.min() == pytest.approx(0.5, abs=0.05)

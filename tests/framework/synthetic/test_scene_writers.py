@@ -1,4 +1,4 @@
-"""Tests of scene writing by several processes: resuming, and files identical to those of one process."""
+"""Tests of scenes that several processes write: resuming, and files identical to those of one process."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_write_scenes_writes_common_files(root: Path) -> None:
     assert json.loads((root / "synthesize.json").read_text())["generation"] == GENERATION
     assert SceneNN(root, scene="007").domain == RENDERED_ROOMS
     assert "fx 54.447329\n" in (root / "intrinsic" / "asus.ini").read_text()
-    assert not list(root.rglob(".*")), "no temporary file is left"
+    assert not list(root.rglob(".*")), "expected no temporary files"
 
 
 @pytest.mark.acceptance
@@ -127,7 +127,7 @@ def test_write_scenes_chooses_current_then_untouched_scene(tmp_path: Path) -> No
     second.take()
     for _ in range(3):
         first.take()
-    assert first.ready == 0, "other processes are writing the remaining files"
+    assert first.ready == 0, "expected no ready files: other processes are writing the remaining ones"
     assert _choose(scenes, first) is second
     first.running = 0
     assert first.ready == 1

@@ -75,8 +75,8 @@ def test_scenenn_scene_poses_are_rigid_and_world_is_y_up(scene: SceneNNScene) ->
     for index, T_world_camera in found.items():
         check_rigid(f"pose {index}", T_world_camera)
         np.testing.assert_allclose(inverse(T_YUP_ZUP) @ T_world_camera, scene.path.pose(index), atol=1e-6)
-        assert 1.2 < T_world_camera[1, 3] < 1.8, "camera height above the floor"
-        assert T_world_camera[1, 1] < -0.8, "the camera's y points down"
+        assert 1.2 < T_world_camera[1, 3] < 1.8, "expected a camera height of 1.2 to 1.8 m"
+        assert T_world_camera[1, 1] < -0.8, "expected a camera y axis that points down"
     assert np.linalg.det(T_YUP_ZUP) == 1.0
 
 
@@ -92,7 +92,7 @@ def test_scenenn_scene_annotation_labels_match_mesh(scene: SceneNNScene, mesh: P
     annotated = read_annotation(scene.folder / "007.xml")
     labels = mesh.properties["label"]
     assert sorted(one.id for one in annotated) == sorted(set(labels.tolist()) - {0})
-    assert max(one.id for one in annotated) > 1000, "ids are not consecutive"
+    assert max(one.id for one in annotated) > 1000, "expected ids that are not consecutive"
     names = [one.nyu_class for one in annotated if one.nyu_class in SCENENN_TO_COCO]
     assert sorted(set(names) - {"books"}) == ["chair", "toilet"]
     assert names.count("chair") == 2
@@ -101,7 +101,7 @@ def test_scenenn_scene_annotation_labels_match_mesh(scene: SceneNNScene, mesh: P
         points = mesh.vertices[labels == one.id]
         np.testing.assert_allclose(one.aabb, [points.min(axis=0), points.max(axis=0)], atol=1e-6)
     of_pieces = [scene.room.surfaces.class_names[k] for k in np.argsort(scene.labels)[1:]]
-    assert of_pieces != sorted(of_pieces, key=str), "the order of ids is random"
+    assert of_pieces != sorted(of_pieces, key=str), "expected ids in random order"
 
 
 def test_clutter_names_exclude_evaluated_classes() -> None:
@@ -114,7 +114,7 @@ def test_scenenn_scene_mesh_matches_rendered_depth_and_labels(scene: SceneNNScen
     depth, instance_ids = picture.depth, picture.instance_ids
     hits = RayCaster(mesh.vertices, mesh.triangles).cast(image_rays(scene.camera, poses(scene)[index]))
     met = hits.triangle != NO_TRIANGLE
-    assert met[picture.unread < 1].mean() > 0.97, "holes only at occlusion borders"
+    assert met[picture.unread < 1].mean() > 0.97, "expected holes only at occlusion borders"
     same = met & (np.abs(hits.distance - depth) < 1e-3)
     assert same.sum() > 0.985 * met.sum()
     labels = mesh.properties["label"][mesh.triangles[hits.triangle, 0]]
@@ -130,7 +130,7 @@ def test_scenenn_scene_depth_in_millimeters_matches_mesh(scene: SceneNNScene, me
     read = (depth_mm > 0) & (hits.triangle != NO_TRIANGLE)
     error = np.abs(depth_mm[read] - 1000 * hits.distance[read])
     assert read.mean() > 0.6
-    assert np.median(error / (hits.distance[read] ** 2)) < 3.0, "mm at 1 m; noise is quadratic in depth"
+    assert np.median(error / (hits.distance[read] ** 2)) < 3.0, "expected noise below 3 mm per squared meter of depth"
     color = read_color(color_file)
     assert color.shape == (*scene.camera.shape, 3)
     assert color.std() > 10
@@ -167,4 +167,4 @@ def test_scenenn_scene_half_rate_equals_every_second_frame(
         other.write_frame(index)
         colors.append(read_color(frame_files(tmp_path, index)[0]))
     np.testing.assert_array_equal(colors[0], colors[1])
-    assert (colors[0] != colors[2]).any(), "at twice the rate the camera moves half as far"
+    assert (colors[0] != colors[2]).any(), "expected other images: at twice the rate, the camera moves half as far"

@@ -128,7 +128,7 @@ def test_synthetic_frames_agree_after_reprojection(exact):
     assert np.median(difference) < 4
 
 
-def test_walk_has_hand_held_camera_motion(bedroom, exact):
+def test_camera_path_has_hand_held_motion(bedroom, exact):
     for sequence in (bedroom, exact):
         poses = [sequence.path.pose(k) for k in range(len(sequence))]
         position = np.array([T[:3, 3] for T in poses])
@@ -142,7 +142,7 @@ def test_walk_has_hand_held_camera_motion(bedroom, exact):
         assert np.abs(np.diff(position, n=3, axis=0)).max() < 1e-4  # m; no jerk
 
 
-def test_walk_keeps_distance_from_walls_and_furniture(bedroom, exact):
+def test_camera_path_keeps_distance_from_walls_and_furniture(bedroom, exact):
     for sequence in (bedroom, exact):
         layout = sequence.room.layout
         position = np.array([sequence.path.pose(k)[:2, 3] for k in range(len(sequence))])

@@ -88,7 +88,7 @@ def test_table_difference_error_is_over_scenes(tmp_path: Path) -> None:
             run(tmp_path, row, seed, ap, 1.0, scene=scene)
     text = write_tables(tmp_path)
     lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert "| other | 6 | +0.200 ± 0.100 |" in lines  # the error over six runs would be 0.045: significant
+    assert "| other | 6 | +0.200 ± 0.100 |" in lines  # an error over six runs would be 0.045
     assert "paired by seed, scene: mean ± standard error over the values of scene, after averaging" in text
     with (tmp_path / "table.csv").open() as file:
         _, other = csv.DictReader(file)
@@ -112,7 +112,7 @@ def test_table_notes_list_missing_runs(sweep: Path) -> None:
     assert "- Code: 1234567 (4 runs), 89abcde (1 run)." in lines
 
 
-def test_table_notes_list_requested_runs_without_record(sweep: Path) -> None:
+def test_table_notes_list_requested_runs_without_outputs(sweep: Path) -> None:
     asked = {"sweeper": {"params": {"row": "${all_of:${rows}}", "seed": 0}}, "overrides": {"task": ["seed=range(0,5)"]}}
     config = {"table": TABLE, "rows": ROWS, "hydra": asked}
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
@@ -188,7 +188,7 @@ def test_table_on_scenenn_has_published_run_times(sweep: Path, annotation: str |
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert lines[2] == "| row | runs | Hz | refinement (ms) | frames lost | poses |"
     assert "| the paper (published) | – | 10.8 | not known | – | tracked |" in lines
-    assert "Voxblox++ (published)" not in text, "a row without values is omitted"
+    assert "Voxblox++ (published)" not in text, "expected no row without values"
     assert "- Published, the paper: DDNS 2020, article 2528954; all components on every frame of 640x480" in text
     unknown = [line for line in lines if "Published results not looked up" in line]
     assert unknown == [
@@ -255,7 +255,7 @@ def test_table_unknown_metric_is_dash(sweep: Path) -> None:
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": TABLE | {"columns": ["no.such"]}, "rows": ROWS}))
     text = write_tables(sweep)
     assert "| identity |    3 |       – | ground_truth |" in text
-    assert "- Metrics in no run: no.such." in text, "it may be misspelled"
+    assert "- Metrics in no run: no.such." in text, "expected a note on the column, which may be misspelled"
 
 
 def test_table_without_experiment_has_available_columns(tmp_path: Path) -> None:
@@ -272,7 +272,7 @@ def test_table_without_experiment_has_available_columns(tmp_path: Path) -> None:
         "- Omitted columns without values: AP50, AP50 agnostic, AP25, AP, mean IoU (only with ground-truth instances); "
     )
     assert [line for line in lines if "Omitted" in line] == [absent + f"instances, {FUSER_HEADS}."]
-    assert "transfer" not in text, "nothing was compared with ground-truth instances"
+    assert "transfer" not in text, "expected no note on the transfer without ground-truth instances"
     assert "ap50" not in (tmp_path / "table.csv").read_text()
 
 

@@ -126,7 +126,7 @@ def test_sequence_columns_table_has_published_rows(sweep: Path) -> None:
     )
     found, missing = "**0.700 ± 0.141** | 0.400 ± 0.141 |", " ".join(["missing |"] * 8)
     assert first[2] == f"| ours | ground truth | made up | {found} {missing} **0.550 ± 0.000 (2 of 10)** |"
-    assert len(first) == 6, "systems without published values have no line"
+    assert len(first) == 6, "expected no line for systems without published values"
     assert first[-1] == (
         "| Voxblox++ with Detectron2 panoptic (published) | ground truth | not known "
         "| 0.655 | 0.033 | 0.676 | 0.269 | 0.517 | 0.325 | 0.299 | – | 0.190 | – | – |"
@@ -139,7 +139,7 @@ def test_sequence_columns_table_has_published_rows(sweep: Path) -> None:
 
 @pytest.mark.parametrize("table", [ACROSS | {"published": "table3"}, BY | {"published": "table2"}])
 def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: dict[str, Any]) -> None:
-    """Sequences that only the publication has get no columns or groups."""
+    """Sequences that occur only in the publication get no columns or groups."""
     experiment(sweep, table)
     run(sweep, "ours", "016", 2, release="synthetic 1, seed 0, 240 frames", **{AP50: 0.5})
     text = write_tables(sweep)
@@ -188,7 +188,7 @@ def test_table_tracked_row_needs_tracked_baseline(sweep: Path) -> None:
 def test_table_separates_other_data_and_annotations(
     sweep: Path, changed: dict[str, Any], usual: str, other: str, annotation: str
 ) -> None:
-    """Runs with different data or annotations are neither averaged nor compared."""
+    """Runs on different data or with different annotations are neither averaged nor compared."""
     for path in sweep.glob("*row=other*/metrics.json"):
         path.unlink()
     run(sweep, "ours", "078", 0, **{AP50: 0.9}, **changed)
@@ -232,8 +232,8 @@ def test_sequence_groups_table_has_expected_lines(sweep: Path) -> None:
     assert second[2] == "| Prior (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
 
 
-def test_table_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
-    """The best tracked row has fewer sequences than the rows with given poses."""
+def test_table_bold_mean_ignores_rows_with_fewer_sequences(sweep: Path) -> None:
+    """Of the tracked rows, the one with the highest mean has only one sequence; the others have two."""
     experiment(sweep, BY)
     for row, scene, value in (
         ("ours", "011", 0.2),
@@ -252,8 +252,8 @@ def test_table_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
 
 
 @pytest.mark.parametrize("table", [ACROSS, BY])
-def test_table_bold_mean_is_among_equal_run_counts(sweep: Path, table: dict[str, Any]) -> None:
-    """A mean of fewer runs is marked, even if all sequences are present."""
+def test_table_bold_mean_ignores_rows_with_fewer_runs(sweep: Path, table: dict[str, Any]) -> None:
+    """A mean of fewer runs is marked with its number of runs, even if all sequences are present."""
     experiment(sweep, table)
     for path in sweep.glob("*row=other,seed=1*/metrics.json"):
         path.unlink()

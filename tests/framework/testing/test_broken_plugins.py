@@ -1,4 +1,4 @@
-"""Tests of the contracts with plugins that break one rule each."""
+"""Tests of the contract tests, on plugins that each break one rule."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Dropping(ClusterRefiner):
 
 @dataclass
 class Writing(PoseTracker):
-    """Tracker that starts at an arbitrary pose and, if `writes`, changes the map."""
+    """Tracker that returns a fixed, wrong pose and, if `writes`, changes the map."""
 
     writes: bool = False
 

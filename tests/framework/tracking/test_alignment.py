@@ -30,9 +30,9 @@ def step(
     brightness: float = 0.0,
     seen: Callable[[ModelView], ModelView] = lambda model: model,
 ) -> tuple[np.ndarray, NormalEquations]:
-    """Return the Gauss-Newton step (6,) from T_view_camera at a level, and its equations.
+    """Return the Gauss-Newton step (6,) from T_view_camera at a pyramid level, and its normal equations.
 
-    The model is seen from T_VIEW.
+    The model is the view of the scene from T_VIEW.
     """
     model, intensities = model_of(scene)
     pyramid = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)
@@ -57,11 +57,11 @@ def model_of(scene: Scene) -> tuple[ModelView, list[np.ndarray]]:
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_color_alignment_at_true_pose_has_zero_step(level: int) -> None:
-    """An offset of half a pixel between the levels of frame and model would be a step of several millimeters."""
+    """An offset of half a pixel between frame and model at a level would cause a step of several millimeters."""
     T = pose(0.03, -0.02, 0.01, (0.01, 0.02, -0.01))
     xi, equations = step(WALL, WALL.frame(T), level, inverse(T_VIEW) @ T, COLOR)
     assert equations.matched > 0.5 * CAMERA.width * CAMERA.height / 4**level
-    assert np.abs(xi[:2] + 1.5 * np.array([xi[4], -xi[3]])).max() < 2e-3, "shift on the wall, m"
+    assert np.abs(xi[:2] + 1.5 * np.array([xi[4], -xi[3]])).max() < 2e-3, "expected a shift on the wall below 2 mm"
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
@@ -86,7 +86,9 @@ def test_color_alignment_compensates_exposure_change() -> None:
     _, second = step(WALL, brighter, 0, truth, COLOR, first.brightness)
     _, alike = step(WALL, darker, 0, truth, COLOR, plain.brightness)
     assert second.brightness == first.brightness
-    assert second.matched == pytest.approx(alike.matched, rel=0.01), "a uniform brightness change is no outlier"
+    assert second.matched == pytest.approx(alike.matched, rel=0.01), (
+        "expected the same matches: a uniform brightness change is no outlier"
+    )
     np.testing.assert_allclose(second.A, alike.A, rtol=0.05, atol=0.01 * np.abs(alike.A).max())
 
 
@@ -133,7 +135,7 @@ def test_smoothed_normals_allow_motion_along_wall(level: int) -> None:
         return float(xi[0] / 0.02)
 
     assert share_found(lambda model: model) == pytest.approx(1, abs=0.02)
-    assert share_found(with_noisy_normals) < 0.8, "noisy normals shorten the step"
+    assert share_found(with_noisy_normals) < 0.8, "expected a shorter step with noisy normals"
     assert share_found(lambda model: smoothed(with_noisy_normals(model), level)) == pytest.approx(1, abs=0.1)
 
 
@@ -160,7 +162,7 @@ BOTH = COLOR._replace(depth_weight=np.float32(1), color_weight=np.float32(0.1))
 def enlarged(
     scale: float, offset: np.ndarray, weights: Weights, linear: LinearWeights | None = None
 ) -> NormalEquations:
-    """Return the equations of the corner, enlarged by `scale`, at `offset` (6,) from the true pose."""
+    """Return the normal equations of the corner, enlarged by `scale`, at the twist `offset` (6,) from the true pose."""
     frame = CORNER.frame(T_VIEW)
     model, intensities = model_of(CORNER)
     large = model._replace(depth=np.float32(scale) * model.depth)
@@ -185,7 +187,7 @@ def test_alignment_beyond_range_is_scale_invariant(weights: Weights) -> None:
 
 
 def test_distance_gate_beyond_range_increases_with_depth() -> None:
-    """At 17 to 23 m, Tukey's gate of 0.1 m allows more than 0.3 m. VoxelHashing's gate of 0.15 m is fixed."""
+    """At 17 to 23 m, the Tukey gate of 0.1 m increases to more than 0.3 m. VoxelHashing's gate of 0.15 m is fixed."""
     backward = np.array([0, 0, 0.3, 0, 0, 0])
     assert enlarged(16, backward, DEPTH).matched > 1000
     assert enlarged(16, backward, DEPTH, LinearWeights(np.float32(60), np.float32(0.1))).matched == 0
@@ -311,7 +313,7 @@ def test_linear_weights_require_matching_normals_for_color() -> None:
 
 @pytest.mark.parametrize("kind", SensorKind)
 def test_geometric_weight_is_inverse_variance_of_sensor(kind: SensorKind) -> None:
-    """At the true pose, each matched point adds (n / sigma)^2 to the information of a translation."""
+    """At the true pose, each matched point with normal n adds (n / sigma)^2 to the information of a translation."""
     frame = WALL.frame(T_VIEW)
     model, intensities = model_of(WALL)
     level = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3, kind)[0]

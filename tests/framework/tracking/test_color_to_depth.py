@@ -35,7 +35,7 @@ def frame_at(t: float, delay: float, index: int = 0) -> Frame:
 
 
 def error(frame: Frame, expected: np.ndarray) -> float:
-    """Return the mean color difference, gray levels, without the border, where color is missing."""
+    """Return the mean color difference, in gray levels, excluding the border, where color is missing."""
     inner = np.s_[12:-12, 12:-12]
     return float(np.abs(frame.color[inner].astype(float) - expected[inner]).mean())
 
@@ -123,7 +123,7 @@ def test_color_to_depth_estimated_delay_is_used_and_logged(caplog: pytest.LogCap
             displaced.append(registration.displaced_before)
     assert registration.delay == pytest.approx(0.03, abs=0.002)
     assert found.color_pixels is not None
-    assert sum(displaced) == 1  # at the first use of the estimate
+    assert sum(displaced) == 1  # true only at the first use of the estimate
     assert len(caplog.messages) == 1
     assert "ms after depth with equal timestamps" in caplog.messages[0]
 

@@ -16,7 +16,7 @@ def test_depth_scale_grows_beyond_range(depth: float, growth: float) -> None:
 
 def test_depth_scale_is_median_of_readings() -> None:
     assert DepthScale.of(np.array([[0, 2, 3], [0, 8, 0]], np.float32)).depth == 3
-    assert DepthScale.of(np.zeros((2, 3), np.float32)).growth == 1, "no depth"
+    assert DepthScale.of(np.zeros((2, 3), np.float32)).growth == 1, "expected no growth without depth"
 
 
 def test_depth_scale_divides_translation_by_growth() -> None:

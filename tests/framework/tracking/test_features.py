@@ -1,4 +1,4 @@
-"""Tests of features: subpixel positions, the depth of their surface, and matching by definition."""
+"""Tests of features: subpixel positions, the depth of their surface, and matching compared with a reference."""
 
 from __future__ import annotations
 
@@ -30,9 +30,11 @@ def test_feature_positions_have_subpixel_accuracy(camera: Camera) -> None:
     features = FeatureExtractor().extract(blobs(camera, centers, sigma=camera.width / 100))
     distance = np.linalg.norm(features.pixels[:, None] - centers, axis=-1)
     found = distance.min(axis=0)
-    assert found.max() < 0.1 * camera.width / 320, "0.1 px of the image used by SIFT"
+    assert found.max() < 0.1 * camera.width / 320, "expected errors below 0.1 px of the image used by SIFT"
     error = (features.pixels[distance.argmin(axis=0)] - centers).mean(axis=0)
-    assert np.abs(error).max() < 0.03 * camera.width / 320, "no bias; half-pixel errors are at least 0.25 px"
+    assert np.abs(error).max() < 0.03 * camera.width / 320, (
+        "expected no bias; half-pixel errors would be at least 0.25 px"
+    )
     assert (features.depth[distance.argmin(axis=0)] == 2).all()
 
 
@@ -89,7 +91,7 @@ def test_feature_matching_matches_brute_force_reference() -> None:
         ]
         assert match(query, reference, max_ratio).tolist() == [list(pair) for pair in expected]
     assert len(match(query, reference, 0.8)) >= 30
-    assert len(match(query, reference[:1], 0.8)) == 0, "the ratio test needs two candidates"
+    assert len(match(query, reference[:1], 0.8)) == 0, "expected no match: the ratio test needs two candidates"
 
 
 def test_feature_extractor_parameter_out_of_range_raises() -> None:

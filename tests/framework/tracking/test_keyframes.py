@@ -75,7 +75,7 @@ def test_keyframes_skip_near_frames_after_featureless_frame() -> None:
     keyframes.extractor.extract = lambda frame: seen.append(frame) or extract(frame)
     nothing = blanked(papered_frame(pose(0)))
     assert not any(has_become_one(keyframes, nothing, pose(x)) for x in (0, 0.01, 0.04, 0.06, 0.07))
-    assert len(seen) == 2, "features are extracted at 0 m and 0.06 m"
+    assert len(seen) == 2, "expected features only at 0 m and 0.06 m"
     without_depth = replace(papered_frame(pose(1)), depth=np.zeros(CAMERA.shape, np.float32))
     assert not has_become_one(keyframes, without_depth, pose(1.0))
     assert has_become_one(keyframes, papered_frame(pose(0.9)), pose(0.9))
@@ -95,7 +95,7 @@ def slowed(keyframes: Keyframes, seconds: float) -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, 0.05])
 def test_keyframes_are_independent_of_extraction_time(seconds: float) -> None:
-    """The camera moves in steps of different sizes, half of them without texture; old keyframes are removed."""
+    """The camera moves in steps of different sizes, half of the frames are black, and old keyframes are removed."""
     rng = np.random.default_rng(3)
     at_once, later = (Keyframes(max_keyframes=4, min_distance=0.2) for _ in range(2))
     slowed(later, seconds)
@@ -126,10 +126,10 @@ def test_keyframes_add_waits_only_for_relevant_features() -> None:
     keyframes.extractor.extract = held
     keyframes.add(papered_frame(pose(0)), pose(0))
     keyframes.add(papered_frame(pose(0.04)), pose(0.04))
-    assert not may_end.is_set(), "near the pending keyframe, add does not wait"
+    assert not may_end.is_set(), "expected add not to wait near the pending keyframe"
     threading.Timer(0.1, may_end.set).start()
     keyframes.add(papered_frame(pose(0.1)), pose(0.1))
-    assert may_end.is_set(), "here the result depends on the pending features"
+    assert may_end.is_set(), "expected add to wait at 0.1 m, where the result depends on the pending features"
     assert len(keyframes) == 1
 
 
@@ -189,9 +189,11 @@ def test_relocalize_in_unknown_scene_returns_none(keyframes: Keyframes) -> None:
     noise = rng.integers(0, 255, (*CAMERA.shape, 3)).astype(np.uint8)
     for color in (np.zeros_like(noise), noise, cv2.GaussianBlur(noise, (0, 0), 3), frame.color[:, ::-1]):
         assert keyframes.relocalize(replace(frame, color=np.ascontiguousarray(color))) is None
-    assert keyframes.relocalize(papered_frame(pose(0), paper=1)) is None, "another room"
+    assert keyframes.relocalize(papered_frame(pose(0), paper=1)) is None, "expected no pose in another room"
     twice_as_far = replace(frame, depth=frame.depth * 2)
-    assert keyframes.relocalize(twice_as_far) is None, "a photo of the room is at another depth"
+    assert keyframes.relocalize(twice_as_far) is None, (
+        "expected no pose for a photo of the room, which is at another depth"
+    )
     assert Keyframes().relocalize(frame) is None
 
 

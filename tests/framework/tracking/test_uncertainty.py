@@ -31,7 +31,7 @@ def test_covariance_depends_on_residuals_not_assumed_noise(noise: float) -> None
 
 
 def test_covariance_of_terms_matches_simulated_estimates() -> None:
-    """The noise of color is 3 times the assumed noise, that of geometry half of it; all weights are 1."""
+    """The color noise is 3 times the assumed noise, and the geometric noise is half of it; all weights are 1."""
     rng = np.random.default_rng(1)
     J, J_color = rng.normal(size=(60, 6)), rng.normal(size=(60, 6))
     both = np.concatenate([J, J_color])

@@ -1,4 +1,4 @@
-"""Tests of training targets, compared with manual cases and with inverse functions."""
+"""Tests of training targets, compared with hand-computed results and with inverse functions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_anchor_match_assigns_object_background_or_ignored() -> None:
 def test_anchor_match_each_object_assigns_best_box() -> None:
     iou = torch.tensor([[0.2, 0.0], [0.1, 0.0], [0.0, 0.0]])
     assert match(iou, 0.7, 0.3, each_object=True).tolist() == [0, BACKGROUND, BACKGROUND], (
-        "no box for an object without overlap"
+        "expected no box for an object without overlap"
     )
 
 

@@ -30,7 +30,7 @@ def test_room_pictures_show_known_classes_in_varied_colors(seen: list) -> None:
 
 def test_room_pictures_round_trip_keeps_masks_and_classes(seen: list, tmp_path: Path) -> None:
     render_room(tmp_path, 3, 2)
-    assert [path.name for path in tmp_path.iterdir()] == ["room_000002"], "no temporary folder is left"
+    assert [path.name for path in tmp_path.iterdir()] == ["room_000002"], "expected no temporary folder"
     stored = RoomPictures(tmp_path, 2, 1)
     assert len(stored) == 3
     for k, (color, ids, names) in enumerate(seen):

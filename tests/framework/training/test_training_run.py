@@ -42,7 +42,7 @@ def test_train_writes_network_usable_for_further_training(tmp_path: Path) -> Non
     assert first.objects == 2 * PICTURES
     written = json.loads((tmp_path / "run" / PRECISION).read_text(), parse_constant=pytest.fail)
     assert written["objects"] == 2 * PICTURES
-    assert written["ap50_by_class"]["toilet"] is None, "no image has a toilet"
+    assert written["ap50_by_class"]["toilet"] is None, "expected no AP: no image has a toilet"
     train(config(tmp_path / "rooms", "schedule.steps=3"), tmp_path / "run")
     described = describe_network(tmp_path / "run" / NETWORK)
     assert described.card["steps"] == 3

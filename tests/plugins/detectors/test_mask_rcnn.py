@@ -45,7 +45,7 @@ def test_mask_rcnn_class_row_excludes_background(path):
     found = detector.detect(frame)
     everything = torch.softmax(seen[0][0].double(), dim=1).numpy()
     assert len(found) > 5
-    assert everything[:, 0].min() > 0.01, "background is not negligible"
+    assert everything[:, 0].min() > 0.01, "expected a background probability that is not negligible"
     for score, row in zip(found.scores, found.class_probabilities, strict=True):
         of_objects = everything[:, 1:] / everything[:, 1:].sum(axis=1, keepdims=True)
         nearest = np.abs(of_objects - row).max(axis=1).argmin()
@@ -99,7 +99,7 @@ def test_mask_rcnn_proposal_and_detection_limits_are_respected(path, monkeypatch
     assert len(given[0]) == 7
     one = MaskRCNNDetector(weights=path, device="cpu", proposals_before_nms=1)
     one.detect(noise(4))
-    assert len(given[1]) <= 5, "one proposal per level"
+    assert len(given[1]) <= 5, "expected at most one proposal per level"
 
 
 def test_mask_rcnn_sides_default_to_network_settings(path):
@@ -115,7 +115,7 @@ def test_mask_rcnn_sides_default_to_network_settings(path):
 def known_object(folder, monkeypatch, extent, resized):
     """Return a detector that resizes images to a short side of `resized` px and detects one chair.
 
-    `extent` is the box x1 y1 x2 y2 of the chair, px of an image of 160x120 px.
+    `extent` is the box x1 y1 x2 y2 of the chair, px, in an image of 160x120 px.
     """
     network = tiny_network(replace(TINY, short_side=resized, long_side=4 * resized))
     for parameter in network.roi_heads.parameters():

@@ -18,7 +18,7 @@ from tests.support import registered
 
 pytestmark = pytest.mark.integration
 
-ROOMS = 2_000_000  # seed of rooms that are neither training rooms nor held-out rooms
+ROOMS = 2_000_000  # seed; its rooms are neither training rooms nor held-out rooms
 MAX_BYTES = 20 << 20
 
 
@@ -35,7 +35,7 @@ def test_bundled_network_is_small_and_has_model_card(detector: MaskRCNNDetector)
     card = describe_network(Path(detector.weights)).card
     assert {"data", "steps", "seed", "mask_ap50", "limits"} <= set(card)
     assert isinstance(card["mask_ap50"], float)
-    assert card["mask_ap50"] >= 0.5, "mean over the nine classes, on held-out rooms"
+    assert card["mask_ap50"] >= 0.5, "expected a mean AP50 of at least 0.5 over the nine classes on held-out rooms"
 
 
 @pytest.mark.acceptance

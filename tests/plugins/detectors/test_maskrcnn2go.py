@@ -65,7 +65,7 @@ def best_scores(detections):
 def test_maskrcnn2go_detects_expected_objects_in_real_images(detector, scene, index, expected):
     found = best_scores(detector.detect(shared_picture(scene, index)))
     missing = {name: score for name, score in expected.items() if found.get(name, 0) < score}
-    assert not missing, f"found only {found}"
+    assert not missing, f"expected {expected}, got {found}"
 
 
 def test_maskrcnn2go_mask_of_bed_overlaps_ground_truth(detector):
@@ -82,7 +82,7 @@ def test_maskrcnn2go_mask_of_bed_overlaps_ground_truth(detector):
             if score > 0.7 and COCO[row.argmax()] == "bed":
                 ious.append(max((mask & (ids == i)).sum() / (mask | (ids == i)).sum() for i in beds))
     assert len(ious) >= 5
-    assert np.median(ious) > 0.7  # the pillows on a bed have their own labels
+    assert np.median(ious) > 0.7  # pillows have their own labels and are not part of the bed
 
 
 def test_maskrcnn2go_mask_grids_match_full_graph():

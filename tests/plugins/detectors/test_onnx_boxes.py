@@ -110,7 +110,7 @@ def test_onnx_boxes_image_placement_is_inverted(tmp_path, placement):
         device="cpu",
         min_readings=1.0,
     )
-    # at constant depth, everything in the box is foreground, so the mask is the box
+    # at constant depth, all pixels in the box are foreground, so the mask is the box
     flat = replace(frame(), depth=np.ones((120, 160), np.float32))
     (mask,) = detector.detect(flat).masks
     expected = np.zeros_like(mask)

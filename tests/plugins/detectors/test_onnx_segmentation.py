@@ -27,7 +27,7 @@ def frame():
 def outputs(objectness=False, transposed=False):
     """Return the outputs for a cup in the left half of its box and a chair in the lower half of its box.
 
-    The prototypes are linear in the pixel.
+    The prototypes are linear in the pixel coordinates.
     """
     cells = SIZE // CELL
     prototypes = np.stack(
@@ -92,7 +92,7 @@ def test_onnx_segmentation_tflite_file_error_names_converter(tmp_path):
 
 
 def suppressed(folder, **parameters):
-    """Return the detector of a network with internal suppression and the same candidates, one class each."""
+    """Return a detector with the same candidates in the layout of networks that suppress duplicates: one class each."""
     table, prototypes = outputs(transposed=True).values()
     (folder / "labels.txt").write_text("\n".join(LABELS))
     center, size, scores = table[0, :, :2], table[0, :, 2:4], table[0, :, 4:7]
@@ -104,7 +104,7 @@ def suppressed(folder, **parameters):
 
 @pytest.mark.parametrize(("spread", "expected"), [(1.0, [0.6, 0.5]), (0.5, [0.8, 0.7]), (0.0, [1.0, 1.0])])
 def test_onnx_segmentation_single_class_spreads_remaining_mass(tmp_path, spread, expected, caplog):
-    """With spread 1, the score of 0.4 is raised to 0.5, the equal probability of two classes."""
+    """With spread 1, a score of 0.4 gives probability 0.5, so that the label remains the best of two classes."""
     with caplog.at_level("INFO"):
         found = suppressed(tmp_path, class_spread=spread).detect(frame())
     assert "n.onnx reports one class per detection" in caplog.text
@@ -206,7 +206,7 @@ def test_onnx_segmentation_yolo_agrees_in_all_layouts(tmp_path, yolo, photograph
         )
         both = (found.masks & wanted.masks).sum(axis=(1, 2)) / (found.masks | wanted.masks).sum(axis=(1, 2))
         assert both.min() > 0.995
-        if detector._layout.suppressed:  # the score is the label's probability, and the others share the rest
+        if detector._layout.suppressed:  # the label has the score, the other classes share the rest
             best = np.maximum(found.scores, 1 / len(found.classes))
             np.testing.assert_allclose(found.class_probabilities.max(axis=1), best, rtol=1e-5)
             np.testing.assert_allclose(found.class_probabilities.min(axis=1), (1 - best) / 79, atol=1e-6)

@@ -41,13 +41,13 @@ def picture(shape: tuple[int, int]) -> Frame:
     return Frame(0, 0.0, color, np.full(shape, 2, np.float32), camera)
 
 
-class Saying:
-    """Replacement of OWLv2 that returns given boxes, px, with given probabilities of the queries."""
+class FixedBoxes:
+    """Replacement for OWLv2 that returns given boxes, px, with given probabilities of the queries."""
 
     dtype = torch.float32
 
     def __init__(self, shape: tuple[int, int], boxes: list[list[float]], probabilities: list[list[float]]) -> None:
-        # Fractions of the square that has the image at its upper left.
+        # fractions of the padded square, with the image at its upper left
         shares = (torch.tensor(boxes) + 0.5) / max(shape)
         centers = (shares[:, :2] + shares[:, 2:]) / 2
         self.boxes = torch.cat([centers, shares[:, 2:] - shares[:, :2]], dim=1)[None]
@@ -58,8 +58,8 @@ class Saying:
         return SimpleNamespace(pred_boxes=self.boxes, logits=self.logits)
 
 
-class Filling:
-    """Replacement of SAM that fills the prompted box."""
+class BoxFiller:
+    """Replacement for SAM that fills the prompted box."""
 
     dtype = torch.float32
 
@@ -77,7 +77,7 @@ class Filling:
 def test_open_vocabulary_boxes_map_from_square_input_to_image(owlv2: Path, shape: tuple[int, int]) -> None:
     boxes = TextPromptedBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half_precision=False)
     wanted = [[4.5, 9.5, 24.5, 39.5], [30, 2, 55, 58]]
-    boxes._network = Saying(shape, wanted, [[0.8, 0.1], [0.3, 0.6]])
+    boxes._network = FixedBoxes(shape, wanted, [[0.8, 0.1], [0.3, 0.6]])
     found, probabilities = boxes(picture(shape).color)
     np.testing.assert_allclose(found, wanted, atol=1e-4)
     np.testing.assert_allclose(probabilities, [[0.8, 0.1], [0.3, 0.6]], atol=1e-6)
@@ -86,7 +86,7 @@ def test_open_vocabulary_boxes_map_from_square_input_to_image(owlv2: Path, shape
 def test_open_vocabulary_pads_image_with_gray_at_lower_right(owlv2: Path) -> None:
     boxes = TextPromptedBoxes(str(owlv2), "main", ("bed",), CPU, half_precision=False)
     seen: list[torch.Tensor] = []
-    saying = Saying((32, 64), [[0, 0, 9, 9]], [[0.5]])
+    saying = FixedBoxes((32, 64), [[0, 0, 9, 9]], [[0.5]])
 
     def record(**given: Any) -> Any:
         seen.append(given["pixel_values"])
@@ -95,7 +95,7 @@ def test_open_vocabulary_pads_image_with_gray_at_lower_right(owlv2: Path) -> Non
     record.dtype = torch.float32
     boxes._network = record
     boxes(np.full((32, 64, 3), 255, np.uint8))
-    assert (seen[0][0, :, :31] > 1.5).all(), "white"
+    assert (seen[0][0, :, :31] > 1.5).all(), "expected a white image"
     np.testing.assert_allclose(seen[0][0, 0, 33:], (128 / 255 - 0.48145466) / 0.26862954, atol=1e-5)
 
 
@@ -124,12 +124,12 @@ def test_open_vocabulary_masks_lie_in_prompt_boxes(sam: Path, shape: tuple[int, 
     frame = picture(shape)
     random = masks(frame.color, np.float32([[5, 5, 30, 30]]))
     assert random.shape == (1, *shape)
-    masks._network = Filling()
+    masks._network = BoxFiller()
     found = masks(frame.color, np.float32([[9.5, 19.5, 29.5, 49.5], [-0.5, -0.5, 59.5, 9.5]]))
     expected = np.zeros((2, *shape), np.bool_)
     expected[0, 20:50, 10:30] = expected[1, :10, :60] = True
     overlap = (found & expected).sum(axis=(1, 2)) / (found | expected).sum(axis=(1, 2))
-    assert (overlap > 0.9).all(), "equal except for rounding to the grid"
+    assert (overlap > 0.9).all(), "expected equal masks except for rounding to the grid"
     for mask, wanted in zip(found, expected, strict=True):
         center, middle = (np.argwhere(area).mean(axis=0) for area in (mask, wanted))
         np.testing.assert_allclose(center, middle, atol=0.5)
@@ -152,9 +152,9 @@ def test_open_vocabulary_detections_combine_boxes_and_masks(owlv2: Path, masks: 
     assert detector.classes == ("red chair", "bed", SOMETHING_ELSE)
     shape = (64, 64)
     boxes = [[4, 4, 28, 28], [5, 4, 28, 28], [35, 35, 60, 60], [0, 0, 63, 63]]
-    detector._boxes._network = Saying(shape, boxes, [[0.8, 0.1], [0.7, 0.3], [0.1, 0.6], [0.1, 0.1]])
+    detector._boxes._network = FixedBoxes(shape, boxes, [[0.8, 0.1], [0.7, 0.3], [0.1, 0.6], [0.1, 0.1]])
     if detector._masks is not None:
-        detector._masks._network = Filling()
+        detector._masks._network = BoxFiller()
     found = detector.detect(picture(shape))
     np.testing.assert_allclose(found.scores, [0.8, 0.6], atol=1e-6)
     assert found.class_probabilities.argmax(axis=1).tolist() == [0, 1]

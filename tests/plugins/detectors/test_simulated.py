@@ -113,7 +113,7 @@ def test_simulated_split_object_gives_two_parts_at_split_rate():
     detections = replace(PERFECT, split_rate=1.0).detect(frame())
     assert len(detections) == 8
     assert (detections.masks.sum(axis=0) == np.isin(IDS, (5, 6, 9, 12))).all()
-    assert detections.scores.max() < 0.7  # about half of the object each
+    assert detections.scores.max() < 0.7  # each part covers about half of the object
     rate = np.mean([len(replace(PERFECT, split_rate=0.25).detect(frame(k))) - 4 for k in range(200)]) / 4
     assert rate == pytest.approx(0.25, abs=0.05)
 
@@ -139,7 +139,7 @@ def test_simulated_bleed_grows_mask_by_given_pixels():
         (box,) = [b for b, m in zip(detections.boxes, detections.masks, strict=True) if m[40, 40] and not m[40, 90]]
         assert box.tolist() == [40 - side / 2, 40 - side / 2, 39 + side / 2, 39 + side / 2]
     bed = max(replace(PERFECT, bleed=-4.0).detect(frame()).masks, key=lambda m: m[110, 150])
-    assert bed[119, 159], "a mask does not shrink at the image border"
+    assert bed[119, 159], "expected a mask that does not shrink at the image border"
 
 
 def test_simulated_shift_and_border_noise_have_given_deviation():
@@ -240,8 +240,8 @@ def test_simulated_false_positives_have_given_rate_and_score():
 
 THING = np.zeros((120, 160), np.int32)
 THING[20:60, 20:60] = 5  # a chair
-THING[20:50, 60:90] = 31  # a thing that touches it
-THING[80:110, 20:50] = 32  # one that touches nothing
+THING[20:50, 60:90] = 31  # an object without a class that touches the chair
+THING[80:110, 20:50] = 32  # an object without a class that touches no other object
 ROOM = FrameTruth(THING, {5: "chair", **dict.fromkeys(range(31, 200))})
 
 
@@ -305,9 +305,9 @@ def test_simulated_false_positives_keep_world_position():
             classes.append(int(row.argmax()))
     assert 20 < len(places) < 60
     _, counts = np.unique(classes, return_counts=True)
-    assert counts.max() > 20, "one position is used in most frames"
+    assert counts.max() > 20, "expected one position in most frames"
     first = np.array(places)[np.array(classes) == np.bincount(classes).argmax()]
-    assert np.ptp(first) < 0.55, "the position is 0.5 m wide"
+    assert np.ptp(first) < 0.55, "expected positions within a width of 0.5 m"
 
 
 def test_simulated_recurring_false_positives_need_poses():

@@ -65,7 +65,7 @@ def test_transformers_all_model_families_are_covered():
 
 def test_transformers_tiny_networks_return_detections(detector):
     found = [detector.detect(frame(seed)) for seed in range(3)]
-    assert sum(map(len, found)) >= 3, "the other tests need detections"
+    assert sum(map(len, found)) >= 3, "expected detections, which the other tests need"
     assert detector.classes == CLASSES
     assert not np.array_equal(found[0].masks, found[1].masks)
 

@@ -99,7 +99,7 @@ def test_with_embeddings_frame_interval_sets_embedded_frames(siglip: Path) -> No
 
 
 def test_with_embeddings_contrast_controls_background(siglip: Path) -> None:
-    """With contrast 0, only the object affects the embedding; with contrast 1, the background does, too."""
+    """With contrast 0, only the object affects the embedding; with contrast 1, the background affects it, too."""
     plain, other = picture(), picture()
     inside = Blocks().detect(plain).masks[0]
     other.color[~inside] = 255 - other.color[~inside]
@@ -125,7 +125,7 @@ def test_with_embeddings_crop_is_padded_square_around_box() -> None:
     mask[:] = False
     mask[0, :4, :4] = True
     [corner] = square_crops(color, mask, 8, 2.0)
-    assert (corner[:2] == 0).all(), "0 outside the image"
+    assert (corner[:2] == 0).all(), "expected 0 outside the image"
     assert (corner[2:6, 2:6, 3] == 255).all()
     assert not square_crops(color, np.zeros((1, 40, 60), np.bool_), 8, 1.5).any()
 

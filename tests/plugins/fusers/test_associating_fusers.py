@@ -85,7 +85,7 @@ def test_fuser_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frame
     for k in range(4, 12):
         fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.5])
     [instance] = fuser.scene.instances().values()
-    assert instance.observations == 12, "a frame that saw both halves counts once"
+    assert instance.observations == 12, "expected a frame with both halves to count once"
     assert set(np.unique(fuser.scene.mesh().instance_ids)) == {0, instance.id}
 
 
@@ -104,13 +104,13 @@ def test_fuser_merges_instances_covered_by_one_cluster(
     fuse_masks(fuser, frames[0], [left, whole & ~left], [0.9, 0.8])
     for k in range(1, 1 + merge_frames):
         fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.1])
-    assert len(fuser.scene.table.records) == 2, "one frame with both halves delays the merge"
+    assert len(fuser.scene.table.records) == 2, "expected no merge yet: one frame with both halves delays it"
     last = 1 + merge_frames
     fuse_masks(fuser, dataclasses.replace(frames[0], index=last), [whole], [0.1])
     [record] = fuser.scene.table.records.values()
     assert record.id == 1
     assert record.observations == 1 + last
-    assert record.visible == 1 + last, "a frame with both halves in view counts once"
+    assert record.visible == 1 + last, "expected a frame with both halves in view to count once"
     assert record.detections == 2 + last
     assert record.score_sum == pytest.approx(0.9 + 0.8 + last * 0.1)
     odds = (0.68 / 0.32) ** record.detections
@@ -224,7 +224,7 @@ def test_fuser_min_area_does_not_depend_on_voxel_size(new_fuser: NewFuser, voxel
         for k in range(3):
             fuse_masks(fuser, wall.frame(np.eye(4), k), [poster], [0.9])
         assert len(fuser.scene.instances()) == count
-        assert len(fuser.scene.instance_ids()) == 1, "independent of the mesh"
+        assert len(fuser.scene.instance_ids()) == 1, "expected one instance id for any min_area"
 
 
 @pytest.mark.parametrize(
@@ -254,10 +254,10 @@ def test_fuser_floored_distribution_is_positive_and_normalized() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lying_on", "same_class", "keeps"), [(0.6, False, True), (1.0, False, False), (0.6, True, False)]
+    ("support_overlap", "same_class", "keeps"), [(0.6, False, True), (1.0, False, False), (0.6, True, False)]
 )
 def test_fuser_supported_object_keeps_voxels_under_larger_mask(
-    lying_on: float, same_class: bool, keeps: bool, frames: list[Frame]
+    support_overlap: float, same_class: bool, keeps: bool, frames: list[Frame]
 ) -> None:
     """The object is confirmed; later only the desk is detected, with a mask that covers the object.
 
@@ -267,7 +267,7 @@ def test_fuser_supported_object_keeps_voxels_under_larger_mask(
         BayesianTsdf,
         voxel_size=0.02,
         max_depth=4.0,
-        support_overlap=lying_on,
+        support_overlap=support_overlap,
         occlusion_area_ratio=0.0,
         merge_agreement=1.0,
     )

@@ -79,7 +79,7 @@ def test_paper_fuser_association_agrees_with_slow_reference(frames: list[Frame])
 
 @pytest.mark.parametrize(("source", "found"), [("RAYCAST", True), ("SURFACE_LOOKUP", False)])
 def test_paper_fuser_new_surface_votes_for_instance_behind(source: str, found: bool) -> None:
-    """A nearer sphere occludes the mapped one, so its depth is in front of the mapped surface."""
+    """A new sphere occludes the mapped sphere, so its depth is less than that of the mapped surface."""
     behind, front = (Scene([(np.array([0.0, 0.0, -1.0]), -2.5)], [(np.array([0.0, 0.0, z]), 0.35)]) for z in (2.0, 1.6))
     fuser = paper_fuser(f"fuser.association={source}")
     fuse_masks(fuser, behind.frame(pose(), 0), masks_of(behind.frame(pose(), 0)), [0.9])
@@ -127,7 +127,7 @@ def slow_distributions(
 ) -> tuple[Float64, Float64] | None:
     """Return the class and instance distributions of a voxel, by eqs. (6) to (8) in float64; instance 0 = none.
 
-    Return None if it depends on rounding which pixel sees the voxel or whether it is near the surface.
+    Return None if rounding determines which pixel sees the voxel, or that the voxel is near the surface.
     """
     assert frame.T_world_camera is not None
     x, y, z = (inverse(frame.T_world_camera) @ [*position, 1.0])[:3]
@@ -169,7 +169,7 @@ def test_paper_fuser_recursions_agree_with_slow_reference(
         masks = [whole[0] | whole[1], np.roll(whole[1], k, axis=0), whole[2]]  # two overlap; the last one is too weak
         seen.append(masks)
         fuse_masks(fuser, dataclasses.replace(frame, index=k), masks, SCORES, PROBABILITIES)
-    assert any((matches.instance_ids == 0).any() for matches in found.matches), "some mask is unmatched"
+    assert any((matches.instance_ids == 0).any() for matches in found.matches), "expected an unmatched mask"
     evidence, scale = fuser.scene.labels.evidence, fuser.scene.labels.score_scale
     voxels, positions = labeled_voxels(fuser.scene)
     compared = np.random.default_rng(0).permutation(len(voxels))[:2000]

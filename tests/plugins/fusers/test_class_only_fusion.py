@@ -98,7 +98,7 @@ def test_class_only_single_false_detection_is_removed(frames: list[Frame], when:
             assert len(fuser.scene.instances()) == 1
     assert not fuser.scene.instances()
     class_ids = fuser.scene.render(CAMERA, walk(10)[5]).class_ids
-    assert (class_ids >= 0).sum() < 0.01 * masks_of(frames[5])[0].sum(), "only silhouette points remain"
+    assert (class_ids >= 0).sum() < 0.01 * masks_of(frames[5])[0].sum(), "expected only points at the silhouette"
 
 
 def test_class_only_missed_1_ignores_unmasked_frames(frames: list[Frame]) -> None:
@@ -114,7 +114,9 @@ def test_class_only_instance_below_min_area_is_excluded(frames: list[Frame]) -> 
     fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [0.6])
     assert not fuser.scene.instances()
     assert (fuser.scene.mesh().class_ids == -1).all()
-    assert (fuser.scene.render(CAMERA, walk(10)[0]).class_ids == 0).any(), "voxels have no area limit"
+    assert (fuser.scene.render(CAMERA, walk(10)[0]).class_ids == 0).any(), (
+        "expected labels in the view: voxels have no area limit"
+    )
 
 
 # Attributes of an instance
@@ -156,7 +158,7 @@ def test_class_only_voxel_evidence_matches_reference(mapped: SemanticMap, frames
         same = (evidence.masked[row, n], evidence.unmasked[block, n]) == (masked, unmasked)
         differing += not (same and np.allclose(held, log[:2] - log[2], atol=1e-3))
     assert seen > 50
-    assert differing <= 6, "rounding at pixel borders in float32"
+    assert differing <= 6, "expected differences only by rounding at pixel borders"
 
 
 def test_class_only_instance_attributes_match_voxel_reference(mapped: SemanticMap) -> None:
@@ -200,11 +202,11 @@ def test_class_only_detected_spheres_are_instances(mapped: SemanticMap) -> None:
     assert np.quantile(np.abs(np.linalg.norm(points - center, axis=1) - radius), 0.9) < 0.03
     view = mapped.render(CAMERA, walk(10)[5])
     assert (view.class_ids[masks_of(room().frame(walk(10)[5]))[0]] == 0).mean() > 0.9
-    assert not view.instance_ids.any(), "voxels have no instance"
+    assert not view.instance_ids.any(), "expected no instance ids: voxels have no instance"
 
 
 def test_class_only_score_is_probability_of_best_class(frames: list[Frame]) -> None:
-    """The best class has 0.7, so the background has more than half with score 0.33, and a seventh with 0.6."""
+    """The best class has probability 0.7. The background has more than 1/2 for score 0.33, and 1/7 for score 0.6."""
     for score, label in ((0.33, -1), (0.6, 0)):
         fuser = new_fuser()
         fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [score])
@@ -323,7 +325,7 @@ def test_class_only_smoothness_equals_icm_reference(mapped: SemanticMap, smoothn
     plain = with_smoothness(mapped, tmp_path, 0.0)
     expected = slowly_smoothed(plain, smoothness)
     smooth = with_smoothness(mapped, tmp_path, smoothness).mesh().class_ids
-    assert (smooth != expected).sum() <= 2, "float32 may break a tie differently"
+    assert (smooth != expected).sum() <= 2, "expected at most two differences: float32 may break a tie differently"
     assert (expected != plain.mesh().class_ids).sum() > 2
 
 

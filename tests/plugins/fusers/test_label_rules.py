@@ -57,4 +57,4 @@ def test_fuser_class_probabilities_match_label_rule(
     classes = view.class_ids[view.instance_ids == instance.id]
     assert np.bincount(classes).argmax() == np.argmax(expected)
     if fuser_class is not BayesianTsdf:
-        assert 1 not in classes, "only the best class of a detection counts"
+        assert 1 not in classes, "expected only the best class of a detection"

@@ -74,7 +74,9 @@ def test_object_volumes_each_box_is_one_instance(mapped: ObjectVolumes) -> None:
     for key, instance in instances.items():
         points = mesh.vertices[instance.vertices].astype(np.float64)
         owners = BOXES.owners(points, VOXEL / 2)
-        assert np.isin(owners, (key, -1)).mean() > 0.97, "-1 = where the box touches the floor"
+        assert np.isin(owners, (key, -1)).mean() > 0.97, (
+            "expected vertices of the box, or where it touches the floor (-1)"
+        )
         assert (owners == key).sum() > 300
 
 
@@ -99,27 +101,27 @@ def test_object_volumes_statistics_include_all_volumes(mapped: ObjectVolumes) ->
     scene = mapped.scene
     objects = sum(volume.block_count for volume in scene.volumes.values())
     assert scene.statistics.voxels == 512 * (scene.background.voxels.block_count + objects)
-    per_object_voxel = 8 + 4  # bytes of a grid and of the two counts
+    per_object_voxel = 8 + 4  # bytes per voxel: grid and two counts
     assert scene.statistics.bytes > 8 * 512 * scene.background.voxels.block_count + per_object_voxel * 512 * objects
     assert 0 < objects < scene.background.voxels.block_count
 
 
-def share_of_the_room(fuser: ObjectVolumes) -> float:
-    """Return the fraction of the first object's vertices that are more than a voxel from all boxes."""
+def room_fraction(fuser: ObjectVolumes) -> float:
+    """Return the fraction of the first object's vertices that are within a voxel of the room, but not of a box."""
     mesh = fuser.scene.mesh()
     points = mesh.vertices[mesh.instance_ids == 1].astype(np.float64)
     return float((BOXES.owners(points, VOXEL) == 0).mean())
 
 
 def test_object_volumes_remove_single_but_not_constant_bleed() -> None:
-    """The camera moves little, so with constant bleed the same voxels are always under the mask."""
+    """The camera moves only a little, so with constant bleed, the mask always covers the same voxels."""
     once, always = new_fuser(), new_fuser()
     for k, frame in enumerate(pan(0.1)):
         mask = masks_of(frame)[0]
         fuse(once, frame, [bled(mask, 12) if k == 3 else mask])
         fuse(always, frame, [bled(mask, 12)])
-    assert share_of_the_room(once) < 0.02
-    assert share_of_the_room(always) > 0.2, "a known weakness: constant errors are not removed"
+    assert room_fraction(once) < 0.02
+    assert room_fraction(always) > 0.2, "expected the known weakness: constant errors are not removed"
 
 
 def test_object_volumes_remove_bled_voxels_after_unmasked_view(frames: list[Frame]) -> None:
@@ -127,9 +129,9 @@ def test_object_volumes_remove_bled_voxels_after_unmasked_view(frames: list[Fram
     frame, fuser = frames[0], new_fuser(min_observations=1)
     mask = masks_of(frame)[0]
     fuse(fuser, frame, [bled(mask, 12)])
-    assert share_of_the_room(fuser) > 0.2
+    assert room_fraction(fuser) > 0.2
     fuse(fuser, replace(frame, index=1), [mask])
-    assert share_of_the_room(fuser) < 0.02
+    assert room_fraction(fuser) < 0.02
 
 
 def test_object_volumes_change_only_when_detected(frames: list[Frame]) -> None:
@@ -198,7 +200,9 @@ def test_object_volumes_two_detections_are_one_observation(frames: list[Frame]) 
     (record,) = fuser.scene.table.records.values()
     assert (record.observations, record.detections, record.visible) == (2, 3, 2)
     counts = fuser.scene.volumes[1].arrays()
-    assert (counts["foreground"][counts["foreground"] > 0] == 2).mean() > 0.95, "each voxel counts once per frame"
+    assert (counts["foreground"][counts["foreground"] > 0] == 2).mean() > 0.95, (
+        "expected each voxel to count once per frame"
+    )
 
 
 def test_object_volumes_weak_or_far_detection_creates_no_object(frames: list[Frame]) -> None:
@@ -224,7 +228,7 @@ def test_object_volumes_probabilities_are_mean_of_detections(frames: list[Frame]
     assert set(mesh.class_ids[mesh.instance_ids == 1]) == {1}
 
 
-def test_object_volumes_unconfirmed_is_removed_when_visible(frames: list[Frame]) -> None:
+def test_object_volumes_unconfirmed_object_in_view_is_removed(frames: list[Frame]) -> None:
     """After 1 detection and n misses, the probability of existence is 2 / (3 + n), below 0.1 for n >= 18."""
     frame, fuser = frames[0], new_fuser(min_observations=1)
     wall = np.zeros(CAMERA.shape, np.bool_)
@@ -234,7 +238,7 @@ def test_object_volumes_unconfirmed_is_removed_when_visible(frames: list[Frame])
     elsewhere = replace(frame, depth=np.zeros_like(frame.depth))
     for k in range(30):
         fuse(fuser, replace(elsewhere, index=1 + k), [])
-    assert set(fuser.scene.instances()) == {1}, "the region is unobserved"
+    assert set(fuser.scene.instances()) == {1}, "expected the object: its region is unobserved"
     for k in range(17):
         fuse(fuser, replace(frame, index=31 + k), [])
     assert set(fuser.scene.instances()) == {1}
@@ -243,7 +247,7 @@ def test_object_volumes_unconfirmed_is_removed_when_visible(frames: list[Frame])
     assert not fuser.scene.volumes
     assert (fuser.scene.mesh().instance_ids == 0).all()
     fuse(fuser, replace(frame, index=49), [wall])
-    assert set(fuser.scene.table.records) == {2}, "ids are not reused"
+    assert set(fuser.scene.table.records) == {2}, "expected a new id"
 
 
 def test_object_volumes_below_min_area_are_excluded(frames: list[Frame]) -> None:

@@ -114,8 +114,8 @@ def test_open3d_vbg_only_voxels_in_band_under_mask_vote(frames: list[Frame]) -> 
     expected[inside] = mask[at] & (np.abs(frame.depth[at] - z[inside]) <= 2.0 * 0.02)
     found = scene.grid.flat("instance")[numbers] == 7
     assert expected.sum() > 500
-    assert (found != expected).mean() < 1e-4, "equal except for rounding"
-    assert (scene.grid.flat("instance") == 7).sum() == found.sum(), "voxels without a block have no votes"
+    assert (found != expected).mean() < 1e-4, "expected equal votes except for rounding"
+    assert (scene.grid.flat("instance") == 7).sum() == found.sum(), "expected no votes in voxels without a block"
 
 
 @pytest.mark.parametrize(("scores", "winner"), [([0.9, 0.6], 1), ([0.6, 0.9], 2)])
@@ -182,7 +182,9 @@ def test_open3d_vbg_min_weight_applies_after_first_frames() -> None:
         scene.integrate(dataclasses.replace(frame, depth=half), np.eye(4))
     seen = scene.render(CAMERA, np.eye(4)).depth > 0
     assert seen[:, : CAMERA.width // 2 - 4].mean() > 0.9
-    assert not seen[:, CAMERA.width // 2 + 4 :].any(), "the right half was observed once, min_weight is 3"
+    assert not seen[:, CAMERA.width // 2 + 4 :].any(), (
+        "expected no surface in the right half: it was observed once, and min_weight is 3"
+    )
     assert scene.mesh().vertices[:, 0].max() < 0.1
 
 
@@ -264,7 +266,9 @@ def test_open3d_vbg_instance_below_min_area_is_excluded(frames: list[Frame]) -> 
         fuse_masks(fuser, frame, masks_of(frame)[:1], [0.9])
     assert not fuser.scene.instances()
     assert (fuser.scene.mesh().class_ids == -1).all()
-    assert fuser.scene.render(CAMERA, frames[0].T_world_camera).instance_ids.any(), "it is tentative, not removed"
+    assert fuser.scene.render(CAMERA, frames[0].T_world_camera).instance_ids.any(), (
+        "expected a tentative instance in the view"
+    )
 
 
 # Storage
@@ -320,7 +324,9 @@ def test_open3d_vbg_map_file_round_trip_is_exact(mapped: Open3DMap, tmp_path: Pa
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
     with np.load(tmp_path / "map.npz") as file:
         coords = file["block_coords"].tolist()
-    assert coords == sorted(coords, key=lambda xyz: xyz[::-1]), "Open3D's order differs between runs"
+    assert coords == sorted(coords, key=lambda xyz: xyz[::-1]), (
+        "expected sorted blocks: Open3D's order differs between runs"
+    )
 
 
 def test_open3d_vbg_damaged_or_foreign_file_raises(mapped: Open3DMap, tmp_path: Path) -> None:

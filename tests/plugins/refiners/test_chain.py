@@ -81,7 +81,7 @@ def test_chain_overrides_set_remove_replace_and_add_links(overrides: list[str], 
     chain = registered.built("refiner", "chain", *overrides)
     found = {name: type(link) for name, link in chain.links.items()}
     assert found == links
-    assert list(found) == list(links), "in this order"
+    assert list(found) == list(links), "expected this order of links"
     if "std_floor" in overrides[0]:
         assert chain.links["gmm_em"].std_floor == 0.02
 

@@ -55,7 +55,7 @@ def test_dbscan_keeps_largest_component_with_border(seed):
 
 
 def test_dbscan_eps_increases_with_depth():
-    """The points are 5 cm apart on a line at 2 m."""
+    """The points are 5 cm apart on a line at a depth of 2 m, except for one gap of 11 cm."""
     line = np.stack([np.arange(20) * 0.05, np.zeros(20), np.full(20, 2.0)], axis=1)
     line[12:, 0] += 0.06
     for slope, kept in ((0.01, 12), (0.05, 20)):
@@ -64,7 +64,7 @@ def test_dbscan_eps_increases_with_depth():
 
 
 def test_dbscan_skipped_points_join_nearby_samples():
-    """The two plates have different sizes; with a stride, skipped pixels are assigned like nearby samples."""
+    """Of two plates, the larger is kept; with a stride, skipped pixels are assigned like nearby samples."""
     v, u = np.mgrid[:60, :90]
     plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.3)], axis=-1).reshape(-1, 3)
     clusters = clusters_of(plates)
@@ -81,10 +81,12 @@ def test_dbscan_weights_sampled_points_for_skipped_points():
     plate[-90:, 1] += 0.5  # the last row is removed: it contains no sample
     for eps, min_points, kept in ((0.035, 9 * 3, 59 * 90), (0.035, 9 * 5 + 1, 60 * 90)):
         refiner = Dbscan(eps=eps, eps_per_depth=0.0, min_points=min_points, stride=1, max_points=600)
-        assert len(refiner.refine(clusters_of(plate), FRAME).pixels) == kept, "at most 5 samples are within eps"
+        assert len(refiner.refine(clusters_of(plate), FRAME).pixels) == kept, (
+            "expected the weights of at most 5 samples within eps"
+        )
 
 
-def test_dbscan_first_of_two_equal_components_stays():
+def test_dbscan_first_of_two_equal_components_is_kept():
     rng = np.random.default_rng(0)
     ball = rng.normal(0, 0.01, (50, 3))
     for offset in (1.0, -1.0):
@@ -111,7 +113,7 @@ def test_dbscan_degenerate_clusters_are_valid():
     assert len(Dbscan(eps=0.001, eps_per_depth=0, min_points=1, stride=1).refine(clusters_of(far), FRAME).pixels) == 1
 
 
-def test_dbscan_unassigned_points_stay():
+def test_dbscan_keeps_unassigned_points():
     clusters = clusters_of(blobs(0))
     cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, 0).astype(np.int32)
     refined = Dbscan(stride=1).refine(replace(clusters, cluster=cluster), FRAME)

@@ -45,7 +45,7 @@ def image_of(clusters: PointClusters, k: int) -> np.ndarray:
     u, v = clusters.pixels[clusters.cluster == k].T
     assert not image[v, u].any()
     image[v, u] = True
-    assert image.sum() == (clusters.cluster == k).sum(), "each pixel occurs once"
+    assert image.sum() == (clusters.cluster == k).sum(), "expected each pixel once"
     return image
 
 
@@ -66,8 +66,8 @@ def test_geometric_corrects_shifted_mask_to_box():
     after = Geometric().refine(before, frame)
     box = image_of(after, 0)
     assert (box & (ids == 1)).sum() > 0.97 * (ids == 1).sum()
-    assert (box & (ids == 0)).sum() < 2 * 90, "table pixels only along the border"
-    assert (box & ~mask).sum() > 200, "the mask has grown"
+    assert (box & (ids == 0)).sum() < 2 * 90, "expected table pixels only along the border"
+    assert (box & ~mask).sum() > 200, "expected added pixels of the box"
     everything = lifted(np.ones((1, *CAMERA.shape), bool), frame).points_world.reshape(*CAMERA.shape, 3)
     u, v = after.pixels.T
     np.testing.assert_allclose(after.points_world, everything[v, u], atol=1e-5)
@@ -95,7 +95,7 @@ def test_geometric_segment_goes_to_mask_of_largest_coverage():
     assert set(refined.cluster.tolist()) == {1}
     assert image_of(refined, 1)[ids == 1].mean() > 0.97
     equal = Geometric().refine(lifted(np.stack([ids == 1, ids == 1]), frame), frame)
-    assert set(equal.cluster.tolist()) == {0}, "the first of equal masks"
+    assert set(equal.cluster.tolist()) == {0}, "expected the first of equal masks"
 
 
 @pytest.mark.parametrize(("min_overlap", "claimed"), [(0.4, True), (0.6, False)])
@@ -108,7 +108,7 @@ def test_geometric_does_not_claim_segment_below_min_overlap(min_overlap, claimed
     assert len(refined) == 1
 
 
-def test_geometric_unassigned_points_stay():
+def test_geometric_keeps_unassigned_points():
     depth, ids = table()
     frame = frame_of(depth)
     before = lifted((ids == 1)[None], frame)
@@ -131,7 +131,9 @@ def test_geometric_collinear_points_are_not_extended():
     np.testing.assert_array_equal(refiner.refine(before, frame).pixels, before.pixels)
     mask[0, 40:80, 61] = True
     mask[0, 70:80, 61] = False
-    assert len(refiner.refine(lifted(mask, frame), frame).pixels) == 80, "two columns determine the pose"
+    assert len(refiner.refine(lifted(mask, frame), frame).pixels) == 80, (
+        "expected added points: two columns determine the pose"
+    )
 
 
 def test_geometric_degenerate_input_is_valid():

@@ -136,7 +136,7 @@ def test_gmm_frame_point_assignment_matches_reference(levels: int, children: int
 
 
 @pytest.mark.parametrize("treatment", ForeignPoints)
-def test_gmm_frame_foreign_points_move_drop_or_stay(treatment: ForeignPoints) -> None:
+def test_gmm_frame_foreign_points_are_moved_dropped_or_kept(treatment: ForeignPoints) -> None:
     points, masks, _ = three_objects(2)
     clusters = clusters_of(points, masks, (0.9, 0.8, 0.7))
     expected = slow_masks(GmmFrame(), points, masks, 3)
@@ -175,7 +175,7 @@ def test_gmm_frame_small_cluster_is_dropped() -> None:
     for min_points, left in ((10, {0, 1, 2}), (30, {0, 2})):
         refined = GmmFrame(min_points=min_points, foreign_points=ForeignPoints.STAY).refine(clusters, FRAME)
         assert set(np.unique(refined.cluster)) == left
-        assert len(refined) == 3, "cluster k is detection k"
+        assert len(refined) == 3, "expected one cluster per detection"
 
 
 def test_gmm_frame_k_means_start_differs_but_finds_objects() -> None:

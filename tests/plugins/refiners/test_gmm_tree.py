@@ -67,10 +67,12 @@ def test_gmm_tree_removes_mask_bleed(px, levels):
     frame = frame_of(depth)
     mask = bleeding(ids > 0, px)
     after = kept(GmmTree(levels=levels).refine(lifted(mask[None], frame), frame))
-    assert after[ids == 1].mean() > 0.98, "the top is within the bleeding margin, so that it is ambiguous"
+    assert after[ids == 1].mean() > 0.98, (
+        "expected the front of the box; its top is ambiguous within the bleeding margin"
+    )
     assert 1 - after[mask & (ids == 0)].mean() > 0.92
     before = kept(Identity().refine(lifted(mask[None], frame), frame))
-    assert before[mask].all(), "the input has background points"
+    assert before[mask].all(), "expected background points in the input"
 
 
 def test_gmm_tree_mask_log_odds_decide_in_one_plane():
@@ -82,7 +84,9 @@ def test_gmm_tree_mask_log_odds_decide_in_one_plane():
     clusters = lifted(mask, frame)
     after = kept(GmmTree().refine(clusters, frame))
     assert after[85:155, 125:195].mean() > 0.98
-    assert len(GmmTree(mask_log_odds=0.0).refine(clusters, frame).pixels) == 0, "without evidence, both sides tie"
+    assert len(GmmTree(mask_log_odds=0.0).refine(clusters, frame).pixels) == 0, (
+        "expected no points: without evidence, both sides tie"
+    )
 
 
 def test_gmm_tree_refines_masks_independently():
@@ -102,16 +106,20 @@ def test_gmm_tree_cluster_with_too_few_points_is_unchanged():
     frame = frame_of(depth)
     tiny = np.zeros((1, *CAMERA.shape), bool)
     tiny[0, 100:105, 150:155] = True
-    assert len(GmmTree().refine(lifted(tiny, frame), frame).pixels) == 25, "fewer than min_points"
+    assert len(GmmTree().refine(lifted(tiny, frame), frame).pixels) == 25, (
+        "expected no change for fewer than min_points points"
+    )
     lonely = frame_of(np.where(ids > 0, depth, 0).astype(np.float32))
     box = lifted((ids > 0)[None], lonely)
-    assert len(GmmTree().refine(box, lonely).pixels) == (ids > 0).sum(), "a ring without depth"
+    assert len(GmmTree().refine(box, lonely).pixels) == (ids > 0).sum(), "expected no change for a ring without depth"
     sparse = frame_of(np.where((np.indices(depth.shape).sum(axis=0) % 40) == 0, depth, 0).astype(np.float32))
     few = lifted(bleeding(ids > 0, 8)[None], sparse)
-    assert len(GmmTree(min_node=10**6).refine(few, sparse).pixels) == len(few.pixels), "a tree without a node"
+    assert len(GmmTree(min_node=10**6).refine(few, sparse).pixels) == len(few.pixels), (
+        "expected no change for a tree without nodes"
+    )
 
 
-def test_gmm_tree_unassigned_points_stay():
+def test_gmm_tree_keeps_unassigned_points():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids > 0, 8)[None], frame)

@@ -126,7 +126,7 @@ def test_plane_removal_keeps_plane_with_most_cluster_points():
     assert cup.sum() > 0.8 * (ids == 2).sum()
     assert not cup[ids == 1].any()
     assert refined.structure is not None
-    assert not refined.structure[ids == 1].any(), "points kept by an object are not structure"
+    assert not refined.structure[ids == 1].any(), "expected no structure in points that an object keeps"
     half = (ids == 1) & (np.cumsum(ids == 1).reshape(ids.shape) <= 0.49 * (ids == 1).sum())
     [left] = masks_of(PlaneRemoval(min_area=0.3).refine(lifted(frame, half), frame))
     assert not left.any()
@@ -136,7 +136,7 @@ def test_plane_removal_keeps_plane_with_most_cluster_points():
 
 @pytest.mark.parametrize(("share", "unchanged"), [(0.4, False), (0.6, True)])
 def test_plane_removal_cluster_fraction_counts_all_parts(share, unchanged):
-    """The wall is visible between posts; the mask covers a part of the image and several thread blocks."""
+    """The wall is visible between posts. The mask covers the top `share` of the image, split among threads."""
     post = np.arange(320) // 32 % 2 == 1
     depth = np.where(post, 1.5, 2.0) * np.ones(CAMERA.shape)
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth.astype(np.float32), CAMERA)
@@ -159,7 +159,7 @@ def test_plane_removal_keeps_screen_and_removes_wall_behind():
 
 
 def test_plane_removal_wall_with_small_opening_is_structure():
-    """With an opening of 1/20 a wall is structure; with one of 1/3 it could be the side of a cupboard."""
+    """A wall with an opening of 1/20 of its width is structure; with 1/3, it could be the side of a cupboard."""
     for width, dropped in ((12, True), (100, False)):
         frame, _ = scene(BOX)
         depth = frame.depth.copy()
@@ -204,7 +204,7 @@ def test_plane_removal_small_plane_is_not_structure():
         assert len(strict.refine(clusters, frame).pixels) == len(clusters.pixels)
 
 
-def test_plane_removal_unassigned_points_stay():
+def test_plane_removal_keeps_unassigned_points():
     frame, ids = scene(BOX)
     clusters = lifted(frame, bleeding(ids == 1), np.zeros_like(ids, bool))
     cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, clusters.cluster).astype(np.int32)

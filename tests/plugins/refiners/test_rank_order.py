@@ -49,7 +49,7 @@ def test_rank_order_separated_blobs_split_at_any_scale(scale):
 
 
 def test_rank_order_skipped_points_join_nearest_sample():
-    """Of 5400 points of two plates at most 200 are sampled, one per pixel block; others join the nearest sample."""
+    """Of the 5400 points of two plates, at most 200 are sampled, one per pixel block; others join the nearest one."""
     v, u = np.mgrid[:60, :90]
     rng = np.random.default_rng(0)
     plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.5)], axis=-1).reshape(-1, 3)
@@ -66,7 +66,7 @@ def test_rank_order_skipped_points_join_nearest_sample():
     np.testing.assert_array_equal(refined.pixels[:, 1] * 90 + refined.pixels[:, 0], np.flatnonzero(right))
 
 
-def test_rank_order_first_of_two_equal_groups_stays():
+def test_rank_order_first_of_two_equal_groups_is_kept():
     rng = np.random.default_rng(0)
     ball = rng.normal(0, 0.01, (60, 3))
     for offset in (1.0, -1.0):
@@ -86,7 +86,7 @@ def test_rank_order_degenerate_clusters_are_valid():
     assert len(RankOrder().refine(clusters_of(), FRAME)) == 0
 
 
-def test_rank_order_unassigned_points_stay():
+def test_rank_order_keeps_unassigned_points():
     clusters = clusters_of(blobs(0, 900))
     cluster = np.where(np.arange(900) % 3 == 0, -1, 0).astype(np.int32)
     refined = RankOrder(threshold=0.3).refine(replace(clusters, cluster=cluster), FRAME)

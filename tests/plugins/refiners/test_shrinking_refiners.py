@@ -84,7 +84,7 @@ def test_gmm_em_removes_mask_bleed(px):
     doubting = GmmEm(object_components=2, mask_log_odds=2.0, expected_bleed=0.5).refine(before, frame)
     doubting_recall, doubting_rejection = recall_and_rejection(doubting, before, ids)
     assert doubting_recall > 0.97
-    assert doubting_rejection > 0.95, "a less trusted mask allows the mixture to remove more"
+    assert doubting_rejection > 0.95, "expected more removed points for a less trusted mask"
     for other in (KMeans(), LargestComponent(), GmmEm(mask_log_odds=0.0)):
         other_recall, other_rejection = recall_and_rejection(other.refine(before, frame), before, ids)
         assert recall + rejection > other_recall + other_rejection, other
@@ -145,7 +145,7 @@ def test_shrinking_refiner_degenerate_input_is_valid(make):
     assert len(refiner.refine(whole, frame_of(depth)).points_world) > 0
     flat = frame_of(np.full_like(depth, 2.0))
     on_wall = refiner.refine(lifted((ids == 1)[None], flat), flat)
-    assert len(on_wall) == 1, "object and background in one plane must not raise"
+    assert len(on_wall) == 1, "expected a result for object and background in one plane"
 
 
 @pytest.mark.parametrize("make", [GmmEm, KMeans])
@@ -154,13 +154,15 @@ def test_shrinking_refiner_keeps_cluster_with_too_few_points(make):
     tiny = np.zeros((1, 240, 320), bool)
     tiny[0, 100:105, 150:155] = True
     frame = frame_of(depth)
-    assert len(make().refine(lifted(tiny, frame), frame).pixels) == 25, "fewer than min_points"
+    assert len(make().refine(lifted(tiny, frame), frame).pixels) == 25, (
+        "expected no change for fewer than min_points points"
+    )
     lonely = frame_of(np.where(ids == 1, depth, 0).astype(np.float32))
     box = lifted((ids == 1)[None], lonely)
-    assert len(make().refine(box, lonely).pixels) == (ids == 1).sum(), "a ring without depth"
+    assert len(make().refine(box, lonely).pixels) == (ids == 1).sum(), "expected no change for a ring without depth"
 
 
-def test_shrinking_refiner_unassigned_points_stay():
+def test_shrinking_refiner_keeps_unassigned_points():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids == 1, 8)[None], frame)

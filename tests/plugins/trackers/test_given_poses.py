@@ -32,7 +32,7 @@ def true_poses(_: Path) -> PoseTracker:
     return GroundTruth()
 
 
-def poses_of_a_file(folder: Path) -> PoseTracker:
+def poses_from_file(folder: Path) -> PoseTracker:
     write_tum(folder / "poses.txt", [k / 30 for k in POSED], [pose_at(k) for k in POSED])
     return TrajectoryFile(folder / "poses.txt")
 
@@ -42,7 +42,7 @@ TRACKERS = pytest.mark.parametrize(
     [
         (true_poses, "frame 0: expected a ground-truth pose at 0.000 s, got none"),
         (
-            poses_of_a_file,
+            poses_from_file,
             "frame 0: poses.txt: expected a pose within 0.02 s (tracker.max_time_difference) of 0.000 s, "
             "got the nearest pose 0.033 s away",
         ),

@@ -52,7 +52,7 @@ def test_voxel_hashing_icp_recovers_known_motion(color_weight: float) -> None:
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=color_weight), frames)
     assert not any(pose.lost for pose in poses)
     worst = max(drift(pose, frame) for pose, frame in zip(poses, frames, strict=True))
-    assert worst[0] < 0.004, "a fifth of a voxel"
+    assert worst[0] < 0.004, "expected errors below a fifth of a voxel"
     assert drift(poses[-1], frames[-1])[1] < 0.003
 
 
@@ -74,7 +74,7 @@ def test_voxel_hashing_icp_color_determines_motion_along_wall() -> None:
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], frames[-1])[0] < 0.01
     alone, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=0.0), frames)
-    assert any(pose.lost for pose in alone), "geometry alone does not determine the motion"
+    assert any(pose.lost for pose in alone), "expected lost frames: geometry alone does not determine the motion"
 
 
 def enlarged(frame: Frame, scale: float) -> Frame:
@@ -131,7 +131,7 @@ def test_voxel_hashing_icp_relocalizes_or_is_lost_after_jump() -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, 0.1])
 def test_voxel_hashing_icp_does_not_depend_on_feature_timing(seconds: float) -> None:
-    """Doubtful and lost frames need keyframes while the worker thread is still extracting one."""
+    """Doubtful and lost frames need keyframes while the worker thread is still extracting features."""
     path = [exp_se3(np.array([0.03 * k - 0.3, 0, 0, 0, 0.01 * k, 0])) for k in range(24)]
     for k in (8, 16, 17):
         path[k] = path[k] @ exp_se3(np.array([0, 0, -0.4, 0, 0.3, 0]))
@@ -246,16 +246,16 @@ def test_voxel_hashing_icp_implausible_step_is_lost(bound: dict[str, float]) -> 
     assert np.array_equal(poses[1].T_world_camera, poses[0].T_world_camera)
 
 
-def spoilt_beginnings() -> dict[str, np.ndarray]:
+def unusable_first_frames() -> dict[str, np.ndarray]:
     corner = np.zeros(CAMERA.shape, np.float32)
     corner[:10, :10] = 1.0
     return {"nothing": np.zeros_like(corner), "a corner": corner, "out of range": np.full_like(corner, 9.0)}
 
 
-@pytest.mark.parametrize("name", spoilt_beginnings())
+@pytest.mark.parametrize("name", unusable_first_frames())
 def test_voxel_hashing_icp_starts_after_unusable_first_frame(name: str) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
-    frames[0] = dataclasses.replace(frames[0], depth=spoilt_beginnings()[name])
+    frames[0] = dataclasses.replace(frames[0], depth=unusable_first_frames()[name])
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert poses[0].lost
     assert poses[0].reason
@@ -326,7 +326,7 @@ def test_voxel_hashing_icp_is_lost_after_bad_final_step(monkeypatch: pytest.Monk
 
 
 def aligned(T_world_camera: np.ndarray, agreement: float = 0.85, behind: float = 0.05) -> Alignment:
-    """Return an alignment with imperfect agreement, as for an inexact camera or a wrong pose."""
+    """Return an alignment with imperfect agreement, as caused by inexact intrinsics or a wrong pose."""
     return Alignment(T_world_camera, 0.7, agreement, behind, agreement / (1 - behind), "", "85% agree")
 
 
@@ -348,9 +348,9 @@ def test_voxel_hashing_icp_steady_motion_needs_less_agreement(
         tracker, "_align", lambda *_: (a := aligned(next(ends))) and (a._replace(doubt="") if perfect.pop(0) else a)
     )
     lost = [tracker.track(frame, fuser.scene).lost for frame in frames[1 : STEADY + 4]]
-    assert not any(lost), "the prediction was correct before"
+    assert not any(lost), "expected no lost frame while the predictions are correct"
     monkeypatch.setattr(tracker, "_align", lambda *_: aligned(tracker._T_world_last @ moved(0.2)))
-    assert tracker.track(frames[-2], fuser.scene).lost, "20 cm from the prediction"
+    assert tracker.track(frames[-2], fuser.scene).lost, "expected a lost frame 20 cm from the prediction"
     for worse in (aligned(tracker._T_world_last, agreement=0.7), aligned(tracker._T_world_last, 0.8, behind=0.15)):
         tracker._lost_frames, tracker._steady_frames = 0, STEADY
         monkeypatch.setattr(tracker, "_align", lambda *_, worse=worse: worse)
@@ -368,7 +368,7 @@ def test_voxel_hashing_icp_uses_features_until_motion_is_steady(monkeypatch: pyt
 
 
 def test_voxel_hashing_icp_features_reject_contradicting_pose(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All points agree with the map, but features give a position 30 cm away, from where alignment diverges."""
+    """All points agree with the map, but features give a position 30 cm away, from which the alignment diverges."""
     frames = [room().frame(walk(1)[0], k) for k in range(2)]
     tracker = VoxelHashingIcp(finest_scale=1.0)
     fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
@@ -430,7 +430,7 @@ def test_voxel_hashing_icp_tracks_slow_motion() -> None:
 
 
 @pytest.mark.parametrize(("step", "held"), [(0.0005, True), (0.002, False)])
-def test_voxel_hashing_icp_holds_only_small_uncertain_motion(step: float, held: bool) -> None:
+def test_voxel_hashing_icp_keeps_pose_for_small_uncertain_motion(step: float, held: bool) -> None:
     """Along a wall with little texture, the uncertainty may exceed the motion of a moving camera."""
     tracker = VoxelHashingIcp()
     tracker._T_world_last = moved(1.0)
@@ -445,7 +445,7 @@ def test_voxel_hashing_icp_covariance_matches_errors() -> None:
     frames = noisy(0.004, 30)
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert poses[0].covariance is not None
-    assert not poses[0].covariance.any(), "the first pose defines the world"
+    assert not poses[0].covariance.any(), "expected no uncertainty of the first pose, which defines the world"
     squares = []
     for (a, b), (q_a, q_b) in zip(pairwise(poses[5:]), pairwise(frames[5:]), strict=True):
         E = inverse(inverse(q_a.T_world_camera) @ q_b.T_world_camera) @ inverse(a.T_world_camera) @ b.T_world_camera
@@ -481,7 +481,7 @@ def test_voxel_hashing_icp_lost_reason_names_scattered_depth() -> None:
 
 
 def coarse(frame: Frame) -> Frame:
-    """Return the frame with depth in steps of 3.92 cm, as in 8 bits."""
+    """Return the frame with depth in steps of 3.92 cm, as in 8 bits over a range of 10 m."""
     steps = (np.floor(frame.depth / 0.0392) + 0.5) * 0.0392
     return dataclasses.replace(frame, depth=np.where(frame.depth > 0, steps, 0).astype(np.float32))
 
@@ -499,8 +499,10 @@ def test_voxel_hashing_icp_tracks_coarse_depth_without_normals(monkeypatch: pyte
     monkeypatch.setattr(VoxelHashingIcp, "_align", recorded)
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert not any(pose.lost for pose in poses)
-    assert max(drift(pose, frame)[0] for pose, frame in zip(poses, frames, strict=True)) < 0.0392, "one depth step"
+    assert max(drift(pose, frame)[0] for pose, frame in zip(poses, frames, strict=True)) < 0.0392, (
+        "expected errors below one depth step"
+    )
     without_normals, matched[:] = np.mean(matched), []
     monkeypatch.setattr(voxel_hashing_icp, "is_coarse", lambda *_, **__: False)
     run(VoxelHashingIcp(finest_scale=1.0), frames)
-    assert np.mean(matched) < 0.9 * without_normals, "normals of steps do not match those of the surface"
+    assert np.mean(matched) < 0.9 * without_normals, "expected fewer matches with normals, which depth steps distort"

@@ -76,8 +76,8 @@ def test_paper_tracker_uses_published_parameters(monkeypatch: pytest.MonkeyPatch
         assert weights.depth_weight == 1
         assert weights.max_distance == np.float32(0.15)
         assert weights.min_normal_dot == np.float32(0.97)
-        assert linear == (np.float32(4.0), np.float32(0.1)), "max_depth of the map"
-        assert brightness == 0, "exposure is not compensated"
+        assert linear == (np.float32(4.0), np.float32(0.1)), "expected the max_depth of the map, 4 m"
+        assert brightness == 0, "expected no compensation of exposure"
 
 
 def test_paper_tracker_lost_frames_keep_last_pose() -> None:
@@ -106,7 +106,7 @@ def test_paper_tracker_uses_no_features(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def hidden_frames() -> list[Frame]:
-    """Return a walk with random depth in half of the last view."""
+    """Return frames along a path, the last one with random depth in half of the image."""
     frames = walked(8)
     frames[-1].depth[:, :80] = np.random.default_rng(0).uniform(0.5, 4, (120, 80))
     return frames

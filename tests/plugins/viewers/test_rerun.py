@@ -101,7 +101,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def stages_timed(milliseconds: Sequence[float]) -> list[str]:
-    """Return the stages with a finite time; there is one value per stage of the legend."""
+    """Return the stages with a finite time; `milliseconds` has one value per stage of the legend."""
     return [stage for stage, time in zip(STAGE_COLORS, milliseconds, strict=True) if np.isfinite(time)]
 
 
@@ -114,7 +114,9 @@ def test_rerun_stage_times_cover_only_completed_stages(recorded: Path) -> None:
     times = {row["frame"]: row["Scalars:scalars"] for row in rows(recorded, "milliseconds")}
     assert sorted(times) == [0, 1, 3, 4, 5]
     assert all(stages_timed(times[k]) == [*STAGE_NAMES] for k in (0, 1, 3, 5))
-    assert stages_timed(times[4]) == ["reading", "detection", "tracking"], "frame 4 is lost"
+    assert stages_timed(times[4]) == ["reading", "detection", "tracking"], (
+        "expected only the stages before fusion: frame 4 is lost"
+    )
 
 
 def test_rerun_lost_and_skipped_frames_are_logged(recorded: Path) -> None:
@@ -168,7 +170,7 @@ def test_rerun_camera_has_pose_and_intrinsics(recorded: Path) -> None:
     np.testing.assert_allclose(camera["Transform3D:translation"][0], pose_at(5)[:3, 3], atol=1e-6)
     assert camera["Pinhole:resolution"][0] == [CAMERA.width, CAMERA.height]
     K = np.array(camera["Pinhole:image_from_camera"][0]).reshape(3, 3).T
-    np.testing.assert_allclose(K, [[90, 0, 48], [0, 90, 36], [0, 0, 1]])  # rerun's pixel centers are at half-integers
+    np.testing.assert_allclose(K, [[90, 0, 48], [0, 90, 36], [0, 0, 1]])  # rerun: pixel centers at half-integers
 
 
 def test_rerun_viewer_does_not_change_result(tmp_path: Path) -> None:
@@ -225,7 +227,7 @@ def test_rerun_recording_of_killed_run_has_last_second(tmp_path: Path) -> None:
     frames = list(rows(fixed(file), "world/camera/color"))
     assert len(frames) > 3
     last = max(row["log_time"] for row in frames) / 1e9
-    assert abs(fused_at - last) < 1.5, f"{fused_at - last:.2f} s are missing"
+    assert abs(fused_at - last) < 1.5, f"expected at most 1.5 s to be missing, got {fused_at - last:.2f} s"
 
 
 def test_rerun_mapper_writes_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,7 +241,7 @@ def test_rerun_mapper_writes_recording(tmp_path: Path, monkeypatch: pytest.Monke
     del mapper
     times = {row["frame"]: row["Scalars:scalars"] for row in rows(tmp_path / "recording.rrd", "milliseconds")}
     assert sorted(times) == [0, 2]
-    assert stages_timed(times[0]) == [*STAGE_NAMES[1:]], "the caller reads the frame"
+    assert stages_timed(times[0]) == [*STAGE_NAMES[1:]], "expected no reading time: the caller reads the frame"
     assert [row["TextLog:text"] for row in rows(tmp_path / "recording.rrd", "log")]
 
 
@@ -299,7 +301,7 @@ def test_rerun_occupied_port_raises(tmp_path: Path) -> None:
 
 
 def listening() -> set[str]:
-    """Return where this process listens, as ADDRESS:PORT in the hexadecimal format of /proc."""
+    """Return the addresses on which this process listens, as hexadecimal ADDRESS:PORT in the format of /proc."""
     own = {str(file.readlink()) for file in list(Path("/proc/self/fd").iterdir()) if file.is_symlink()}
     lines = [line.split() for table in ("tcp", "tcp6") for line in Path("/proc/net", table).read_text().splitlines()]
     return {line[1] for line in lines if line[3] == "0A" and f"socket:[{line[9]}]" in own}
@@ -312,7 +314,7 @@ def test_rerun_browser_mode_listens_only_on_localhost(tmp_path: Path) -> None:
     served = {address.partition(":")[2]: address.partition(":")[0] for address in listening()}
     viewer.end()
     assert {served.pop(f"{port:04X}") for port in (viewer.port, viewer.web_port)} == {"0100007F"}
-    assert not {host for host in served.values() if not host.endswith("7F")}, "no other address is open"
+    assert not {host for host in served.values() if not host.endswith("7F")}, "expected no other open address"
 
 
 def test_rerun_window_mode_binds_only_localhost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -354,4 +356,4 @@ def test_rerun_browser_page_connects_only_to_own_server(tmp_path: Path) -> None:
     assert "*" not in policy
     assert (tmp_path / "also.rrd").exists()
     with socket.socket() as probe:
-        assert probe.connect_ex(("127.0.0.1", viewer.web_port)) != 0, "the server is closed"
+        assert probe.connect_ex(("127.0.0.1", viewer.web_port)) != 0, "expected a closed server"

@@ -21,7 +21,7 @@ def save(path: Path, nodes: list[Any], inputs: list[Any], outputs: list[Any], co
 
 
 def constant_network(path: Path, shape: tuple[int | str, ...], outputs: Mapping[str, np.ndarray[Any, Any]]) -> Path:
-    """Write a network with an image input of `shape` and constant `outputs`, to which 0 times the image is added."""
+    """Write a network with an image input of `shape` and constant `outputs`, plus 0 times the image."""
     nodes = [
         helper.make_node("ReduceMax", ["images"], ["largest"], keepdims=0),
         helper.make_node("Mul", ["largest", "zero"], ["nothing"]),

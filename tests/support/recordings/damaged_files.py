@@ -69,7 +69,7 @@ def damaged(draw: st.DrawFn, content: bytes, tokens: tuple[bytes, ...]) -> bytes
 
 
 def check(read: Callable[[Path], object], path: Path, content: bytes) -> str:
-    """Write and read the file; return the error message, or "" without an error. Fails for other outcomes."""
+    """Write and read the file; return the error message, or "" without an error. Fail for other outcomes."""
     path.write_bytes(content)
     began = time.perf_counter()
     try:

@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 MOST = 300  # maximum detections of networks with internal suppression
 
 
-class Surgery:
+class NetworkEditor:
     """Editor that appends nodes to both outputs of a YOLO segmentation network; boxes are center and size, px."""
 
     def __init__(self, source: Path) -> None:
@@ -25,7 +25,7 @@ class Surgery:
         self._names = 0
 
     def add(self, kind: str, *inputs: str | np.ndarray[Any, Any], outputs: int = 1, **attributes: Any) -> Any:
-        """Add a node; array inputs become constants. Returns the names of its outputs."""
+        """Add a node; array inputs become constants. Return the names of its outputs."""
         names = [self._constant(one) if isinstance(one, np.ndarray) else one for one in inputs]
         made = [self._name() for _ in range(outputs)]
         self.graph.node.append(helper.make_node(kind, names, made, **attributes))
@@ -54,33 +54,33 @@ class Surgery:
         return f"rewritten_{self._names}"
 
 
-def transposed(net: Surgery) -> None:
+def transposed(net: NetworkEditor) -> None:
     net.table = net.add("Transpose", net.table, perm=[0, 2, 1])
 
 
-def channels_last(net: Surgery) -> None:
+def channels_last(net: NetworkEditor) -> None:
     net.prototypes = net.add("Transpose", net.prototypes, perm=[0, 2, 3, 1])
 
 
-def unit(net: Surgery) -> None:
+def unit(net: NetworkEditor) -> None:
     scale = np.ones((1, net.columns, 1), np.float32)
     scale[:, :4] = 1 / net.side
     net.table = net.add("Mul", net.table, scale)
 
 
-def corners(net: Surgery) -> None:
+def corners(net: NetworkEditor) -> None:
     center, half = net.columns_of(0, 2), net.add("Mul", net.columns_of(2, 4), np.array(0.5, np.float32))
     first, second = net.add("Sub", center, half), net.add("Add", center, half)
     net.table = net.add("Concat", first, second, net.columns_of(4, net.columns), axis=1)
 
 
-def any_size(net: Surgery) -> None:
+def any_size(net: NetworkEditor) -> None:
     for dimension, name in zip(net.graph.input[0].type.tensor_type.shape.dim, ("n", "", "h", "w"), strict=True):
         if name:
             dimension.dim_param = name
 
 
-def best_rows(net: Surgery) -> None:
+def best_rows(net: NetworkEditor) -> None:
     """Select the cells with the best scores as detections, for networks without suppression."""
     corners(net)
     scores = net.columns_of(4, net.columns - 32)
@@ -89,7 +89,7 @@ def best_rows(net: Surgery) -> None:
     _finish(net, scores, net.add("Squeeze", index, np.array([0])))
 
 
-def suppressed(net: Surgery) -> None:
+def suppressed(net: NetworkEditor) -> None:
     """Suppress duplicates within the best class at the detector's threshold; pad with zero rows up to MOST."""
     corners(net)
     scores = net.columns_of(4, net.columns - 32)
@@ -105,7 +105,7 @@ def suppressed(net: Surgery) -> None:
     net.table = net.add("Slice", padded, np.array([0]), np.array([MOST]), np.array([1]))
 
 
-def _finish(net: Surgery, scores: str, index: str) -> None:
+def _finish(net: NetworkEditor, scores: str, index: str) -> None:
     """Set the table (1, n, 38) to the rows `index` (n,)."""
     best = net.add("ReduceMax", scores, axes=[1], keepdims=1)
     label = net.add("Cast", net.add("ArgMax", scores, axis=1, keepdims=1), to=TensorProto.FLOAT)
@@ -115,14 +115,14 @@ def _finish(net: Surgery, scores: str, index: str) -> None:
     net.table = net.add("Transpose", net.add("Gather", rows, index, axis=2), perm=[0, 2, 1])
 
 
-def unit_rows(net: Surgery) -> None:
+def unit_rows(net: NetworkEditor) -> None:
     """Convert the boxes of the detections from px to fractions of the image size."""
     scale = np.ones((1, 1, 38), np.float32)
     scale[..., :4] = 1 / net.side
     net.table = net.add("Mul", net.table, scale)
 
 
-LAYOUTS: dict[str, tuple[Callable[[Surgery], None], ...]] = {
+LAYOUTS: dict[str, tuple[Callable[[NetworkEditor], None], ...]] = {
     "transposed": (transposed,),
     "in 0..1, channels last, as in TensorFlow": (unit, channels_last),
     "corners": (corners,),
@@ -136,7 +136,7 @@ LAYOUTS: dict[str, tuple[Callable[[Surgery], None], ...]] = {
 
 def rewritten(source: Path, name: str, path: Path) -> Path:
     """Write the network `source` in the layout `name` to `path`."""
-    net = Surgery(source)
+    net = NetworkEditor(source)
     for step in LAYOUTS[name]:
         step(net)
     return net.save(path)

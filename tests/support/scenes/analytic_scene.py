@@ -76,7 +76,7 @@ class Scene:
         return Frame(index, index / 30, color, depth, camera, T_world_camera, FrameTruth(instance_ids, names))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance (P,) m of points (P, 3) to the nearest surface."""
+        """Return the distances (P,), m, of points (P, 3), m, to the nearest surface."""
         distances = [np.abs(points @ n - d) for n, d in self.planes]
         distances += [np.abs(np.linalg.norm(points - center, axis=1) - radius) for center, radius in self.spheres]
         return np.min(distances, axis=0)

@@ -43,7 +43,7 @@ from framework.testing.corner_room import CAMERA, CLASSES, frame_at, look, pose_
 
 @dataclass
 class CornerRoom(RGBDSequence):
-    """The room as a video."""
+    """The corner room as a sequence with configurable errors."""
 
     frames: int = 6  # number of frames
     unreadable: int = -1  # index of the frame that raises FrameError; -1 = none
@@ -81,7 +81,7 @@ class CornerRoom(RGBDSequence):
 
 @dataclass
 class LiveRoom(LiveVideo):
-    """The room as live video, with ground-truth poses."""
+    """The corner room as live video, with ground-truth poses."""
 
     frames_sent: int = 6  # number of frames that are sent
     period_s: float = -1.0  # time between frames, s; -1 = each frame is sent when the previous one has been read

@@ -22,7 +22,7 @@ UP = np.array([0.0, 0.0, 1.0])
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # R_world_room of a world frame with y up
 Block = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1 m
 
-WALLS: list[Block] = [(0, 0, 0, 4, 3, 2.5)]  # seen from inside
+WALLS: list[Block] = [(0, 0, 0, 4, 3, 2.5)]  # walls, floor and ceiling, seen from inside
 TABLE: list[Block] = [
     (0.8, 1.0, 0.7, 2.0, 1.8, 0.75),
     *((x, y, 0, x + 0.05, y + 0.05, 0.7) for x in (0.8, 1.95) for y in (1.0, 1.75)),
@@ -52,7 +52,7 @@ def faces(block: Block, inward: bool = False) -> tuple[np.ndarray, np.ndarray]:
 
 
 def look_about(places: Sequence[tuple[float, float, float]], n: int = 12) -> Float64:
-    """Return the poses T_room_camera (F, 4, 4) of cameras at `places` (m) that look in all directions and down."""
+    """Return T_room_camera (F, 4, 4) of cameras at `places` (m), in `n` directions and at three downward angles."""
     poses = []
     for place in places:
         for angle in np.linspace(0, 2 * np.pi, n, endpoint=False):
@@ -72,7 +72,7 @@ class ExportedRoom:
         default_factory=lambda: {"dining table": TABLE, "cube": CUBE, "picture": PICTURE}
     )
     walls: list[Block] = field(default_factory=lambda: WALLS)
-    blocks: list[Block] = field(default_factory=list)  # without an object, seen from outside
+    blocks: list[Block] = field(default_factory=list)  # boxes that belong to no object, seen from outside
     eyes: Sequence[tuple[float, float, float]] = ((0.4, 0.4, 1.5), (3.5, 2.5, 1.5), (0.4, 2.6, 1.5), (3.5, 0.4, 1.5))
     R_world_room: Float64 = field(default_factory=lambda: np.eye(3))
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, position of the room in the world frame

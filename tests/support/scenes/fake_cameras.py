@@ -83,7 +83,7 @@ class _Images:
 def _image(pixels: np.ndarray, shift: int = 0, time_us: int = 0) -> SimpleNamespace:
     """Return an image of both libraries; `shift`, px, simulates depth that is not registered to color."""
     pixels = np.roll(pixels, shift, axis=1)
-    pixels.setflags(write=False)  # owned by the library
+    pixels.setflags(write=False)  # read-only, because the library owns the image
     height, width = pixels.shape[:2]
     return SimpleNamespace(
         get_data=lambda: pixels,

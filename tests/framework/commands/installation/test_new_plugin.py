@@ -128,7 +128,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def copy_kernels(site: Path) -> None:
-    """Copy the numba cache of the checkout to the installed files, with the file times that numba checks."""
+    """Copy the numba cache of the checkout to the installed files, with the modification times that numba checks."""
     for path in (CHECKOUT / "framework").rglob("*.py"):
         shutil.copystat(path, site / path.relative_to(CHECKOUT))
     for path in (CHECKOUT / "framework").rglob("*.nb[ic]"):
@@ -160,7 +160,7 @@ def test_new_plugin_installed_plugins_pass_their_tests(place: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_new_plugin_sweep_with_builtin_tabulates_both(place: Path) -> None:
+def test_new_plugin_and_builtin_option_share_sweep_table(place: Path) -> None:
     (place / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")
     chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"
@@ -194,7 +194,7 @@ def test_installed_package_runs_doctor_and_new_plugin(place: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_installed_package_maps_the_desk(place: Path) -> None:
+def test_installed_package_maps_desk(place: Path) -> None:
     """Run the command with its default dataset, and the Python example of the README, on a few frames each."""
     assert run(place, "instancemap", "--version") == f"instancemap {framework.__version__}\n"
     run(place, "instancemap", "dataset.stop=3", "hydra.run.dir=desk")

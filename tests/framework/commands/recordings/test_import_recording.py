@@ -72,9 +72,7 @@ def test_import_existing_output_raises_before_reading(
 
 
 @pytest.mark.acceptance
-def test_import_of_phone_recording_is_mappable(
-    shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_import_phone_recording_is_mappable(shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The export of a real kitchen contains 256x192 depth, a video and ARKit poses. All frames are tracked."""
     kitchen = RgbdFolder(shared_data / "redkitchen", stride=3, stop=180)
     write_stray_scanner(tmp_path / "export", list(seen_by_phone(list(kitchen))))

@@ -85,7 +85,7 @@ def test_evaluate_unchanged_run_keeps_exact_metrics(stored: Path, command) -> No
     assert after == before | CODE
     assert [key for key in after if key not in CODE] == list(before)
     assert (stored / "metrics.json").stat().st_mtime_ns == time, (
-        "expected an unchanged modification time: tables use the latest record of a run"
+        "expected an unchanged modification time: tables use the latest outputs of a run"
     )
     assert command(stored) == (0, f"{stored}: unchanged\n", "")
     assert metrics_of(stored) == after
@@ -103,7 +103,7 @@ def test_evaluate_old_metrics_are_replaced_and_others_kept(stored: Path, command
     assert metrics_of(stored) == true | CODE | {"fps": 3.0, "trajectory.ate_rmse_m": 0.25}
 
 
-def test_evaluate_to_map_transfer_is_printed(stored: Path, command) -> None:
+def test_evaluate_transfer_to_map_is_printed(stored: Path, command) -> None:
     true = metrics_of(stored)
     write_metrics(stored, true | {"instances.ap50": 0.125, "instances.to_map.ap25": 0.25})
     assert command(stored, "--transfer", "to_map", "--dry-run")[1].startswith(
@@ -133,7 +133,7 @@ def test_evaluate_changed_ground_truth_requires_option(stored: Path, command, op
     assert metrics_of(stored) == true | CODE
 
 
-def test_evaluate_record_without_truth_hash_is_evaluated(stored: Path, command) -> None:
+def test_evaluate_run_without_truth_hash_is_evaluated(stored: Path, command) -> None:
     true = metrics_of(stored)
     write_metrics(stored, {key: value for key, value in true.items() if key != "truth_sha256"})
     assert command(stored)[:2] == (0, f"{stored}: 1 new\n")
@@ -290,7 +290,7 @@ def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
 
 
 @pytest.mark.parametrize("started", [["-m", "framework"], ["-P", "-m", "framework"]])
-def test_evaluate_does_not_execute_code_in_record(started: list[str], stored: Path) -> None:
+def test_evaluate_does_not_execute_code_in_run_directory(started: list[str], stored: Path) -> None:
     """Modules in an untrusted run directory are not imported."""
     (stored / "brought.py").write_text(
         "print('runs')\nfrom tests.support.scenes.corner_room import CornerRoom as Brought\n"

@@ -111,7 +111,7 @@ def test_experiment_table_has_one_column_per_sequence(tmp_path: Path) -> None:
 
 
 def composed(overrides: list[str], *directories: Path) -> tuple[DictConfig, Any]:
-    """Return the config and the choices by group of a job, as in a sweep."""
+    """Return the config of a sweep job, and its chosen option in each config group."""
     with initialize_config_dir(str(directories[0] if directories else CONF), version_base="1.3"):
         config = compose("config", overrides=overrides, return_hydra_config=True)
         HydraConfig.instance().set_config(config)
@@ -140,7 +140,7 @@ def test_experiment_rows_compose_with_every_preset(experiment: str, preset: str 
         config, choices = composed([*asked, f"row={row}"])
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
-        if list(rows[row]) != ["preset=default"]:  # this row may equal a row without a tracker
+        if list(rows[row]) != ["preset=default"]:  # the config of this row may equal that of another row
             hashes[row] = config_hash({str(key): value for key, value in resolved.items()})
         for interface in (PoseTracker, ClusterRefiner, MapFuser):
             build(interface, config[stage_of(interface)])
@@ -201,7 +201,7 @@ def test_preset_default_changes_nothing() -> None:
 
 @pytest.mark.parametrize("experiment", ["table1_runtime", "table2_class_ap", "table3_map", "figure3_stage_times"])
 def test_sequences_of_scenenn_select_real_data_settings(experiment: str) -> None:
-    """The settings are a network for real images, no rendered ground truth, the paper's sequences and a new folder."""
+    """They use a network for real images, no rendered ground truth, the paper's sequences and a separate folder."""
     overrides = [f"experiment={experiment}", "sequences=scenenn", "dataset.root=DIR"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         asked = compose("config", overrides=overrides, return_hydra_config=True)
@@ -227,12 +227,12 @@ def test_experiment_on_synthetic_scenes_simulates_detector(experiment: str) -> N
 
 
 @pytest.mark.parametrize(("sequences", "stop"), [("benchmark", 40), ("scenenn", 1000)])
-def test_experiment_progress_stop_depends_on_sequence_length(sequences: str, stop: int) -> None:
+def test_figure4_progress_stop_frame_depends_on_sequences(sequences: str, stop: int) -> None:
     config, _ = composed(["experiment=figure4_progress", f"sequences={sequences}", "row=third"])
     assert config.dataset.stop == stop
 
 
-def test_experiment_ranks_folder_names_sequences_and_detector() -> None:
+def test_ranks_folder_name_contains_sequences_and_detector() -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         asked = compose(
             "config",

@@ -32,7 +32,7 @@ LONGEST_WAIT_S = 1.2  # maximum wait before a kill; mapping takes about 0.5 s, s
 
 
 def whole_files(place: Path) -> set[str]:
-    """Return the names of the output files in a run directory. Raises DataError for a truncated file."""
+    """Return the names of the output files in a run directory. Raise DataError for a truncated file."""
     read = {
         "trajectory.txt": read_tum,
         "timings.csv": read_timings,
@@ -54,7 +54,7 @@ def test_run_truncated_output_file_is_detected(tmp_path: Path) -> None:
         whole_files(tmp_path)
 
 
-def test_run_killed_at_random_moment_leaves_valid_record(tmp_path: Path) -> None:
+def test_run_killed_at_random_time_leaves_valid_outputs(tmp_path: Path) -> None:
     chosen = random.Random(19)
     place, undisturbed = tmp_path / "run", tmp_path / "undisturbed"
     arguments = (*SHORT, f"hydra.run.dir={place}")

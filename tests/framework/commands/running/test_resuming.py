@@ -54,7 +54,7 @@ def test_resumed_map_is_identical_to_single_run(tmp_path: Path, room: CornerRoom
 
 
 def test_resumed_map_continues_frame_numbers(tmp_path: Path, room: CornerRoom) -> None:
-    """Both recordings number their frames from 0. An object in both is observed in the frames of both."""
+    """Both recordings number their frames from 0. An object in both is observed in the frames of both recordings."""
     first, _ = mapped(room, *GIVEN)
     again, _ = mapped(room, *GIVEN, f"resume_from={stored_files(first, tmp_path / 'first')}")
     for key, instance in first.instances().items():

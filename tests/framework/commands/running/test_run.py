@@ -66,7 +66,7 @@ def ignore_ctrl_c() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("background", [False, True])
-def test_run_signal_leaves_partial_record(tmp_path: Path, number: signal.Signals, background: bool) -> None:
+def test_run_signal_leaves_partial_outputs(tmp_path: Path, number: signal.Signals, background: bool) -> None:
     """Runs that a script starts in the background ignore Ctrl-C."""
     place = tmp_path / "run"
     process = begin(tmp_path, *ENDLESS, f"hydra.run.dir={place}", before=ignore_ctrl_c if background else None)
@@ -91,7 +91,7 @@ def test_run_signal_leaves_partial_record(tmp_path: Path, number: signal.Signals
         ("masks", "masks"),
     ],
 )
-def test_run_stage_error_leaves_partial_record(tmp_path: Path, kind: str, message: str) -> None:
+def test_run_stage_error_leaves_partial_outputs(tmp_path: Path, kind: str, message: str) -> None:
     place = tmp_path / "run"
     status, stderr = end(begin(tmp_path, "detector=faulty", f"detector.kind={kind}", f"hydra.run.dir={place}"))
     assert status == 3
@@ -100,7 +100,7 @@ def test_run_stage_error_leaves_partial_record(tmp_path: Path, kind: str, messag
     assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json"}
     left = figures(place)
     assert message in str(left["partial"])
-    assert left["frames"] in (3, 4)  # a detector error is before the frame is counted, a mask error after
+    assert left["frames"] in (3, 4)  # a detector error occurs before the frame is counted, a mask error afterwards
     assert len((place / "trajectory.txt").read_text().splitlines()) in (3, 4)
 
 
@@ -115,7 +115,7 @@ def test_run_folder_deleted_during_run_is_recreated(tmp_path: Path) -> None:
     assert (place / "config.yaml").read_bytes() == config
 
 
-def test_run_error_before_first_frame_leaves_no_record(tmp_path: Path) -> None:
+def test_run_error_before_first_frame_leaves_no_outputs(tmp_path: Path) -> None:
     place = tmp_path / "run"
     status, _ = end(begin(tmp_path, "detector=faulty", "detector.at=0", f"hydra.run.dir={place}"))
     assert status == 1
@@ -148,7 +148,7 @@ def test_run_on_full_disk_writes_small_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_run_signal_during_saving_completes_record(tmp_path: Path, number: signal.Signals) -> None:
+def test_run_signal_during_saving_completes_outputs(tmp_path: Path, number: signal.Signals) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, "fuser.slow_save_s=1", f"hydra.run.dir={place}")
     wait_for(place / "metrics.partial.json", process)
@@ -181,7 +181,7 @@ LIVE = ("dataset=live", "dataset.frames_sent=100000", "fuser.capacity=100000", "
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_live_run_signal_completes_record(tmp_path: Path, number: signal.Signals) -> None:
+def test_live_run_signal_completes_outputs(tmp_path: Path, number: signal.Signals) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, *LIVE, f"hydra.run.dir={place}")
     wait_for(tmp_path / "note", process)
@@ -198,7 +198,7 @@ def test_live_run_signal_completes_record(tmp_path: Path, number: signal.Signals
     assert left["frames"] == len((place / "trajectory.txt").read_text().splitlines()) > 0
 
 
-def test_live_run_second_signal_leaves_partial_record(tmp_path: Path) -> None:
+def test_live_run_second_signal_leaves_partial_outputs(tmp_path: Path) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, *LIVE, "fuser.slow_s=2", f"hydra.run.dir={place}")
     wait_for(tmp_path / "note", process)
@@ -211,7 +211,7 @@ def test_live_run_second_signal_leaves_partial_record(tmp_path: Path) -> None:
     assert figures(place)["partial"] == "ended by SIGTERM"
 
 
-def test_live_run_source_failure_leaves_partial_record(tmp_path: Path) -> None:
+def test_live_run_source_failure_leaves_partial_outputs(tmp_path: Path) -> None:
     place = tmp_path / "run"
     status, stderr = end(begin(tmp_path, "dataset=live", "dataset.fails_after=3", f"hydra.run.dir={place}"))
     assert status == 3
@@ -219,7 +219,7 @@ def test_live_run_source_failure_leaves_partial_record(tmp_path: Path) -> None:
     assert figures(place)["frames"] == 3
 
 
-def test_sweep_signal_during_saving_ends_after_record(tmp_path: Path) -> None:
+def test_sweep_signal_during_saving_ends_after_current_run(tmp_path: Path) -> None:
     sweep = (
         "hydra.mode=MULTIRUN",
         "seed=1,2",

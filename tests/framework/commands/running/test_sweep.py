@@ -86,7 +86,7 @@ def begun(directory: Path) -> dict[str, int]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
-    """Return the folder and the ended process of an uninterrupted joblib sweep; the runs of one row fail."""
+    """Return the folder and the finished process of an uninterrupted joblib sweep; the runs of one row fail."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     directory = tmp_path_factory.mktemp("whole")
     return directory, end(begin(directory, *BY_JOBLIB, *SIX))
@@ -194,8 +194,8 @@ def test_sweep_without_experiment_is_resumed(tmp_path: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_sweep_over_neutral_settings_has_separate_folders(tmp_path: Path) -> None:
-    """A sweep that times these settings needs them in its directory names. Workers use the same names."""
+def test_sweep_over_settings_without_effect_has_separate_folders(tmp_path: Path) -> None:
+    """A sweep over settings that affect only the speed has them in its directory names, also in worker processes."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     _, first = swept(tmp_path, "threads=1,2", "prefetch=0")
     assert set(first) == {"threads=1,tracker=fake", "threads=2,tracker=fake"}
@@ -232,7 +232,7 @@ ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=10000
         pytest.param(signal.SIGINT, False, 1, "1,2", 1, marks=pytest.mark.acceptance),  # joblib starts no worker
     ],
 )
-def test_sweep_signal_leaves_partial_record_of_active_runs(
+def test_sweep_signal_leaves_partial_outputs_of_active_runs(
     tmp_path: Path, signal_sent: signal.Signals, all_at_once: bool, n_jobs: int, seeds: str, at_work: int
 ) -> None:
     """A terminal sends Ctrl-C to the workers as well; `kill` signals only the main process."""
@@ -286,7 +286,7 @@ def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
     wait_until(lambda: len(begun(tmp_path)) == 2, first)
     workers = psutil.Process(first.pid).children(recursive=True)
     for worker in workers:
-        worker.suspend()  # until the second sweep waits, on a machine of any speed
+        worker.suspend()  # until the second sweep waits, so that the result does not depend on the speed of the machine
     first.kill()
     again = begin(tmp_path, *arguments)
     logs = (tmp_path / PLACE).glob

@@ -30,7 +30,7 @@ def test_distorted_matches_opencv(intrinsics: Intrinsics) -> None:
 
 
 def recorded(camera: Camera, lens: Distortion, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the depth (H, W), m, and color (H, W, 3) seen through the lens, from the inverted lens model."""
+    """Return depth (H, W), m, and color (H, W, 3) as seen through the lens, by inversion of the lens model."""
     wide = Camera(3 * camera.width, 3 * camera.height, 2 * camera.fx, 2 * camera.fy, 239.5, 179.5)
     depth, color, _ = room().render(wide, T_world_camera)
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(np.float64)

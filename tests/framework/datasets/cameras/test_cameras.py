@@ -162,13 +162,13 @@ def test_camera_disconnected_device_raises_and_stops(
 def test_camera_pauses_below_timeout_are_tolerated(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
     monkeypatch.setattr(device_frames, "time", clock)
-    message: list[str | None] = []
+    received: list[str | None] = []
     coming = iter(["first", None, "second", None, "third", None, None])
     with pytest.raises(DataError, match="it: expected a frame within 5 s, got none"):  # noqa: PT012
         for images in device_frames.images_of("it", lambda: next(coming)):
-            message.append(images)
+            received.append(images)
             clock.now += 3.0
-    assert message == ["first", None, "second", None, "third", None]
+    assert received == ["first", None, "second", None, "third", None]
 
 
 def test_camera_idle_device_yields_none(brand: Brand, device: FakeCamera) -> None:

@@ -267,7 +267,7 @@ class Known(PoseTracker):
         return Pose(pose_at(frame.index))
 
 
-def test_folder_watch_folder_is_mapped_while_written(folder: Path) -> None:
+def test_watched_folder_is_mapped_while_written(folder: Path) -> None:
     """The writer is slow, writes its files in place, and at the end creates the file `end`."""
 
     def writer() -> None:

@@ -59,7 +59,7 @@ def write_wall(path: Path, T: np.ndarray | None = None, **properties: np.ndarray
 
 
 def seen_labels(k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the labels (H, W) of frame k on the wall, and a mask (H, W) of the pixels away from label borders."""
+    """Return the labels (H, W) of the wall in frame k, and a mask (H, W) of the pixels away from label borders."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(CAMERA.shape)], axis=-1)
     T = pose(k)

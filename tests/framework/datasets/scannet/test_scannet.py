@@ -47,7 +47,7 @@ def write(request: pytest.FixtureRequest) -> Writer:
 
 
 def write_labels(scene: Path) -> None:
-    """Write a wall 2 m in front of the first camera: a chair at x < 0, and no label at x > 0.3 m."""
+    """Write the mesh of a wall 2 m in front of the first camera: a chair at x < 0, and no label at x > 0.3 m."""
     x, y = np.meshgrid(np.linspace(-1.5, 1.5, 31), np.linspace(-1.5, 1.5, 31))
     vertices = np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(30)[:, None] * 31 + np.arange(30)).ravel()
@@ -247,7 +247,7 @@ def test_scannet_truth_matches_labeled_mesh(tmp_path: Path, write: Writer) -> No
 
 
 def test_scannet_missing_label_table_changes_annotation_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Without the table, the same map has other metrics. Result tables must keep both apart."""
+    """The label table affects the metrics of a map, so result tables must not mix runs with and without it."""
     as_sens(tmp_path / SCENE, shots())
     write_labels(tmp_path / SCENE)
     (tmp_path / "scannetv2-labels.combined.tsv").unlink()

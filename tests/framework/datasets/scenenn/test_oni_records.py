@@ -48,7 +48,7 @@ def test_oni_records_openni_1_end_is_valid(tmp_path):
     assert (contents.cut_off, contents.end, contents.largest_node) == (False, path.stat().st_size, 2)
 
 
-def test_oni_records_end_node_in_other_record_truncates(tmp_path):
+def test_oni_records_end_node_id_in_image_record_truncates(tmp_path):
     content = bytearray(recording().write(tmp_path / "a.oni").read_bytes())
     second = recording()
     second.write(tmp_path / "b.oni")

@@ -140,7 +140,7 @@ def test_scenenn_true_masks_match_mesh_at_true_pose(root: Path) -> None:
     row = vertex_labels.reshape(41, 41)[0]
     expected = np.where(np.abs(x) <= 1, row[np.clip(nearest, 0, 40)], 0)
     expected[expected == CABINET] = 0
-    sure = np.abs(x / 0.05 - np.floor(x / 0.05) - 0.5) > 0.01  # between two vertices the result depends on rounding
+    sure = np.abs(x / 0.05 - np.floor(x / 0.05) - 0.5) > 0.01  # not midway between vertices, where rounding decides
     np.testing.assert_array_equal(frame.truth.instance_ids[11, sure], expected[sure])
 
 
@@ -220,7 +220,7 @@ def test_scenenn_annotation_release_is_reported(root: Path) -> None:
     assert SceneNN(root, "016").annotation == "not named"
 
 
-def test_scenenn_intrinsics_select_file_and_sensor(root: Path) -> None:
+def test_scenenn_intrinsics_parameter_selects_file_and_sensor(root: Path) -> None:
     assert SceneNN(root, "016")[0].sensor is SensorKind.KINECT_V1
     with pytest.raises(DataError, match=r"kinect2\.ini"):
         SceneNN(root, "016", intrinsics=SceneNNIntrinsics.KINECT2)

@@ -107,7 +107,7 @@ def test_hub_model_is_downloaded_once_and_logged(hub, caplog):
     assert folder.name == COMMIT
     wanted = ["config.json", "preprocessor_config.json", "model.safetensors"]
     assert hub.sent == wanted
-    hub.server_close()  # the server is no longer used
+    hub.server_close()  # later calls use only the downloaded files
     assert find_model("somebody/something", "main") == folder
     assert hub.sent == wanted
 

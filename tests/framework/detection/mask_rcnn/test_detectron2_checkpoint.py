@@ -164,7 +164,7 @@ class Detectron2:
 
 
 def moved(boxes, deltas, weights):
-    """Return the boxes after Box2BoxTransform.apply_deltas."""
+    """Return the boxes (N, 4), px, moved by `deltas` (N, 4), as Box2BoxTransform.apply_deltas does."""
     widths, heights = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
     x, y = boxes[:, 0] + 0.5 * widths, boxes[:, 1] + 0.5 * heights
     dx, dy, dw, dh = (deltas[:, k] / weights[k] for k in range(4))

@@ -36,7 +36,7 @@ def assert_one_line(path, *parts):
         assert part in message
 
 
-def test_network_file_round_trip_keeps_weights_and_card(tmp_path):
+def test_network_file_round_trip_keeps_weights_and_model_card(tmp_path):
     network, path = tiny_network(), tmp_path / "network.safetensors"
     save_network(network, path, {"steps": 300, "mask_ap50": 0.51, "data": "rooms"})
     loaded = load_network(path)

@@ -18,7 +18,7 @@ SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 @pytest.fixture
 def server():
-    """Serve CONTENT as /network.pth and truncated as /cut.pth, and record the requested paths."""
+    """Serve CONTENT as /network.pth and a truncated copy as /cut.pth, and record the requested paths."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):

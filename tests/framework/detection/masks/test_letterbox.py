@@ -24,7 +24,7 @@ def test_letterbox_placement_sets_size_and_offsets(image, placement, resized, to
 
 @pytest.mark.parametrize("placement", Placement)
 def test_letterbox_image_borders_round_trip_exactly(placement):
-    """The image spans -0.5 to W - 0.5 px, also if its size in the input is rounded."""
+    """The image spans -0.5 to W - 0.5 px, even if its size in the input is rounded."""
     letterbox = Letterbox.fit((333, 217), (416, 320), placement)
     height, width = letterbox.resized
     corners = [letterbox.left, letterbox.top, letterbox.left + width, letterbox.top + height]

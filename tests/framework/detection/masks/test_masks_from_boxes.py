@@ -76,7 +76,7 @@ def test_masks_in_boxes_slanted_plane_is_whole_below_limit(slant, whole):
     assert (mask.sum() == 12 * 60) == whole
 
 
-def test_masks_in_boxes_grow_joins_pixels_below_largest_step():
+def test_region_growing_joins_pixels_below_depth_step_limit():
     for z in (0.5, 1.0, 4.0):
         limit = masks_from_boxes_kernels._largest_step(z, np.tan(np.radians(80)) / 150, NOISE)
         assert limit == pytest.approx(z * np.tan(np.radians(80)) / 150 + 3 * (0.0012 + 0.0019 * (z - 0.4) ** 2))
@@ -90,7 +90,7 @@ def test_masks_in_boxes_grow_joins_pixels_below_largest_step():
             assert mask.all() == joined
 
 
-def test_masks_in_boxes_grow_and_hole_closing_match_labeling():
+def test_region_growing_and_hole_closing_match_labeling():
     rng = np.random.default_rng(3)
     for _ in range(20):
         depth = np.where(rng.random((30, 40)) < 0.62, 1.0, rng.choice([0.0, 2.0], (30, 40))).astype(np.float32)
@@ -146,7 +146,7 @@ def test_masks_in_boxes_without_boxes_are_empty():
     assert (masks.shape, found.shape) == ((0, 120, 160), (0,))
 
 
-def test_masks_in_boxes_noise_keeps_surface_whole():
+def test_masks_in_boxes_noisy_surface_is_not_split():
     rng = np.random.default_rng(4)
     depth = np.where(disk(28), 2.0, 4.0)
     depth = (depth + rng.normal(0, 0.0012 + 0.0019 * (depth - 0.4) ** 2)).astype(np.float32)

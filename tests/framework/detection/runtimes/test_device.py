@@ -9,27 +9,27 @@ from framework.detection.runtimes.device import one_torch_thread
 PATIENCE_S = 10.0
 
 
-def test_one_torch_thread_overlapping_uses_restore_count():
+def test_one_torch_thread_in_two_threads_restores_thread_count():
     """A thread that uses torch for the first time gets the last count that any thread has set."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     first_is_in, second_is_in = threading.Event(), threading.Event()
     seen = []
 
-    def come_and_leave_first() -> None:
+    def use_first() -> None:
         with one_torch_thread():
             seen.append(torch.get_num_threads())
             first_is_in.set()
             assert second_is_in.wait(PATIENCE_S)
 
-    def come_and_leave_second() -> None:
+    def use_second() -> None:
         assert first_is_in.wait(PATIENCE_S)
         with one_torch_thread():
             second_is_in.set()
             first.join(PATIENCE_S)
             seen.append(torch.get_num_threads())
 
-    first, second = (threading.Thread(target=work) for work in (come_and_leave_first, come_and_leave_second))
+    first, second = (threading.Thread(target=work) for work in (use_first, use_second))
     new = threading.Thread(target=lambda: seen.append(torch.get_num_threads()))
     try:
         for thread in (first, second):

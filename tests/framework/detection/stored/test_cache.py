@@ -49,7 +49,7 @@ FIELDS = ("masks", "boxes", "scores", "class_probabilities")
 
 @dataclass
 class Noise(Detector):
-    """Detector of random masks that depend on the colors and the parameter; counts its calls."""
+    """Detector that returns random masks, seeded with the color image and `strength`, and counts its calls."""
 
     strength: float = 1.0
     broken_at: int = -1
@@ -143,7 +143,7 @@ def test_cache_with_other_detector_misses(room: CornerRoom, tmp_path: Path, chan
 
 @dataclass
 class Named(Noise):
-    """Detector that resolves its weights by name."""
+    """Detector that resolves its weights by name and declares its fingerprint."""
 
     revision: str = "main"
 
@@ -153,7 +153,7 @@ class Named(Noise):
 
 @dataclass
 class OldNamed(Noise):
-    """Detector for an older interface, in which Detector had a fingerprint."""
+    """Detector for an older interface, in which Detector had a method `fingerprint`."""
 
     def fingerprint(self) -> str:
         return f"{super().fingerprint()} main"  # type: ignore[misc]

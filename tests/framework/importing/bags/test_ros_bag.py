@@ -189,7 +189,7 @@ def test_ros_bag_realsense_depth_is_registered_to_color(tmp_path: Path) -> None:
     bag = BagWriter(ros1=True)
     add_realsense(bag, DEPTH_CAMERA)
     assert not imported(bag.write(tmp_path / "recorded.bag"), tmp_path / "out")
-    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)  # depth moves to the nearest pixel
+    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)  # registration moves depth to the nearest pixel
     assert json.loads((tmp_path / "out/camera.json").read_text())["sensor"] == "REALSENSE_D435"
 
 
@@ -363,7 +363,7 @@ def add_accelerometer(
 ) -> None:
     """Add accelerometer messages of a slowly rotating camera at 300 Hz, with vibrations of 4 m/s^2 at 50 Hz.
 
-    `length` is the length of gravity, m/s^2; `late` is added to the timestamps, s.
+    `length` is the magnitude of gravity, m/s^2; `late`, s, is added to the timestamps.
     """
     for n in range(-30, 10 * COUNT + 30):
         acceleration = length * UP_WORLD + np.array([4.0, 0, 0]) * np.sin(2 * np.pi * n / 6)
@@ -384,7 +384,7 @@ def check_up(folder: Path, within: float = 1.0) -> None:
 
 @pytest.mark.parametrize("name", ["ros1.bag", "ros2_folder"])
 def test_ros_bag_accelerometer_gives_up_vector_in_camera_axes(tmp_path: Path, name: str) -> None:
-    """The frame chain contains inverted transforms; messages of a gyroscope have no acceleration."""
+    """The transforms from sensor to camera include inverted ones; messages of a gyroscope have no acceleration."""
     bag = BagWriter(ros1=KINDS[name])
     add_camera_of_ros(bag)
     add_accelerometer(bag)

@@ -158,7 +158,7 @@ def test_stray_scanner_real_recording_is_imported(shared_data: Path, tmp_path: P
     depth = sequence[0].depth
     assert (depth > 0).mean() == pytest.approx(1 - 8939 / (192 * 256), abs=0.01)  # 8939 have confidence 0
     assert np.median(depth[depth > 0]) == pytest.approx(2.72, abs=0.05)
-    # in the accelerometer data, too, the camera looks down: 0.20 of gravity is along its optical axis
+    # the accelerometer agrees that the camera looks down: 0.20 of gravity is along its optical axis
     assert sequence[0].T_world_camera[1, 2] == pytest.approx(-0.24, abs=0.01)
     assert upright(written.ups) == Turn(1)  # the phone was held upright
     # at rest Core Motion's acceleration points down; the camera's x, y, z are the phone's -y, -x, -z

@@ -127,7 +127,9 @@ def test_overlap_min_pixels_prevents_match_with_stray_pixels() -> None:
     seen[:, :3] = 1  # the object; the cluster covers most of it
     seen[0, 0] = 2  # a single voxel of another instance
     overlaps = overlaps_of(clusters_of([columns(0, 2)], [1]), seen)
-    assert best_first(overlaps.over_smaller(min_pixels=1), 0.35).tolist() == [1], "1/1 of 2 exceeds 7/8 of 1"
+    assert best_first(overlaps.over_smaller(min_pixels=1), 0.35).tolist() == [1], (
+        "expected a match with the stray pixel: 1/1 exceeds 7/8"
+    )
     assert best_first(overlaps.over_smaller(min_pixels=4), 0.35).tolist() == [0]
 
 
@@ -184,8 +186,8 @@ def test_keep_on_top_assigns_pixels_to_smaller_object() -> None:
     assert clusters_at(keep_on_top(points, ids, 0.25)) == 4 * [[0], [0], [1], [0], [0]]
     assert clusters_at(keep_on_top(points, ids, 0.2)) == 4 * [[0], [0], [0, 1], [0], [0]]
     unmatched = keep_on_top(points, np.int32([7, 0]), 0.25)
-    assert clusters_at(unmatched) == 4 * [[0], [0], [0], [0], [0]], "an unmatched cluster has no pixels"
-    assert clusters_at(points) == 4 * [[0], [0], [0, 1], [0], [0]], "the input lists are unchanged"
+    assert clusters_at(unmatched) == 4 * [[0], [0], [0], [0], [0]], "expected no pixels for an unmatched cluster"
+    assert clusters_at(points) == 4 * [[0], [0], [0, 1], [0], [0]], "expected unchanged input lists"
 
 
 @settings(max_examples=100, deadline=None)
@@ -209,7 +211,9 @@ def test_points_by_pixel_keep_point_order(seed: int) -> None:
     points = list_points_by_pixel(clusters, SHAPE)
     assert clusters_at(points) == expected
     used = [tuple(found) for found in expected]
-    assert (points.pixel_counts > 0).sum() == len({*used, ()}) - (() not in used), "one list per set of clusters"
+    assert (points.pixel_counts > 0).sum() == len({*used, ()}) - (() not in used), (
+        "expected one list for each set of clusters"
+    )
 
 
 @settings(max_examples=100, deadline=None)
@@ -246,4 +250,4 @@ def test_remove_supports_matches_reference(seed: int) -> None:
     both = [[k for k in left if k in top] for left, top in zip(expected, clusters_at(on_top), strict=True)]
     assert clusters_at(remove_supports(on_top, lying, seen, stride)) == both
     unchanged = remove_supports(points, lying & False, seen, stride)
-    assert clusters_at(unchanged) == clusters_at(points), "the input lists are unchanged"
+    assert clusters_at(unchanged) == clusters_at(points), "expected unchanged input lists"

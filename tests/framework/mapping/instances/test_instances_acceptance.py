@@ -26,9 +26,9 @@ def mapped(frames: list[Frame], detections: list[Detections], refiner: str = "ch
 
 
 def shares(scene: BoxScene, fuser: MapFuser) -> np.ndarray:
-    """Return the fraction (objects + 1, instances + 1) of the vertices of each object per instance.
+    """Return the fraction (objects + 1, instances + 1) of each object's vertices that belong to each instance.
 
-    Row 0 is the room, and column 0 is no instance.
+    Row 0 is the room, and column 0 is "no instance".
     """
     mesh = fuser.scene.mesh()
     owners = scene.owners(mesh.vertices, VOXEL)
@@ -45,7 +45,7 @@ def true_mask(frame: Frame, *objects: int) -> np.ndarray:
 def assert_one_each(scene: BoxScene, fuser: MapFuser, least: float) -> None:
     """Check that one instance covers more than the fraction `least` of each object, and that the room has none."""
     found = shares(scene, fuser)
-    assert found.shape[1] == scene.count, f"{scene.count - 1} objects became {found.shape[1] - 1} instances"
+    assert found.shape[1] == scene.count, f"expected {scene.count - 1} instances, got {found.shape[1] - 1}"
     assert sorted(found[1:, 1:].argmax(axis=1)) == list(range(scene.count - 1))
     assert (found[1:, 1:].max(axis=1) > least).all(), found.round(3)
     assert found[0, 0] > 0.99, found[0].round(4)

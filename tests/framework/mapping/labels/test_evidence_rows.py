@@ -46,7 +46,9 @@ def test_evidence_merge_adds_evidence_and_keeps_best_first(
     found = dict(zip(rows.evidence.instance_ids[0].tolist(), rows.evidence.instance_value[0].tolist(), strict=True))
     assert found == dict(zip(merged_ids, merged_logs, strict=True))
     assert rows.evidence.instance_ids[0, 0] == merged_ids[0]
-    assert ((rows.evidence.instance_ids[0] > 0) == (np.array(merged_ids) > 0)).all(), "the used slots come first"
+    assert ((rows.evidence.instance_ids[0] > 0) == (np.array(merged_ids) > 0)).all(), (
+        "expected the used slots before the empty slots"
+    )
 
 
 @pytest.mark.parametrize("count", [1, 511, 512, 513, 2000])
@@ -81,7 +83,7 @@ def at_pixel(block: int, *voxels: int) -> SeenBlocks:
 
 
 def seen_at(blocks: Int32, pixels: Int32) -> SeenBlocks:
-    """Return the seen blocks of a frame; `pixels` (A, 512) are those of their voxels, -1 = far from the surface."""
+    """Return the seen blocks of a frame; `pixels` (A, 512) are those that see the voxels, -1 = far from the surface."""
     block, voxel = np.nonzero(pixels >= 0)
     count = np.bincount(block, minlength=len(blocks))
     return SeenBlocks(
@@ -104,7 +106,7 @@ def test_evidence_rows_allocate_only_labeled_voxels() -> None:
         assert rows.voxels.grid.label_row[:2].tolist() == [-1, 0]
         assert best_class(rows.evidence, rows.evidence.labeled[0, 7]) == 2
         rows.update(at_pixel(0, 3), voted([0], [1.0], [3], Combine.SUM))
-        assert (rows.row_count, rows.voxel_count) == (1, 1), "a cluster without an instance allocates nothing"
+        assert (rows.row_count, rows.voxel_count) == (1, 1), "expected no allocation for a cluster without an instance"
         assert len(rows.in_use().class_ids) == 1
 
 
@@ -129,28 +131,28 @@ def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
     evicted = 0
     for frame in range(frames):  # the last of 40 frames has no new voxel
         instances = [0, 1, 2, 3 + frame]
-        message = voted(instances, [1.0, 0.5, 2.0, 1.5], rng.integers(0, 6, 4).tolist(), Combine.SUM)
+        measurement = voted(instances, [1.0, 0.5, 2.0, 1.5], rng.integers(0, 6, 4).tolist(), Combine.SUM)
         points = 12
         cluster = rng.integers(0, 4, points).astype(np.int32)
         pixel_of = rng.integers(0, 8, points)  # pixels 8 and 9 have no cluster
         lists = [[k for k in cluster[pixel_of == pixel] if instances[k]] for pixel in range(10)]
-        message = message._replace(
+        measurement = measurement._replace(
             list_ids=np.arange(1, 11, dtype=np.int32)[None],
             offsets=np.cumsum([0, 0, *map(len, lists)], dtype=np.int32),
             clusters=np.array([k for clusters in lists for k in clusters], np.int32),
             absence=np.float32(-0.2),
         )
         # The types and limits of compact storage.
-        message = message._replace(class_scores=message.class_scores.astype(np.int32), max_score=MAX_SCORE)
+        measurement = measurement._replace(class_scores=measurement.class_scores.astype(np.int32), max_score=MAX_SCORE)
         blocks = rng.permutation(block_count)[1:].astype(np.int32)
         pixels = rng.integers(-1, 10, (len(blocks), 512)).astype(np.int32)
         pixels[rng.random(pixels.shape) > 4 / block_count] = -1
         pixels[-1] = -1
-        rows.update(seen_at(blocks, pixels), message)
+        rows.update(seen_at(blocks, pixels), measurement)
         for a, n in np.argwhere(pixels >= 0).tolist():
             key, pixel = (int(blocks[a]), n), pixels[a, n]
             if lists[pixel] or key in by_voxel:
-                evicted += update_voxel(by_voxel.setdefault(key, blank()), 0, message, np.int32(pixel + 1))
+                evicted += update_voxel(by_voxel.setdefault(key, blank()), 0, measurement, np.int32(pixel + 1))
     evidence = rows.in_use()
     assert len(by_voxel) == rows.voxel_count > 100
     for (block, n), own in by_voxel.items():
@@ -170,12 +172,12 @@ def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
 
 
 def test_evidence_rows_count_evictions_of_new_voxel() -> None:
-    message = voted([1, 2, 3, 4, 5, 6], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0] * 6, Combine.SUM)
-    expected = update_voxel(blank(), 0, message, COVERED)
+    measurement = voted([1, 2, 3, 4, 5, 6], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0] * 6, Combine.SUM)
+    expected = update_voxel(blank(), 0, measurement, COVERED)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10))
     rows.begin(6)
     rows.voxels.allocate(np.zeros((1, 3), np.int32))
-    rows.update(at_pixel(0, 5), message)
+    rows.update(at_pixel(0, 5), measurement)
     assert rows.evicted == expected == 2
 
 

@@ -26,7 +26,7 @@ def test_label_update_matches_full_recursion_if_labels_fit(seed: int, labels: in
     rng = np.random.default_rng(seed)
     classes = labels  # every class is named
     evidence = blank()
-    instance_log = np.zeros(labels + 1)  # [0]: every other instance
+    instance_log = np.zeros(labels + 1)  # [0]: all other instances together
     class_log = np.zeros(classes)
     for _ in range(20):
         instance = int(rng.integers(1, labels + 1))
@@ -91,7 +91,7 @@ def test_label_update_absence_counts_only_if_detected() -> None:
     assert float(evidence.instance_value[0, 0]) == np.float32(before + np.log(0.5))
     for _ in range(10):
         update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)
-    assert best_instance(evidence, 0) == 0, "unnamed instances are more likely"
+    assert best_instance(evidence, 0) == 0, "expected no instance: unnamed instances are more likely"
 
 
 def test_label_update_without_instance_adds_no_evidence() -> None:
@@ -114,7 +114,7 @@ def test_named_classes_are_relative_to_mean_of_unnamed_classes() -> None:
 def test_label_slots_replace_least_likely_label_if_full() -> None:
     labels, logs = np.arange(1, 5, dtype=np.int32), np.float32([4, 1, 2, 3])
     assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5), Combine.SUM, np.float32(9)) == 1
-    assert labels.tolist() == [1, 2, 3, 4], "the new label is the least likely"
+    assert labels.tolist() == [1, 2, 3, 4], "expected no change: the new label is the least likely"
     assert add_evidence(labels, logs, 0, np.int32(9), np.float32(1.5), Combine.SUM, np.float32(9)) == 1
     assert dict(zip(labels.tolist(), logs.tolist(), strict=True)) == {1: 4, 9: 1.5, 3: 2, 4: 3}
 
@@ -127,7 +127,9 @@ def test_best_counted_instance_skips_uncounted_instances() -> None:
     counts[1] = False
     assert best_counted_instance(evidence, 0, counts) == 3
     counts[[3, 5]] = False
-    assert best_counted_instance(evidence, 0, counts) == 0, "unnamed instances are more likely than 2"
+    assert best_counted_instance(evidence, 0, counts) == 0, (
+        "expected no instance: unnamed instances are more likely than 2"
+    )
 
 
 SEEN = [([1], [0.9], [2]), ([2], [0.4], [3]), ([2], [0.5], [3]), ([3], [0.6], [2])]
@@ -163,19 +165,19 @@ def test_sum_rule_counts_observations() -> None:
     for _ in range(3):
         assert update_voxel(evidence, 0, voted([7], [1.0], [2], Combine.SUM), COVERED) == 0
     assert evidence.instance_value[0].tolist() == [3, 0, 0, 0]
-    assert evidence.class_value[0, 0] == 300, "an observation is 100 stored units"
+    assert evidence.class_value[0, 0] == 300, "expected 100 stored units per observation"
     assert evidence.class_ids[0].tolist() == [2, *[NO_CLASS] * (CLASS_SLOTS - 1)]
 
 
 def test_compact_scores_saturate_without_wrapping() -> None:
     evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
-    message = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(max_score=MAX_SCORE)
+    measurement = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(max_score=MAX_SCORE)
     relative = np.zeros((2, 6))
     relative[:, 2], relative[:, 3] = MAX_CLUSTER_SCORE, -MAX_CLUSTER_SCORE
-    bits = (message.class_scores & ALL_NAMED).astype(np.uint8)
+    bits = (measurement.class_scores & ALL_NAMED).astype(np.uint8)
     for _ in range(40):
         update_voxel(
-            evidence, 0, message._replace(class_scores=pack_class_scores(relative, 1, bits, np.int32)), COVERED
+            evidence, 0, measurement._replace(class_scores=pack_class_scores(relative, 1, bits, np.int32)), COVERED
         )
     assert evidence.class_value[0, :2].tolist() == [MAX_SCORE, -MAX_SCORE]
     assert best_class(evidence, 0) == 2
@@ -188,11 +190,11 @@ def test_most_likely_class_is_stable_over_repetition(classes: int, best: float) 
     p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
     relative, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
     evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
-    message = measured([1], [0.9], p, 1.0, 1)._replace(
+    measurement = measured([1], [0.9], p, 1.0, 1)._replace(
         class_scores=pack_class_scores(relative, 64, bits, np.int32), named_classes=named, max_score=MAX_SCORE
     )
     for _ in range(1000):
-        update_voxel(evidence, 0, message, COVERED)
+        update_voxel(evidence, 0, measurement, COVERED)
         assert best_class(evidence, 0) == classes - 1
 
 

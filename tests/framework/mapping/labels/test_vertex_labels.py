@@ -44,7 +44,7 @@ def labels_of(scene: InstanceMap, counts: np.ndarray, surface: UnlabeledMesh) ->
     return instances, classes
 
 
-def slow_election(fuser: BayesianTsdf, counts: np.ndarray, vertex: np.ndarray) -> tuple[int, int]:
+def slow_vote(fuser: BayesianTsdf, counts: np.ndarray, vertex: np.ndarray) -> tuple[int, int]:
     scene = fuser.scene
     grid, evidence = scene.volume.voxels.grid, scene.labels.evidence
     place = vertex.astype(np.float64) / scene.volume.voxel_size
@@ -83,11 +83,11 @@ def test_vertex_labels_match_voxelwise_reference(fuser: BayesianTsdf, dropped: t
     counts[list(dropped)] = False
     surface = scene.volume.surface()
     instances, classes = labels_of(scene, counts, surface)
-    assert len(np.unique(instances)) >= 4 - len(dropped), "the labels must differ"
+    assert len(np.unique(instances)) >= 4 - len(dropped), "expected several different labels"
     rng = np.random.default_rng(0)
     near_labels = np.flatnonzero(instances > 0)
     chosen = np.concatenate([rng.choice(near_labels, 400), rng.choice(len(instances), 400)])
-    expected = [slow_election(fuser, counts, surface.vertices[v]) for v in chosen]
+    expected = [slow_vote(fuser, counts, surface.vertices[v]) for v in chosen]
     # if an instance has exactly half of the votes, the result depends on rounding
     agree = np.mean([(instances[v], classes[v]) == e for v, e in zip(chosen.tolist(), expected, strict=True)])
     assert agree >= 0.995

@@ -46,7 +46,7 @@ def test_map_file_is_reproducible(saved: Path, tmp_path: Path) -> None:
     assert (tmp_path / "again.npz").read_bytes() == saved.read_bytes()
     with zipfile.ZipFile(saved) as archive:
         assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}, (
-            "the bytes do not depend on the time of writing"
+            "expected a fixed date, so that files are reproducible"
         )
 
 

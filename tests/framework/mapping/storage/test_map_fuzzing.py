@@ -26,7 +26,7 @@ from tests.support.true_masks import fuse_masks, masks_of
 
 pytestmark = pytest.mark.integration
 
-SLOWEST = 5.0  # s of CPU time, because other processes may use the machine
+SLOWEST = 5.0  # maximum CPU time, s; elapsed time would depend on other processes
 CAMERA = Camera(24, 18, 20.0, 20.0, 11.5, 8.5)
 KINDS = ("bayesian_tsdf", "words", "exact", "last_write", "object_volumes", "open3d_vbg", "class_only_fusion")
 

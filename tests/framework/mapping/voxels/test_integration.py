@@ -41,7 +41,7 @@ def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) ->
 
 
 def test_integration_of_one_frame_matches_reference() -> None:
-    """The reference computes every voxel of the active blocks in double precision and plain numpy."""
+    """The reference computes every voxel of the active blocks with plain NumPy in double precision."""
     frame = room().frame(pose(0.1, -0.05, 0.0, (0.1, -0.2, 0.05)))
     integrator = new_integrator()
     active, near_pixel = seen_by(integrator, frame, frame.T_world_camera)
@@ -108,7 +108,9 @@ def test_integration_allocates_blocks_near_surface() -> None:
     surface = np.stack([(u - CAMERA.cx) / CAMERA.fx * d, (v - CAMERA.cy) / CAMERA.fy * d, d], axis=-1)
     blocks = {tuple(c) for c in integrator.voxels.grid.block_coords[: integrator.voxels.block_count]}
     wanted = {tuple(c) for c in np.floor(surface / (8 * VOXEL)).astype(int)}
-    assert len(wanted - blocks) <= 0.02 * len(wanted), "only blocks seen by fewer pixels than the stride may be missed"
+    assert len(wanted - blocks) <= 0.02 * len(wanted), (
+        "expected only blocks seen by fewer pixels than the stride to be missing"
+    )
 
 
 def test_integration_rounding_averages_are_unbiased() -> None:
@@ -215,8 +217,8 @@ def test_integration_does_not_average_color_of_free_space() -> None:
     assert np.abs(channels(packed[packed > 0]) - 200).max() <= 0.25
 
 
-def test_integration_replaces_outdated_colors_at_next_observation() -> None:
-    """The first colors are replaced at the first later observation, which is averaged with those after it."""
+def test_integration_next_observation_replaces_outdated_color() -> None:
+    """The next observation replaces an outdated color; later observations are averaged with the new color."""
     integrator = new_integrator()
     wall = np.full(CAMERA.shape, 1.5, np.float32)
     wall[:, CAMERA.width // 2 :] = 0  # seen by the first frames only
@@ -252,7 +254,7 @@ def test_integration_limits_weight_to_maximum() -> None:
 
 
 def test_integration_averages_noise() -> None:
-    """After 40 frames with 10 mm noise, noise of about 10 / sqrt(40) mm remains in voxels near the surface."""
+    """After 40 frames with noise of 10 mm, voxels near the surface have noise of about 10 / sqrt(40) mm."""
     frame = room().frame(pose())
     integrator = new_integrator()
     rng = np.random.default_rng(0)
@@ -275,7 +277,7 @@ def test_integration_averages_noise() -> None:
 
 
 def test_integration_removes_objects_seen_through() -> None:
-    """A removed sphere disappears from the map after the wall behind it was visible often enough."""
+    """A removed sphere disappears from the map after the wall behind it has been observed in enough frames."""
     scene, empty = room(), room()
     empty.spheres = []
     integrator = new_integrator()

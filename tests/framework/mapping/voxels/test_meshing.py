@@ -45,7 +45,7 @@ def grid_of(distance: np.ndarray, blocks: np.ndarray, origin: tuple[int, int, in
 
 
 def slow_surface_nets(stored: np.ndarray, most_jump: float) -> tuple[dict, set]:
-    """Compute surface nets by definition: the vertex of each cell, voxels, and the quads as tuples of cells."""
+    """Return the vertex of each cell, in voxels, and the quads as tuples of cells, as surface nets define them."""
     corners = np.array(list(itertools.product((0, 1), repeat=3)))
     vertices = {}
     for cell in itertools.product(*(range(n - 1) for n in stored.shape)):
@@ -94,9 +94,9 @@ def test_surface_nets_match_reference() -> None:
     places = (np.array(list(expected.values())) + 8 * np.array(origin)) * VOXEL
     error, match = KDTree(places).query(surface.vertices)
     assert error.max() < 1e-5
-    assert np.array_equal(np.sort(match), np.arange(len(cells))), "each cell has exactly one vertex"
+    assert np.array_equal(np.sort(match), np.arange(len(cells))), "expected exactly one vertex per cell"
     first, second = match[surface.triangles[::2]], match[surface.triangles[1::2]]
-    assert np.array_equal(first[:, [0, 2]], second[:, :2]), "two triangles share a diagonal"
+    assert np.array_equal(first[:, [0, 2]], second[:, :2]), "expected pairs of triangles with a common diagonal"
     found = [tuple(cells[v] for v in (*t, u)) for t, u in zip(first, second[:, 2], strict=True)]
     assert len(found) == len(quads) > 500
     assert set(found) == quads
@@ -118,14 +118,18 @@ def sphere() -> VoxelGrid:
 def test_surface_nets_sphere_is_closed_and_faces_outward(sphere: VoxelGrid) -> None:
     vertices, triangles, _ = SurfaceNets(sphere).extract()
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    assert len(np.unique(edges, axis=0)) == len(edges), "no directed edge occurs twice"
-    assert {tuple(e) for e in edges} == {tuple(e) for e in edges[:, ::-1]}, "each edge has a triangle on both sides"
-    assert len(vertices) - len(edges) // 2 + len(triangles) == 2, "Euler's formula"
+    assert len(np.unique(edges, axis=0)) == len(edges), "expected each directed edge only once"
+    assert {tuple(e) for e in edges} == {tuple(e) for e in edges[:, ::-1]}, (
+        "expected a triangle on both sides of each edge"
+    )
+    assert len(vertices) - len(edges) // 2 + len(triangles) == 2, "expected V - E + F = 2 (Euler's formula)"
     a, b, c = (vertices[triangles[:, i]].astype(np.float64) for i in range(3))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
     assert volume == pytest.approx(4 / 3 * np.pi * 0.6**3, rel=0.01)
     error = np.abs(np.linalg.norm(vertices - (0.9, 0.85, 0.8), axis=1) - 0.6)
-    assert np.median(error) < 0.03 * VOXEL, "vertices lie inside the sphere by the sagitta of a cell, 1/96 voxel"
+    assert np.median(error) < 0.03 * VOXEL, (
+        "expected vertices inside the sphere by about the sagitta of a cell, 1/96 voxel"
+    )
     assert error.max() < 0.06 * VOXEL
 
 
@@ -150,7 +154,9 @@ def test_surface_nets_reread_only_changed_blocks(sphere: VoxelGrid) -> None:
         assert all(map(np.array_equal, after, SurfaceNets(sphere).extract()))
     finally:
         sphere.grid.tsdf[block] = kept
-    assert np.array_equal(before.vertices, SurfaceNets(sphere).extract().vertices), "returned arrays are unchanged"
+    assert np.array_equal(before.vertices, SurfaceNets(sphere).extract().vertices), (
+        "expected unchanged arrays of the earlier result"
+    )
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -202,21 +208,21 @@ def test_mesh_updates_match_full_extraction() -> None:
         fuse(updated, T, k)
         fuse(asked_late, T, k)
         mesh = updated.scene.mesh()
-        assert asked_late.scene.volume._nets is None, "no mesh is extracted before the first request"
+        assert asked_late.scene.volume._nets is None, "expected no extraction before the first request"
         reference = SurfaceNets(updated.scene.volume.voxels).extract()
         assert np.array_equal(mesh.vertices, reference.vertices)
         assert np.array_equal(mesh.triangles, reference.triangles)
         sizes.append(updated.scene.volume.voxels.block_count)
         named.append(len(np.unique(mesh.instance_ids)))
-    assert sizes[0] < 1024 < sizes[-1], "the grid's arrays grew"
-    assert named[0] == 1, "no instance is confirmed"
+    assert sizes[0] < 1024 < sizes[-1], "expected growth of the grid's arrays"
+    assert named[0] == 1, "expected no confirmed instance in the first mesh"
     assert named[-1] > 2
     ours = updated.scene.mesh()
     assert equal(ours, asked_late.scene.mesh())
     kept, dropped = np.unique(ours.instance_ids)[1:3].tolist()
     updated.scene.merge(kept, dropped)
     merged = updated.scene.mesh()
-    assert merged.vertices is ours.vertices, "a merge changes labels, not vertices"
+    assert merged.vertices is ours.vertices, "expected a merge to change labels, not vertices"
     assert dropped not in merged.instance_ids
     assert same_mesh(updated.scene)
 

@@ -70,7 +70,7 @@ def test_raycast_spheres_have_accurate_depth_without_holes() -> None:
     exact, color, surface = scene.render(CAMERA, T)
     on_sphere = surface > len(scene.planes)
     both = (view.depth > 0) & on_sphere
-    assert both.sum() > 0.9 * on_sphere.sum(), "the view has no holes in mapped areas"
+    assert both.sum() > 0.9 * on_sphere.sum(), "expected no holes in mapped areas"
     assert np.median(np.abs(view.depth - exact)[both]) < 0.1 * VOXEL
     assert np.median(np.abs(view.color.astype(float) - color)[both]) < 6
     assert (view.instance_ids == 0).all()
@@ -83,7 +83,7 @@ def test_raycast_from_outside_or_of_empty_map_is_empty() -> None:
     away = render(voxels, evidence, SENSOR, CAMERA, pose(rotvec=(0, np.pi, 0)))
     assert (away.depth == 0).all()
     behind = render(voxels, evidence, SENSOR, CAMERA, pose(z=5.0, rotvec=(0, np.pi, 0)))
-    assert (behind.depth == 0).mean() > 0.95, "back faces are not rendered"
+    assert (behind.depth == 0).mean() > 0.95, "expected no rendered back faces"
     empty = VoxelGrid(VOXEL, SENSOR.max_truncation, 10)
     nothing = render(empty, EvidenceRows(empty).evidence, SENSOR, CAMERA, pose())
     assert (nothing.depth == 0).all()
@@ -128,8 +128,8 @@ def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
 
 
 @pytest.mark.parametrize("sparse", ["every pixel", "every fourth column", "one in ten"])
-def test_raycast_near_readings_finds_surface(sparse: str) -> None:
-    """The surface is also found at pixels between the coarse rays."""
+def test_raycast_near_sensor_depth_finds_surface(sparse: str) -> None:
+    """The surface is found at every pixel with sensor depth, including those between the coarse rays."""
     voxels = mapped(room(), [pose()])
     T = pose(0.1, -0.05, 0.1, (0.05, 0.1, 0.0))
     exhaustive = every_ray(voxels, T)

@@ -31,7 +31,9 @@ def test_find_block_returns_only_allocated_blocks() -> None:
     found = look_up(voxels.grid, coords)
     assert (voxels.grid.block_coords[found] == coords).all()
     in_order = coords[np.sort(first)]
-    assert (voxels.grid.block_coords[: voxels.block_count] == in_order).all(), "numbered in order of first occurrence"
+    assert (voxels.grid.block_coords[: voxels.block_count] == in_order).all(), (
+        "expected block numbers in the order of first occurrence"
+    )
     absent = coords + np.int32(10_000)
     assert (look_up(voxels.grid, absent) == -1).all()
 

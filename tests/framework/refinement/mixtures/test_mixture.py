@@ -22,7 +22,7 @@ def blobs(seed: int, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sklearn_from(points: np.ndarray, labels: np.ndarray, iterations: int, floor: float = 0.0) -> GaussianMixture:
-    """Return scikit-learn's mixture started from the M-step of `labels`."""
+    """Return scikit-learn's mixture, initialized by an M-step from `labels`."""
     covariances = np.array([np.cov(points[labels == j].T, bias=True) for j in range(4)], np.float64)
     reference = GaussianMixture(
         4,
@@ -124,7 +124,7 @@ def test_mixture_fit_likelihood_increases_until_tolerance():
         mixture.fit(points, starts, labels, 4, EmSettings(i, -np.inf, 1e-6, 0.02))
         for i in range(1, 20)
     ]  # fmt: skip
-    assert (np.diff([fit.log_likelihoods[0] for fit in fits]) > -1e-4).all(), "decreases only by rounding"
+    assert (np.diff([fit.log_likelihoods[0] for fit in fits]) > -1e-4).all(), "expected decreases only by rounding"
     stopped = mixture.fit(points, starts, labels, 4, EmSettings(1000, 1e-3, 1e-6, 0.02))
     assert stopped.iterations[0] < 1000
     before = fits[stopped.iterations[0] - 2].log_likelihoods[0]

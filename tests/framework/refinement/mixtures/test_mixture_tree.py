@@ -145,7 +145,7 @@ def test_mixture_tree_weights_sum_to_one(min_support):
         expanded = np.diff(level.firsts) > 0
         assert expanded.any()
         np.testing.assert_allclose(children[expanded], above.weights[expanded], rtol=1e-12)
-        assert not level.outlier_weights[~expanded].any(), "a leaf has no uniform component"
+        assert not level.outlier_weights[~expanded].any(), "expected no uniform component in a leaf"
         assert (level.weights >= min_support).all()
     for depth in (1, 2, 3):
         np.testing.assert_allclose(masses(tree, depth, 2), 1, rtol=1e-12)
@@ -189,12 +189,12 @@ def test_mixture_tree_own_ratios_maximize_likelihood():
     ratios = np.exp(odds[:60].astype(np.float64))[:, None]
     objective = np.log(grid * ratios + 1 - grid).sum(axis=0) + 4 * (0.5 * np.log(grid) + 0.5 * np.log(1 - grid))
     assert shares[0] == pytest.approx(grid[objective.argmax()], abs=2e-3)
-    assert shares[1] == pytest.approx(0.7), "a node without points has the ratio of its parent"
+    assert shares[1] == pytest.approx(0.7), "expected the parent's ratio for a node without points"
     leaning = mixture_tree.own_ratios(odds, starts, np.full(4, 0.9, np.float32), 4.0)
     objective += 4 * (0.4 * np.log(grid) - 0.4 * np.log(1 - grid))
     assert leaning[0] == pytest.approx(grid[objective.argmax()], abs=2e-3)
     assert shares[2] > 0.6 > 0.4 > shares[3]
-    assert shares[2] + shares[3] == pytest.approx(1.0, abs=1e-5), "opposite log-odds give complementary ratios"
+    assert shares[2] + shares[3] == pytest.approx(1.0, abs=1e-5), "expected complementary ratios for opposite log-odds"
 
 
 def test_mixture_tree_cut_matches_slow_reference():
@@ -204,15 +204,19 @@ def test_mixture_tree_cut_matches_slow_reference():
         labels = mixture_tree.cut(points, starts, groups)
         np.testing.assert_array_equal(labels[:300], slow_cut(points[:300].astype(np.float64), groups))
         np.testing.assert_array_equal(labels[300:], slow_cut(points[300:].astype(np.float64), groups))
-    assert not mixture_tree.cut(np.ones((50, 3), np.float32), np.array([0, 50]), 8).any(), "equal points are not cut"
+    assert not mixture_tree.cut(np.ones((50, 3), np.float32), np.array([0, 50]), 8).any(), (
+        "expected one group for equal points"
+    )
 
 
-def test_mixture_tree_degenerate_sets_are_handled():
+def test_mixture_tree_degenerate_sets_have_at_most_one_node():
     points = np.concatenate([np.ones((40, 3)), surface(0, 200), np.zeros((1, 3))]).astype(np.float32)
     starts = np.array([0, 0, 40, 240, 241])
     tree = grown(points, starts, levels=2)
-    assert np.diff(tree.levels[0].firsts)[[0, 3]].tolist() == [0, 0], "an empty set and a single point have no nodes"
-    assert np.diff(tree.levels[0].firsts)[1] == 1, "forty equal points have one node"
+    assert np.diff(tree.levels[0].firsts)[[0, 3]].tolist() == [0, 0], (
+        "expected no nodes for an empty set and a single point"
+    )
+    assert np.diff(tree.levels[0].firsts)[1] == 1, "expected one node for forty equal points"
     found = log_likelihoods(tree, points, starts)
     assert found[0] == 0.0
     assert np.isfinite(found[1:3]).all()

@@ -56,7 +56,7 @@ def noisy(depth: np.ndarray, noise: float) -> np.ndarray:
 
 
 def main_segment(labels: np.ndarray, region: np.ndarray) -> tuple[int, float, float]:
-    """Return the largest segment in a region, its fraction of the region, and the fraction of it inside the region."""
+    """Return the segment that covers most of a region, the covered fraction of the region, and that of the segment."""
     label = np.bincount(labels[region] + 1).argmax() - 1
     both = ((labels == label) & region).sum()
     return int(label), both / region.sum(), both / (labels == label).sum()
@@ -87,12 +87,12 @@ def test_segments_separate_box_from_table_and_keep_box_whole(cell, noise):
     labels, _ = cut(noisy(depth, noise), camera, cell=cell)
     box, covered_box, pure_box = main_segment(labels, ids == 1)
     table, covered_table, _ = main_segment(labels, (ids == 0) & (depth < 2.0))
-    assert box != table, "a concave edge separates them"
-    assert covered_box > 0.95, "convex edges between its faces do not split it"
+    assert box != table, "expected two segments at a concave edge"
+    assert covered_box > 0.95, "expected one segment across convex edges"
     assert min(covered_table, pure_box) > 0.97
     assert (labels[ids == 1] == table).mean() < 0.02
     for face in faces_of(boxes[0], 0.5, camera, depth, ids == 1):
-        assert face.sum() > 150, "three faces are visible"
+        assert face.sum() > 150, "expected three visible faces"
         assert main_segment(labels, face)[:1] == (box,)
         assert main_segment(labels, face)[1] > 0.9
 
@@ -231,7 +231,7 @@ def test_segments_of_degenerate_images_are_valid(shape, cell):
         assert labels.max(initial=-1) < count or count == 0
         assert (labels[depth == 0] == -1).all()
     labels, _ = cut(np.full(shape, 2.0), camera, cell=cell, min_pixels=1)
-    assert (labels == labels[0, 0]).all(), "one flat wall"
+    assert (labels == labels[0, 0]).all(), "expected one segment for a flat wall"
     assert labels[0, 0] >= 0
 
 

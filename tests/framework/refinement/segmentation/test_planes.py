@@ -52,7 +52,7 @@ def test_find_planes_recovers_exact_plane(camera):
     np.testing.assert_allclose(planes.m[0], WALL, atol=1e-6)
     np.testing.assert_allclose(planes.normals[0], -WALL / np.linalg.norm(WALL), atol=1e-6)
     assert planes.deviations[0] < 1e-6
-    assert planes.fractions[0] > 0.95, "all except incomplete cells at the border"
+    assert planes.fractions[0] > 0.95, "expected all pixels except incomplete cells at the border"
     assert planes.behind[0] == 0
 
 
@@ -139,7 +139,9 @@ def test_find_planes_without_plane_is_empty():
     assert not plane_image(frame_of(one), found(one), 0.02).any()
     tiny = Camera(1, 1, 1.0, 1.0, 0.0, 0.0)
     assert len(found(np.ones((1, 1)), tiny)) == 0
-    assert len(found(np.ones((1, 400)), Camera(400, 1, 50.0, 50.0, 200.0, 0.0), min_area=0.0)) == 0, "a row of pixels"
+    assert len(found(np.ones((1, 400)), Camera(400, 1, 50.0, 50.0, 200.0, 0.0), min_area=0.0)) == 0, (
+        "expected no plane in a row of pixels"
+    )
 
 
 def test_plane_image_without_depth_is_zero():
