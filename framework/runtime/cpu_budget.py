@@ -79,8 +79,14 @@ class CpuBudget:
 
     @contextmanager
     def prefetching(self, workers: int = 1) -> Iterator[None]:
-        """Run the body on the cores for prefetching. The body prefetches one frame, in one of `workers` threads."""
-        with kernel_threads(self.cores if self._alone else max(self.prefetch_cores() // workers, 1)):
+        """Run the body on the cores for prefetching. The body prefetches one frame, in one of `workers` threads.
+
+        If all cores map, the priority of the thread is low from then on, so that parallel loops do not wait for it.
+        """
+        cores = self.cores if self._alone else self.prefetch_cores()
+        if cores == 0:
+            lower_priority()
+        with kernel_threads(max(cores // workers, 1)):
             began = time.thread_time()
             yield
             self._record(self._prefetching, time.thread_time() - began)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 MIN_DEPTH = 0.05  # minimum depth of projected points in the color image, m
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+# Not parallel: on two cores, its second thread would wait for the thread that reads the next frame.
+@njit(cache=True, nogil=True, error_model="numpy")
 def register_colors(depth, otherwise, intrinsics, T_color_depth, color, registered, pixels):
     """Set `registered` (H, W, 3) to the nearest color of each pixel of `depth` (H, W), m, and `pixels` to its index.
 
@@ -25,7 +26,7 @@ def register_colors(depth, otherwise, intrinsics, T_color_depth, color, register
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     inv_fx = one / fx
     colors = color.reshape(height * width, 3)
-    for v in prange(height):
+    for v in range(height):
         y = (np.float32(v) - cy) / fy
         row_x, row_y, row_z = R01 * y + R02, R11 * y + R12, R21 * y + R22
         for u in range(width):

@@ -5,10 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import cast
+from unittest.mock import Mock
 
 import numba
 import pytest
 
+from framework.runtime import cpu_budget
 from framework.runtime.cpu_budget import RECENT, CpuBudget
 
 
@@ -26,7 +29,8 @@ def thread_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], N
 
 @pytest.fixture(params=[1, 2, 4])
 def sharing(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> CpuBudget:
-    """Return a budget of 1, 2 or 4 cores; Numba's thread limit is replaced by a variable."""
+    """Return a budget of 1, 2 or 4 cores; Numba's thread limit is replaced by a variable, and priorities are kept."""
+    monkeypatch.setattr(cpu_budget, "lower_priority", Mock())
     threads = [request.param]
     monkeypatch.setattr(numba, "get_num_threads", lambda: threads[0])
     monkeypatch.setattr(numba, "set_num_threads", lambda number: threads.__setitem__(0, number))
@@ -60,6 +64,24 @@ def test_cpu_budget_assigns_all_cores_to_loaded_side(sharing: CpuBudget, thread_
     assert sharing.prefetch_cores() == sharing.cores
     with sharing.mapping():
         assert numba.get_num_threads() == 1
+
+
+def test_cpu_budget_lowers_priority_if_all_cores_map(sharing: CpuBudget, thread_time: Callable[[float], None]) -> None:
+    lower_priority = cast(Mock, cpu_budget.lower_priority)
+    pass_frames(sharing, thread_time, ahead=20.0, mapping=1.0)
+    lower_priority.reset_mock()
+    with sharing.prefetching():
+        lower_priority.assert_not_called()
+    pass_frames(sharing, thread_time, ahead=0.1, mapping=1.0)
+    with sharing.prefetching():
+        lower_priority.assert_called()
+
+
+def test_cpu_budget_without_prefetch_keeps_priority(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cpu_budget, "lower_priority", Mock())
+    budget = CpuBudget(with_prefetch=False)
+    pass_frames(budget, lambda _: None, ahead=0.1, mapping=1.0)
+    cast(Mock, cpu_budget.lower_priority).assert_not_called()
 
 
 def test_cpu_budget_is_divided_among_workers(sharing: CpuBudget, thread_time: Callable[[float], None]) -> None:
