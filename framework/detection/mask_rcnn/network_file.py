@@ -176,10 +176,11 @@ def _parsed(kind: Any, value: Any, name: str) -> Any:
         if unknown := sorted(value.keys() - kinds.keys()):
             raise ValueError(f"{name}: expected known fields, got {unknown[0]}; update InstanceMap for newer files")
         fields = {field: _parsed(kinds[field], part, f"{name}.{field}") for field, part in value.items()}
-        try:
-            return typing.cast(Any, kind)(**fields)
-        except TypeError as error:
-            raise ValueError(f"{name}: expected all required fields, got only {', '.join(fields) or 'none'}") from error
+        no_value = dataclasses.MISSING
+        required = [f.name for f in dataclasses.fields(kind) if f.default is no_value is f.default_factory]
+        if missing := [field for field in required if field not in fields]:
+            raise ValueError(f"{name}: expected all required fields, got none for: {', '.join(missing)}")
+        return typing.cast(Any, kind)(**fields)
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, list):
             raise ValueError(f"{name}: expected a list, got {value!r}")
