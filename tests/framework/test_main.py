@@ -46,14 +46,14 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
         ("detector=fakke", ["detector: expected one of", "got fakke; did you mean fake?"]),
         (
             "dataset.frames=many",
-            ["ERROR", "CornerRoom", "frames", "'many'", "Integer"],
+            ["ERROR", "CornerRoom", "frames", "'many'", "expected an integer"],
         ),
         (
             "refiner._target_=this.GivenPose",
             ["ERROR", "got this.GivenPose", "refiner: expected the _target_ of a registered option of"],
         ),
         ("fuser.capcity=3", ["fuser.capcity", "did you mean fuser.capacity?"]),
-        ("dataset.frames=[1", ["dataset.frames=[1", "key=value"]),
+        ("dataset.frames=[1", ["dataset.frames=[1", "KEY=VALUE"]),
         ("seed=-1", ["ERROR", "seed", "seed: expected an integer in [0, ", "got -1"]),
         ("skip_completed=flase", ["ERROR", "skip_completed", "'flase'"]),
         ("debug=maybe", ["ERROR", "debug: expected true or false, got 'maybe'"]),

@@ -52,7 +52,7 @@ class Sharing(SphereDetector):
 
     def detect(self, frame: Frame) -> Detections:
         self.frame = frame
-        time.sleep(0.01)
+        time.sleep(0.1)  # long enough for the other threads to begin
         return super().detect(self.frame)
 
 
