@@ -28,6 +28,7 @@ from framework.runs.inputs import INPUTS, inputs_sha256
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
+from framework.runs.plugin_code import plugin_code
 from framework.runs.provenance import code_version, config_hash, environment
 from framework.runs.stored_runs import (
     CONFIG,
@@ -69,7 +70,7 @@ class RunRecord:
         assert isinstance(resolved, dict)
         plain = {str(key): value for key, value in resolved.items()}
         inputs = inputs_sha256(plain)
-        provenance: Metrics = {**code_version(), **environment()}
+        provenance: Metrics = {**code_version(), **plugin_code(plain), **environment()}
         directory.mkdir(parents=True, exist_ok=True)
         remove_left_over(directory)
         for name in (METRICS, PARTIAL_METRICS, REPORT):

@@ -19,6 +19,7 @@ from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
 from framework.files.json_file import read_json
 from framework.files.yaml_file import load_yaml
 from framework.runs.inputs import INPUTS, inputs_sha256
+from framework.runs.plugin_code import changed_code, plugin_code
 from framework.runs.provenance import code_version, config_hash, environment, shows_speed, speed_settings
 from framework.runs.timings_file import current_key
 
@@ -139,8 +140,8 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
 def is_recorded(directory: Path, config: DictConfig) -> bool:
     """Return True if `directory` contains a completed run of this config and inputs, and log the reason.
 
-    If the experiment's table shows the speed, settings that change times must also match. The commit may differ: most
-    commits do not change results, and tables list the commits of their runs.
+    The code of its plugins must match. If the experiment's table shows the speed, settings that change times must also
+    match. The commit may differ: most commits do not change results, and tables list the commits of their runs.
     """
     if not (directory / METRICS).exists():
         return False
@@ -154,6 +155,9 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
     plain = {str(key): value for key, value in resolved.items()}
     if record.metrics["config_hash"] != config_hash(plain):
         log.info("repeating the run: the config in %s differs", directory)
+        return False
+    if changed := changed_code(record.metrics, plugin_code(plain)):
+        log.info("repeating the run: the code changed since the run in %s: %s", directory, "; ".join(changed))
         return False
     if record.metrics.get(INPUTS) not in (None, inputs_sha256(plain)):  # None: an older run
         log.info("repeating the run: weights or data changed since the run in %s", directory)

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from framework.evaluation.instances import MAX_DISTANCE
 from framework.registry import STAGES
 from framework.runs.metrics import is_evaluation
+from framework.runs.plugin_code import CODE
 from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, following
 from framework.runs.stored_runs import Record, is_number
 from framework.tables.comparison import ComparisonTable, mean_by_sequence
@@ -35,6 +36,7 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
     yield from _published(comparison)
     yield f"Data: {data(comparison.records)}."
     yield f"Code: {counted(record.code for record in comparison.records)}."
+    yield from _mixed_code(comparison)
     yield f"Machine: {counted(machine(record) for record in comparison.records)}."
     yield f"Config: config.yaml of each run; SHA-256 of all config hashes: {digest(comparison.records)}."
     yield from _missing(comparison)
@@ -136,6 +138,15 @@ def _missing(comparison: ComparisonTable) -> Iterator[str]:
         yield f"Omitted older records of the same runs: {comparison.superseded}."
     for one in comparison.incomplete:
         yield f"Incomplete: {one.directory.relative_to(comparison.root)}: {one.reason.rstrip('.')}."
+
+
+def _mixed_code(comparison: ComparisonTable) -> Iterator[str]:
+    """Yield a note for each row whose runs have different plugin code."""
+    for row in comparison.rows:
+        keys = sorted({key for record in row.records.values() for key in record.metrics if key.startswith(CODE)})
+        codes = {key: counted(str(record.metrics.get(key)) for record in row.records.values()) for key in keys}
+        if mixed := [f"{key.removeprefix(CODE)} {code}" for key, code in codes.items() if "(" in code]:
+            yield f"Mixed plugin code in {row.name}: {'; '.join(mixed)}; repeat its runs with skip_completed=true."
 
 
 def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:

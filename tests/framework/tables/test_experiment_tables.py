@@ -130,6 +130,14 @@ def test_table_code_note_names_later_evaluation_commit(sweep: Path) -> None:
     assert expected in write_tables(sweep).splitlines()
 
 
+def test_table_notes_name_rows_of_mixed_plugin_code(sweep: Path) -> None:
+    for seed, code in enumerate(("mean 0.1 3f", "mean 0.1 9c", "mean 0.1 9c")):
+        run(sweep, "mean", seed, 0.5, 1.0, **{"code.refiner": code, "code.fuser": "tsdf 1.0 aa"})
+    assert "- Mixed plugin code in mean: refiner mean 0.1 9c (2 runs), mean 0.1 3f (1 run); repeat its runs with" in (
+        write_tables(sweep)
+    )
+
+
 def test_table_notes_replace_line_breaks(sweep: Path) -> None:
     (sweep / "row=chain,seed=1" / "metrics.json").unlink()
     partial = {"partial": "the map\nis\r\nfull"}
