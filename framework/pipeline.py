@@ -254,13 +254,14 @@ class Pipeline:
         if pose.lost:
             return pose
         with journal.timed(frame.index, "lifting"):
-            clusters = lift(detections, frame, pose, color_pixels)
+            lifted = lift(detections, frame, pose, color_pixels)
         with journal.timed(frame.index, "refinement"):
-            clusters = refine(self.refiner, clusters, frame)
+            clusters = refine(self.refiner, lifted, frame)
         journal.frames_in_map += 1
         with journal.fusing(frame.index) as timer:
             self.fuser.fuse(frame, pose, clusters, timer)
         journal.frame_fused(frame)
+        journal.digest(frame.index, detection=detections, lifting=lifted, refinement=clusters, fusion=self.fuser.scene)
         return pose
 
 

@@ -18,6 +18,7 @@ from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum
 from framework.interfaces import RGBDVideo
 from framework.registry import build
+from framework.runs.manifest import MANIFEST, Manifest
 from framework.runs.metrics import TRUTH, evaluation_metrics, is_evaluation
 from framework.runs.provenance import code_version, leaves
 from framework.runs.stored_map import read_objects
@@ -117,6 +118,10 @@ class Reevaluation:
                 )
             write_json(path, self.metrics)
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+            if (self.record.directory / MANIFEST).exists():
+                stored = Manifest.read(self.record.directory)
+                names = list(stored.files)
+                Manifest.of(self.record.directory, names, stored.status, stored.inputs).write(self.record.directory)
 
 
 def read_predictions(record: Record) -> PredictedInstances:

@@ -24,14 +24,17 @@ from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import RGBDVideo
 from framework.registry import STAGES
 from framework.rendering.overview import write_overview
-from framework.runs.inputs import INPUTS, inputs_sha256
+from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import write_instances
+from framework.runs.manifest import MANIFEST, Manifest, Status
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
 from framework.runs.plugin_code import plugin_code
-from framework.runs.provenance import code_version, config_hash, environment
+from framework.runs.provenance import code_version, config_hash, environment, frozen_environment
 from framework.runs.stored_runs import (
     CONFIG,
+    DIGESTS,
+    ENVIRONMENT,
     INSTANCES,
     KEYFRAMES,
     MAP,
@@ -40,6 +43,7 @@ from framework.runs.stored_runs import (
     METRICS,
     PARTIAL_METRICS,
     REPORT,
+    RESULT_FILES,
     TRAJECTORY,
 )
 from framework.runtime.run_log import RunResult
@@ -60,7 +64,7 @@ class RunRecord:
     directory: Path
     config: Mapping[str, Any]  # resolved
     choices: Mapping[str, str | None]  # chosen option of each config group
-    inputs: str  # inputs_sha256
+    inputs: Mapping[str, str]  # input_hashes
     provenance: Metrics  # code and machine at the start of the run
 
     @classmethod
@@ -69,11 +73,11 @@ class RunRecord:
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
         plain = {str(key): value for key, value in resolved.items()}
-        inputs = inputs_sha256(plain)
+        inputs = input_hashes(plain)
         provenance: Metrics = {**code_version(), **plugin_code(plain), **environment()}
         directory.mkdir(parents=True, exist_ok=True)
         remove_left_over(directory)
-        for name in (METRICS, PARTIAL_METRICS, REPORT):
+        for name in (MANIFEST, METRICS, PARTIAL_METRICS, REPORT):
             (directory / name).unlink(missing_ok=True)
         _write_config(directory / CONFIG, plain)
         _reset_peak_memory()
@@ -98,7 +102,7 @@ class RunRecord:
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         scene, attempt = result.scene, _Attempts(result.stopped_by)
-        for name in (*MAPPED, KEYFRAMES):  # from an earlier run
+        for name in (MANIFEST, *MAPPED, KEYFRAMES, DIGESTS, ENVIRONMENT):  # from an earlier run
             attempt((self.directory / name).unlink, missing_ok=True)
         if not (self.directory / CONFIG).exists():  # the directory was removed
             attempt(_write_config, self.directory / CONFIG, self.config)
@@ -106,6 +110,8 @@ class RunRecord:
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
         attempt(write_tum, self.directory / TRAJECTORY, np.array([frame.timestamp for frame in trusted]), poses)
         attempt(write_timings, self.directory / "timings.csv", result)
+        attempt(write_digests, self.directory / DIGESTS, result)
+        attempt(_write_text, self.directory / ENVIRONMENT, frozen_environment())
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **(counts or {})}
         found = attempt(lambda: (scene.mesh(), scene.instances()))
         if found is not None:
@@ -134,6 +140,7 @@ class RunRecord:
             (self.directory / PARTIAL_METRICS).unlink(missing_ok=True)
         else:
             attempt(self._write_partial, video, figures, attempt.error)
+        attempt(self._write_manifest, Status.COMPLETE if attempt.error is None else Status.PARTIAL)
         self._announce(title, labels if found is not None else {}, figures, attempt.error)
         return attempt.error
 
@@ -146,7 +153,7 @@ class RunRecord:
             "seed": self.config.get("seed"),
             "detection_interval": self.config.get("detection_interval", 1),
             "config_hash": config_hash(self.config),
-            INPUTS: self.inputs,
+            INPUTS: hash_of(self.inputs),
             **self.provenance,
         }
 
@@ -154,6 +161,10 @@ class RunRecord:
         """Write the metrics of a partial run with the reason; `error` None = the outputs are still being written."""
         why = "the outputs were not completed" if error is None else reason(error)
         write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
+
+    def _write_manifest(self, status: Status) -> None:
+        names = [*RESULT_FILES, METRICS, PARTIAL_METRICS]
+        Manifest.of(self.directory, names, status, self.inputs).write(self.directory)
 
     def _announce(
         self, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics, error: BaseException | None
@@ -245,6 +256,17 @@ def write_timings(path: Path, result: RunResult) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("frame", "stage", "milliseconds"))
         writer.writerows((time.frame, time.stage, f"{time.milliseconds:.3f}") for time in result.timings)
+
+
+def write_digests(path: Path, result: RunResult) -> None:
+    """Write the digest of each stage for each frame, in chronological order."""
+    lines = [f"{one.frame},{one.stage},{one.digest:08x}" for one in result.digests]
+    _write_text(path, "\n".join(["frame,stage,digest", *lines]) + "\n")
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, "utf-8")
 
 
 def peak_memory() -> int | None:

@@ -36,6 +36,11 @@ KEYFRAMES = "keyframes.npz"  # of the tracker, to resume the map; optional
 MAPPED = (TRAJECTORY, "timings.csv", INSTANCES, MESH, MAP, "overview.png")
 """Files of a map in the order of writing, small files first in case the disk is full."""
 
+DIGESTS = "digests.csv"  # digest of each stage and frame, to locate differences between runs
+ENVIRONMENT = "environment.txt"  # versions of all installed packages, as constraints for pip
+RESULT_FILES = (CONFIG, *MAPPED, KEYFRAMES, DIGESTS, ENVIRONMENT)
+"""Files listed in manifest.json, in addition to the metrics."""
+
 EVALUATION = "evaluation."  # prefix of the code version of a re-evaluation
 GROUND_TRUTH = EVALUATION + "ground_truth"  # key of dataset.ground_truth in the last re-evaluation, if it was set
 
