@@ -24,6 +24,8 @@ COMMANDS = {
     "check": "validate a recording and suggest parameter fixes",
     "diff": "list objects that appeared, vanished or moved between two runs",
     "export": "export a run as GLB, USD, PLY, OBJ, floor plan, ROS map or scene graph",
+    "bundle": "pack the runs, tables and plugin code of an experiment into a ZIP file",
+    "reproduce": "run stored runs or a bundle again and compare the results",
     "query": 'rank the objects of a run by a text query: "a red chair"',
     "evaluate": "re-evaluate stored runs without mapping them again",
     "detect": "write the detections of a sequence as a COCO result file",
@@ -41,7 +43,7 @@ COMMANDS = {
 
 FOLDERS = {
     "running": ("run", "detect", "show-refinement"),
-    "results": ("tables", "figures", "raycast", "report", "diff", "export", "query", "evaluate"),
+    "results": ("tables", "figures", "raycast", "report", "diff", "export", "query", "evaluate", "bundle", "reproduce"),
     "recordings": ("import", "check", "synthesize", "convert-oni"),
     "installation": ("compile", "doctor", "plugins", "new-plugin", "train-detector", "convert-weights"),
 }

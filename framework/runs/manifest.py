@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -63,11 +63,13 @@ class Manifest:
         }
         write_json(directory / MANIFEST, content | {"digest": _digest(content)})
 
-    def changed_files(self, directory: Path) -> list[str]:
-        """Return one message for each missing or changed file."""
+    def changed_files(self, directory: Path, optional: Collection[str] = ()) -> list[str]:
+        """Return one message for each changed or missing file; files in `optional` may be missing."""
         found = []
         for name, (size, sha256) in self.files.items():
             path = directory / name
+            if name in optional and not path.exists():
+                continue
             if not path.is_file():
                 found.append(f"{path}: expected a file of {size} bytes, got none")
             elif path.stat().st_size != size or path_hash(path) != sha256:

@@ -31,11 +31,32 @@ def plugin_code(config: Mapping[str, Any]) -> dict[str, str]:
     Args:
         config: The resolved config of a run.
     """
-    found: dict[str, dict[str, None]] = {}
-    for key, value in leaves({stage: config.get(stage) or {} for stage in STAGES}):
-        if key.endswith("._target_") and isinstance(value, str):
-            found.setdefault(key.partition(".")[0], {})[_described(value)] = None
+    found: dict[str, set[str]] = {}
+    for stage, target in targets_of(config):
+        found.setdefault(stage, set()).add(_described(target))
     return {f"{CODE}{stage}": ", ".join(sorted(codes)) for stage, codes in found.items()}
+
+
+def targets_of(config: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the stage and the dotted class name of each plugin of a resolved config, including nested plugins."""
+    values = leaves({stage: config.get(stage) or {} for stage in STAGES})
+    return [
+        (key.partition(".")[0], value) for key, value in values if key.endswith("._target_") and isinstance(value, str)
+    ]
+
+
+def plugin_files(target: str) -> list[tuple[str, Path]]:
+    """Return the relative names and the paths of the files of a third-party class; empty for this project's classes."""
+    package = target.partition(".")[0]
+    if package in OWN:
+        return []
+    found = []
+    for path in _module_files(package):
+        if path.is_dir():
+            found += [(f"{package}/{file.relative_to(path).as_posix()}", file) for file in _files_below(path)]
+        else:
+            found.append((path.name, path))
+    return found
 
 
 def changed_code(metrics: Mapping[str, Any], now: Mapping[str, str]) -> list[str]:

@@ -101,9 +101,12 @@ def commit_of(metrics: Mapping[str, Any]) -> str:
     return f"{str(metrics.get('git_commit'))[:7]}{changes}"
 
 
-def read_record(directory: Path) -> Record:
-    """Read the completed run in `directory`. Raises DataError for invalid or inconsistent files."""
-    return _read(directory, METRICS)
+def read_record(directory: Path, check_config: bool = True) -> Record:
+    """Read the completed run in `directory`. Raises DataError for invalid or inconsistent files.
+
+    Without `check_config`, the config may differ from that of the run.
+    """
+    return _read(directory, METRICS, check_config)
 
 
 def read_partial(directory: Path) -> tuple[Record, str]:
@@ -112,10 +115,10 @@ def read_partial(directory: Path) -> tuple[Record, str]:
     return record, str(record.metrics.get("partial"))
 
 
-def _read(directory: Path, name: str) -> Record:
+def _read(directory: Path, name: str, check_config: bool = True) -> Record:
     path = directory / name
     metrics, config = _read_flat(path), read_yaml(directory / CONFIG)
-    if metrics.get("config_hash") != config_hash(config):
+    if check_config and metrics.get("config_hash") != config_hash(config):
         raise DataError(
             f"{path}: expected the config_hash of {CONFIG}, {config_hash(config)[:8]}, got "
             f"{metrics.get('config_hash')!s:.8}; repeat the run"
