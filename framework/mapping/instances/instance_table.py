@@ -116,7 +116,7 @@ class InstanceTable:
         frame_index: int,
         embedding: ObjectEmbedding | None = None,
     ) -> None:
-        """Add one detection with the evidence (C,) for its classes."""
+        """Add one detection to an instance: its class evidence (C,), score, frame and optional embedding."""
         record = self.records[instance_id]
         record.class_evidence = _combined(record.class_evidence, class_evidence, self.combine)
         record.last_frame = max(record.last_frame, frame_index)

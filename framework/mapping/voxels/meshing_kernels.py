@@ -48,7 +48,11 @@ def mark_stale(grid, changed, stale):
 
 @device
 def _any_and_all(words, around, z):
-    """Return two words with one bit per cell of slice z: if any, and if all, of its corners in the slice are set."""
+    """Return two words with one bit per cell: 1 if any, and 1 if all, of its four corners in slice z are set.
+
+    `words` (B + 1, 8) has one bit per voxel. `around` (8,) are the blocks at +0 or
+    +1 along each axis. Slice z = 8 is slice 0 of the next block.
+    """
     up = 4 * (z >> 3)
     z &= 7
     here, block_x = words[around[up], z], words[around[up + 1], z]
@@ -60,7 +64,7 @@ def _any_and_all(words, around, z):
 
 @device
 def _cell_corners(tsdf, around, x, y, z, corners):
-    """Write the stored distances at the corners of cell (x, y, z) of a block to corners (8,)."""
+    """Write the stored distances at the corners of cell (x, y, z) of a block to corners (8,), x fastest."""
     for c in range(8):
         i, j, k = x + (c & 1), y + ((c >> 1) & 1), z + (c >> 2)
         corners[c] = tsdf[around[(i >> 3) + 2 * (j >> 3) + 4 * (k >> 3)], voxel_number(i, j, k)]

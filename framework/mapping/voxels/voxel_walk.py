@@ -137,7 +137,7 @@ def interpolate(s, fx, fy, fz):
 
 @device
 def all_seen(s):
-    """Return True if all eight corners were observed."""
+    """Return True if all eight voxels with the stored distances `s` were observed."""
     return min(min(min(s[0], s[1]), min(s[2], s[3])), min(min(s[4], s[5]), min(s[6], s[7]))) != UNSEEN
 
 
@@ -215,7 +215,10 @@ def prefetch_row(array, row):
 
 @device
 def directions(view, scale, v):
-    """Return the ray of pixel (0, v), voxels per m of depth, and its change per pixel; `scale` is in voxels per m."""
+    """Return the world-frame ray of pixel (0, v), voxels per m of depth, and its change per pixel.
+
+    `scale` is in voxels per m, and `view` contains T_world_camera.
+    """
     x, y, z = ray_direction(view, 0, v)
     # not the difference of two rays, because its rounding error would accumulate along the row
     change = scale / view.fx
@@ -224,7 +227,10 @@ def directions(view, scale, v):
 
 @device
 def points_of_row(view, scale, v, depth, points):
-    """Fill `points` (3, W), in voxels, with the points of row v at `depth` (W,), m."""
+    """Fill `points` (3, W), world frame, in voxels, with the points of image row v at `depth` (W,), m.
+
+    `scale` is in voxels per m, and `view` contains T_world_camera.
+    """
     origin, change = directions(view, scale, v)
     tx, ty, tz = view.t[0] * scale, view.t[1] * scale, view.t[2] * scale
     for n in range(depth.shape[0]):
@@ -292,7 +298,10 @@ def step_to_surface(view, scale, v, found, points, converged, reach, limits, dep
 
 @device
 def blend_colors(found, points, color):
-    """Fill color (W, 3) by interpolation between the packed colors `found` (8, W) around `points` (3, W)."""
+    """Fill color (W, 3), RGB, by interpolation between the packed colors `found` (8, W) around `points` (3, W).
+
+    `points`, in voxels, is overwritten.
+    """
     half = np.float32(0.5)
     for n in range(points.shape[1]):
         x, y, z = points[0, n], points[1, n], points[2, n]

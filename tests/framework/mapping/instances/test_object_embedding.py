@@ -140,7 +140,7 @@ def test_embeddings_of_other_space_raise() -> None:
     frame = room().frame(walk(4)[0], 9)
     with pytest.raises(DataError, match=r"detector: expected embeddings from words@1 \(as in the map\)"):
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=EMBEDDINGS, space="words@2")
-    with pytest.raises(DataError, match="embeddings: expected equal lengths, got 2 and 3;"):
+    with pytest.raises(DataError, match="detector: expected embeddings of equal length, got 2 and 3 numbers;"):
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=np.eye(3))
 
 
