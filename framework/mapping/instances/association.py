@@ -65,7 +65,7 @@ class Overlaps:
         return self.over_smaller(min_pixels) if rule is OverlapRule.SMALLER else self.over_union(min_pixels)
 
     def over_union(self, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return the IoUs (N, M), in [0, 1], of clusters and visible instances; unions count as at least `min_pixels`."""
+        """Return the IoUs (N, M), in [0, 1], of clusters and instances, with a union of at least `min_pixels`."""
         union = self.sizes[:, None] + self.visible[None, :] - self.votes
         return np.asarray(self.votes / np.maximum(union, min_pixels))
 
@@ -301,7 +301,7 @@ def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str,
     """
     if known and known != found:
         raise DataError(
-            f"detector: expected the label space of the map ({len(known)} classes), got a different label space "
-            f"({len(found)} classes); use one detector, or map all detectors to one label space"
+            f"detector: expected the label space of the map (length {len(known)}), got a different label space "
+            f"(length {len(found)}); use one detector, or map all detectors to one label space"
         )
     return found
