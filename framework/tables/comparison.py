@@ -65,7 +65,7 @@ class TableChoice:
         if self.columns_by and len(self.columns) > 1:
             raise ConfigError(
                 f"table.columns: expected one metric with table.columns_by, got {len(self.columns)}; set "
-                f"table.group_by={self.columns_by} for several metrics"
+                f"table.columns_by=null and table.group_by={self.columns_by} for several metrics"
             )
         if self.published and read_published(self.published).layout != self.layout:
             raise ConfigError(
@@ -164,7 +164,7 @@ class ComparisonTable:
 
     @property
     def compared(self) -> list[tuple[RunRow, RunRow]]:
-        """Pairs of a row and its baseline."""
+        """Pairs of a row and its baseline, for every row with a baseline."""
         pairs = ((row, self.base_of(row)) for row in self.rows)
         return [(row, base) for row, base in pairs if base is not None]
 
@@ -243,7 +243,7 @@ class SequenceMean:
 
 
 def mean_by_sequence(values: Mapping[Run, float]) -> dict[str, Mean]:
-    """Return the mean of each sequence; the sequence is the last part of a run."""
+    """Return the mean of each sequence over the other keys. The sequence is the last entry of a Run."""
     grouped: dict[str, list[float]] = {}
     for run, value in values.items():
         grouped.setdefault(run[-1], []).append(value)
@@ -262,5 +262,8 @@ def mean_over_sequences(values: Mapping[Run, float]) -> SequenceMean:
 
 
 def mean_difference(differences: Mapping[Run, float]) -> Mean:
-    """Return the mean of paired differences; its standard error is over sequences, as seeds are not independent."""
+    """Return the mean of paired differences over sequences.
+
+    Its standard error is computed over sequences, because runs of one sequence with other seeds are not independent.
+    """
     return Mean.of(mean.value for mean in mean_by_sequence(differences).values())

@@ -29,7 +29,7 @@ class PublishedRow:
     remark: str  # conditions of the measurement
     poses: str  # source of the poses
     annotation: str  # release of the annotation
-    decimals: int  # number of known decimals of the values
+    decimals: int  # number of known decimals of the values, in the unit of metrics.json
     values: Mapping[Key, float | None] | None  # in the unit of metrics.json; None = not looked up
 
     def knows(self, keys: Iterable[Key]) -> bool:

@@ -56,10 +56,11 @@ class ClassOnlyFusion(MapFuser):
             self.scene.labels.update(seen, masks)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
-        """Return log P(O_u = c) / P(O_u = background) (N, C) of a pixel under each mask, for eq. (7), with a floor.
+        """Return the log ratios (N, C), log P(O_u = c) / P(O_u = background), of eq. (7) for a pixel under each mask.
 
         A score is the probability of the best class, but the distribution excludes the background. Therefore, the score
-        divided by the best class's entry is the probability of all classes together.
+        divided by the entry of the best class is the probability of all classes together. The result is mixed with a
+        fraction `class_floor` of the uniform distribution.
         """
         p = clusters.class_probabilities.astype(np.float64)
         objects = np.minimum(clusters.scores[:, None] / p.max(axis=1, keepdims=True, initial=1e-6), 1.0)

@@ -225,7 +225,7 @@ def test_evaluate_empty_map_has_zero_scores_and_empty_truth_none():
 
 def test_evaluate_inconsistent_predictions_raise():
     truth = scene([(1, 100)], {1: "chair"})
-    with pytest.raises(DataError, match="expected labels in `ids`, got 6"):
+    with pytest.raises(DataError, match="expected 0 or a value of `ids`, got 6"):
         prediction(truth, [(6, 10)], {5: ("chair", 1.0)})
     with pytest.raises(DataError, match="expected finite values"):
         prediction(truth, [(5, 10)], {5: ("chair", float("nan"))})

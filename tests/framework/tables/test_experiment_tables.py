@@ -145,7 +145,7 @@ def test_table_notes_list_parameters_equal_to_seed(tmp_path: Path) -> None:
         (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
         metrics = json.loads((directory / "metrics.json").read_text()) | {"config_hash": config_hash(config)}
         (directory / "metrics.json").write_text(json.dumps(metrics))
-    expected = "- Also averaged over keys whose value equals that of seed in every run: dataset.stride."
+    expected = "- Also averaged over keys with the same value as seed in every run: dataset.stride."
     assert expected in write_tables(tmp_path)
 
 
