@@ -322,7 +322,7 @@ class _Overlaps:
         return Judgment(int(self.predicted_ids[k]), outcome, truth_id, truth_class, iou)
 
     def best(self) -> tuple[dict[int, float], dict[int, int]]:
-        """Return the best IoU, and the prediction with this IoU (0 = none), of each evaluated ground-truth instance by id."""
+        """Return the best IoU, and the prediction with it (0 = none), of each evaluated ground-truth instance by id."""
         columns = {int(self.truth_ids[t]): self.iou[:, t] for t in np.flatnonzero(self.evaluated)}
         ious = {key: float(column.max(initial=0.0)) for key, column in columns.items()}
         ids = {key: int(self.predicted_ids[columns[key].argmax()]) if iou > 0 else 0 for key, iou in ious.items()}
