@@ -1,6 +1,7 @@
 """Class evidence of the voxels of a semantic map, including the background, and its update from a frame.
 
-The update follows SemanticFusion (McCormac et al. 2017, eq. 2). It is eq. (7) with one distribution per pixel:
+The update follows SemanticFusion (McCormac et al. 2017, eq. 2). It is eq. (7) of docs/method.md with one distribution
+per pixel:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t),   c = background or a class
 
@@ -110,7 +111,7 @@ class ClassRows:
         self.evidence = _free_rows(min(classes, CLASS_SLOTS))
 
     def update(self, seen: SeenBlocks, masks: MaskClasses | None) -> None:
-        """Update the voxels near the measured surface; `masks` = None: no update, because the detector did not run."""
+        """Update the voxels near the measured surface. If the detector did not run (`masks` is None), do nothing."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.evidence.unmasked) < capacity:
             self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, zeros=True))

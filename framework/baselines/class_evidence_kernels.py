@@ -108,7 +108,8 @@ def find_blocks_under_masks(grid, seen, cluster, wants_row):
 def update_classes(grid, seen, evidence, masks, evicted):
     """Update the voxels near the measured surface in the seen blocks.
 
-    Sets evicted (A,) to the number of evictions in each block.
+    Voxels at a pixel of a mask get the evidence of the mask, and all other voxels count the frame as unmasked. Sets
+    evicted (A,) to the number of evictions in each block.
     """
     unmasked = evidence.unmasked  # numba 0.68 drops assignments to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):

@@ -2,8 +2,8 @@
 
 As in Fusion++ (McCormac et al. 2018), a voxel counts its observations inside a mask of the object (foreground) and
 outside (background). Its foreground probability is the mean of Beta(1 + foreground, 1 + background). The surface of the
-object is the part of the TSDF surface with a probability above 1/2. Therefore, occasional mask errors are outvoted, but
-systematic errors are not.
+object is the part of the TSDF surface with a probability above 1/2. Therefore, occasional mask errors average out, but
+systematic errors do not.
 
 Every depth reading in the blocks of the volume is integrated, inside or outside the mask. Therefore, distances at the
 outline are as accurate as elsewhere. Blocks are aligned with the blocks of other volumes. Counts take 4 bytes per voxel
@@ -76,7 +76,7 @@ class ObjectVolume:
             self.low, self.high = coords.min(axis=0) * side, (coords.max(axis=0) + 1) * side
 
     def encloses(self, points_world: Float32) -> Bool:
-        """Return a Boolean array (P,), True where a point (P, 3), m, is inside the bounding box of the blocks."""
+        """Return a Boolean array (P,), True where a world point (P, 3), m, is inside the bounding box of the blocks."""
         return np.asarray(((points_world >= self.low) & (points_world <= self.high)).all(axis=1))
 
     def foreground_at(self, points_world: Float32) -> Float32:

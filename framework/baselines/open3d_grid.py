@@ -60,7 +60,7 @@ class BlockGridSettings:
 
     @classmethod
     def of(cls, saved: MapHeader) -> BlockGridSettings:
-        """Return the settings in a map's header. Raises DataError or ConfigError if they are invalid."""
+        """Return the settings in the header of a map file. Raises DataError or ConfigError if they are invalid."""
         return cls(
             voxel_size=saved.number("voxel_size", BOUNDS["voxel_size"]),
             block_resolution=saved.whole("block_resolution"),
@@ -199,7 +199,7 @@ class BlockGrid:
         return voxels.numpy().ravel()[inside[near]], pixels[near]
 
     def voxels_at(self, points_world: Float32) -> Int64:
-        """Return the flat indices (P,) of the voxels nearest to the points (P, 3), m; -1 outside all blocks."""
+        """Return the flat indices (P,) of the voxels nearest to the world points (P, 3), m; -1 outside all blocks."""
         if not len(points_world) or not self.block_count:
             return np.full(len(points_world), -1)
         r = self.settings.block_resolution

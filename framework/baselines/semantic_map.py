@@ -129,8 +129,9 @@ class SemanticMap(SceneMap):
         """Return the connected components of the mesh as instances.
 
         The class distribution is the mean over the voxels nearest to the vertices, without the background. The
-        confidence is the mean probability of the class, including the background. The number of observations is the
-        largest number of frames in which one of these voxels was under a mask.
+        confidence is the mean probability of the class of the component over these voxels, in the distributions with
+        the background. The number of observations is the largest number of frames in which one of these voxels was
+        under a mask.
         """
         mesh, up, instances = self.mesh(), self.gravity().up, {}
         found = self._sum_components(self.volume.surface().voxels, mesh.instance_ids)

@@ -30,7 +30,7 @@ class Appearance(NamedTuple):
 
     instance: int  # id of the object
     side: float  # px, square root of the area
-    parts: int  # number of detections mostly on the object
+    parts: int  # number of detections mostly on the object; see PART_INSIDE and PART_COVERS
     iou: float = 0.0  # of the object and its best detection; the other values are 0 without a detection
     inside: float = 0.0  # fraction of the detection's pixels on the object
     covered: float = 0.0  # fraction of the object's pixels in the detection

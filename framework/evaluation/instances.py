@@ -115,7 +115,7 @@ class Outcome(Enum):
     RIGHT = "correct"  # matched with a ground-truth instance of its class
     WRONG_CLASS = "wrong class"  # IoU with a ground-truth instance of another class reaches the threshold
     FALSE = "false positive"  # insufficient IoU, or a duplicate of a more confident prediction
-    IGNORED = "ignored"  # the ground truth is unknown
+    IGNORED = "ignored"  # not evaluated; see the rules in the docstring of this module
 
 
 @dataclass(frozen=True)
@@ -330,7 +330,7 @@ class _Overlaps:
 
 
 def average_precision(hits: Bool, truths: int) -> float:
-    """Return the area under the precision-recall curve of ranked predictions `hits` (K,), True = right.
+    """Return the area under the precision-recall curve of ranked predictions `hits` (K,), True = correct.
 
     `truths` is the number of ground-truth instances. All-point interpolation: each hit contributes the maximum
     precision at its own or a later position in the ranking, divided by `truths`.

@@ -17,8 +17,8 @@ SAME_POSE = 1e-6  # maximum difference between the entries of equal poses; files
 def in_map_world(truth: SceneTruth, timestamps: Float64, poses: Float64) -> SceneTruth:
     """Return the ground truth in the world frame of the map whose trajectory is `poses`.
 
-    If the run may use the ground-truth poses, and the first common pose is equal in both trajectories, they share one
-    world frame. Otherwise, the ground truth is aligned rigidly to the map by the poses at common times.
+    If the ground-truth poses are available to the run, and the first common pose is equal in both trajectories, they
+    share one world frame. Otherwise, the ground truth is aligned rigidly to the map by the poses at common times.
 
     Args:
         truth: The ground truth.

@@ -53,7 +53,10 @@ class Page:
         self.figure.text(*self._fraction(x, y), text, **style)
 
     def write(self, path: Path) -> list[Path]:
-        """Write `path`.png and `path`.pdf, and return their paths. The files are byte-identical in repeated calls."""
+        """Write the page to `path` with the suffixes .png and .pdf, and return both paths.
+
+        Repeated calls write byte-identical files.
+        """
         png, pdf = path.with_suffix(".png"), path.with_suffix(".pdf")
         with atomic_write(png) as temporary:
             self.figure.savefig(temporary, dpi=PNG_DPI)

@@ -17,7 +17,7 @@ from framework.rendering.viewpoint import best_view, fitted
 from framework.runs.stored_map import StoredMap
 
 ZOOM = 2.5  # magnification of the window with the most differing pixels
-FRAMING_SCALE = 0.1  # scale of the image that is rendered to frame a view
+FRAMING_SCALE = 0.1  # scale of the image rendered to determine the framing of a view
 
 
 @dataclass(frozen=True)

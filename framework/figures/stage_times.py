@@ -66,7 +66,7 @@ class MeanTimes:
 
     @property
     def columns(self) -> list[str]:
-        """Names of the columns with known times."""
+        """Names in COLUMNS with known times."""
         return [name for name, values in self.mean.items() if np.isfinite(values).any()]
 
     def growth(self, name: str) -> float:
@@ -92,7 +92,7 @@ def running_median(values: Float64, window: int) -> Float64:
 
 
 def spread(positions: Sequence[float], gap: float) -> list[float]:
-    """Return positions at least `gap` apart, with the smallest sum of squared displacements."""
+    """Return positions in the same order, at least `gap` apart, with the smallest sum of squared displacements."""
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(len(order))
     result = np.empty(len(order))

@@ -42,7 +42,7 @@ class TableChoice:
     `group_by`, each value of that key has a group of lines.
     """
 
-    # config keys for averaging and pairing; runs with the same value of the last key are not independent
+    # config keys to average over and to pair runs by; standard errors are computed over the values of the last key
     average_over: list[str] = field(default_factory=lambda: ["seed"])
     columns_by: str | None = None  # config key with one column per value; None = one column per metric
     group_by: str | None = None  # config key with one group of lines per value; None = one line per row
@@ -61,7 +61,9 @@ class TableChoice:
                 f"table.columns_by, table.group_by: expected at most one key, got {self.columns_by} and {self.group_by}"
             )
         if self.split_key in self.average_over:
-            raise ConfigError(f"table.average_over: expected keys other than table.{self.layout}, got {self.split_key}")
+            raise ConfigError(
+                f"table.average_over: expected keys other than the key of table.{self.layout}, got {self.split_key}"
+            )
         if self.columns_by and len(self.columns) > 1:
             raise ConfigError(
                 f"table.columns: expected one metric with table.columns_by, got {len(self.columns)}; set "
@@ -75,7 +77,7 @@ class TableChoice:
 
     @property
     def layout(self) -> str:
-        """`columns_by`, `group_by` or `rows`."""
+        """Layout of the table: `columns_by`, `group_by` or `rows`."""
         return "columns_by" if self.columns_by else "group_by" if self.group_by else "rows"
 
     @property
@@ -85,7 +87,7 @@ class TableChoice:
 
     @classmethod
     def of(cls, node: Any) -> TableChoice:
-        """Return the choice of a config's `table`. Raises ConfigError for unknown keys and wrong types."""
+        """Return the choice of a config block. Raises ConfigError for unknown keys and wrong types."""
         choice = cls(**checked_block(cls, "table", node))
         # a stored sweep may have keys of an older version
         return replace(choice, columns=[current_key(key) for key in choice.columns])
@@ -211,7 +213,7 @@ class ComparisonTable:
         return list(dict.fromkeys([*self.published.sequences, *order]))
 
     def called(self, row: RunRow, without: str = "") -> str:
-        """Return a row's name in the table; the value of the key `without` is omitted."""
+        """Return the name of a row in the table, without the part of its variant for the config key `without`."""
         named = self.choice.names.get(row.system, row.system)
         variant = [part for part in row.variant if not without or not part.startswith(f"{without}=")]
         return ", ".join([named, *variant] if named else variant) or row.name

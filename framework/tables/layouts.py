@@ -89,6 +89,8 @@ _Cell = tuple[str, float]  # text and compared value; NaN = not compared
 
 @dataclass(frozen=True)
 class _Line:
+    """A line of a table with sequences."""
+
     labels: list[str]
     cells: list[_Cell]
     variant: tuple[str, ...] = ()  # lines with the same variant are compared

@@ -1,4 +1,4 @@
-"""Voxels with class and instance distributions, updated by Bayes' rule: section 3.2.3 of the paper."""
+"""Voxels with class and instance distributions, updated by Bayes' rule (section 3.2.3 of the paper)."""
 
 from __future__ import annotations
 
@@ -60,9 +60,10 @@ class BayesianTsdf(MapFuser):
             self.association.merge(self.scene, matches)
 
     def evidence(self, clusters: PointClusters, instances: int) -> DetectionEvidence:
-        """Return log P(O_u | I_t) of eqs. (7) and (8) for the clusters; for instances, relative to any other instance.
+        """Return the evidence of the clusters, log P(O_u | I_t) of eqs. (7) and (8).
 
-        `instances` is the number of instances in the map.
+        The evidence for an instance is relative to any other instance. `instances` is the number of instances in the
+        map.
         """
         if self.instance_floor > 0:  # a score counts as at least twice the floor, so that no match lowers the log-odds
             log_odds = np.log(np.maximum(clusters.scores, 2 * self.instance_floor) / self.instance_floor)

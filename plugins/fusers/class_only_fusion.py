@@ -22,9 +22,10 @@ class ClassOnlyFusion(MapFuser):
     The baseline follows SemanticFusion (McCormac et al. 2017) and Pham et al. (WACV 2019). These systems label every
     pixel. Here, the distributions come from masks. A pixel gets the distribution of the mask with the highest score at
     this pixel. In this distribution, the background has the probability that the detector assigns to no class. A pixel
-    under no mask is background, unless the detector missed an object. Two touching objects of one class become one
-    instance. Both systems regularize with a CRF. Here, `smoothness` is the weight of a Potts model over the mesh. It is
-    off by default, because it did not improve AP50.
+    outside all masks is evidence for the background. This evidence is limited by `missed`, because the detector may
+    have missed an object. Two touching objects of one class become one instance. Both systems regularize with a CRF.
+    Here, `smoothness` is the weight of a Potts model over the mesh. It is off by default, because it did not improve
+    AP50.
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)

@@ -110,8 +110,8 @@ def class_agreement(clusters: Float32, instances: Float32) -> npt.NDArray[np.flo
 def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int32:
     """Return the matched column (N,) of each row, -1 = unmatched.
 
-    The matching of the `allowed` pairs (N, M) is greedy, largest preference first. Ties go to the smaller column, then
-    to the smaller row.
+    The matching of the `allowed` pairs (N, M) is greedy, in order of decreasing `preference` (N, M). Ties go to the
+    smaller column, then to the smaller row.
     """
     match = np.full(len(allowed), -1, np.int32)
     rows, columns = np.nonzero(allowed)
@@ -137,7 +137,7 @@ class LabeledMap(Protocol):
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
         """Return the most likely instance (ceil(H / stride), ceil(W / stride)) at the measured surface, 0 = none.
 
-        Samples every stride-th depth reading of every stride-th row of `frame.depth`. Unlike ray casting, the
+        The samples are every stride-th depth reading of every stride-th row of `frame.depth`. Unlike ray casting, the
         look-up never returns an instance that is hidden behind a new object.
         """
 

@@ -43,7 +43,7 @@ class Confirmation:
 
     @classmethod
     def of(cls, saved: MapHeader) -> Confirmation:
-        """Return the conditions in a map's header. Raises DataError or ConfigError if they are invalid."""
+        """Return the conditions in the header of a map file. Raises DataError or ConfigError if they are invalid."""
         return cls(saved.whole("min_observations"), saved.number("min_confidence"), saved.number("min_area"))
 
     def is_met(self, record: InstanceRecord) -> bool:
@@ -58,7 +58,7 @@ class Confirmation:
         return counts
 
     def min_vertices(self, voxel_size: float) -> int:
-        """Return the number of mesh vertices of an instance with an area of `min_area`."""
+        """Return the number of mesh vertices of an instance with the area `min_area`; `voxel_size` is in m."""
         return vertices_of_area(self.min_area, voxel_size)
 
     def too_small(self, instance_ids: Int32, voxel_size: float) -> Bool:

@@ -87,10 +87,10 @@ class InstanceTable:
         self._offset = 0  # offset of the frame indices of this sequence
         self.combine = combine
         self.logarithmic = logarithmic
-        self.embedding_space = ""  # space of the instances' embeddings; "" = no embeddings
+        self.embedding_space = ""  # space of the embeddings of the instances; "" = no embeddings
 
     def create(self, classes: int, frame_index: int) -> InstanceRecord:
-        """Create an instance without observations, with zero evidence for each of `classes` classes."""
+        """Create an instance in a frame, without observations and with zero evidence for each of `classes` classes."""
         self.last_id += 1
         record = InstanceRecord(self.last_id, np.zeros(classes), first_frame=frame_index, last_frame=frame_index)
         self.records[self.last_id] = record
@@ -103,7 +103,7 @@ class InstanceTable:
         self._offset = 0
 
     def number_of(self, frame_index: int) -> int:
-        """Return the index of a frame in this map, offset to be above all frames of previous sequences."""
+        """Return `frame_index` plus an offset, so that the index exceeds those of all frames of previous sequences."""
         if frame_index + self._offset <= self._last_before:
             self._offset = self._last_before + 1
         return frame_index + self._offset

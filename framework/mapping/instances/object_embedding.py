@@ -45,7 +45,7 @@ class ObjectEmbedding:
 
     @property
     def mean(self) -> Float32:
-        """The unit vector (D,) along the sum; 0 if the vectors cancel out."""
+        """Unit vector (D,) along the sum; zeros if the vectors cancel out."""
         length = float(np.linalg.norm(self.sum))
         return np.asarray(self.sum / length if length > 0 else self.sum, np.float32)
 

@@ -37,7 +37,7 @@ SLOTS = Evidence._fields[1:]  # fields with one row per labeled voxel
 
 
 class Storage(Enum):
-    """Labels that a voxel stores: the most likely labels, or all labels."""
+    """Labels that a voxel stores: COMPACT = the most likely labels, EXACT = all labels."""
 
     COMPACT = "compact"
     EXACT = "exact"
@@ -134,9 +134,9 @@ class EvidenceRows:
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:
-        """Combine the evidence for instance `dropped` with that for `kept` in every voxel.
+        """Combine the evidence for instance `dropped` with the evidence for `kept` in every voxel.
 
-        Merging is rare. It visits only the rows whose instance set contains the bit of `dropped`.
+        Merging visits only the rows whose instance set contains the bit of `dropped`.
         """
         row_bits = self._row_bits[: self.row_count]
         merge_instances(self.evidence, row_bits, np.int32(kept), np.int32(dropped), int(self.combine))
@@ -165,7 +165,7 @@ class EvidenceRows:
         self.evidence = Evidence(self._labeled, **{name: self._slots[name] for name in SLOTS})
 
     def _free_classes(self) -> UInt8:
-        """Return the class slots of a new voxel: free slots, or every class in exact storage."""
+        """Return the class ids (T,) in the slots of a new voxel: free slots, or every class in exact storage."""
         named = np.arange(self._class_slots) if self.storage is Storage.EXACT else np.full(self._class_slots, NO_CLASS)
         return named.astype(np.uint8)
 

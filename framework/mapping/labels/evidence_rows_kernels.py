@@ -154,7 +154,7 @@ def fewest_free(instance_ids):
 
 @device
 def _merge_voxel(ids, values, kept, dropped, combine):
-    """Combine a voxel's evidence for instance `dropped`, if any, with that for `kept`, and free its slot."""
+    """Combine the evidence of a voxel for instance `dropped`, if any, with the evidence for `kept`, and free a slot."""
     for s in range(len(ids)):
         if ids[s] == dropped:
             value = values[s]

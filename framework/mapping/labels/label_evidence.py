@@ -63,7 +63,7 @@ class Measurement(NamedTuple):
     instance_id: Int32  # (N,) instance associated with each cluster, 0 = none
     instance_log_odds: Float32  # (N,) log-odds of that instance over any other instance
     absence: np.float32  # log-odds, <= 0, of a matched instance in voxels outside its mask
-    matched: Bool  # (ids + 1,) True if an instance was matched in this frame, by id
+    matched: Bool  # (ids + 1,) indexed by id, True where an instance was matched in this frame
     class_scores: Integers  # (N, NO_CLASS + 1) int32, in exact storage int64; see pack_class_scores()
     named_classes: UInt8  # (N, NEW_CLASSES) most likely classes of each cluster
     combine: int  # value of Combine

@@ -47,7 +47,7 @@ class LabelRule(NamedTuple):
 class DetectionEvidence(NamedTuple):
     """Evidence of a frame's N clusters."""
 
-    instances: Float32  # (N,) evidence for the matched instance of each cluster over any other instance
+    instances: Float32  # (N,) evidence for the matched instance of each cluster, relative to any other instance
     classes: Float64  # (N, C) evidence for each class
     absence: float = 0.0  # evidence for a matched instance outside its mask, <= 0
 
@@ -131,7 +131,10 @@ class LabeledVoxels:
     def measurement(
         self, table: InstanceTable, points: PixelLists, matches: Matches, evidence: DetectionEvidence, rule: LabelRule
     ) -> Measurement:
-        """Return the evidence of a frame's clusters in the form used by the voxel update."""
+        """Return the evidence of the clusters of a frame for the voxel update.
+
+        The lists of `points` are reduced by the occlusion order and the support rule.
+        """
         updating = np.ones_like(matches.instance_ids) if self.update_unmatched else matches.instance_ids
         points = keep_on_top(points, updating, self.occlusion_area_ratio)
         supported = self.supported_instances(table, matches)

@@ -101,7 +101,8 @@ def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kep
 def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
     """Fill new_ids (H, W) with replacement[i, column[k]] for pixels of list i at instance k of the map.
 
-    Adds the number of pixels that get each new list to moved (CHUNKS, lists), which must start at 0.
+    `seen` holds the instance at every stride-th pixel of every stride-th row, and column[k] is 0 for instances without
+    a replacement. Adds the number of pixels that get each new list to moved (CHUNKS, lists), initially 0.
     """
     height, width = list_ids.shape
     for chunk in prange(CHUNKS):

@@ -140,13 +140,16 @@ def machine_memory() -> int:
 
 
 def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], length: int, prefix: str = "") -> None:
-    """Raise DataError unless the arrays have `length` rows, and the types and row shapes of the `expected` arrays."""
+    """Raise DataError unless the arrays have `length` rows, and the types and row shapes of the `expected` arrays.
+
+    The names in `arrays` begin with `prefix`.
+    """
     for name, like in expected.items():
         check_array(prefix + name, arrays[prefix + name], (length, *like.shape[1:]), like.dtype)
 
 
 def check_known(name: str, array: Array, known: Iterable[int]) -> None:
-    """Raise DataError unless all values of the array are in `known`, because kernels use the values as indices."""
+    """Raise DataError unless all values of the array are in `known`, because kernels use them as indices."""
     unknown = array[~np.isin(array, list(known))]
     if unknown.size:
         raise DataError(f"{name}: expected ids in the map, got {unknown[0]}")

@@ -57,8 +57,8 @@ def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
 def surface_blocks(depth, view, sensor, block_size, stride, samples, found, counts):
     """Write the keys of blocks along the band of every stride-th depth reading to `found` (CHUNKS, M), by chunk.
 
-    Samples every stride-th row. Writes the number of keys of each chunk to counts (CHUNKS,); counts above M mean that
-    `found` is too small.
+    Only every stride-th row is used, and `block_size` is in m. Writes the number of keys of each chunk to counts
+    (CHUNKS,); counts above M mean that `found` is too small.
     """
     height, width = depth.shape
     rows, columns = (height + stride - 1) // stride, (width + stride - 1) // stride

@@ -31,7 +31,7 @@ class SeenBlocks(NamedTuple):
     """
 
     blocks: Int32  # (A,) block indices
-    near_start: Int64  # (A,) start of the near voxels of each block
+    near_start: Int64  # (A,) start of the near voxels of each block in near_voxel and near_pixel
     near_count: Int32  # (A,) number of near voxels of each block
     near_voxel: UInt16  # (512 A,) index of each near voxel in its block, ascending
     near_pixel: Int32  # (512 A,) index v * width + u of the pixel of each near voxel

@@ -265,7 +265,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, 
     """Fill `depth` as cast_coarse() does, but start the search at the camera's depth readings (H, W), m.
 
     No pixel is searched beyond its depth in `limits` (H, W), m. If the limit is 0, the depth is -1 (not searched),
-    because neighboring pixels may still be searched.
+    because neighboring pixels may still be searched. `noise` contains the depth noise parameters of the sensor.
 
     Depth readings are noisy, and a wrong pose displaces them. Therefore, the search starts at the extrapolation of the
     two previous rays if the reading agrees with it. Otherwise it starts at the reading plus the last displacement.

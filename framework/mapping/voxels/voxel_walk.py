@@ -121,7 +121,10 @@ def corners(grid, values, block, i, j, k, missing):
 
 @device
 def interpolate(s, fx, fy, fz):
-    """Return (value, d/dx, d/dy, d/dz) at fractions (fx, fy, fz) of a voxel between eight corners `s`, x fastest."""
+    """Return (value, d/dx, d/dy, d/dz) at fractions (fx, fy, fz) of a voxel between eight corners `s`, x fastest.
+
+    The derivatives are per voxel.
+    """
     x00, x10, x01, x11 = np.float32(s[0]), np.float32(s[2]), np.float32(s[4]), np.float32(s[6])
     dx00, dx10 = np.float32(s[1]) - x00, np.float32(s[3]) - x10
     dx01, dx11 = np.float32(s[5]) - x01, np.float32(s[7]) - x11
@@ -143,7 +146,7 @@ def all_seen(s):
 
 @device
 def trilinear(grid, block, x, y, z):
-    """Return (value, d/dx, d/dy, d/dz, valid): the stored distance and its gradient at (x, y, z), voxels.
+    """Return (value, d/dx, d/dy, d/dz, valid): the distance and its gradient at (x, y, z), voxels, in stored units.
 
     `block` contains the voxel at the floor of the point. The result is valid if all eight voxels around the point were
     observed.

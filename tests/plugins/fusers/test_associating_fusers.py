@@ -147,7 +147,7 @@ def test_fuser_merges_supported_object_only_if_classes_agree(
     assert len(fuser.scene.table.records) == (1 if merged else 2)
 
 
-def test_fuser_separate_objects_stay_apart_under_shared_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
+def test_fuser_separate_objects_are_not_merged_by_shared_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
     fuser = new_fuser()
     first, second, _ = masks_of(frames[0])
     for _ in range(5):

@@ -185,7 +185,7 @@ def test_compact_scores_saturate_without_wrapping() -> None:
 
 @pytest.mark.parametrize(("classes", "best"), [(2, 0.7), (3, 0.6), (9, 0.8), (80, 0.5)])
 def test_most_likely_class_is_stable_over_repetition(classes: int, best: float) -> None:
-    """A distribution whose last class is the most likely, and the first the second most likely, is fused 1000 times."""
+    """The last class is the most likely, and the first class the second most likely; 1000 updates are fused."""
     p = np.full((1, classes), 0.1 * (1 - best) / max(classes - 2, 1))
     p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
     relative, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
