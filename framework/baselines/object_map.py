@@ -2,7 +2,7 @@
 
 Fusion++ (McCormac et al. 2018) represents an object by 64^3 voxels, which are resampled as the object grows. It
 integrates every frame that shows the object, corrects object poses by loop closures, and tracks against a coarse
-background. MaskFusion (Runz et al. 2018) stores surfels under the masks only, and tracks moving objects.
+background. MaskFusion (Runz et al. 2018) stores surfels only at the pixels of masks, and tracks moving objects.
 
 Here, all volumes have voxels of the same size, objects are static, and a volume changes only in frames in which its
 object is detected.

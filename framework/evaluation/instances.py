@@ -237,12 +237,12 @@ class _Overlaps:
     """The overlaps of K predictions, in order of decreasing confidence, with T ground-truth instances."""
 
     iou: Float64  # (K, T)
-    ignorable: Bool  # (K,) True: more than half of the points on ignored instances, or class not annotated
+    ignorable: Bool  # (K,) True where most points are on ignored instances, or the class was not annotated
     predicted_ids: Int64  # (K,)
     predicted_classes: npt.NDArray[np.object_]  # (K,)
     truth_ids: Int64  # (T,)
     truth_classes: npt.NDArray[np.object_]  # (T,) name or None
-    evaluated: Bool  # (T,) True: known class and sufficient size; False: ignored
+    evaluated: Bool  # (T,) True where the class is known and the size sufficient; False = ignored
 
     @classmethod
     def between(

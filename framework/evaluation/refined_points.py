@@ -110,7 +110,7 @@ class TrueFit:
 
     iou: Float64  # (N,) intersection over union with the object; 0 for an empty cluster
     points_inside: Int32  # (N,) number of the cluster's points on the object
-    unknown: Bool  # (N,) True: not evaluated, because an object of unknown class fits better
+    unknown: Bool  # (N,) True where an object of unknown class fits better, so that the cluster is not evaluated
 
 
 def point_counts(clusters: PointClusters) -> Int32:

@@ -70,7 +70,10 @@ class MeanTimes:
         return [name for name, values in self.mean.items() if np.isfinite(values).any()]
 
     def growth(self, name: str) -> float:
-        """Return the median over the last third of the frames divided by that over the first third; NaN if unknown."""
+        """Return the median time of the last third of the frames divided by the median time of the first third.
+
+        Return NaN if a median is unknown.
+        """
         third = max(1, len(self.frames) // 3)
         first, last = self.mean[name][:third], self.mean[name][-third:]
         if not np.isfinite(first).any() or not np.isfinite(last).any():

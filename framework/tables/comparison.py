@@ -189,12 +189,12 @@ class ComparisonTable:
     @property
     def published_rows(self) -> list[PublishedRow]:
         """Published rows with a number in the table."""
-        return [row for row in self.published.rows if row.knows(self._keys)]
+        return [row for row in self.published.rows if row.has_any(self._keys)]
 
     @property
     def published_unknown(self) -> list[PublishedRow]:
         """Published rows with numbers for this table that were not looked up."""
-        return [row for row in self.published.rows if not row.knows(self._keys) and row.leaves_open(self._keys)]
+        return [row for row in self.published.rows if not row.has_any(self._keys) and row.lacks_any(self._keys)]
 
     @property
     def _keys(self) -> list[Key]:
@@ -207,7 +207,7 @@ class ComparisonTable:
 
     @cached_property
     def sequences(self) -> list[str]:
-        """Values of the split key: those of the published table, then those of the runs."""
+        """Values of the split key: first the values in the published table, then the values in the runs."""
         found = {run[-1] for run in self._runs} if self.choice.split_key else set()
         order = sorted(found, key=lambda value: natural((value,)))
         return list(dict.fromkeys([*self.published.sequences, *order]))

@@ -164,7 +164,7 @@ def by_grid(comparison: ComparisonTable) -> TextTable:
 
     sections: dict[str, list[_Line]] = {}
     for sequence in comparison.sequences:
-        known = [one for one in comparison.published_rows if one.knows((sequence, key) for key in keys)]
+        known = [one for one in comparison.published_rows if one.has_any((sequence, key) for key in keys)]
         sections[sequence] = [
             _row_line(comparison, row, [of_key.cell(row, sequence, digits) for of_key in figures])
             for row in rows

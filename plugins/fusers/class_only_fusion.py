@@ -57,7 +57,7 @@ class ClassOnlyFusion(MapFuser):
             self.scene.labels.update(seen, masks)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
-        """Return the log ratios (N, C), log P(O_u = c) / P(O_u = background), of eq. (7) for a pixel under each mask.
+        """Return the log ratios (N, C), log P(O_u = c) / P(O_u = background), of eq. (7) for a pixel inside each mask.
 
         A score is the probability of the best class, but the distribution excludes the background. Therefore, the score
         divided by the entry of the best class is the probability of all classes together. The result is mixed with a

@@ -97,13 +97,13 @@ class InstanceTable:
         return record
 
     def begin_recording(self) -> None:
-        """Begin another sequence, whose frame indices may repeat those of previous sequences."""
+        """Begin another sequence. Its frame indices may repeat frame indices of previous sequences."""
         spans = [span[1] for record in self.records.values() for span in record.in_view.spans[-1:]]
         self._last_before = max([*spans, *(record.last_frame for record in self.records.values())], default=-1)
         self._offset = 0
 
     def number_of(self, frame_index: int) -> int:
-        """Return `frame_index` plus an offset, so that the index exceeds those of all frames of previous sequences."""
+        """Return `frame_index` plus an offset, so that the result exceeds all frame indices of previous sequences."""
         if frame_index + self._offset <= self._last_before:
             self._offset = self._last_before + 1
         return frame_index + self._offset

@@ -109,7 +109,7 @@ def label_vertices(grid, evidence, counts, surface, colors, instance_ids, class_
 
     The color comes from the nearest voxel. The instance is the majority of the eight surrounding voxels, weighted
     trilinearly. Each voxel votes for its most likely instance among those with `counts[id]` True. The class comes from
-    the voxel with the largest weight among those of the majority. Vertices without an instance have no class.
+    the voxel with the largest weight in the majority. Vertices without an instance have no class.
     """
     vertices = surface.vertices
     for chunk in prange(-(-len(vertices) // CHUNK)):

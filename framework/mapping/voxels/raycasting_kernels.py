@@ -74,7 +74,7 @@ def _refined(grid, o, d, step, z, reach, key, region):
 def _first_surface(grid, o, d, step, near, far, key, region):
     """Return (z, nx, ny, nz, key, region) of the first front face between depths `near` and `far`, m; z is 0 if none.
 
-    The parameters and the other results are those of _refined().
+    See _refined() for the parameters and the other results.
     """
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     to_voxels = grid.tsdf_unit / grid.voxel_size
