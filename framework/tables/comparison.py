@@ -42,7 +42,7 @@ class TableChoice:
     `group_by`, each value of that key has a group of lines.
     """
 
-    # config keys for averaging and pairing; runs with the same value of the last key are not independent
+    # config keys to average over and to pair runs by; standard errors are computed over the values of the last key
     average_over: list[str] = field(default_factory=lambda: ["seed"])
     columns_by: str | None = None  # config key with one column per value; None = one column per metric
     group_by: str | None = None  # config key with one group of lines per value; None = one line per row
@@ -61,11 +61,13 @@ class TableChoice:
                 f"table.columns_by, table.group_by: expected at most one key, got {self.columns_by} and {self.group_by}"
             )
         if self.split_key in self.average_over:
-            raise ConfigError(f"table.average_over: expected keys other than table.{self.layout}, got {self.split_key}")
+            raise ConfigError(
+                f"table.average_over: expected keys other than the key of table.{self.layout}, got {self.split_key}"
+            )
         if self.columns_by and len(self.columns) > 1:
             raise ConfigError(
                 f"table.columns: expected one metric with table.columns_by, got {len(self.columns)}; set "
-                f"table.group_by={self.columns_by} for several metrics"
+                f"table.columns_by=null and table.group_by={self.columns_by} for several metrics"
             )
         if self.published and read_published(self.published).layout != self.layout:
             raise ConfigError(
@@ -75,7 +77,7 @@ class TableChoice:
 
     @property
     def layout(self) -> str:
-        """`columns_by`, `group_by` or `rows`."""
+        """Layout of the table: `columns_by`, `group_by` or `rows`."""
         return "columns_by" if self.columns_by else "group_by" if self.group_by else "rows"
 
     @property
@@ -85,7 +87,7 @@ class TableChoice:
 
     @classmethod
     def of(cls, node: Any) -> TableChoice:
-        """Return the choice of a config's `table`. Raises ConfigError for unknown keys and wrong types."""
+        """Return the choice of a config block. Raises ConfigError for unknown keys and wrong types."""
         choice = cls(**checked_block(cls, "table", node))
         # a stored sweep may have keys of an older version
         return replace(choice, columns=[current_key(key) for key in choice.columns])
@@ -164,7 +166,7 @@ class ComparisonTable:
 
     @property
     def compared(self) -> list[tuple[RunRow, RunRow]]:
-        """Pairs of a row and its baseline."""
+        """Pairs of a row and its baseline, for every row with a baseline."""
         pairs = ((row, self.base_of(row)) for row in self.rows)
         return [(row, base) for row, base in pairs if base is not None]
 
@@ -187,12 +189,12 @@ class ComparisonTable:
     @property
     def published_rows(self) -> list[PublishedRow]:
         """Published rows with a number in the table."""
-        return [row for row in self.published.rows if row.knows(self._keys)]
+        return [row for row in self.published.rows if row.has_any(self._keys)]
 
     @property
     def published_unknown(self) -> list[PublishedRow]:
         """Published rows with numbers for this table that were not looked up."""
-        return [row for row in self.published.rows if not row.knows(self._keys) and row.leaves_open(self._keys)]
+        return [row for row in self.published.rows if not row.has_any(self._keys) and row.lacks_any(self._keys)]
 
     @property
     def _keys(self) -> list[Key]:
@@ -205,13 +207,13 @@ class ComparisonTable:
 
     @cached_property
     def sequences(self) -> list[str]:
-        """Values of the split key: those of the published table, then those of the runs."""
+        """Values of the split key: first the values in the published table, then the values in the runs."""
         found = {run[-1] for run in self._runs} if self.choice.split_key else set()
         order = sorted(found, key=lambda value: natural((value,)))
         return list(dict.fromkeys([*self.published.sequences, *order]))
 
     def called(self, row: RunRow, without: str = "") -> str:
-        """Return a row's name in the table; the value of the key `without` is omitted."""
+        """Return the name of a row in the table, without the part of its variant for the config key `without`."""
         named = self.choice.names.get(row.system, row.system)
         variant = [part for part in row.variant if not without or not part.startswith(f"{without}=")]
         return ", ".join([named, *variant] if named else variant) or row.name
@@ -243,7 +245,7 @@ class SequenceMean:
 
 
 def mean_by_sequence(values: Mapping[Run, float]) -> dict[str, Mean]:
-    """Return the mean of each sequence; the sequence is the last part of a run."""
+    """Return the mean of each sequence over the other keys. The sequence is the last entry of a Run."""
     grouped: dict[str, list[float]] = {}
     for run, value in values.items():
         grouped.setdefault(run[-1], []).append(value)
@@ -262,5 +264,8 @@ def mean_over_sequences(values: Mapping[Run, float]) -> SequenceMean:
 
 
 def mean_difference(differences: Mapping[Run, float]) -> Mean:
-    """Return the mean of paired differences; its standard error is over sequences, as seeds are not independent."""
+    """Return the mean of paired differences over sequences.
+
+    Its standard error is computed over sequences, because runs of one sequence with other seeds are not independent.
+    """
     return Mean.of(mean.value for mean in mean_by_sequence(differences).values())

@@ -49,7 +49,7 @@ def _grids(comparison: ComparisonTable) -> Iterator[TextTable]:
 
 
 def comma_separated_rows(comparison: ComparisonTable) -> str:
-    """Return a CSV table with one line per row, with all digits. Unknown values are empty."""
+    """Return a CSV table with one line per row, with values in full precision. Unknown values are empty."""
     statistics = ("mean", "sd", "n", "difference", "se", "pairs")
     keys = [f"{column}.{name}" for column in comparison.choice.columns for name in statistics]
     text = io.StringIO()
@@ -70,7 +70,10 @@ def comma_separated_rows(comparison: ComparisonTable) -> str:
 
 
 def comma_separated_runs(comparison: ComparisonTable) -> str:
-    """Return a CSV table with one line per run and metric, with all digits. Undefined metrics have no line."""
+    """Return a CSV table with one line per run and metric, with values in full precision.
+
+    Undefined metrics have no line.
+    """
     split_key = comparison.choice.split_key
     assert split_key
     text = io.StringIO()

@@ -1,7 +1,7 @@
-"""Layouts of a comparison: a line per row, a column per sequence, or a group of lines per sequence.
+"""Layouts of a comparison: one line per row, one column per sequence, or one group of lines per sequence.
 
-In the layouts with sequences, rows with the same pose source are adjacent, and their highest mean is bold. Means over
-fewer runs than the others are not compared.
+In the layouts with sequences, rows with the same pose source are adjacent, and the highest mean among them is bold.
+Means over fewer runs than the others are not compared.
 """
 
 from __future__ import annotations
@@ -89,6 +89,8 @@ _Cell = tuple[str, float]  # text and compared value; NaN = not compared
 
 @dataclass(frozen=True)
 class _Line:
+    """A line of a table with sequences."""
+
     labels: list[str]
     cells: list[_Cell]
     variant: tuple[str, ...] = ()  # lines with the same variant are compared
@@ -109,7 +111,10 @@ class _SequenceFigures:
         return {sequence for of_row in self.means.values() for sequence in of_row}
 
     def cell(self, row: RunRow, sequence: str, digits: int) -> _Cell:
-        """Return the mean ± standard deviation over seeds, with the number of seeds if values are missing."""
+        """Return the mean ± standard deviation over the seeds of one sequence.
+
+        The number of seeds is appended if values are missing.
+        """
         if not any(run[-1] == sequence for run in row.records):
             return MISSING, math.nan
         mean = self.means[row.name].get(sequence, Mean.of(()))
@@ -118,7 +123,10 @@ class _SequenceFigures:
         return _mean_cell(mean, digits, self._seeds), mean.value if mean.count == most else math.nan
 
     def mean_cell(self, row: RunRow, expected: int, digits: int) -> _Cell:
-        """Return the mean ± standard deviation over seeds, with the number of sequences or runs if some are missing."""
+        """Return the mean over sequences ± standard deviation over seeds.
+
+        The number of sequences or runs is appended if some of the `expected` sequences or of their runs are missing.
+        """
         mean = self._overall[row.name]
         others = [self._overall[other.name] for other in self._rows if other.variant == row.variant]
         competes = (mean.count, mean.runs) == max((other.count, other.runs) for other in others)
@@ -129,7 +137,7 @@ class _SequenceFigures:
 
 
 def across_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a table of each row's means over seeds: one column per sequence, and a column with their mean."""
+    """Return a table of the means of each row over seeds, with one column per sequence and a column with their mean."""
     [key] = comparison.choice.columns
     figures, sequences = _SequenceFigures(comparison, key), comparison.sequences
     digits = _decimals([figures])
@@ -147,7 +155,7 @@ def across_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def by_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a table with a group of lines per sequence, and one line per row. The last group contains the means."""
+    """Return a table with one group of lines per sequence, and one line per row. The last group contains the means."""
     keys = comparison.choice.columns
     rows = [row for rows in _by_variant(comparison.rows) for row in rows]
     figures = [_SequenceFigures(comparison, key) for key in keys]
@@ -156,7 +164,7 @@ def by_grid(comparison: ComparisonTable) -> TextTable:
 
     sections: dict[str, list[_Line]] = {}
     for sequence in comparison.sequences:
-        known = [one for one in comparison.published_rows if one.knows((sequence, key) for key in keys)]
+        known = [one for one in comparison.published_rows if one.has_any((sequence, key) for key in keys)]
         sections[sequence] = [
             _row_line(comparison, row, [of_key.cell(row, sequence, digits) for of_key in figures])
             for row in rows
@@ -267,7 +275,7 @@ def _difference(mean: Mean, digits: int) -> str:
 
 
 def _of(text: str, count: int, expected: int) -> str:
-    """Return the text, with the count appended if it differs from the expected count."""
+    """Return the text, with the count appended if it differs from the expected count; NOTHING if the count is 0."""
     if not count:
         return NOTHING
     return text if count == expected else f"{text} ({count} of {expected})"

@@ -46,12 +46,12 @@ def _averaging(comparison: ComparisonTable) -> Iterator[str]:
     """Yield notes about the means and the comparison of rows."""
     choice, over = comparison.choice, ", ".join(comparison.choice.average_over)
     if others := following(comparison.records, choice.average_over):
-        yield f"Also averaged over keys whose value equals that of {over} in every run: {', '.join(others)}."
+        yield f"Also averaged over keys with the same value as {over} in every run: {', '.join(others)}."
     if choice.split_key:
         yield (
             f"Cells: mean ± sample standard deviation over {over}. mean: average of the sequences "
-            f"({choice.split_key}) with equal weights; its deviation is over the runs with all sequences. "
-            "Bold: highest value for the same poses and number of runs. missing: no complete run."
+            f"({choice.split_key}) with equal weights; its standard deviation is computed over the {over} values with "
+            "all sequences. Bold: highest value for the same poses and number of runs. missing: no complete run."
         )
     else:
         yield f"Cells: mean ± sample standard deviation over {over}. runs: number of complete runs."
@@ -65,11 +65,11 @@ def _averaging(comparison: ComparisonTable) -> Iterator[str]:
             error += f" over {kinds}, after averaging the runs of each"
         yield (
             f"Differences are paired by {', '.join(keys)}: {error}. "
-            f"*: the {CONFIDENCE:.0%} interval of Student's t excludes 0."
+            f"*: the {CONFIDENCE:.0%} confidence interval (Student's t) excludes 0."
         )
         bases = [base for _, base in comparison.compared]
         if alone := [row.name for row in comparison.rows if not (comparison.base_of(row) or row in bases)]:
-            yield f"Rows without a matching row of {comparison.base_name}: {'; '.join(alone)}."
+            yield f"Rows without a matching baseline row ({comparison.base_name}): {'; '.join(alone)}."
 
 
 def _with_needs(columns: Sequence[str]) -> str:
@@ -159,7 +159,7 @@ def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
 
 
 def _same(records: Sequence[Record]) -> str:
-    """Return the options that all runs have in common, by stage."""
+    """Return the config options that all runs have in common, as stage=option."""
     chosen = {stage: {record.metrics.get(f"{CHOICE}{stage}") for record in records} for stage in STAGES}
     agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}
     return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
@@ -184,7 +184,7 @@ def machine(record: Record) -> str:
 
 
 def counted(words: Iterable[str]) -> str:
-    """Return the distinct words, each with its number of runs if there are several words."""
+    """Return the distinct texts, each with its number of runs if there are several."""
     counts = Counter(words).most_common()
     if len(counts) == 1:
         return counts[0][0]
@@ -192,6 +192,6 @@ def counted(words: Iterable[str]) -> str:
 
 
 def digest(records: Sequence[Record]) -> str:
-    """Return one short hash of the configs of several runs, independent of their order."""
+    """Return 12 hexadecimal digits of the hash of the configs of several runs, independent of their order."""
     hashes = sorted(str(record.metrics["config_hash"]) for record in records)
     return hashlib.sha256("".join(hashes).encode()).hexdigest()[:12]

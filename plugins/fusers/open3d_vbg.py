@@ -66,7 +66,7 @@ class Open3DVoxelBlockGrid(MapFuser):
 
 
 def _paint(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> Int32:
-    """Return the instance (H, W) at each pixel, 0 = none; overlaps go to the cluster with the highest score."""
+    """Return the instance ids (H, W), 0 = none; pixels of several clusters go to the one with the highest score."""
     image = np.zeros(shape, np.int32)
     for k in np.argsort(clusters.scores, kind="stable"):
         if instance_ids[k]:

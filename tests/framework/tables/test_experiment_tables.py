@@ -153,7 +153,7 @@ def test_table_notes_list_parameters_equal_to_seed(tmp_path: Path) -> None:
         (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
         metrics = json.loads((directory / "metrics.json").read_text()) | {"config_hash": config_hash(config)}
         (directory / "metrics.json").write_text(json.dumps(metrics))
-    expected = "- Also averaged over keys whose value equals that of seed in every run: dataset.stride."
+    expected = "- Also averaged over keys with the same value as seed in every run: dataset.stride."
     assert expected in write_tables(tmp_path)
 
 
@@ -182,7 +182,7 @@ RUN_TIMES = {
 
 
 def of_dataset(sweep: Path, dataset: str, annotation: str | None = None, only: str = "") -> None:
-    """Set the dataset of all runs, or of those of one row."""
+    """Set the dataset of all runs, or only of the runs of one row."""
     for path in sweep.glob(f"row={only}*/metrics.json"):
         expected = {"choice.dataset": dataset, "annotation_release": annotation}
         path.write_text(json.dumps(json.loads(path.read_text()) | expected))
@@ -299,7 +299,7 @@ def test_table_without_experiment_has_column_for_single_value(tmp_path: Path) ->
 def test_table_without_metrics_has_all_columns(tmp_path: Path) -> None:
     run(tmp_path, "a", 0, None, 1.0, **{"stage_ms.refinement.median": None})
     text = write_tables(tmp_path)
-    assert text.splitlines()[2].count("|") == 18  # row, runs, poses, and all 14 figures
+    assert text.splitlines()[2].count("|") == 18  # row, runs, poses, and all 14 metrics
     assert "Omitted" not in text
 
 

@@ -93,10 +93,10 @@ GOLDEN = """\
 | other                     | ground truth | made up    | +0.500 | +0.400 | +0.450 ± 0.050 |     3 |
 
 - Cells: mean ± sample standard deviation over seed. mean: average of the sequences (dataset.scene) with equal \
-weights; its deviation is over the runs with all sequences. Bold: highest value for the same poses and number of runs. \
-missing: no complete run.
+weights; its standard deviation is computed over the seed values with all sequences. Bold: highest value for the same \
+poses and number of runs. missing: no complete run.
 - Differences are paired by seed, dataset.scene: mean ± standard error over the sequences, after averaging the runs of \
-each. *: the 95% interval of Student's t excludes 0.
+each. *: the 95% confidence interval (Student's t) excludes 0.
 - ours compared with Prior (re-implementation), ground truth: higher in 1 of 2 sequences, lower in 1: 016.
 - ours compared with other, ground truth: higher in 2 of 2 sequences, lower in 0.
 - Overrides of each row: ours: none; prior: refiner=geometric; other: refiner=identity.
@@ -174,7 +174,7 @@ def test_table_tracked_row_needs_tracked_baseline(sweep: Path) -> None:
     text = write_tables(sweep)
     _, second = grids(text)
     assert len(second) == 3
-    assert "- Rows without a matching row of ours: other, tracker=icp." in text
+    assert "- Rows without a matching baseline row (ours): other, tracker=icp." in text
 
 
 @pytest.mark.parametrize(
