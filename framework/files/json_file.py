@@ -23,7 +23,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path, most: int = MAX_TEXT) -> Any:
-    """Read a JSON file of at most `most` bytes. Raises DataError."""
+    """Read a JSON file of at most `most` bytes. Raises DataError that names the file."""
     return parse_json(path, read_bytes(path, most))
 
 
@@ -43,7 +43,7 @@ def parse_json(where: object, content: bytes | str) -> Any:
 
 def _whole(digits: str) -> int:
     if len(digits) > MAX_BITS or (value := int(digits)).bit_length() > MAX_BITS:
-        raise DataError(f"expected integers of at most {MAX_BITS} bits, got {digits[:20]}... of {len(digits)} digits")
+        raise DataError(f"expected integers of at most {MAX_BITS} bits, got {digits[:20]}... with {len(digits)} digits")
     return value
 
 
