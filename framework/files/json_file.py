@@ -43,7 +43,7 @@ def parse_json(where: object, content: bytes | str) -> Any:
 
 def _whole(digits: str) -> int:
     if len(digits) > MAX_BITS or (value := int(digits)).bit_length() > MAX_BITS:
-        raise DataError(f"expected integers of at most {MAX_BITS} bits, got {digits[:20]}... with {len(digits)} digits")
+        raise DataError(f"expected integers of at most {MAX_BITS} bits, got {digits[:20]}... of {len(digits)} digits")
     return value
 
 

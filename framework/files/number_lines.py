@@ -105,9 +105,8 @@ def _direction(where: str, words: Sequence[str]) -> Float64 | None:
         return None
     length = math.hypot(*values)
     if not MIN_LENGTH <= length <= MAX_LENGTH:
-        raise DataError(
-            f"{where}: expected a nonzero direction x y z, or nan nan nan if unknown, got {' '.join(words)!r}"
-        )
+        expected = f"expected a direction x y z of length {MIN_LENGTH:g} to {MAX_LENGTH:g}, or nan nan nan if unknown"
+        raise DataError(f"{where}: {expected}, got {' '.join(words)!r}")
     return np.array(values) / length
 
 
