@@ -91,7 +91,7 @@ def test_polycam_export_without_depth_raises(tmp_path: Path) -> None:
     write_polycam(tmp_path / "export", FRAMES)
     (tmp_path / "export/keyframes/depth").rename(tmp_path / "depth")
     with pytest.raises(
-        DataError, match="expected camera files .* and a folder depth/, got no folder depth/; record with"
+        DataError, match=r"expected camera files .* and a folder depth/, got no folder depth/; record with"
     ):
         open_source(tmp_path / "export")
 
