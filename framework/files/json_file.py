@@ -23,7 +23,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path, most: int = MAX_TEXT) -> Any:
-    """Read a JSON file of at most `most` bytes. Raises DataError."""
+    """Read a JSON file of at most `most` bytes. Raises DataError that names the file."""
     return parse_json(path, read_bytes(path, most))
 
 

@@ -81,7 +81,7 @@ def read_tum_lines(path: Path) -> list[TumLine]:
 
 
 def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence[Float64] | Float64) -> None:
-    """Write timestamps in s and poses T_world_camera (4, 4).
+    """Write timestamps in s and poses T_world_camera (4, 4) atomically.
 
     `read_tum` returns these values with an absolute error of at most 1e-9. Raises DataError for different lengths, a
     pose that is not rigid, or a failed write.

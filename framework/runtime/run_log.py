@@ -47,7 +47,7 @@ class TrackedFrame:
     position: int  # position in the sequence, counting skipped frames
     timestamp: float  # s
     pose: Pose
-    T_world_camera_truth: Float64 | None  # (4, 4)
+    T_world_camera_truth: Float64 | None  # (4, 4); None = unknown
 
 
 @dataclass(frozen=True)
@@ -135,14 +135,17 @@ class Journal:
 
     @contextmanager
     def timed(self, frame: int, stage: str) -> Iterator[None]:
-        """Record the time of the body for a frame index and a stage, if the body succeeds."""
+        """Record the run time of the body as a stage time of the frame with index `frame`, unless the body raises."""
         started = time.perf_counter()
         yield
         self.timings.append(StageTime(frame, stage, 1e3 * (time.perf_counter() - started)))
 
     @contextmanager
     def fusing(self, frame: int) -> Iterator[StageTimer]:
-        """Record the times of the fuser's stages, if the body succeeds."""
+        """Record the stage times that the fuser measures with the yielded timer, unless the body raises.
+
+        If the fuser measures none, the run time of the body is recorded as FUSION.
+        """
         seconds: defaultdict[str, float] = defaultdict(float)
 
         @contextmanager

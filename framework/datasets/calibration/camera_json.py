@@ -1,4 +1,4 @@
-"""Cameras and numbers in JSON files, with format-specific keys."""
+"""Readers of cameras and numbers in JSON files with format-specific keys."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Calibration:
         object.__setattr__(self, "lens", Undistortion(self.camera, self.distortion) if self.distortion else None)
 
     def color(self, raw: UInt8, name: Path | str) -> UInt8:
-        """Return the undistorted color (H, W, 3). Raises FrameError that names an image of the wrong size."""
+        """Return the undistorted color (H, W, 3), RGB. Raises FrameError that names an image of the wrong size."""
         self.check_size(name, raw.shape)
         return self.lens.smooth(raw) if self.lens else raw
 
@@ -56,7 +56,7 @@ class Calibration:
         return self.lens.exact(depth) if self.lens else depth
 
     def labels(self, raw: UInt16, name: Path | str) -> UInt16:
-        """Return the undistorted labels (H, W). Raises FrameError that names an image of the wrong size."""
+        """Return the undistorted instance ids (H, W). Raises FrameError that names an image of the wrong size."""
         self.check_size(name, raw.shape)
         return self.lens.exact(raw) if self.lens else raw
 

@@ -30,9 +30,9 @@ class LabeledRecording(Recording):
         super().__post_init__()
 
     def load_mesh(self, files: Sequence[Path], read: Callable[..., LabeledMesh]) -> None:
-        """Load the mesh with `read` if all of its files exist and `ground_truth` is not set.
+        """Load the mesh with `read(*files)` if all `files` exist and `ground_truth` is not set.
 
-        Raises DataError if a file is missing and `frame_ground_truth` requires the mesh.
+        Raises DataError if a file is missing and `frame_ground_truth` is set.
         """
         if self.named_truth is not None:
             return

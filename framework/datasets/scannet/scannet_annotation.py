@@ -1,4 +1,4 @@
-"""ScanNet's instances: segments of a mesh, objects as sets of segments, and classes of object names."""
+"""Reader of ScanNet annotations: mesh segments, objects as sets of segments, and classes of object names."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def read_aggregation(path: Path) -> tuple[SegGroup, ...]:
 def read_label_table(path: Path) -> Mapping[str, str]:
     """Return the NYU40 class of each name in a label table of either release; "" = no class.
 
-    Raises DataError that names the file and the line.
+    Names and classes are in lower case. Raises DataError that names the file and the line.
     """
     header, *rows = read_text(path, LARGEST_FILE).rstrip("\r\n").split("\n")
     columns = header.rstrip("\r").split("\t")
@@ -163,7 +163,7 @@ def _group(where: str, group: Any) -> SegGroup:
 def _read_list(path: Path, key: str) -> Sequence[Any]:
     found = read_json_object(path, LARGEST_FILE).get(key)
     if not isinstance(found, list):
-        raise DataError(f"{path}: expected a list {key!r}, got {type(found).__name__}")
+        raise DataError(f"{path}: expected a list {key!r}, got {'none' if found is None else type(found).__name__}")
     return found
 
 

@@ -88,7 +88,7 @@ class RosBag:
             raise DataError(f"{self.path}: expected readable messages, got an error ({reason})") from error
 
     def first(self, topic: str) -> Any:
-        """Return the decoded first message of a topic, or None without messages. Raises DataError."""
+        """Return the decoded first message of a topic; None = no messages. Raises DataError for a damaged bag."""
         message = next(self.messages([topic]), None)
         return None if message is None else self.decoded(message)
 
@@ -104,7 +104,10 @@ class RosBag:
             ) from error
 
     def sensed_at(self, message: Message) -> float:
-        """Return the measurement time in s from the header of a message. The header must be the first field."""
+        """Return the measurement time in s from the header of a message.
+
+        The header must be the first field. Raises FrameError if the message is too short for a header.
+        """
         try:
             if self._is_ros1:
                 seconds, nanoseconds = struct.unpack_from("<xxxxII", message.raw)
@@ -148,10 +151,10 @@ def _whole(stored: Array, unit: float) -> Float32:
 
 
 def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
-    """Return the depth (H, W) in m of a PNG image.
+    """Return the depth (H, W) in m of a PNG image, 0 = no reading. `unit` is the unit of integer depth in m.
 
     In the compressedDepth format, a 12-byte header precedes the image. For float depth, the header contains the
-    quantization of inverse depth.
+    quantization of inverse depth: depth = A / (value - B).
     """
     encoding, _, codec = message.format.partition(";")
     data = message.data.tobytes()

@@ -116,7 +116,7 @@ def _read_camera(path: Path, video: Video) -> Camera:
 
 
 class Video:
-    """Reader of video frames in sensor orientation, like depth. The rotation in the metadata is ignored."""
+    """Reader of video frames in sensor orientation, as for depth. The rotation in the metadata is ignored."""
 
     def __init__(self, path: Path) -> None:
         """Open a video. Raises DataError that names the file if it cannot be decoded."""

@@ -335,7 +335,7 @@ def test_rgbd_folder_instance_images_without_names_raise(folder):
             "expected unique instance ids, got 7 twice, the second time as '07'",
         ),
         ({"7": "chair"}, "instance 7: expected .* got 'chair'"),
-        ({"7": {"name": "n" * 5000}}, "instance 7: expected .*, or null if unknown}, got {'name': 'nnn"),
+        ({"7": {"name": "n" * 5000}}, r"instance 7: expected .*, or null if unknown\), got {'name': 'nnn"),
         ({"7": {"class": 3}}, "instance 7: class: expected a COCO name, or null if unknown, got 3$"),
         ({"7": {"class": "flurb" * 1000}}, "instance 7: class: expected a COCO name, .* got 'flurb"),
         ({"7": {"class": " Chairs"}}, r"instance 7: .* got ' Chairs'; did you mean 'chair'\?"),

@@ -148,7 +148,7 @@ def test_atomic_write_failure_names_requested_file(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(Path, "unlink", refused)
     with (
-        pytest.raises(DataError, match=r"page\.html: expected a writable file, got Read-only"),
+        pytest.raises(DataError, match=r"page\.html: expected a writable file, got an error \(Read-only"),
         atomic_write(tmp_path / "page.html"),
     ):
         refused()

@@ -213,10 +213,14 @@ def test_named_truth_run_with_given_poses_is_not_aligned(folder: Path, tracked_r
         (
             lambda mesh: mesh.unlink(),
             ConfigError,
-            r"^dataset\.ground_truth: expected a labeled mesh .*, got nonexistent .*\.ply$",
+            r"^dataset\.ground_truth: expected a labeled mesh .*, got the nonexistent path .*\.ply$",
         ),
-        (lambda mesh: write_wall(mesh, label=np.ones(6561, np.int32)), DataError, "'instance' of integers, got label"),
-        (lambda mesh: write_wall(mesh, instance=np.ones(6561, np.float32)), DataError, "'instance' of integers"),
+        (
+            lambda mesh: write_wall(mesh, label=np.ones(6561, np.int32)),
+            DataError,
+            "'instance', got only .* x, y, z, label;",
+        ),
+        (lambda mesh: write_wall(mesh, instance=np.ones(6561, np.float32)), DataError, "'instance', got float32;"),
         (lambda mesh: write_wall(mesh, instance=np.zeros(6561, np.int32)), DataError, "got only instance 0"),
         (lambda mesh: write_wall(mesh, instance=np.full(6561, -1, np.int32)), DataError, "instance: expected values"),
         (lambda mesh: write_wall(mesh, instance=np.full(6561, 9, np.int32)), DataError, "got none for instance 9"),

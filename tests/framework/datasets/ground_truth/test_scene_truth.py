@@ -93,5 +93,5 @@ def test_scene_truth_empty_depth_gives_no_points():
 
 
 def test_scene_truth_point_outside_grid_raises():
-    with pytest.raises(DataError, match=r"expected points within \d+ m of the origin"):
+    with pytest.raises(DataError, match=r"expected all points within \d+ m of the world origin"):
         fuse_scene_truth([view(np.full(CAMERA.shape, 3e6), np.ones(CAMERA.shape))], {}, 0.02)

@@ -94,7 +94,7 @@ def test_oni_stalled_player_raises_after_timeout(tmp_path, monkeypatch):
     monkeypatch.setattr(oni, "PATIENCE", 200)
     path = OniFile(recording()).write(tmp_path / "a.oni")
     streams = {stream: Images(node=1, count=9, last=9) for stream in Stream}
-    with pytest.raises(DataError, match="got a stall of OpenNI 2 after images depth 4 of 9, color 4 of 9"):
+    with pytest.raises(DataError, match="got a stall of OpenNI 2 after depth image 4 of 9 and color image 4 of 9"):
         list(oni.play(path, streams))
 
 
