@@ -198,7 +198,7 @@ def _truncated_mesh(directory: Path) -> None:
         (lambda directory: (directory / "instances.json").unlink(), "instances.json: expected a readable file"),
         (
             lambda directory: _with_dataset(directory, truth=False),
-            "expected a dataset with instances (as in its metrics), got a dataset without instances",
+            "expected ground-truth instances of the dataset (as in metrics.json), got none",
         ),
         (lambda directory: _with_dataset(directory, colour=1), "got 'colour'"),
     ],
@@ -248,7 +248,7 @@ def test_evaluate_run_restarted_during_evaluation_is_unchanged(
     monkeypatch.setattr(CornerRoom, "scene_truth", begins_again)
     status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert "expected an unchanged file, got a file of a restarted run" in err
+    assert "expected an unchanged file, got the file of a restarted run" in err
     assert not (stored / "metrics.json").exists()
 
 
@@ -317,5 +317,5 @@ def test_evaluate_stored_config_cannot_read_environment(stored: Path, command, m
     _with_dataset(stored, scene="${oc.env:SECRET}")
     status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert "config of the run: expected resolved values, got dataset.scene=${oc.env:SECRET}" in err
+    assert "dataset.scene: expected a resolved value in the run's config.yaml, got ${oc.env:SECRET}" in err
     assert "hunter2" not in err
