@@ -195,7 +195,7 @@ def _write_config(path: Path, config: Mapping[str, Any]) -> None:
 
 
 def _from_here(path: Path) -> Path:
-    """Return the path relative to the working folder if it is inside this folder."""
+    """Return the path relative to the working directory if it is inside it, otherwise the absolute path."""
     here, place = Path.cwd(), path.absolute()
     return place.relative_to(here) if place.is_relative_to(here) else place
 

@@ -35,8 +35,8 @@ THREADS = 2
 FRAMES = 8
 ROUNDS = 3  # passes over the frames
 WARM_UP = 2  # images that are not timed
-LONGEST = 20.0  # s, after which a slow detector is stopped
-MASKS = 20  # detections that random networks return
+LONGEST = 20.0  # s, maximum time per detector; slower detectors are stopped early
+MASKS = 20  # number of detections that random networks return per image
 
 
 def random_mask_rcnn(backbone: str, folder: Path) -> list[str]:

@@ -174,10 +174,14 @@ def test_gravity_contradictory_sensor_is_ignored(caplog: pytest.LogCaptureFixtur
     assert caplog.text.count("sensor gravity: expected one direction in the world frame, got several") == 1
 
 
-def test_gravity_round_trips_and_invalid_values_raise() -> None:
+def test_gravity_saved_state_round_trip_is_exact() -> None:
     saved = sensing(np.eye(3)).saved()
     read = GravityEstimator.of(MapHeader(json.loads(json.dumps(saved))))
     assert read.saved() == saved
+
+
+def test_gravity_saved_state_with_invalid_values_raises() -> None:
+    saved = sensing(np.eye(3)).saved()
     for wrong in ([], [1, 2], ["a", 0, 0], [float("nan"), 0, 0], [True, None, 0], [1e200, 0, 0]):
         for key in ("camera_up", "sensed_up"):
             with pytest.raises(DataError, match=key):

@@ -25,7 +25,10 @@ def jpeg(image):
 
 
 def with_table(image):
-    """Return the 16zT encoding of OpenNI without short forms: values, first index, then 0xff and each other index."""
+    """Return an image in OpenNI's 16zT encoding, without its short forms.
+
+    The content is the table of values, the index of the first pixel, and then 0xff and the index for each other pixel.
+    """
     values, places = np.unique(image, return_inverse=True)
     table = struct.pack("<H", len(values)) + values.astype("<u2").tobytes()
     first, *others = places.ravel()

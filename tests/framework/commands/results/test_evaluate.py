@@ -91,7 +91,7 @@ def test_evaluate_unchanged_run_keeps_exact_metrics(stored: Path, command) -> No
     assert metrics_of(stored) == after
 
 
-def test_evaluate_old_metrics_are_replaced_and_others_kept(stored: Path, command) -> None:
+def test_evaluate_replaces_only_evaluation_metrics(stored: Path, command) -> None:
     true = metrics_of(stored)
     old = {key: value for key, value in true.items() if not key.startswith("instances.to_map.")}
     old |= {"instances.ap50": 0.125, "instances.ap50.sofa": 0.5, "annotation_release": "first", "fps": 3.0}
@@ -203,9 +203,7 @@ def _truncated_mesh(directory: Path) -> None:
         (lambda directory: _with_dataset(directory, colour=1), "got 'colour'"),
     ],
 )
-def test_evaluate_refuses_unusable_run_and_evaluates_others(
-    stored: Path, command, spoil: Callable[[Path], None], message: str
-) -> None:
+def test_evaluate_refuses_only_unusable_run(stored: Path, command, spoil: Callable[[Path], None], message: str) -> None:
     spoilt = Path(shutil.copytree(stored, stored.parent / "a spoilt one"))
     spoil(spoilt)
     before = {path.name: path.read_bytes() for path in spoilt.iterdir()}
