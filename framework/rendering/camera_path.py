@@ -49,7 +49,7 @@ class ProjectedPath:
         return np.asarray(np.rint(mixed), np.uint8)
 
     def draw(self, image: Image.Image) -> None:
-        """Draw the path as a line with a dot at each end; occluded segments are thin."""
+        """Draw the path into `image`, as a line with a dot at each end; occluded segments are thin."""
         canvas = ImageDraw.Draw(image)
         points = [tuple(pixel) for pixel in self.pixels.tolist()]
         shades = [tuple(shade) for shade in self.shades().tolist()]

@@ -74,7 +74,7 @@ def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tup
 
 
 def draw_labels(image: Image.Image, labels: Sequence[Label], font: ImageFont.FreeTypeFont) -> None:
-    """Draw the names and their leader lines."""
+    """Draw the names and their leader lines into `image`."""
     canvas = ImageDraw.Draw(image)
     for label in labels:
         if label.target is not None:

@@ -39,7 +39,9 @@ def upward(poses: Float64, surface: Surface) -> Float64:
 
 
 def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the camera and the pose T_world_camera (4, 4) with the best view of a surface.
+    """Return a camera and the pose T_world_camera (4, 4) from which the most objects of a surface are well visible.
+
+    The poses are candidates above the surface in AZIMUTHS directions, and are ranked by `_score`.
 
     Args:
         surface: Surface in view.

@@ -29,7 +29,7 @@ class Truth:
     """The ground truth of a run's dataset."""
 
     scene: SceneTruth | None  # None = not labeled
-    annotation: str  # RGBDVideo.annotation
+    annotation: str  # release of the ground truth, as in RGBDVideo.annotation
     named: str | None = None  # dataset.ground_truth; None = the ground truth of the dataset
 
     @classmethod

@@ -45,7 +45,10 @@ def room() -> tuple[Float32, Int32]:
 
 
 def held(turned: Float64, downwards: float = 0.5) -> GravityEstimator:
-    """Return the estimator of a hand-held camera that looks `downwards` rad down, in a world rotated by `turned`."""
+    """Return the estimator of a hand-held camera that is pitched down by `downwards` rad.
+
+    `turned` (3, 3) is the rotation of the world frame.
+    """
     gravity = GravityEstimator()
     for k in range(8):
         heading = Rotation.from_euler("z", k / 8 * 3)
