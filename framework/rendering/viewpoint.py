@@ -39,9 +39,10 @@ def upward(poses: Float64, surface: Surface) -> Float64:
 
 
 def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return a camera and the pose T_world_camera (4, 4) from which the most objects of a surface are well visible.
+    """Return a camera and the pose T_world_camera (4, 4) with the best view of a surface.
 
-    The poses are candidates above the surface in AZIMUTHS directions, and are ranked by `_score`.
+    Candidate views look down from AZIMUTHS directions at the angles ELEVATIONS_RAD. The best view has the highest
+    `_score`, which favors many visible objects; directions similar to those of the mapping cameras are preferred.
 
     Args:
         surface: Surface in view.

@@ -13,7 +13,8 @@ from framework.exporting.object_meshes import REST
 from framework.exporting.upright_room import plain_name, upright
 
 MAX_BYTES = 9_500_000  # maximum size of the file, bytes, for mobile browsers
-BYTES_OF_VERTEX, BYTES_OF_TRIANGLE = 24, 12  # bytes; position, color and first view; three indices
+BYTES_OF_VERTEX = 24  # bytes of position, color and first view
+BYTES_OF_TRIANGLE = 12  # bytes of three indices
 MAX_TRIANGLES = 300_000  # maximum number of triangles; with their vertices, about 7 MB
 NOT_GEOMETRY = 200_000  # bytes reserved for names and nodes
 FIRST_SEEN = "_FIRST_SEEN"  # name of the vertex attribute with the values of `first_seen`

@@ -113,7 +113,7 @@ class Reevaluation:
                 before = None
             if before is None or before.st_mtime != self.record.written:
                 raise DataError(
-                    f"{path}: expected an unchanged file, got the file of a restarted run; evaluate it after the run"
+                    f"{path}: expected an unchanged file, got a file of a restarted run; evaluate it after the run ends"
                 )
             write_json(path, self.metrics)
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))

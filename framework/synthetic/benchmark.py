@@ -142,7 +142,7 @@ class Scene:
 
 
 def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: float) -> Scene:
-    """Return the candidate scene whose objects are visible best.
+    """Return the candidate scene with the best visibility of its objects along the camera path.
 
     Raises DataError if no candidate has space for the furniture and the camera path.
 

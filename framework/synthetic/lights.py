@@ -20,7 +20,7 @@ GATHER_DIRECTIONS = 48  # number of rays per vertex for light from other surface
 BOUNCES = 3  # number of diffuse bounces
 LIFT = 4e-3  # m, height of the ray origins above the surface
 CHUNK = 8192  # number of vertices per chunk, to limit memory
-WALL_BRIGHTNESS = 0.60  # mean irradiance of floor, walls and ceiling after scaling; bright areas stay below WHITE
+WALL_BRIGHTNESS = 0.60  # mean irradiance of floor, walls and ceiling after scaling; leaves headroom for bright areas
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,7 @@ def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
 
 
 def _allowed_phase_speed(path: CameraPath) -> float:
-    """Return the highest phase speed, rad/s, that keeps to MAX_SPEED and MAX_TURN along the whole path."""
+    """Return the highest phase speed, rad/s, at which the whole path is within MAX_SPEED and MAX_TURN."""
     phase = np.linspace(0, 2 * np.pi, 721)
     step = phase[1]
     position, yaw, pitch, roll = path._state(phase)

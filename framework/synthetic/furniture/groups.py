@@ -46,7 +46,7 @@ class Group:
 
 
 def against_wall(piece: Furniture) -> float:
-    """Return the y offset (m) that places the back of an object at the wall, the plane y = 0."""
+    """Return the y offset, m, that places the back of an object at the distance WALL_GAP from the wall at y = 0."""
     return WALL_GAP - float(piece.bounds()[0][1])
 
 
@@ -195,7 +195,7 @@ def desk_group(rng: Rng) -> Group:
 def single(name: str, piece: Furniture, z: float = 0.0, hung: bool = False) -> Group:
     """Return a group with one object at the height `z` m.
 
-    The back of the object is at the distance WALL_GAP from the wall, or directly on the wall if `hung` is True.
+    The back of the object is at the distance WALL_GAP from the wall, or 2 mm if `hung` is True.
     """
     group = Group(name)
     group.add(piece, y=0.002 if hung else against_wall(piece), z=z)

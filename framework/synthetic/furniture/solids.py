@@ -17,7 +17,7 @@ import numpy as np
 from framework.data import Float64, Int32
 
 SPACING = 0.07  # m, vertex spacing on flat faces, the resolution of baked shadows
-WELD = 1e-6  # m, maximum distance between vertices that are merged
+WELD = 1e-6  # m, rounding of vertex positions for the test whether they are equal
 
 
 @dataclass(frozen=True)

@@ -246,7 +246,7 @@ def test_evaluate_run_restarted_during_evaluation_is_unchanged(
     monkeypatch.setattr(CornerRoom, "scene_truth", begins_again)
     status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert "expected an unchanged file, got the file of a restarted run" in err
+    assert "expected an unchanged file, got a file of a restarted run" in err
     assert not (stored / "metrics.json").exists()
 
 
