@@ -37,7 +37,13 @@ class ObjectRow:
 def object_rows(
     contents: RunContents, pictures: Mapping[int, Picture], judgments: Mapping[int, Judgment]
 ) -> list[ObjectRow]:
-    """Return the rows of the table, most confident object first; `pictures` and `judgments` are by object id."""
+    """Return the rows of the table, most confident object first.
+
+    Args:
+        contents: Outputs of the run.
+        pictures: Image of each visible object, by object id.
+        judgments: Comparison of each object with the ground truth, by object id; empty = not compared.
+    """
     colors = colors_by_id(contents.objects)
     rows = []
     for one in sorted(contents.objects, key=lambda one: (-one.confidence, one.id)):
@@ -81,9 +87,10 @@ def object_data(
 
 
 def _size(one: StoredInstance, up: Float64 | None) -> str:
-    """Return the length, width and height of an object's oriented box as text, cm.
+    """Return the side lengths of an object's oriented box as text, cm.
 
-    If `up` is None, the sides are in descending order of length.
+    The order is length, width and height, where the length is the longer level side. If `up` (3,) is None, the order is
+    descending.
     """
     sides = np.sort(one.obb.extent)[::-1]
     if up is not None:

@@ -125,7 +125,14 @@ class TruthCheck:
 def truth_section(
     check: TruthCheck | None, why_unchecked: str, contents: RunContents, pictures: Mapping[int, Picture]
 ) -> dict[str, Any] | None:
-    """Return the context for the section's template, None for a run without ground truth."""
+    """Return the variables of the ground-truth section in run.html; None for a run without ground truth.
+
+    Args:
+        check: Comparison of the objects with the ground truth; None = not available.
+        why_unchecked: Reason for a missing comparison, "" = the run has no mesh.
+        contents: Outputs of the run.
+        pictures: Image of each visible object, by object id.
+    """
     metrics = contents.record.metrics
     main = [(name, f"{metrics[key]:.2f}") for key, name in METRICS.items() if is_number(metrics.get(key))]
     if not main and check is None:

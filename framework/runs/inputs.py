@@ -1,4 +1,4 @@
-"""Hash of the input files of a run: weights, recording and others."""
+"""Hash of the input files of a run, such as weights and the recording."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from framework.errors import ConfigError, DataError
 from framework.files.search_paths import folder_of
 from framework.runs.provenance import leaves, relevant
 
-INPUTS = "inputs_sha256"  # the key of metrics.json
+INPUTS = "inputs_sha256"  # key in metrics.json
 ROOT = "dataset.root"  # key of the recording
-MAX_FILES = 200_000  # maximum number of hashed files of a recording (3 s); known datasets have up to 20,000
+MAX_FILES = 200_000  # maximum number of hashed files of a recording (takes 3 s); known datasets have up to 20,000
 OUTPUTS = {"outputs", "multirun"}  # Hydra's output folders
 
 

@@ -51,7 +51,7 @@ from framework.tracking.keyframes import write_keyframes
 
 log = logging.getLogger(__name__)
 
-LIKELY = 0.3  # minimum confidence of instances in figures and log messages; files contain all
+LIKELY = 0.3  # minimum confidence of instances in figures and log messages; files contain all instances
 
 Arguments = ParamSpec("Arguments")
 Made = TypeVar("Made")
@@ -185,9 +185,9 @@ class RunRecord:
 
 @dataclass
 class _Attempts:
-    """Caller of functions that logs their errors, so that a failing call does not prevent later calls."""
+    """Callable that runs functions and logs their errors, so that a failing call does not prevent later calls."""
 
-    error: BaseException | None  # the first error
+    error: BaseException | None  # first error; None = no error
 
     def __call__(
         self, function: Callable[Arguments, Made], *arguments: Arguments.args, **named: Arguments.kwargs
@@ -207,7 +207,7 @@ def _write_config(path: Path, config: Mapping[str, Any]) -> None:
 
 
 def _from_here(path: Path) -> Path:
-    """Return the path relative to the working folder if it is inside this folder."""
+    """Return the path relative to the working directory if it is inside it, otherwise the absolute path."""
     here, place = Path.cwd(), path.absolute()
     return place.relative_to(here) if place.is_relative_to(here) else place
 
@@ -244,7 +244,7 @@ def headline(metrics: Mapping[str, Any]) -> str:
 
 
 def reason(error: BaseException) -> str:
-    """Return the reason for a partial run as text."""
+    """Return the error that ended a partial run as one line of text."""
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted by Ctrl-C"
     return one_line(error) if isinstance(error, InstanceMapError) else f"{type(error).__name__}: {one_line(error)}"
@@ -270,9 +270,9 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def peak_memory() -> int | None:
-    """Return the peak resident memory of this process in bytes; on Linux since the start of the run.
+    """Return the peak resident memory of this process in bytes; None on Windows, which has no module `resource`.
 
-    None on Windows, which has no module `resource`.
+    On Linux, the peak is measured from the start of the run; on macOS, from the start of the process.
     """
     try:
         import resource
@@ -283,6 +283,6 @@ def peak_memory() -> int | None:
 
 
 def _reset_peak_memory() -> None:
-    """Reset the peak memory of earlier sweep jobs."""
+    """Reset the peak memory of the process on Linux, because it includes earlier jobs of a sweep."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")

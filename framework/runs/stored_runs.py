@@ -41,8 +41,8 @@ ENVIRONMENT = "environment.txt"  # versions of all installed packages, as constr
 RESULT_FILES = (CONFIG, *MAPPED, KEYFRAMES, DIGESTS, ENVIRONMENT)
 """Files listed in manifest.json, in addition to the metrics."""
 
-EVALUATION = "evaluation."  # prefix of the code version of a re-evaluation
-GROUND_TRUTH = EVALUATION + "ground_truth"  # key of dataset.ground_truth in the last re-evaluation, if it was set
+EVALUATION = "evaluation."  # prefix of the keys with the code version of the last re-evaluation
+GROUND_TRUTH = EVALUATION + "ground_truth"  # key of the `dataset.ground_truth` of the last re-evaluation, if it was set
 
 FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # prefixes of numeric metrics
 
@@ -58,7 +58,7 @@ class Record:
     directory: Path
     metrics: Mapping[str, Any]  # flat; None = undefined
     config: Mapping[str, Any]  # resolved
-    written: float  # modification time, s
+    written: float  # modification time of the metrics file, s since the epoch
 
     @property
     def commit(self) -> str:
@@ -126,7 +126,7 @@ def _read(directory: Path, name: str, check_config: bool = True) -> Record:
     try:
         written = path.stat().st_mtime
     except OSError as error:  # the run has been restarted
-        raise DataError(f"{path}: expected a readable file, got {error.strerror}") from error
+        raise DataError(f"{path}: expected a readable file, got an error ({error.strerror})") from error
     return Record(directory, metrics, config, written)
 
 
@@ -146,7 +146,7 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
 
 
 def is_recorded(directory: Path, config: DictConfig) -> bool:
-    """Return True if `directory` contains a completed run of this config and inputs, and log the reason.
+    """Return True if `directory` contains a completed run with this config and these inputs. Log the decision.
 
     The code of its plugins must match. If the experiment's table shows the speed, settings that change times must also
     match. The commit may differ: most commits do not change results, and tables list the commits of their runs.
@@ -167,7 +167,7 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
     if changed := changed_code(record.metrics, plugin_code(plain)):
         log.info("repeating the run: the code changed since the run in %s: %s", directory, "; ".join(changed))
         return False
-    if record.metrics.get(INPUTS) not in (None, inputs_sha256(plain)):  # None: an older run
+    if record.metrics.get(INPUTS) not in (None, inputs_sha256(plain)):  # None = written before the key existed
         log.info("repeating the run: weights or data changed since the run in %s", directory)
         return False
     settings = speed_settings(record.config, record.metrics)
@@ -200,7 +200,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         content = OmegaConf.to_container(load_yaml(path), resolve=False)
     except OmegaConfBaseException as error:
-        raise DataError(f"{path}: expected a readable file, got {first_line(error)}") from error
+        raise DataError(f"{path}: expected valid YAML, got an error ({first_line(error)})") from error
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected keys and values, got a list")
     return {str(key): _with_text_keys(value) for key, value in content.items()}
@@ -224,7 +224,7 @@ def read_metrics(directory: Path) -> dict[str, Any]:
 def _read_flat(path: Path) -> dict[str, Any]:
     content = read_json(path)
     if not isinstance(content, dict):
-        raise DataError(f"{path}: expected an object, got {type(content).__name__}")
+        raise DataError(f"{path}: expected a JSON object, got {content!r:.40}")
     if nested := [key for key, value in content.items() if isinstance(value, dict | list)]:
         raise DataError(f"{path}: expected flat values, got nested values below {nested[0]!r}")
     for key, value in content.items():

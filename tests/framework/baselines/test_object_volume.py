@@ -38,5 +38,5 @@ def test_box_window_in_front_of_camera_is_tight() -> None:
 
 def test_box_window_behind_camera_is_empty() -> None:
     low, high = np.array([[-0.1, -0.1, -2.0]]), np.array([[0.1, 0.1, -1.0]])
-    [behind] = boxes_in_view(CAMERA, np.eye(4), low, high, NEAR).tolist()
-    assert behind[0] >= behind[2]
+    [window] = boxes_in_view(CAMERA, np.eye(4), low, high, NEAR).tolist()
+    assert window[0] >= window[2]

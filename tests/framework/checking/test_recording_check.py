@@ -1,4 +1,4 @@
-"""Tests of the recording check: valid recordings have no findings, and each wrong convention is named."""
+"""Tests of the recording check: valid recordings pass, and each wrong convention is named."""
 
 from __future__ import annotations
 

@@ -311,7 +311,7 @@ def test_scene_graph_matches_schema(run: Path, tmp_path: Path) -> None:
 
 
 def divided(door: float) -> list[Block]:
-    """Return a wall with a door of this width, m, which divides the floor into two rooms of 4 x 3 m."""
+    """Return a wall with a door `door` m wide, which divides the floor into two rooms of 4 x 3 m."""
     low, high = 1.5 - door / 2, 1.5 + door / 2
     return [(4.0, 0.0, 0.0, 4.1, low, 2.5), (4.0, high, 0.0, 4.1, 3.0, 2.5)]
 

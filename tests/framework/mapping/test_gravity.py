@@ -48,7 +48,10 @@ def room() -> tuple[Float32, Int32]:
 
 
 def held(turned: Float64, downwards: float = 0.5) -> GravityEstimator:
-    """Return the estimator of a hand-held camera that looks `downwards` rad down, in a world rotated by `turned`."""
+    """Return the estimator of a hand-held camera that is pitched down by `downwards` rad.
+
+    `turned` (3, 3) is the rotation of the world frame.
+    """
     gravity = GravityEstimator()
     for k in range(8):
         heading = Rotation.from_euler("z", k / 8 * 3)
@@ -177,13 +180,13 @@ def test_gravity_contradictory_sensor_is_ignored(caplog: pytest.LogCaptureFixtur
     assert caplog.text.count("sensor gravity: expected one direction in the world frame, got several") == 1
 
 
-def test_gravity_save_and_load_round_trip_is_exact() -> None:
+def test_gravity_saved_state_round_trip_is_exact() -> None:
     saved = sensing(np.eye(3)).saved()
     read = GravityEstimator.of(MapHeader(json.loads(json.dumps(saved))))
     assert read.saved() == saved
 
 
-def test_gravity_invalid_saved_values_raise() -> None:
+def test_gravity_saved_state_with_invalid_values_raises() -> None:
     saved = sensing(np.eye(3)).saved()
     for wrong in ([], [1, 2], ["a", 0, 0], [float("nan"), 0, 0], [True, None, 0], [1e200, 0, 0]):
         for key in ("camera_up", "sensed_up"):

@@ -56,7 +56,7 @@ def test_read_record_returns_config_and_metrics(directory: Path) -> None:
         ("metrics.json", '{"seed": 0', "metrics.json: expected"),
         ("metrics.json", "[" * 100_000, "metrics.json: expected"),
         ("metrics.json", "\xff", "metrics.json: expected"),
-        ("metrics.json", "[1, 2]", r"metrics\.json: expected an object, got list"),
+        ("metrics.json", "[1, 2]", r"metrics\.json: expected a JSON object, got \[1, 2\]"),
         ("metrics.json", '{"fps": [1]}', r"metrics\.json: expected flat values, got nested values below 'fps'"),
         ("metrics.json", '{"instances.ap50": "best"}', r"instances\.ap50: expected a number or null, got 'best'"),
         (

@@ -178,7 +178,7 @@ def test_simulated_coarse_mask_grid_keeps_square_and_blurs_comb():
     assert np.mean(mask != (comb == 5)) > 0.2
 
 
-def test_confusion_kernel_is_normalized_and_favors_lookalikes():
+def test_confusion_kernel_is_normalized_and_favors_similar_classes():
     kernel = confusion_kernel(COCO, 0.25)
     np.testing.assert_allclose(kernel.sum(axis=1), 1)
     np.testing.assert_allclose(np.diag(kernel), 0.75)
@@ -349,9 +349,12 @@ def test_simulated_ellipse_matches_reference(place):
             np.testing.assert_array_equal(ellipse(x, y, a, b, field), expected)
 
 
-def test_simulated_missing_truth_raises_and_empty_gives_none():
+def test_simulated_missing_truth_raises():
     with pytest.raises(DataError, match="expected instance ground truth"):
         SimulatedDetector().detect(replace(frame(), truth=None))
+
+
+def test_simulated_frame_without_instances_has_no_detections():
     assert len(PERFECT.detect(replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {})))) == 0
 
 

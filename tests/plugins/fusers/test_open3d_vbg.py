@@ -288,7 +288,7 @@ def test_open3d_vbg_grid_growth_keeps_content(frames: list[Frame], monkeypatch: 
         assert np.array_equal(getattr(small.mesh(), name), getattr(large.mesh(), name))
 
 
-def test_open3d_vbg_full_map_raises_and_keeps_content(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open3d_vbg_full_map_error_keeps_content(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("framework.baselines.open3d_grid.FIRST_BLOCKS", 16)
     first = new_fuser()
     fuse_masks(first, frames[0], [], [])

@@ -169,7 +169,7 @@ def test_report_of_empty_run_is_written(stored: Path, command) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("instances.json", "{}", "instances.json: expected a list of instances"),
+        ("instances.json", "{}", "instances.json: expected a JSON array of instances"),
         ("instances.json", '[{"id": 1}]', "entry 1"),
         ("instances.json", '[{"id": 1, "class": "cup", "confidence": NaN}]', "entry 1"),
         ("mesh.ply", "ply\n", "mesh.ply"),

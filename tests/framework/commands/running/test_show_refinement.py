@@ -105,7 +105,7 @@ def test_show_refinement_tries_few_frames_of_long_video() -> None:
     assert Counted.calls == CANDIDATES
 
 
-def test_show_refinement_called_returns_refiner_overrides() -> None:
+def test_called_returns_refiner_overrides() -> None:
     overrides = ["refiner=chain", "refiner.links.gmm_em=null", "refiner@refiner.links.x=kmeans", "frame=3", "seed=1"]
     assert called("chain", overrides) == "refiner=chain refiner.links.gmm_em=null refiner@refiner.links.x=kmeans"
     added = "+refiner@refiner.links.last=largest_component"

@@ -43,7 +43,7 @@ def label_at(x: np.ndarray) -> np.ndarray:
 
 
 def write_wall(path: Path, T: np.ndarray | None = None, **properties: np.ndarray) -> None:
-    """Write the mesh of a wall of 4 x 4 m, transformed by T. By default, it has labels."""
+    """Write the mesh of a wall of 4 x 4 m, transformed by T (4, 4). `properties` replace its instance labels."""
     side = np.arange(-2.0, 2.0 + CELL / 2, CELL)
     x, y = np.meshgrid(side, side)
     vertices = np.stack([x, y, np.full_like(x, WALL)], axis=-1).reshape(-1, 3).astype(np.float32)

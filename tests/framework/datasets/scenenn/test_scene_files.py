@@ -167,7 +167,7 @@ def test_trajectory_log_missing_file_raises(path):
     ("poses", "message"),
     [({0: 2 * np.eye(4)}, "pose of frame 0: expected a rigid transform"), ({-1: np.eye(4)}, "got -1")],
 )
-def test_trajectory_log_invalid_pose_raises_and_leaves_no_file(path, poses, message):
+def test_trajectory_log_writing_invalid_pose_leaves_no_file(path, poses, message):
     with pytest.raises(DataError, match=message):
         write_trajectory_log(path, poses)
     assert list(path.parent.iterdir()) == []

@@ -23,7 +23,7 @@ X, Y = np.float32([1, 0, 0]), np.float32([0, 1, 0])
 WITH_TABLES = ("bayesian_tsdf", "last_write", "object_volumes", "open3d_vbg")
 
 
-def test_embedding_mean_and_spread_match_manual_result() -> None:
+def test_object_embedding_mean_and_spread_match_definition() -> None:
     once = ObjectEmbedding.of(X, 0.7)
     np.testing.assert_allclose(once.mean, X, atol=1e-6)
     assert once.spread == pytest.approx(0, abs=1e-6)
