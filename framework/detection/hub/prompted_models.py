@@ -54,7 +54,10 @@ class TextPromptedBoxes:
 
     @torch.inference_mode()
     def __call__(self, color: UInt8) -> tuple[Float32, Float32]:
-        """Return boxes (P, 4) x1 y1 x2 y2 px, pixel centers at integers, and the probabilities (P, T) of T texts."""
+        """Return P candidate boxes (P, 4) and the probability (P, T) of each of the T texts for each box.
+
+        Boxes are x1 y1 x2 y2, px of the image `color` (H, W, 3), with pixel centers at integers.
+        """
         long = max(color.shape[:2])
         square = np.full((long, long, 3), PADDING, np.uint8)
         square[: color.shape[0], : color.shape[1]] = color
@@ -91,7 +94,7 @@ class BoxPromptedMasks:
 
     @torch.inference_mode()
     def __call__(self, color: UInt8, boxes: Float32) -> Bool:
-        """Return the masks (N, H, W) of the objects in boxes (N, 4) px, pixel centers at integers."""
+        """Return the masks (N, H, W) of the objects in boxes (N, 4) x1 y1 x2 y2 px, pixel centers at integers."""
         height, width = color.shape[:2]
         if not len(boxes):
             return np.zeros((0, height, width), np.bool_)

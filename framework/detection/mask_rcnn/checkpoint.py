@@ -63,7 +63,7 @@ def domain_of_network(path: Path) -> str:
 
 
 def _read_torch(path: Path) -> dict[str, Tensor]:
-    """Return the state_dict in a file of torch.save."""
+    """Return the state_dict in a file written by torch.save."""
     check_regular(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)

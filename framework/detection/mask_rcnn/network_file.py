@@ -39,10 +39,10 @@ class NetworkDescription:
 
 
 def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: bool = False) -> None:
-    """Write the network to `path` atomically; `half`: store weights as float16.
+    """Write the network to `path` atomically.
 
-    Only weights with two or more dimensions become float16. Biases and statistics are few, and variances may exceed the
-    range of float16.
+    `half`: True = weights with two or more dimensions are stored as float16. Biases and statistics remain float32,
+    because they are few and variances may exceed the range of float16.
 
     Raises DataError if a weight is not finite or the file cannot be written.
     """
@@ -125,7 +125,7 @@ def _check_names(expected: typing.AbstractSet[str], found: typing.AbstractSet[st
 
 
 def _first_of(names: typing.AbstractSet[str]) -> str:
-    """Return the first name, and the number of other names."""
+    """Format the first name and the number of other names for messages."""
     return f"{min(names)} and {len(names) - 1} more" if len(names) > 1 else min(names)
 
 

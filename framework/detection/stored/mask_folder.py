@@ -45,9 +45,9 @@ class InstanceOfImage(Segmentation):
 def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetection]:
     """Read the detections from a mask folder.
 
-    NNNNNN is `Frame.index`. The PNG has one channel of 16 bits. The JSON is a list of {"id", "class", "score"} and
-    optionally "class_probabilities". Unlisted ids are not detections. Masks cannot overlap. Raises DataError with the
-    file and the entry for an invalid entry.
+    NNNNNN is `Frame.index`. The PNG has one channel of 16 bits. The JSON is a list of objects with the keys "id",
+    "class", "score" and optionally "class_probabilities". `labels`: the names in the folder's label space. Unlisted ids
+    are not detections. Masks cannot overlap. Raises DataError with the file and the entry for an invalid entry.
     """
     index = {name: k for k, name in enumerate(labels)}
     found: list[StoredDetection] = []
@@ -64,7 +64,9 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
         ids: set[int] = set()
         entries = read_json(description)
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise DataError(f"{description}: expected a list of objects with id, class and score, got {entries!r:.100}")
+            raise DataError(
+                f"{description}: expected a list of JSON objects with id, class and score, got {entries!r:.100}"
+            )
         for k, entry in enumerate(entries):
             where = f"{description}, entry {k}"
             with errors_of(where):

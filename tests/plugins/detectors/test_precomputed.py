@@ -273,7 +273,7 @@ def test_precomputed_mask_image_with_wrong_size_or_type_raises(
         ({"segmentation": {"size": [6], "counts": PACKED}}, "size"),
         ({"segmentation": {"size": [6, 8], "counts": [3, 4]}}, "run lengths: expected"),
         ({"segmentation": [[1, 2, 3, 4]]}, "at least 3 points, got [1, 2, 3, 4]"),
-        ({"segmentation": []}, "segmentation: expected a polygon, got none"),
+        ({"segmentation": []}, "segmentation: expected at least one polygon, got an empty list"),
         ({"bbox": [1, 2, 3]}, "bbox: expected [x, y, width, height] px, at most"),
         ({"class_probabilities": [0.5, 0.5]}, "class_probabilities: expected 80 values, one for each label, got 2"),
         ({"class_probabilities": {"chair": 0.5}}, "class_probabilities: expected a sum of 1, got 0.5"),
