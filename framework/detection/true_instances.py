@@ -13,7 +13,7 @@ from framework.errors import DataError
 
 @dataclass(frozen=True)
 class TrueInstances:
-    """The N visible ground-truth instances of known class, in descending order of area; equal areas are sorted by id."""
+    """The N visible ground-truth instances of known class, sorted by decreasing number of pixels, then by id."""
 
     ids: Int32  # (N,)
     class_ids: Int32  # (N,) index into the detector's classes

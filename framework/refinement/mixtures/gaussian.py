@@ -24,7 +24,10 @@ SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vect
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32) -> None:
-    """Set out[i] = log(pi_k N(x_i | mu_k, Sigma_k)), given the coefficients `row` of component k."""
+    """Set out[i] = log(pi_k N(x_i | mu_k, Sigma_k)) for the points (x[i], y[i], z[i]), m.
+
+    `row`: the coefficients (10,) of component k, from `set_coefficients`.
+    """
     c, mx, my, mz = row[0], row[1], row[2], row[3]  # unpacking the array takes longer than the loop
     w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
@@ -36,7 +39,7 @@ def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to_density(x: Float32, y: Float32, z: Float32, row: Float32, values: Float32) -> None:
-    """Set values[i] to the maximum of values[i] and the result of log_densities() for point i."""
+    """Set values[i] to the maximum of values[i] and the log density of point i, as in `log_densities`."""
     c, mx, my, mz = row[0], row[1], row[2], row[3]
     w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
@@ -135,9 +138,9 @@ def invert(values: Float32, others: Float32, n: int) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: Float32, moment: Float64) -> None:
-    """Add sum_i gamma_i (1, x_i, x_i x_i^T) with gamma_i = densities[i] * scale[i] to the moment.
+    """Add sum_i gamma_i (1, x_i, x_i x_i^T) with gamma_i = densities[i] * scale[i] to `moment` (10,).
 
-    Single precision suffices within a block.
+    The last six entries are the upper triangle of the symmetric matrix. Single precision suffices within a block.
     """
     zero = np.float32(0.0)
     s, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -160,7 +163,7 @@ def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: F
 
 @njit(cache=True, nogil=True)
 def add_point(moment: Float64, point: Float32, center: Float64, gamma: float) -> None:
-    """Add gamma * (1, x, x x^T) of the centered point x, with only the upper triangle of the symmetric matrix."""
+    """Add gamma * (1, x, x x^T) with x = point - center to `moment` (10,), as in `add_moments`."""
     x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
     gx, gy, gz = gamma * x, gamma * y, gamma * z
     moment[0] += gamma
