@@ -47,11 +47,11 @@ class LabelMapping:
     meaning: Int32  # (C,) index of each label in `classes`; -1 = no object class of COCO
 
     def apply(self, probabilities: Float32) -> tuple[Float32, Bool]:
-        """Return the float32 distributions (N, C') over `classes` from `probabilities` (N, C) of the labels.
+        """Return the float32 distributions (N, C') over `classes`, and an array (N,), True where they are meaningful.
 
-        The probabilities of labels with the same meaning are summed, labels without a meaning are removed, and the
-        result is normalized. Also return a mask (N,) of the rows whose best label has a meaning. A row without any
-        class becomes uniform, and its mask is False. `probabilities` must not be negative.
+        `probabilities` (N, C) are nonnegative weights of the labels. Labels with the same COCO name are summed, labels
+        without a COCO name are removed, and the result is normalized. The array is True for rows whose best label has a
+        COCO name. A row whose sum is 0 becomes uniform, and its entry is False.
         """
         has_meaning = self.meaning >= 0
         sums = np.zeros((len(probabilities), len(self.classes)))
@@ -87,8 +87,8 @@ def read_labels(name_or_path: str) -> tuple[str, ...]:
 def to_coco(labels: Sequence[str]) -> LabelMapping:
     """Map `labels` to COCO names with `label_spaces.yaml`.
 
-    Case, outer spaces and text after a comma are ignored: "Sofa, couch, lounge" is "sofa". Raises ConfigError with all
-    unknown labels, or if no label is an object class of COCO.
+    Case, leading and trailing spaces, and text after a comma are ignored: "Sofa, couch, lounge" is "sofa". Raises
+    ConfigError with all unknown labels, or if no label is an object class of COCO.
     """
     keys = [label.partition(",")[0].strip().lower() for label in labels]
     unknown = [label for label, key in zip(labels, keys, strict=True) if key not in MEANINGS]
