@@ -262,7 +262,7 @@ class RefinerContract:
 
 
 def readings(frame: Frame) -> Float64:
-    """Return the world-frame point (H, W, 3), m, of each pixel of a frame from `frame_at`; NaN where depth is missing."""
+    """Return the point (H, W, 3), m, world frame, of each pixel of a frame; NaN where depth is missing."""
     whole = replace(spheres_in(frame), masks=np.ones((2, *CAMERA.shape), np.bool_))
     lifted = lift(whole, frame, Pose(pose_at(frame.index)))
     points = np.full((*CAMERA.shape, 3), np.nan)
