@@ -18,8 +18,9 @@ from framework.refinement.refine import keep_points
 class KMeans(ClusterRefiner):
     """Removal of the points nearer to a background center than to an object center.
 
-    Lloyd's algorithm runs on each mask and the ring around it, as in `gmm_em`. The object centers start at the means of
-    equal parts of the mask by depth, and the background centers at the means of equal parts of the ring. Clusters with
+    Lloyd's algorithm runs on the points of each mask and of the ring around it, as in `gmm_em`. The object centers
+    start at the means of groups of the mask's points, and the background centers at the means of groups of the ring's
+    points. The groups have equal sizes and are sorted by depth. Clusters with
     fewer than `min_points` points in the mask or the ring stay unchanged.
     """
 
