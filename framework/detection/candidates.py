@@ -21,8 +21,8 @@ YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows
 class OutputLayout(Enum):
     """The outputs of a box detector for K candidates and C classes; arrays may have a leading axis of length 1.
 
-    For the SSD layouts, scores and labels are (K,), and class scores are (K, C) or, with the background first,
-    (K, C + 1).
+    For the SSD layouts, scores and labels are (K,), and class scores are (K, C) or, with the background first, (K, C +
+    1).
     """
 
     yolox = "yolox"  # (K, 5 + C): center offset dx, dy and log w, log h, in cells; objectness; C class scores
@@ -201,8 +201,8 @@ def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
 def spread_rest(one_hot: Float32, scores: Float32, spread: float) -> Float32:
     """Return the class distributions (N, C) for one-hot labels (N, C) and scores (N,).
 
-    The label gets 1 - spread * (1 - score), but at least 1 / C. The other classes share the remainder equally.
-    `spread` is in [0, 1]: with 1, the probability of the label is its score; with 0, the label is certain.
+    The label gets 1 - spread * (1 - score), but at least 1 / C. The other classes share the remainder equally. `spread`
+    is in [0, 1]: with 1, the probability of the label is its score; with 0, the label is certain.
     """
     c = one_hot.shape[1]
     if c == 1:

@@ -190,8 +190,8 @@ def _are_labels(column: Float32, classes: int) -> bool:
 def _looks_suppressed(rows: Float32, classes: int, shape: tuple[int, int]) -> bool:
     """Return True if a table that could contain cells or detections contains detections.
 
-    Detections have integer labels, and their number differs from the number of cells. Labels alone are not
-    sufficient in 8-bit networks, where most scores are 0 and so resemble labels.
+    Detections have integer labels, and their number differs from the number of cells. Labels alone are not sufficient
+    in 8-bit networks, where most scores are 0 and so resemble labels.
     """
     cells = [-(-shape[0] // stride) * -(-shape[1] // stride) for stride in STRIDES]
     counts = {boxes * sum(cells[:levels]) for boxes in BOXES_PER_CELL for levels in (3, 4)}

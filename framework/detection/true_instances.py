@@ -39,7 +39,8 @@ def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) ->
     unknown = sorted({name for name in names.values() if name not in index})
     if unknown:
         raise DataError(
-            f"detector: expected classes for all ground-truth objects, got no class for {', '.join(unknown)}"
+            f"frame {frame.index}: expected ground-truth classes among the {len(classes)} classes of the detector, got "
+            f"{', '.join(map(repr, unknown))}; map them to COCO names"
         )
 
     found, areas = np.unique(frame.truth.instance_ids, return_counts=True)

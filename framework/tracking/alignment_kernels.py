@@ -142,8 +142,8 @@ def _gather_model(depth, normals, size, pixel, points):
 def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
     """Set the term of point `n` in `J`: weight, error, and derivative with respect to a twist of the view's frame.
 
-    (gx, gy, gz) is the derivative of the error with respect to the point (px, py, pz). Values of points with
-    weight 0 may be NaN.
+    (gx, gy, gz) is the derivative of the error with respect to the point (px, py, pz). Values of points with weight 0
+    may be NaN.
     """
     zero = np.float32(0.0)
     weighted = weight > zero

@@ -177,8 +177,8 @@ class Trainer:
             self.step, self.history = state["step"], state["history"]
         except Exception as error:  # torch raises many exception types for a damaged file
             raise DataError(
-                f"{path}: expected an intact checkpoint of this network, got {in_one_line(error)}; remove it, or train "
-                "in another folder"
+                f"{path}: expected an intact checkpoint of this network, got an error ({in_one_line(error)}); remove "
+                "it, or train in another folder"
             ) from error
 
 

@@ -74,18 +74,22 @@ def read_labels(name_or_path: str) -> tuple[str, ...]:
         lines = read_text(path, LARGEST_FILE).rstrip().splitlines()
     except DataError as error:
         raise ConfigError(
-            f"labels: expected one of {', '.join(SPACES)}, or a text file with one name per line, got {name_or_path}"
+            f"detector.label_space: expected one of {', '.join(SPACES)}, or a text file with one name per line, got "
+            f"{name_or_path}"
         ) from error
     names = tuple(line.strip() for line in lines)
     if "" in names:  # skipping an empty line would shift the following names
-        raise ConfigError(f"labels: {path}, line {names.index('') + 1}: expected a name, got an empty line")
+        raise ConfigError(
+            f"detector.label_space: {path}, line {names.index('') + 1}: expected a name, got an empty line; write "
+            f"{NO_CLASS} for an unused index"
+        )
     if not names:
-        raise ConfigError(f"labels: {path}: expected one name per line, got an empty file")
+        raise ConfigError(f"detector.label_space: {path}: expected one name per line, got an empty file")
     return names
 
 
-def to_coco(labels: Sequence[str]) -> LabelMapping:
-    """Map `labels` to COCO names with `label_spaces.yaml`.
+def to_coco(labels: Sequence[str], key: str = "detector.label_space") -> LabelMapping:
+    """Map `labels` from the config key `key` to COCO names with `label_spaces.yaml`.
 
     Case, leading and trailing spaces, and text after a comma are ignored: "Sofa, couch, lounge" is "sofa". Raises
     ConfigError with all unknown labels, or if no label is an object class of COCO.
@@ -94,13 +98,13 @@ def to_coco(labels: Sequence[str]) -> LabelMapping:
     unknown = [label for label, key in zip(labels, keys, strict=True) if key not in MEANINGS]
     if unknown:
         raise ConfigError(
-            f"labels: expected names of a label space, got {len(unknown)} unknown names in {len(labels)} labels: "
+            f"{key}: expected names of a label space, got {len(unknown)} unknown names in {len(labels)} labels: "
             f"{', '.join(map(repr, unknown))}; add them to framework/vocabulary/{Path(__file__).stem}.yaml"
         )
     meanings = [MEANINGS[key] for key in keys]
     classes = tuple(name for name in COCO if name in meanings)
     if not classes:
-        raise ConfigError(f"labels: expected an object class of COCO, got none in {len(labels)} labels")
+        raise ConfigError(f"{key}: expected at least one object class of COCO, got none in {len(labels)} labels")
     index = {name: k for k, name in enumerate(classes)}
     meaning = [-1 if name is None else index[name] for name in meanings]
     return LabelMapping(classes, np.array(meaning, np.int32))

@@ -56,7 +56,8 @@ class Precomputed(Detector):
         self.path = Path(self.path).expanduser()
         self._labels = read_labels(self.label_space)
         if len(set(self._labels)) < len(self._labels):
-            raise ConfigError(f"detector.label_space: expected unique names, got duplicates in {self.label_space}")
+            repeated = next(name for k, name in enumerate(self._labels) if name in self._labels[:k])
+            raise ConfigError(f"detector.label_space: expected unique names, got {repeated!r} twice")
         if self.path.is_dir():
             stored = read_mask_folder(self.path, self._labels)
         else:
@@ -65,7 +66,10 @@ class Precomputed(Detector):
             raise DataError(f"{self.path}: expected at least one detection, got none")
         probabilities, known = self._distributions(stored)
         if not known.any():
-            raise DataError(f"{self.path}: expected detections of COCO's classes, got none of {len(stored)}")
+            raise DataError(
+                f"{self.path}: expected detections of COCO's classes, got none in {len(stored)} detections; check "
+                "detector.label_space"
+            )
         if not known.all():
             lost = sorted({one.label for one, is_known in zip(stored, known, strict=True) if not is_known})
             log.info("%s: dropped %d of %d detections of classes without a COCO name: %s",

@@ -98,7 +98,7 @@ class TransformersSegmentation(Detector):
             require(self._family.any_size, "detector.short_side", short, "0, because this model has a fixed input size")
             size = {"shortest_edge": short, "longest_edge": long}
             self._preprocessing = replace(self._preprocessing, size=size)
-        self._mapping = to_coco(checkpoint.labels)
+        self._mapping = to_coco(checkpoint.labels, "detector.model")
         self.classes = self._mapping.classes
         self._network = checkpoint.read_network().to(self._device)
         self._commit = commit_of(checkpoint.folder)
@@ -205,7 +205,7 @@ class Preprocessing:
                 "(do_split_image); choose another model"
             )
         if content.get("pad_size"):
-            raise DataError(f"{where}: pad_size: expected no value, got {content['pad_size']}")
+            raise DataError(f"{where}: pad_size: expected no value, got {content['pad_size']}; choose another model")
         if content.get("resample", 2) not in RESAMPLING:
             raise DataError(f"{where}: resample: expected one of {[*RESAMPLING]}, got {content['resample']}")
         size = content.get("size") if content.get("do_resize", True) else None

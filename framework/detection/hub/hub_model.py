@@ -117,7 +117,8 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
         wanted = [CONFIG, PREPROCESSING, *_published(more, files), *(_weights(files) or [WHOLE])]
         if missing := [name for name in wanted if name not in files]:
             raise DataError(
-                f"detector.model: expected {' and '.join(missing)} in {model} on {constants.ENDPOINT}, got none"
+                f"detector.model: expected {' and '.join(missing)} in {model} on {constants.ENDPOINT}, got no such "
+                "file; choose another model"
             )
         size = sum(files[name].size or 0 for name in wanted)
         license_ = next((t.removeprefix("license:") for t in info.tags or () if t.startswith("license:")), "unknown")

@@ -115,9 +115,9 @@ class ImageTextModel:
         vectors = tensor.float().cpu().numpy()
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
         if not np.isfinite(lengths).all() or (lengths == 0).any():
+            fix = "; set detector.half_precision=false" if self._network.dtype == torch.float16 else ""
             raise DataError(
-                f"{self.space}: expected finite, nonzero embeddings, got NaN, infinity or 0; set "
-                "detector.half_precision=false"
+                f"detector.model: expected finite, nonzero embeddings from {self.space}, got NaN, infinity or 0{fix}"
             )
         return np.asarray(vectors / lengths, np.float32)
 

@@ -68,10 +68,8 @@ class TextPromptedBoxes:
         boxes = corners(output.pred_boxes[0].float().cpu().numpy()) * np.float32(long) - 0.5  # from 0..1 of the square
         probabilities = torch.sigmoid(output.logits[0].float()).cpu().numpy()
         if not (np.isfinite(boxes).all() and np.isfinite(probabilities).all()):
-            raise DataError(
-                f"detector.model: expected finite outputs from {self.folder}, got NaN or infinity; set "
-                "detector.half_precision=false"
-            )
+            fix = "; set detector.half_precision=false" if self._network.dtype == torch.float16 else ""
+            raise DataError(f"detector.model: expected finite outputs from {self.folder}, got NaN or infinity{fix}")
         return boxes.astype(np.float32), probabilities
 
 
@@ -109,9 +107,9 @@ class BoxPromptedMasks:
         output = self._network(pixel_values=pixels.to(dtype), input_boxes=prompts, multimask_output=False)
         logits = output.pred_masks[0, :, 0].float()
         if not torch.isfinite(logits).all():
+            fix = "; set detector.half_precision=false" if dtype == torch.float16 else ""
             raise DataError(
-                f"detector.mask_model: expected finite outputs from {self._model}, got NaN or infinity; set "
-                "detector.half_precision=false"
+                f"detector.mask_model: expected finite outputs from {self._model}, got NaN or infinity{fix}"
             )
         whole = functional.interpolate(logits[None], (self._side, self._side), mode="bilinear", align_corners=False)
         inside = whole[..., : resized[1], : resized[0]]

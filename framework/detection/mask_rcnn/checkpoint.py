@@ -99,7 +99,7 @@ def from_torchvision(
             )
         tensors, classes = _without_gaps(tensors), COCO
     elif len(classes) != labels - 1:
-        raise DataError(f"{where}: expected {labels - 1} classes, got {len(classes)}")
+        raise DataError(f"{where}: expected {labels - 1} classes, got {len(classes)}; set them with --classes")
     architecture = Architecture(
         classes=classes,
         backbone=_backbone(tensors, norm_eps, where),

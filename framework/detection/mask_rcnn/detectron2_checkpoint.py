@@ -68,7 +68,7 @@ def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str,
         raise DataError(f"{where}: expected COCO's {len(COCO)} classes, got {found}; set the classes with --classes")
     classes = classes or COCO
     if len(classes) != found:
-        raise DataError(f"{where}: expected {found} classes, got {len(classes)}")
+        raise DataError(f"{where}: expected {found} classes, got {len(classes)}; set them with --classes")
     stem = "backbone.body.conv1.weight"
     tensors[stem] = required(tensors, stem, where).flip(1)  # BGR to RGB
     _put_background_first(tensors, where)
@@ -97,7 +97,7 @@ def read_pickle(path: Path) -> dict[str, Tensor]:
         with path.open("rb") as file:
             content = ArraysOnly(file, encoding="latin1").load()
     except Exception as error:  # a damaged pickle can raise almost any exception
-        raise DataError(f"{path}: expected a pickle of numpy arrays, got {in_one_line(error)}") from error
+        raise DataError(f"{path}: expected a pickle of numpy arrays, got an error ({in_one_line(error)})") from error
     state = content.get("model", content) if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(array, np.ndarray) for array in state.values()):
         raise DataError(f"{path}: expected a dictionary of detectron2's numpy arrays, got {type(content).__name__}")

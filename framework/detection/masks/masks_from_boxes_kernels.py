@@ -17,10 +17,9 @@ SIGMAS = 3.0  # depth step that noise may cause, in standard deviations
 def fill_masks(borders, windows, depth, significance, step, noise, min_readings, masks):
     """Write the masks of the objects in the boxes to `masks` (N, H, W), before holes are closed.
 
-    `borders`: the boxes (N, 4) x1 y1 x2 y2, px. `windows`: the pixels u1 <= u < u2, v1 <= v < v2 of the boxes, as
-    (N, 4) u1 v1 u2 v2. `step`: maximum depth step between neighboring pixels per meter of depth. `noise`: the noise
-    model of the sensor. See `masks_in_boxes` for the other arguments. Returns an array (N,), True where a mask was
-    found.
+    `borders`: the boxes (N, 4) x1 y1 x2 y2, px. `windows`: the pixels u1 <= u < u2, v1 <= v < v2 of the boxes, as (N,
+    4) u1 v1 u2 v2. `step`: maximum depth step between neighboring pixels per meter of depth. `noise`: the noise model
+    of the sensor. See `masks_in_boxes` for the other arguments. Returns an array (N,), True where a mask was found.
     """
     found = np.zeros(len(masks), np.bool_)
     for i in range(len(masks)):

@@ -108,8 +108,8 @@ def network_between(
     """Build the network between the blobs `inputs` and `outputs` of a graph.
 
     `tensors`: the weights by name. `spacings`: quantization steps of the kernels by name, for integer convolutions;
-    None = all operators compute in float. A float network has quantized
-    weights, but no rounding between operators. An integer network does not round the following values, at little cost:
+    None = all operators compute in float. A float network has quantized weights, but no rounding between operators. An
+    integer network does not round the following values, at little cost:
 
     - the linear channels between blocks (Sandler et al., "MobileNetV2", 2018), because rounding errors would accumulate
     - outputs, means, fully connected layers and transposed convolutions

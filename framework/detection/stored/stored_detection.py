@@ -106,7 +106,7 @@ def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
         if unknown:
             raise DataError(
                 f"class_probabilities: expected only the {len(index)} names in detector.label_space, got "
-                f"{', '.join(map(repr, unknown))}"
+                f"{', '.join(map(repr, unknown))}; set detector.label_space to the label space of the file"
             )
         given: Sequence[Any] = [found.get(name, 0.0) for name in index]
     elif isinstance(found, list):

@@ -62,8 +62,8 @@ def start_labels(
     """Return the initial component (S,) of each point for EM: object components first, then background components.
 
     Lloyd's algorithm groups the ring's points and, separately, the mask's points with `log_odds` (S,) of at least 0. It
-    starts from groups of equal size by depth and runs for at most `iterations` iterations. The mask's other points
-    get the nearest group of the ring, or an object component if there are no background components.
+    starts from groups of equal size by depth and runs for at most `iterations` iterations. The mask's other points get
+    the nearest group of the ring, or an object component if there are no background components.
     """
     labels = np.empty(len(around.points_camera), np.int32)
     start_all(

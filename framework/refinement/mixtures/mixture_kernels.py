@@ -240,9 +240,9 @@ def claim(
 ) -> None:  # fmt: skip
     """Set `claimed` (S,) to True for points of the blocks with a posterior above `min_posterior`.
 
-    The posterior is own / (own + others), where `own` is the density of the first `own_components` times exp(odds),
-    and `others` is the density of the other components and the uniform component. `rows`: (N, K, 10), from
-    `coefficients`. `log_outliers`: log density (N,) of the uniform component times its weight.
+    The posterior is own / (own + others), where `own` is the density of the first `own_components` times exp(odds), and
+    `others` is the density of the other components and the uniform component. `rows`: (N, K, 10), from `coefficients`.
+    `log_outliers`: log density (N,) of the uniform component times its weight.
     """
     for b in prange(len(blocks.sets)):
         k, begin, end = blocks.sets[b], blocks.begins[b], blocks.ends[b]
