@@ -8,8 +8,8 @@ biweights, lambda is `color_weight`, and I and I_frame are intensities in [0, 1]
 expected noise, so that both terms are in standard deviations. Beyond `FAR` the standard deviation of a depth is its
 noise times depth / FAR. Errors of structured-light cameras at this range cover whole image regions and do not average
 out. `RANGE` is the maximum depth of these cameras. Beyond it, standard deviations and gates are proportional to depth,
-so that the balance of the two terms does not depend on depth. Gauss-Newton steps are twists in the view's frame: T <-
-exp(xi) T.
+so that the balance of the two terms does not depend on depth. A Gauss-Newton step is a twist xi in the view's frame,
+which changes T to exp(xi) T.
 
 `LinearWeights` replaces Tukey's weights by the weights in VoxelHashing's published code, for residuals in m and in
 [0, 1]. With the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:

@@ -63,11 +63,12 @@ class Keyframes:
     min_angle: float = 0.3  # minimum angle of a new view without translation, rad, > 0
     max_features: int = 800  # maximum number of features of a frame, >= 1
     min_features: int = 30  # minimum number of features with depth of a keyframe, >= 4
-    candidates: int = 6  # number of keyframes matched with a lost frame, >= 1
+    candidates: int = 6  # maximum number of keyframes matched with a frame, >= 1
     max_ratio: float = 0.8  # maximum ratio of best to second-best descriptor distance (Lowe's ratio test), in (0, 1]
     max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0
     min_inliers: int = 20  # minimum number of inliers, >= 4
-    min_inlier_ratio: float = 0.15  # minimum fraction of inliers, in (0, 1]; low: candidates may not overlap
+    # minimum fraction of inliers among the matches, in (0, 1]; low, because not all candidates overlap with the frame
+    min_inlier_ratio: float = 0.15
     seed: int = 0  # seed of RANSAC and of the visual words, >= 0
 
     def __post_init__(self) -> None:
@@ -192,7 +193,7 @@ class Keyframes:
         return Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag)
 
     def is_new(self, T_world_camera: Float64) -> bool:
-        """Return True if no keyframe is too close to this pose."""
+        """Return True if the pose T_world_camera (4, 4) is far enough from all keyframes for a new keyframe."""
         self._settle()
         return bool((self._separation(self._poses, T_world_camera) >= 1).all())
 
@@ -208,7 +209,7 @@ class Keyframes:
         return self.locate(frame, features, self.alike(features))
 
     def alike(self, features: Features) -> list[Keyframe]:
-        """Return the candidate keyframes with the most similar visual words, best first."""
+        """Return the `candidates` keyframes with visual words most similar to those of `features`, best first."""
         self._settle()
         if not self._keyframes:
             return []
@@ -217,7 +218,7 @@ class Keyframes:
         return [self._keyframes[k] for k in order[: self.candidates]]
 
     def nearest(self, T_world_camera: Float64) -> list[Keyframe]:
-        """Return the candidate keyframes nearest to a pose, nearest first."""
+        """Return the `candidates` keyframes nearest to the pose T_world_camera (4, 4), nearest first."""
         self._settle()
         order = np.argsort(self._separation(self._poses, T_world_camera), kind="stable")
         return [self._keyframes[k] for k in order[: self.candidates]]

@@ -32,9 +32,9 @@ def find_distinct(bits, table, found):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve(depth, intensity, half_depth, half_intensity):
-    """Set `half_intensity` (h, w) to means over 2x2 px, and `half_depth` (h, w), m, to means over the nearest surface.
+    """Set `half_intensity` and `half_depth` (h, w) to means of `intensity` and `depth` (H, W), m, over 2x2 px.
 
-    Only those of the 2x2 px on the nearest surface are averaged; 0 = no reading.
+    Depth is averaged only over those of the four pixels that are on the nearest surface; 0 = no reading.
     """
     for v in prange(half_depth.shape[0]):
         for u in range(half_depth.shape[1]):

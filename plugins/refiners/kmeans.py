@@ -20,8 +20,8 @@ class KMeans(ClusterRefiner):
 
     Lloyd's algorithm runs on the points of each mask and of the ring around it, as in `gmm_em`. The object centers
     start at the means of groups of the mask's points, and the background centers at the means of groups of the ring's
-    points. The groups have equal sizes and are sorted by depth. Clusters with fewer than `min_points` points in the
-    mask or the ring stay unchanged.
+    points. The points are divided into these groups by depth, with equal numbers of points. Clusters with fewer than
+    `min_points` points in the mask or the ring stay unchanged.
     """
 
     object_centers: int = 5  # number of centers of the object, >= 1

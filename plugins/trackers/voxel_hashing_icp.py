@@ -276,7 +276,7 @@ class VoxelHashingIcp(PoseTracker):
         return self._accept(seen, T_world_camera, np.zeros((6, 6)))
 
     def _update_raw_keyframe(self, levels: list[PyramidLevel], T_world_camera: Float64) -> None:
-        """Replace the raw keyframe if it is missing or too far from a reliable pose."""
+        """Replace the raw keyframe by a frame with a reliable pose if it is missing or too far from this pose."""
         key = self._raw_keyframe
         if key is None or not self._scale.near(key.T_world_camera, T_world_camera, NEW_DISTANCE):
             self._raw_keyframe = RawKeyframe.of(levels, T_world_camera, self._scattered_depth)
@@ -349,9 +349,9 @@ class VoxelHashingIcp(PoseTracker):
         return found
 
     def _align_twice(self, levels: list[PyramidLevel], scene: SceneMap, T_world_from: Float64) -> Alignment:
-        """Return the result of an alignment that starts at the result of an alignment that starts at `T_world_from`.
+        """Align from the pose `T_world_from`, then from the result, and return the second alignment.
 
-        If the results differ, the alignment needs confirmation.
+        If the two results differ, it needs confirmation.
         """
         alignment = self._align(levels, scene, T_world_from, T_world_from)
         if not alignment.reliable or self.min_agreement == 0:
@@ -364,9 +364,10 @@ class VoxelHashingIcp(PoseTracker):
     def _align(
         self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64
     ) -> Alignment:
-        """Align a frame to the view of the map at T_world_view, coarse to fine.
+        """Return the alignment of a frame to the view of the map at T_world_view, computed coarse to fine.
 
-        `levels`: the image pyramid of the frame, finest first. The motion from the pose T_world_from is limited.
+        `levels`: the image pyramid of the frame, finest first. `T_world_from`: the pose from which the motion of the
+        camera is limited.
         """
         view = scene.render_near(levels[0].camera, T_world_view, levels[0].depth, levels[0].sensor)
         model, intensities = model_view(view), model_intensities(view, LEVELS)

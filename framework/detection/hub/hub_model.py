@@ -76,7 +76,7 @@ def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
 
 
 def _listed(index: Path) -> list[str]:
-    """Return the names of the weight files in an index."""
+    """Return the names of the weight files listed in the index file `index`."""
     try:
         return [*read_json(index)["weight_map"].values()]
     except (DataError, KeyError, TypeError, AttributeError) as error:

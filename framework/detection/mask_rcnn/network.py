@@ -56,7 +56,7 @@ class Architecture:
 
 
 class MaskRCNN(nn.Module):
-    """The network; `extract`, `score_anchors`, `classify` and `segment` are its steps."""
+    """Mask R-CNN, with its steps `normalize`, `extract`, `score_anchors`, `classify` and `segment`."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()

@@ -54,7 +54,7 @@ class Network:
 
 
 class Quantization(NamedTuple):
-    """Quantization of a blob: an integer q represents scale * (q - zero_point)."""
+    """Quantization of a blob: a uint8 value q represents scale * (q - zero_point)."""
 
     scale: float
     zero_point: int

@@ -51,7 +51,7 @@ class ReadsFields(Protocol):
 
 @runtime_checkable
 class Fingerprinted(Protocol):
-    """Interface of detectors with weights that parameters do not identify, such as a model name on a hub."""
+    """Interface of detectors whose parameters do not identify their weights, such as the name of a model on a hub."""
 
     def fingerprint(self) -> str:
         """Return a hash of all inputs of the detections except the frame. It must include `fingerprint(self)`."""

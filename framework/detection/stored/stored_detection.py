@@ -63,7 +63,7 @@ class Polygons(Segmentation):
 
 @dataclass(frozen=True)
 class StoredDetection:
-    """One object in one image."""
+    """A detection from a file: one object in one image."""
 
     where: str  # file and entry, for errors
     frame: int  # Frame.index

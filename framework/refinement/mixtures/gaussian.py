@@ -59,7 +59,7 @@ def add_to(values: Float32, summands: Float32) -> None:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to(values: Float32, others: Float32, n: int) -> None:
-    """Set the first n values to max(values, others), by a comparison, which vectorizes, unlike max()."""
+    """Set the first `n` values to max(values, others), with a comparison, because max() would not be vectorized."""
     for i in range(n):
         values[i] = others[i] if others[i] > values[i] else values[i]
 
@@ -84,14 +84,14 @@ def _exp(t: np.float32) -> np.float32:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def constant_exponential(log_density: np.float32, largest: Float32, evidence: Float32, n: int) -> None:
-    """Set the first n values of `evidence` to exp(log_density - largest)."""
+    """Set the first `n` values of `evidence` to exp(log_density - largest)."""
     for i in range(n):
         evidence[i] = _exp(log_density - largest[i])
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int) -> None:
-    """Set the first n densities to exp(densities - largest) and add them to the evidence."""
+    """Set the first `n` log densities in `densities` to exp(densities - largest), and add them to `evidence`."""
     for i in range(n):
         densities[i] = _exp(densities[i] - largest[i])
         evidence[i] += densities[i]
@@ -99,9 +99,9 @@ def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int
 
 @njit(cache=True, nogil=True)
 def log_evidence(largest: Float32, evidence: Float32, n: int) -> float:
-    """Return sum_i largest[i] + log(evidence[i]) over the first n points, with one logarithm per FACTORS factors.
+    """Return sum_i largest[i] + log(evidence[i]) over the first `n` points, with one logarithm per FACTORS points.
 
-    A factor is between 1 and 1 + the number of components.
+    The logarithm is that of a product of evidences, each between 1 and 1 + the number of components.
     """
     total = 0.0
     for begin in range(0, n, FACTORS):
@@ -128,7 +128,7 @@ def _product(values: Float32) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def invert(values: Float32, others: Float32, n: int) -> float:
-    """Set the first n values to 1 / values; return the sum of others / values."""
+    """Set the first `n` values to 1 / values; return the sum of others / values with the old values."""
     total = np.float32(0.0)
     for i in range(n):
         values[i] = np.float32(1.0) / values[i]

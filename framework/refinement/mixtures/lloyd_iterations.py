@@ -36,9 +36,9 @@ def nearest_centers(points: Float32, begins: Int64, ends: Int64, centers: Float6
 def depth_groups(points: Float32, starts: Int64, groups: int) -> Float64:
     """Return the means (N, groups, 3), m, of `groups` groups of points in each of N sets, to initialize `cluster`.
 
-    The groups have equal sizes and are sorted by depth, the third coordinate of the camera-frame points. Set k is
-    `points[starts[k]:starts[k + 1]]`. Depth separates an occluder, the supporting surface and the wall behind the
-    object. For a set with fewer points than groups, centers are repeated. For an empty set, they are 0.
+    Set k is `points[starts[k]:starts[k + 1]]`, m, camera frame. Its points are divided by depth, the third coordinate,
+    into groups of equal size. Depth separates an occluder, the supporting surface and the wall behind the object. For a
+    set with fewer points than groups, centers are repeated. For an empty set, they are 0.
     """
     return np.asarray(group_depths(points, starts, groups), np.float64)
 

@@ -59,9 +59,9 @@ def likely_members(
 ) -> Bool:  # fmt: skip
     """Return an array (S,), True for `points[begins[k]:ends[k]]` with a posterior above `min_posterior` in mixture k.
 
-    The posterior is the probability of the first `own_components`, which form the object. `prior_log_odds` (S,)
-    multiply their densities, as in `fit`; None = 0. For a mixture without components, all entries are True, because
-    there is no evidence against the points. Entries outside the ranges are False.
+    The posterior is the probability of the first `own_components`, which form the object. Their densities at point i
+    are multiplied by exp(prior_log_odds[i]), as in `fit`; None = 0. For a mixture without components, all entries are
+    True, because there is no evidence against the points. Entries outside the ranges are False.
     """
     weights, means, covariances = mixtures.weights, mixtures.means, mixtures.covariances
     rows = coefficients(weights.ravel(), means.reshape(-1, 3), covariances.reshape(-1, 3, 3))

@@ -205,7 +205,7 @@ def _maximize(
 
 @njit(cache=True, nogil=True)
 def _center_and_volume(points: Float32, variance_floor: float) -> tuple[Float64, float]:
-    """Return the points' mean, m, and the volume of their bounding box, m^3.
+    """Return the mean (3,), m, of points (S, 3), m, and the volume of their bounding box, m^3.
 
     A side of the box is at least 4 times the square root of `variance_floor`.
     """

@@ -130,9 +130,9 @@ def cut(points: Float32, starts: Int64, groups: int) -> Int32:
 def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: float) -> Float32:
     """Return the object's fraction (M,) of the density of each node j.
 
-    The evidence `log_odds[starts[j]:starts[j + 1]]` of the node's points are the log-likelihood ratios o_i of object to
-    background. The fraction rho maximizes sum_i log(rho exp(o_i) + 1 - rho). The fraction of the parent, `above` (M,),
-    has the weight of `above_points` additional points. rho is the fixed point of EM over the classes of the points.
+    `log_odds[starts[j]:starts[j + 1]]` are the log-likelihood ratios o_i of object to background of the node's points.
+    The fraction rho maximizes sum_i log(rho exp(o_i) + 1 - rho). The fraction of the parent, `above` (M,), has the
+    weight of `above_points` additional points. rho is computed by EM over the classes of the points.
     """
     ratios = above.astype(np.float32)
     set_own_ratios(log_odds, starts, above_points, ratios)

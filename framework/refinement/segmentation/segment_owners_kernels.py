@@ -35,8 +35,9 @@ def find_owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, cou
 def judged(pixels: Int32, cluster: Int32, labels: Int32, owners: Int32) -> tuple[Bool, Int32, Int32]:
     """Return an array (P,), True for points to keep, and the A uncovered pixels of owned segments with their owners.
 
-    Points are kept if their cluster owns their segment, or if they belong to no cluster. The uncovered pixels (A, 2) u,
-    v of segments with an owner have no kept point. Their owners are clusters (A,). See `find_owners` for the arguments.
+    Points are kept if their cluster owns their segment, or if they belong to no cluster. A pixel of a segment with an
+    owner is uncovered if it has no kept point. Returns the uncovered pixels as (A, 2), u and v, and their owners, which
+    are clusters, as (A,). See `find_owners` for the arguments.
     """
     height, width = labels.shape
     kept, covered = np.ones(len(cluster), np.bool_), np.zeros(labels.shape, np.bool_)
