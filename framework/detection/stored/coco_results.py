@@ -125,7 +125,7 @@ def _read_box(found: Any) -> Float32 | None:
     whole = isinstance(found, list) and len(found) == 4
     if not whole or not all(isinstance(x, int | float) and abs(x) <= MAX_PIXELS for x in found) or min(found[2:]) < 0:
         raise DataError(
-            f"bbox: expected [x, y, width, height] px of at most {MAX_PIXELS} px, width and height >= 0, got "
+            f"bbox: expected [x, y, width, height] px, at most {MAX_PIXELS} px each, width and height >= 0, got "
             f"{found!r:.200}"
         )
     x, y, width, height = found

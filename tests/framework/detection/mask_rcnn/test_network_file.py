@@ -109,7 +109,7 @@ def test_network_file_without_architecture_raises(tmp_path):
         (lambda fields: fields | {"backbone": "resnet18"}, "architecture.backbone: expected a JSON object"),
         (
             lambda fields: fields | {"backbone": fields["backbone"] | {"name": "vgg"}},
-            r"expected a known architecture, got an error \('vgg'",
+            "expected a known architecture, got an error ('vgg'",
         ),
         (lambda fields: fields | {"head_features": 17}, "fc6.bias: expected shape 17, got 16"),
     ],
