@@ -14,7 +14,7 @@ LANES = 16  # number of lanes of a sum; point n of a batch is added to lane n % 
 ROW = 5  # number of sums per derivative of the error: products with itself, the next three and the error
 ENERGY = 6 * ROW  # index of the weighted squared error among the sums of one term of the energy
 COLOR = ENERGY + 1  # index of the first sum of the photometric term, after those of the geometric term
-BRIGHTNESS = 2 * COLOR  # index of the change of brightness
+BRIGHTNESS = 2 * COLOR  # index of the sum of frame minus model intensity
 SUMS = BRIGHTNESS + 1  # number of sums over points, each of LANES lanes
 TERMS = SUMS + 6  # number of values of a chunk: its sums, then its six counts
 # offsets of a batch's point fields: in the frame, in the view, and in the model ...
@@ -36,9 +36,9 @@ NEAREST = 0.05  # minimum depth of projected points in the view, m
 # Not cv2.blur: other threads that use OpenCV change the split of its running sums, and thus the rounding.
 @njit(cache=True, nogil=True, parallel=True)
 def smooth_normals(normals, reach, row_sums, smooth):
-    """Set smooth (3, H, W) to the normalized means of normals (3, H, W) over squares of side 2 reach + 1 px.
+    """Set `smooth` (3, H, W) to the normalized means of `normals` (3, H, W) over squares of side 2 `reach` + 1 px.
 
-    The result is 0 where all normals of a square are 0.
+    The result is 0 where all normals of a square are 0. `row_sums` (3, H, W) is a buffer.
     """
     _, height, width = normals.shape
     for v in prange(height):
@@ -62,7 +62,7 @@ def smooth_normals(normals, reach, row_sums, smooth):
 
 @njit(cache=True, nogil=True, parallel=True)
 def turn_normals(normals_world, R, normals):
-    """Set normals (3, H, W) to the normals_world (H, W, 3) rotated by R (3, 3)."""
+    """Set `normals` (3, H, W) to `normals_world` (H, W, 3) rotated by `R` (3, 3)."""
     for v in prange(normals.shape[1]):
         for u in range(normals.shape[2]):
             x, y, z = normals_world[v, u, 0], normals_world[v, u, 1], normals_world[v, u, 2]
@@ -72,7 +72,7 @@ def turn_normals(normals_world, R, normals):
 
 @device
 def _tukey(r, scale):
-    """Return Tukey's biweight of a residual in standard deviations."""
+    """Return Tukey's biweight of the residual `r`, which is 0 beyond `scale`; both in standard deviations."""
     s = r / scale
     s = max(np.float32(1.0) - s * s, np.float32(0.0))
     return s * s
@@ -80,7 +80,7 @@ def _tukey(r, scale):
 
 @device
 def _load(frame, v, u0, points):
-    """Copy the batch of pixels that starts at (u0, v) to `points`; depth is 0 past the end of the row."""
+    """Copy depth, intensity and normals of the BATCH pixels from (u0, v) on to `points`; depth is 0 past the row."""
     depth, intensity, normals = frame.depth, frame.intensity, frame.normals
     for n in range(BATCH):
         u = u0 + n
@@ -93,7 +93,11 @@ def _load(frame, v, u0, points):
 
 @device
 def _project(frame, v, u0, model, shape, R, t, points, pixel):
-    """Set a batch's points in the view (m and px) and their flat pixel indices (BATCH,), -1 = outside."""
+    """Project the points of a batch into the view, whose image has the `shape` (height, width).
+
+    Set the points PX, PY, PZ, m, and their image positions U, V, px from the image corner. Set `pixel` (BATCH,) to
+    their flat pixel indices, -1 = outside. `R` and `t`: T_view_camera.
+    """
     fx, fy, cx, cy = frame.fx, frame.fy, frame.cx, frame.cy
     one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
     width = np.int32(shape[1])
@@ -119,7 +123,10 @@ def _project(frame, v, u0, model, shape, R, t, points, pixel):
 
 @device
 def _gather_model(depth, normals, size, pixel, points):
-    """Fetch the model's depth and normal at each point's pixel; depth 0 = no surface."""
+    """Set QZ and MX, MY, MZ to the model's depth, m, and normal at the pixel of each point; depth 0 = no surface.
+
+    `size`: number of pixels of the view.
+    """
     for n in range(BATCH):
         i = pixel[n]
         if i >= 0:
@@ -133,10 +140,10 @@ def _gather_model(depth, normals, size, pixel, points):
 
 @device
 def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
-    """Set the term of point n in J: weight, error, and derivative with respect to a twist of the view's frame.
+    """Set the term of point `n` in `J`: weight, error, and derivative with respect to a twist of the view's frame.
 
-    (gx, gy, gz) is the derivative of the error with respect to the point (px, py, pz). Values of points with
-    weight 0 may be NaN.
+    (gx, gy, gz) is the derivative of the error with respect to the point (px, py, pz). Values of points with weight 0
+    may be NaN.
     """
     zero = np.float32(0.0)
     weighted = weight > zero
@@ -152,10 +159,10 @@ def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
 
 @device
 def _add_geometry(model, R, weights, linear, noise_model, points, J):
-    """Set the point-to-plane terms of a batch in J; return the counts (visible, matched, close, behind).
+    """Set the point-to-plane terms of a batch in `J`; return the counts (visible, matched, close, behind).
 
-    points[NEAR] is set to 1 if a point is within max_distance of its model point, otherwise to 0. With linear weights,
-    the normals must also match.
+    The counts are those of `NormalEquations`. points[NEAR] is set to 1 if a point is within max_distance of its model
+    point, otherwise to 0. With linear weights, the normals must also match.
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     inv_fx, inv_fy = one / model.fx, one / model.fy
@@ -213,7 +220,11 @@ def _add_geometry(model, R, weights, linear, noise_model, points, J):
 
 @device
 def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
-    """Fetch the model's four intensities around each point and the bilinear weights; -1 = nothing mapped."""
+    """Set I00, I10, I01, I11 to the model intensities around each point, and A, B to its bilinear weights.
+
+    I00 is -1 for points outside of the image or with NEAR = 0. `inverse_scale`: width of the intensity image divided by
+    the width of the view.
+    """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     width = np.int32(shape[1])
     right, bottom = np.float32(shape[1] - 2), np.float32(shape[0] - 2)
@@ -235,7 +246,11 @@ def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
 
 @device
 def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J):
-    """Set the photometric terms (model minus frame intensity) of a batch in J; return counts (matched, compared)."""
+    """Set the photometric terms of a batch in `J`; return the counts (matched, compared).
+
+    The error is model minus frame intensity plus `brightness`. `compared` is the number of points with a model
+    intensity, and `matched` is the number of these with a nonzero weight.
+    """
     one, zero = np.float32(1.0), np.float32(0.0)
     noise, scale = weights.intensity_noise, weights.photometric_scale
     strength = weights.color_weight / (noise * noise)
@@ -268,7 +283,10 @@ def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J
 
 @device
 def _multiply(J, a, b, c, d, added):
-    """Add a batch's weighted products of the derivative at offset `a` with a, b, c, d and the error from `added` on."""
+    """Add weighted products over a batch to the five sums in `J` from index `added` on, each of LANES lanes.
+
+    They are the products of the field at offset `a` with the fields at `a`, `b`, `c` and `d` and with the error.
+    """
     for lane in range(LANES):
         product0, product1 = J[added + lane], J[added + LANES + lane]
         product2, product3 = J[added + 2 * LANES + lane], J[added + 3 * LANES + lane]
@@ -290,7 +308,7 @@ def _multiply(J, a, b, c, d, added):
 
 @device
 def _add_products(J, added):
-    """Add a batch's sums of one term to J from `added` on.
+    """Add the sums of one term over a batch to `J` from index `added` on.
 
     The sums are w J^T J (upper triangle and three more elements), w J^T r and w r^2.
     """
@@ -310,7 +328,7 @@ def _add_products(J, added):
 
 @device
 def _add_brightness(J):
-    """Add a batch's sum of brightness changes to J."""
+    """Add the sum of frame minus model intensity over a batch to `J`."""
     for lane in range(LANES):
         change = J[ADDED_BRIGHTNESS + lane]
         for step in range(BATCH // LANES):
@@ -321,7 +339,7 @@ def _add_brightness(J):
 
 @device
 def _add_batches(J, lanes, color):
-    """Add the sums of the latest batches to the lanes in double precision, and set them to 0.
+    """Add the sums in `J` of the latest batches to `lanes` in double precision, and set the sums in `J` to 0.
 
     `color` is the first lane of the photometric term.
     """
@@ -338,11 +356,12 @@ def _add_batches(J, lanes, color):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, linear, noise_model, brightness, sums):
-    """Sum the normal equations over a FrameView by chunks of rows into sums (CHUNKS, TERMS).
+    """Set `sums` (CHUNKS, TERMS) to the sums of the normal equations over each chunk of rows of a FrameView.
 
-    `R` (3, 3) and `t` (3,), m, are the rotation and the translation of T_view_camera. `inverse_scale` is the width of
-    model_intensity divided by the width of the view. `linear` is a LinearWeights, or None for Tukey's weights.
-    `noise_model` is the DepthNoise of the frame's sensor.
+    `model` is a ModelView, and `model_intensity` (h, w) is its intensity at the resolution of the frame. `R` (3, 3) and
+    `t` (3,), m, are the rotation and the translation of T_view_camera. `inverse_scale` is the width of model_intensity
+    divided by the width of the view. `linear` is a LinearWeights, or None for Tukey's weights. `noise_model` is the
+    DepthNoise of the frame's sensor.
     """
     height, width = frame.depth.shape
     shape, level_shape = model.depth.shape, model_intensity.shape

@@ -16,7 +16,7 @@ from framework.vocabulary.label_spaces import COCO
 
 @dataclass
 class GroundTruthDetector(Detector):
-    """Visible instances of known class with exact masks, score 1 and a certain class.
+    """Visible ground-truth instances of known class, with exact masks, score 1 and class probability 1.
 
     Raises DataError for a sequence without instance ground truth.
     """

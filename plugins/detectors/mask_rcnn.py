@@ -109,7 +109,7 @@ class MaskRCNNDetector(Detector):
         return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms_iou)
 
     def _resize(self, frame: Frame) -> Tensor:
-        """Return the network's input before normalization (1, 3, H, W), RGB, 0..255."""
+        """Return the resized image (1, 3, H, W), RGB, 0..255, the input of the network before normalization."""
         height, width = frame.camera.shape
         scale = min(self._short_side / min(height, width), self._long_side / max(height, width))
         size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -119,7 +119,10 @@ class MaskRCNNDetector(Detector):
         return image.contiguous(memory_format=torch.channels_last)
 
     def _mask_grids(self, pyramid: list[Tensor], boxes: Float32, label: Int32) -> Float32:
-        """Return the probabilities (N, 28, 28) that points of the box are inside the object."""
+        """Return grids (N, 28, 28) over boxes (N, 4), px, of the probability that a point is inside the object.
+
+        `label`: the class (N,) of the object in each box, from 1.
+        """
         logits = self._network.segment(pyramid, self._on_device(boxes))
         own = logits[torch.arange(len(label), device=self._device), self._on_device(label).long()]
         return self._finite(torch.sigmoid(own.float()))

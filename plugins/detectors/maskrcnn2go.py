@@ -149,7 +149,7 @@ class MaskRCNN2Go(Detector):
         return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms_iou)
 
     def _resize(self, frame: Frame) -> Tensor:
-        """Return the network's input (1, 3, H, W), RGB, 0..255."""
+        """Return the resized image (1, 3, H, W), RGB, 0..255, the input of the network."""
         height, width = frame.camera.shape
         scale = min(self.short_side / min(height, width), self.long_side / max(height, width))
         size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -160,7 +160,10 @@ class MaskRCNN2Go(Detector):
         return roi_align(features, torch.from_numpy(boxes).to(self._device), BINS, 1 / STRIDE)
 
     def _mask_grids(self, pooled: Tensor, label: Int32) -> Float32:
-        """Return the probabilities (N, 24, 24) that points of the box are inside the object of its class."""
+        """Return grids (N, 24, 24) over N boxes of the probability that a point is inside the object.
+
+        `pooled`: the features of the boxes. `label`: the class (N,) of the object in each box, from 1.
+        """
         (features,) = self._mask_head(pooled)
         own = torch.from_numpy(label).long().to(self._device)
         weight, bias = self._mask_logits
@@ -172,7 +175,10 @@ class MaskRCNN2Go(Detector):
 
 
 def _find_weights(folder: Path) -> Path:
-    """Return the network's folder. A relative path is searched in the working folder, then in the project folder."""
+    """Return the existing folder of the network. Raises DataError if there is none.
+
+    A relative path is searched in the working directory, then in the project folder.
+    """
     for candidate in candidates(folder):
         if candidate.is_dir():
             return candidate
@@ -181,7 +187,7 @@ def _find_weights(folder: Path) -> Path:
 
 
 def _read_network(folder: Path) -> tuple[list[Operator], dict[str, Tensor], dict[str, float]]:
-    """Return the operators in order, the float tensors, and the quantization steps of the quantized tensors."""
+    """Return the operators in order, the float32 tensors by name, and the quantization steps of quantized tensors."""
     content = {name: _read_checked(folder / name, sha256) for name, sha256 in SHA256.items()}
     description = json.loads(content["graph.json"])
     quantization: Mapping[str, tuple[float, int]] = description["quant"]

@@ -25,8 +25,8 @@ SOURCE = "yolox_nano.onnx (3.7 MB, COCO, Apache-2.0) is at https://github.com/Me
 class OnnxBoxes(Detector):
     """YOLO or SSD from an ONNX file, run by onnxruntime, with masks from depth.
 
-    The class distribution of a detection is its class scores times the objectness, normalized. Its score is the largest
-    of these products before normalization. A mask is the connected foreground of its box, see
+    The class distribution of a detection consists of the normalized products of its class scores and objectness. Its
+    score is the largest of these products before normalization. A mask is the connected foreground of its box; see
     `framework.detection.masks.masks_from_boxes`. A box with too few depth readings is dropped and counted in
     `boxes_without_depth`. The defaults match Megvii's YOLOX.
     """

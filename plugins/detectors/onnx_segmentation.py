@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class OnnxSegmentation(Detector):
-    """YOLO-style instance segmentation: boxes, class scores, mask coefficients, prototypes; needs the extra `onnx`.
+    """YOLO-style instance segmentation with mask coefficients and prototypes; needs the extra `onnx`.
 
     The network has K candidates, each with a box, C class scores and M coefficients of the prototypes. The outputs are
     (1, 4 + C + M, K) or its transpose, and (1, M, h, w) or (1, h, w, M). If suppression is part of the network (exports
@@ -30,8 +30,8 @@ class OnnxSegmentation(Detector):
     see `framework.detection.segmentation_output`. An ambiguous layout raises DataError.
 
     The class distribution of a detection is its normalized class scores. Its score is the largest class score before
-    normalization. Suppression in the network discards the other scores. Then the other classes get equal parts of
-    `class_spread` * (1 - score), so that ambiguous objects contribute less to the map. The other defaults match
+    normalization. Suppression in the network discards the scores of the other classes. Then the other classes get equal
+    parts of `class_spread` * (1 - score), so that ambiguous objects contribute less to the map. The defaults match
     Ultralytics' exports. Ultralytics' code and weights (AGPL) are not part of this project.
     """
 
@@ -95,7 +95,7 @@ class OnnxSegmentation(Detector):
         return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms_iou)
 
     def _log_classes(self) -> None:
-        """Log single-class outputs, and class names in the file that differ from `label_space`."""
+        """Log that the network reports one class per detection, and class names that differ from `label_space`."""
         if self._layout.suppressed:
             log.info(
                 "detector.class_spread: %s reports one class per detection; the other classes get %g of 1 - score",

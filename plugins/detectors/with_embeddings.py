@@ -16,7 +16,10 @@ from framework.interfaces import Detector
 
 @dataclass
 class WithEmbeddings(Detector):
-    """Detections of another detector with image embeddings of CLIP or SigLIP; needs the extra `transformers`."""
+    """Detections from another detector with image embeddings from CLIP or SigLIP; needs the extra `transformers`.
+
+    An embedding is computed from a square crop around the object. Detections without an embedding have zeros.
+    """
 
     detector: Detector  # wrapped detector; replace it with detector@detector.detector=NAME
     model: str = "google/siglip2-base-patch16-224"  # CLIP or SigLIP model: id on huggingface.co or folder

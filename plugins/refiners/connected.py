@@ -19,10 +19,10 @@ class Connected(ClusterRefiner):
     """Selection of the largest 3D-connected component of each cluster, and of components at a similar depth.
 
     Connected components are defined as in `largest_component`. A component is kept if most of its points agree in depth
-    with the nearest kept point. The allowed difference is the gap plus `max_depth_slope` times the lateral distance.
-    This removes background, such as the carpet between a chair's slats. It keeps object parts that are separated by
-    occlusion or missing readings. All points vote. If only the nearest quarter voted, the leaves of plants would be
-    removed.
+    with the nearest kept point. The allowed difference is the maximum depth step plus `max_depth_slope` times the
+    lateral distance. This removes background, such as the carpet between the slats of a chair. It keeps object parts
+    that are separated by occlusion or missing readings. All points of a component are compared. If only the nearest
+    quarter of them were compared, the leaves of plants would be removed.
     """
 
     max_gap: float = 0.1  # maximum depth step between connected pixels at depth 0, m, >= 0

@@ -20,15 +20,15 @@ from framework.refinement.refine import keep_points
 class GmmEm(ClusterRefiner):
     """Removal of background and outliers by a Gaussian mixture of object, background and outliers.
 
-    The refiner applies eqs. (1) to (4) to each mask. Object components start from groups of the mask's points, and
-    background components from groups of the points in a ring around the mask. A uniform component can represent
-    outliers.
+    The refiner applies eqs. (1) to (4) of docs/method.md to each mask. Object components start from groups of the
+    mask's points, and background components from groups of the points in a ring around the mask. A uniform component
+    can represent outliers.
 
     The mask is also used as evidence. This is our choice: without it, object and background can swap. Log-odds for the
     object decrease linearly from `mask_log_odds` inside the mask to -`mask_log_odds` in the ring. Pixels of the
-    `structure` from an earlier refiner are not part of the ring and do not count as the mask's border. Clusters with
-    fewer than `min_points` points in the mask or the ring remain unchanged. Without background components, only
-    outliers compete with the object.
+    `structure` from an earlier refiner are treated as pixels without a reading, so they are not part of the ring.
+    Clusters with fewer than `min_points` points in the mask or the ring remain unchanged. Without background
+    components, only outliers compete with the object.
     """
 
     object_components: int = 3  # number of Gaussians of the object, >= 1; about one per visible face

@@ -22,19 +22,19 @@ from framework.refinement.refine import keep_points
 class ForeignPoints(Enum):
     """The treatment of points whose most probable Gaussian belongs to another mask."""
 
-    MOVE = "they move to that mask's cluster"
-    DROP = "they are dropped"
-    STAY = "they stay"
+    MOVE = "moved to the cluster of that mask"
+    DROP = "removed"
+    STAY = "kept in their cluster"
 
 
 @dataclass
 class GmmFrame(ClusterRefiner):
     """Assignment of the points of a frame's masks to the most probable mask, by hierarchical EM.
 
-    The refiner applies eqs. (1) to (4) to the points of all masks (section 3.2.2). A pixel in several masks is one
-    point of the mask with the best score. There is no background, and the masks only initialize the mixture. Therefore,
-    a point leaves its cluster only if it fits another cluster better. The paper does not specify the hierarchy. Levels,
-    children and initialization are our choice (J = 8 after Eckart et al., CVPR 2016).
+    The refiner applies eqs. (1) to (4) of docs/method.md to the points of all masks (section 3.2.2). A pixel in several
+    masks is one point of the mask with the best score. There is no background, and the masks only initialize the
+    mixture. Therefore, a point leaves its cluster only if it fits another cluster better. The paper does not specify
+    the hierarchy. Levels, children and initialization are our choice (J = 8 after Eckart et al., CVPR 2016).
     """
 
     levels: int = 2  # number of levels of hierarchical EM, >= 1; 1 = flat
@@ -83,7 +83,10 @@ class GmmFrame(ClusterRefiner):
 
 
 def best_of_pixels(clusters: PointClusters, shape: tuple[int, int]) -> Bool:
-    """Return an array (P,), True for points of the highest-scored cluster at their pixel; ties go to the first."""
+    """Return an array (P,), True for points of the cluster with the highest score at their pixel.
+
+    `shape`: (height, width) of the frame, px. Ties go to the first cluster.
+    """
     rank = np.empty(len(clusters), np.int32)
     rank[np.argsort(-clusters.scores, kind="stable")] = np.arange(len(clusters), dtype=np.int32)
     kept = np.empty(len(clusters.cluster), np.bool_)

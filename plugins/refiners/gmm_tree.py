@@ -19,15 +19,15 @@ from framework.refinement.refine import keep_points
 class GmmTree(ClusterRefiner):
     """Removal of the points on surface patches outside the object by hierarchical EM.
 
-    A tree of mixtures (Eckart et al., CVPR 2016) is fitted to each mask together with the ring around it. Its nodes are
-    surface patches. They do not depend on the mask, because a wrong assignment at the first level could not be
-    corrected at later levels.
+    A tree of mixtures (Eckart et al., CVPR 2016) is fitted to the points of each mask and of the ring around it. Its
+    nodes are surface patches. They do not depend on the border of the mask, because a wrong assignment at the first
+    level could not be corrected at later levels.
 
-    The mask is used as evidence. Points have the log-odds of `gmm_em`. A node's object fraction maximizes the
-    likelihood of its points' evidence, with the parent's fraction as a prior (our choice). A point stays if its leaves
-    and its own evidence give the object a posterior above `min_posterior`. Outliers at the root do not belong to the
-    object. Outliers below a node have the object fraction of this node. Clusters with fewer than `min_points` points in
-    the mask or the ring stay unchanged.
+    The mask is used as evidence. Points have the log-odds of `gmm_em`. The object fraction of a node maximizes the
+    likelihood of the evidence of its points, with the fraction of its parent as a prior (our choice). A point stays if
+    the object fractions of its leaves and its own evidence give the object a posterior above `min_posterior`. Outliers
+    at the root do not belong to the object. Outliers below a node have the object fraction of this node. Clusters with
+    fewer than `min_points` points in the mask or the ring stay unchanged.
     """
 
     levels: int = 2  # number of levels of the tree, >= 1

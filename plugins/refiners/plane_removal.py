@@ -50,7 +50,7 @@ class PlaneRemoval(ClusterRefiner):
         return replace(keep_points(clusters, kept), structure=structure)
 
     def structure(self, frame: Frame) -> Planes:
-        """Return the frame's planes at the border of the scene."""
+        """Return the planes of the frame that are structure: floors, walls and other planes at the scene's border."""
         planes = find_planes(frame, self.plane_distance, self.inverse_depth_noise, self.min_area)
         upright = -planes.normals[:, 1] >= np.cos(np.deg2rad(self.max_tilt)) - 1e-9  # the camera's y axis points down
         large = planes.fractions >= self.min_frame_fraction

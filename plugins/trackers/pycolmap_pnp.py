@@ -1,4 +1,4 @@
-"""Sparse tracking of image features with depth against a local map of keyframes, with poses from pycolmap."""
+"""Sparse tracking: image features with depth are matched with keyframes, and pycolmap estimates the pose."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class PycolmapPnp(PoseTracker):
 
     def __post_init__(self) -> None:
         self._keyframes = Keyframes(**vars(self))
-        self._T_world_last: Float64 | None = None  # last trusted pose
+        self._T_world_last: Float64 | None = None  # last reliable pose
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         features = self._keyframes.extractor.extract(frame)
@@ -60,7 +60,7 @@ class PycolmapPnp(PoseTracker):
         self._keyframes.restore(keyframes)
 
     def _begin(self, frame: Frame, features: Features) -> Pose:
-        """Return the pose of the first frame with enough features, which defines the world frame."""
+        """Return the pose that defines the world frame, or a lost pose if the frame has too few features."""
         T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
         if not self._keyframes.add_with(frame, features, T_world_camera):
             reason = f"the frame has fewer than {self.min_features} features with depth"

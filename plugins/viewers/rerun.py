@@ -27,7 +27,7 @@ from framework.live_view.sealed_page import SealedPage
 log = logging.getLogger(__name__)
 
 RECORDING = "recording.rrd"
-FLUSH_S = 0.2  # maximum duration of data lost by a killed run, s
+FLUSH_S = 0.2  # maximum duration of the data that are lost if a run is killed, s
 
 
 class Mode(Enum):
@@ -42,7 +42,7 @@ class Mode(Enum):
 class RerunViewer(Viewer):
     """Viewer of the camera path, the newest frame with masks and depth, the mesh, object boxes, and stage times.
 
-    If drawing is slower than mapping, images are omitted. Poses, times and lost frames are always shown.
+    If drawing is slower than mapping, some images are omitted. Poses, stage times and lost frames are always shown.
     """
 
     mode: Mode = Mode.RECORD  # output: RECORD (file), WINDOW (rerun's viewer) or BROWSER (local web page)
@@ -100,7 +100,10 @@ class RerunViewer(Viewer):
             self._page.close()
 
     def _sinks(self, rr: Any, directory: Path) -> list[Any]:
-        """Return rerun's sinks for the chosen outputs."""
+        """Open the outputs chosen by `mode` and `file`, and return their rerun sinks.
+
+        `directory`: the run directory, to which `file` is relative.
+        """
         sinks = []
         file = self.file or (RECORDING if self.mode is Mode.RECORD else "")
         if file:
@@ -123,7 +126,7 @@ def _file_sink(rr: Any, path: Path) -> Any:
 
 
 def _server(rr: Any, port: int, memory_limit: str) -> Any:
-    """Serve the data on 127.0.0.1."""
+    """Start a server of the data on 127.0.0.1 and return its rerun sink."""
     with _named_errors(f"viewer.port: expected a free port, got {port}"):
         with socket.socket() as probe:  # rerun would report this only on stderr
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -273,7 +273,7 @@ def test_precomputed_mask_image_with_wrong_size_or_type_raises(
         ({"segmentation": {"size": [6], "counts": PACKED}}, "size"),
         ({"segmentation": {"size": [6, 8], "counts": [3, 4]}}, "run lengths: expected"),
         ({"segmentation": [[1, 2, 3, 4]]}, "at least 3 points, got [1, 2, 3, 4]"),
-        ({"segmentation": []}, "segmentation: expected a polygon, got none"),
+        ({"segmentation": []}, "segmentation: expected at least one polygon, got an empty list"),
         ({"bbox": [1, 2, 3]}, "bbox: expected [x, y, width, height] px, at most"),
         ({"class_probabilities": [0.5, 0.5]}, "class_probabilities: expected 80 values, one for each label, got 2"),
         ({"class_probabilities": {"chair": 0.5}}, "class_probabilities: expected a sum of 1, got 0.5"),
@@ -360,8 +360,8 @@ def test_precomputed_invalid_parameter_raises(tmp_path: Path) -> None:
 
 
 def test_precomputed_unusable_or_duplicate_label_raises(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="expected detections of COCO's classes, got none of 1"):
+    with pytest.raises(DataError, match="expected detections of COCO's classes, got none in 1 detections"):
         Precomputed(write(tmp_path, entry(category_name="wall")), label_space="nyu40")
     (tmp_path / "labels.txt").write_text("chair\nchair\n")
-    with pytest.raises(ConfigError, match=r"detector\.label_space: expected unique names, got duplicates in"):
+    with pytest.raises(ConfigError, match=r"detector\.label_space: expected unique names, got 'chair' twice"):
         Precomputed(write(tmp_path, entry()), label_space=str(tmp_path / "labels.txt"))
