@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
-from framework.runs.bundle import write_bundle
+from framework.runs.run_bundle import write_bundle
 
 
 def main() -> None:

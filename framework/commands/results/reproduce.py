@@ -16,8 +16,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from framework.commands.command_line import EXIT_FAILED, KNOWN_ERRORS, arguments, one_line_errors, print_error
 from framework.errors import ConfigError, DataError
-from framework.runs.bundle import opened_bundle
 from framework.runs.reproduction import Reproduction, causes
+from framework.runs.run_bundle import opened_bundle
 from framework.runs.run_rows import CHOICE
 from framework.runs.stored_runs import METRICS, Record, find_records, read_record
 
