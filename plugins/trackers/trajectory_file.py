@@ -35,7 +35,8 @@ class TrajectoryFile(PoseTracker):
     """
 
     path: Path  # trajectory in TUM format
-    max_time_difference: float = 0.02  # maximum time difference from a frame to its pose, s, >= 0; skipped above it
+    # maximum time difference between a frame and its pose, s, >= 0; frames without a pose are skipped
+    max_time_difference: float = 0.02
     time_offset: float = 0.0  # offset added to the file's timestamps, s
     world_frame: World = World.FIRST_FRAME  # world frame of the poses
 
