@@ -35,7 +35,7 @@ def test_detect_output_is_read_by_precomputed(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["found.json", "found.labels.txt"]
     assert "frame skipped: frame 1" in done.stderr
     assert "10 detections in 5 frames of corner_room" in done.stderr
-    assert "mask AP50 1.00, AP 1.00: mean of 2 classes, 10 ground-truth objects of at least" in done.stderr
+    assert "mask AP50 1.00, mask AP 1.00 (mean of 2 classes, 10 ground-truth objects of at least" in done.stderr
     message = dict(re.findall(r"INFO +(.*?)  +(\S+)$", done.stderr, re.MULTILINE))
     assert (message["found"], message["mask IoU"], message["correct class"], message["false detections per image"]) == (
         *("1.00", "1.00", "1.00", "0.00"),
