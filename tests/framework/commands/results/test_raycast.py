@@ -121,7 +121,11 @@ FAR = ("--pose", 0, 0, -50, 0, 1, 0, 0)
         (["--frame", -1], "--frame: expected a frame number from 0 to 5, got -1"),
         (["--pose", 0, 0, 0, 0, 0, 0, 2], "--pose: expected a quaternion qx qy qz qw of length 1, got 2"),
         (["--pose", "nan", 0, 0, 0, 0, 0, 1], "--pose: expected a finite pose, got nan 0 0 0 0 0 1"),
-        (FAR, "raycast: expected a pose with the map in view, got an empty view from pose 0 0 -50 0 1 0 0; set another "),
+        (
+            FAR,
+            "raycast: expected a pose with the map in view, got an empty view from pose 0 0 -50 0 1 0 0; set another "
+            "--frame or --pose",
+        ),
         (["--out", "view.jpg"], "--out: expected a name with the suffix .png, got view.jpg"),
     ],
 )

@@ -200,7 +200,7 @@ def test_report_invalid_output_path_fails_before_reading(
     stored: Path, command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(RunReport, "of", pytest.fail)
-    assert "expected a file in an existing folder" in command(stored, "--out", stored / "missing" / "page.html")[2]
+    assert "expected an existing parent folder" in command(stored, "--out", stored / "missing" / "page.html")[2]
     assert ": expected a regular file, got a folder" in command(stored, "--out", stored)[2]
 
 

@@ -69,7 +69,7 @@ def test_detect_output_is_read_by_pycocotools(tmp_path: Path) -> None:
     ("overrides", "message"),
     [
         ([], "out: expected a file name, got none; set out=detections.json"),
-        (["out=absent/found.json"], "out: expected a file in an existing folder, got"),
+        (["out=absent/found.json"], "out: expected an existing parent folder, got none"),
         (["out=2024"], "out: expected a path (in quotes if it looks like a number), got 2024"),
         (["out=[a,b]"], "out: expected a path (in quotes if it looks like a number), got ['a', 'b']"),
     ],

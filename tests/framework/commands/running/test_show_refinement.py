@@ -43,7 +43,7 @@ def test_show_refinement_without_detections_draws_frame(tmp_path: Path) -> None:
     ("overrides", "message"),
     [
         ([], "out: expected a file name, got none; set out=refinement.png"),
-        (["out=absent/refinement.png"], "out: expected a file in an existing folder, got"),
+        (["out=absent/refinement.png"], "out: expected an existing parent folder, got none"),
         (["out=refinement.jpg"], "out: expected a name with the suffix .png, got refinement.jpg"),
         (["out=r.png", "frame=6"], "frame: expected a position in [0, 5] among the selected frames of"),
         (["out=r.png", "frame=1", "dataset.unreadable=1"], "frame 1: depth/000001.png is truncated"),
