@@ -60,7 +60,10 @@ def require(holds: bool, name: str, value: object, allowed: str) -> None:
 
 
 def checked_path(name: str, value: object) -> Path:
-    """Return the value of config key `name` as an absolute path. Raises ConfigError if it is no string or empty."""
+    """Return the value of the config key `name` as an absolute path.
+
+    Raises ConfigError unless the value is a nonempty string.
+    """
     require(isinstance(value, str) and value != "", name, repr(value), "a path (in quotes if it looks like a number)")
     return Path(str(value)).expanduser().absolute()
 
@@ -90,7 +93,7 @@ def checked_rows(node: Any) -> dict[str, list[str]]:
     """
     if node is not None and not isinstance(node, Mapping):
         raise ConfigError(
-            f"rows: expected a mapping of names to overrides, got {node!r}; write, for example, mine: [refiner=identity]"
+            f"rows: expected a mapping of names to overrides, got {node!r}; for example, mine: [refiner=identity]"
         )
     rows = {str(name): overrides for name, overrides in (node or {}).items()}
     for name, overrides in rows.items():
