@@ -161,7 +161,7 @@ def _worker() -> subprocess.Popen[str]:
     """Start a process that compiles one kernel per input line, and prints an error or an empty line for each."""
     path = os.pathsep.join(filter(None, [str(CHECKOUT), os.environ.get("PYTHONPATH")]))
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", "framework.compilation.worker"],  # -P: import nothing from the working folder
+        [sys.executable, "-P", "-m", "framework.compilation.worker"],  # -P: import nothing from the working directory
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 class RgbdFolder(Recording):
     """An RGB-D video in a folder of images, with optional poses and instance ground truth."""
 
-    ground_truth_spacing: float = 0.02  # spacing of the ground-truth surface points, m
+    ground_truth_spacing: float = 0.02  # spacing of the ground-truth surface points, m, in [0.001, 1]
 
     def __post_init__(self) -> None:
         check_truth_voxel(self.ground_truth_spacing)

@@ -31,7 +31,7 @@ def _run(code: str) -> tuple[str, str]:
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(":")
     }
-    command = [sys.executable, "-P", "-c", code]  # -P: import nothing from the working folder
+    command = [sys.executable, "-P", "-c", code]  # -P: import nothing from the working directory
     try:
         done = subprocess.run(command, env=environment, input="", capture_output=True, text=True, timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:

@@ -47,7 +47,7 @@ class OnnxBoxes(Detector):
     bgr: bool = True  # channel order: True = BGR, False = RGB
     black_level: float = 0.0  # network input for a channel value of 0
     white_level: float = 255.0  # network input for a channel value of 255; 1 for networks with inputs in [0, 1]
-    # minimum fraction of a box's depth readings, weighted toward the box center, that form the foreground, in [0, 1]
+    # minimum fraction of a box's depth readings in the foreground, weighted toward the box center, in [0, 1]
     min_foreground_fraction: float = 0.4
     # maximum angle between surface and image plane, degrees, in (0, 90); a steeper depth step is an object boundary
     max_slant: float = 85.0

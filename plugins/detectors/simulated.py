@@ -108,9 +108,9 @@ class SimulatedDetector(Detector):
     seed: int = 0  # seed of the simulated errors, >= 0
     min_pixels: int = 64  # minimum number of pixels of a detected instance, >= 1
     clutter_rate: float = 0.0  # fraction of the objects of unknown class that are detected, in [0, 1]
-    # probability that an object and a touching object of unknown class have one common mask, in [0, 1]
+    # probability that an object and a touching object of unknown class share one mask, in [0, 1]
     attach_rate: float = 0.0
-    merge_rate: float = 0.1  # probability that two touching objects have one common mask, in [0, 1]
+    merge_rate: float = 0.1  # probability that two touching objects share one mask, in [0, 1]
     miss_rate: float = 0.1  # probability of missing a large object inside the image, in [0, 1]
     # object side at which the size-related miss probability is 1/e, px, >= 0; 0 = no effect of the size
     small_side: float = 24.0

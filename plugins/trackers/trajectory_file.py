@@ -37,7 +37,7 @@ class TrajectoryFile(PoseTracker):
     path: Path  # trajectory in TUM format
     # maximum time difference between a frame and its pose, s, >= 0; frames without a pose are skipped
     max_time_difference: float = 0.02
-    time_offset: float = 0.0  # offset added to the file's timestamps, s
+    time_offset: float = 0.0  # offset added to the timestamps of the file, s
     world_frame: World = World.FIRST_FRAME  # world frame of the poses
 
     def __post_init__(self) -> None:

@@ -104,7 +104,7 @@ class VoxelHashingIcp(PoseTracker):
     min_agreement: float = 0.92
     # maximum fraction of the visible points behind the map's surface, in [0, 1]; 1 = no check
     max_occluded: float = 0.015
-    raw_keyframe: bool = True  # True = align to a raw keyframe in addition to the map; False = map only
+    raw_keyframe: bool = True  # True = align to a keyframe with raw depth in addition to the map; False = map only
     relocalize: bool = True  # True = relocalize against keyframes and visited poses; False = no relocalization
     seed: int = 0  # seed of the relocalization, >= 0
 

@@ -42,8 +42,8 @@ class DepthCamera(LiveVideo):
     # delay of color relative to depth at equal timestamps, s, in [-0.2, 0.2]; positive = color captured later; AUTO =
     # estimated during the run, 0 until then
     color_delay: str = AUTO
-    # depth sensor, which selects the noise model: AUTO (from the device), EXACT, KINECT_V1, REALSENSE_D435,
-    # TIME_OF_FLIGHT or PHONE_LIDAR
+    # depth sensor, which selects the noise model: AUTO (from the device), EXACT (rendered depth), KINECT_V1,
+    # REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR
     sensor: SensorChoice = SensorChoice.AUTO
 
     def __post_init__(self) -> None:

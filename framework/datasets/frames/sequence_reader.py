@@ -117,13 +117,13 @@ class Recording(RGBDSequence):
     stop: int = TO_THE_END  # index of the first frame after the selection, >= 0; -1 = end of the sequence
     stride: int = 1  # step between selected frames, in frames, >= 1; 1 = every frame
     frame_fraction: float = 1.0  # randomly selected fraction of the frames, in (0, 1]; 1 = all frames
-    seed: int = 0  # seed of the random frame selection
+    seed: int = 0  # seed of the random frame selection, >= 0
     max_depth: float = 10.0  # maximum depth, m, >= 0; farther readings are dropped; 0 = unlimited
     # ground truth for the evaluation: labeled mesh (PLY with instances.json) or run directory; None = ground truth of
     # the recording
     ground_truth: Path | None = None
-    # depth sensor, which selects the noise model: AUTO (from the recording, else KINECT_V1), EXACT, KINECT_V1,
-    # REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR
+    # depth sensor, which selects the noise model: AUTO (from the recording, else KINECT_V1), EXACT (rendered depth),
+    # KINECT_V1, REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR
     sensor: SensorChoice = SensorChoice.AUTO
     pose_reading: PoseReading = field(default_factory=PoseReading)
     depth_reading: DepthReading = field(default_factory=DepthReading)
