@@ -192,7 +192,7 @@ def _feed(
                 error = (
                     answer.strip()
                     if answer
-                    else f"{kernel.module}.{kernel.name}: expected a compiled kernel, got an exit of its process"
+                    else f"{kernel.module}.{kernel.name}: expected a compiled kernel, got a terminated process"
                 )
                 events.put(("done", error))
 

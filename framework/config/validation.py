@@ -45,7 +45,7 @@ def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
 
 
 def check_intervals(stage: str, plugin: object, **intervals: str) -> None:
-    """Raise ConfigError unless each parameter is in its interval, such as nms_iou="(0, 1]"."""
+    """Raise ConfigError unless each parameter is in its interval, such as nms_iou="(0, 1]"; NaN never is."""
     for name, interval in intervals.items():
         low, high = map(float, interval[1:-1].split(","))
         value = getattr(plugin, name)
@@ -71,7 +71,7 @@ def checked_path(name: str, value: object) -> Path:
 def checked_file(name: str, value: object, suffix: str = "") -> Path:
     """Return the value of the config key `name` as the absolute path of an output file.
 
-    Raises ConfigError if the name has another suffix than `suffix` ("" = any), or if its folder does not exist.
+    Raises ConfigError if the file name does not end with `suffix` ("" = any), or if its folder does not exist.
     """
     path = checked_path(name, value)
     if suffix and path.suffix.lower() != suffix:

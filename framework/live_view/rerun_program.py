@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 HERE = "127.0.0.1"
-TIMEOUT_S = 60.0  # s, maximum startup time; a busy machine is slow
+TIMEOUT_S = 60.0  # s, maximum startup time, also on a busy machine
 POLL_S = 0.05  # s, interval between connection attempts
 
 

@@ -78,7 +78,7 @@ def line(change: Change) -> str:
 
 
 def entry(change: Change) -> dict[str, object]:
-    """Return a change as a JSON object, with lengths in meters."""
+    """Return the JSON entry of a change, with lengths in meters."""
     return {
         "kind": change.kind.value,
         "class": change.name,

@@ -70,7 +70,7 @@ def table(found: Sequence[Match], measure: str) -> str:
 
 
 def entry(found: Match) -> dict[str, object]:
-    """Return an object as a JSON object, with lengths in meters."""
+    """Return the JSON entry of a matched object, with lengths in meters."""
     return {
         "id": found.instance.id,
         "class": found.name,
