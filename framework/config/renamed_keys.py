@@ -64,12 +64,12 @@ RENAMED = {
 
 
 def new_name(key: str) -> str | None:
-    """Return the new name of a dotted key; None = not renamed."""
+    """Return the new name of a dotted config key; None = not renamed."""
     parts = key.split(".")
     return RENAMED.get(key) or (RENAMED.get(f"{parts[0]}.{parts[-1]}") if len(parts) > 2 else None)
 
 
 def rename_hint(key: str) -> str:
-    """Return the fix for an unknown key: its new name; "" = not renamed."""
+    """Return the fix for an unknown key, such as "set resume_from (new name of map)"; "" = not renamed."""
     found = new_name(key)
-    return f"{key} was renamed; set {found}" if found else ""
+    return f"set {found} (new name of {key})" if found else ""

@@ -133,8 +133,9 @@ class Ring:
     ring_fraction: float = 0.25  # ratio of the ring's width to the square root of the mask's area, >= 0; 0 = no ring
     min_ring: int = 4  # minimum width of the ring, px, >= 1
     max_ring: int = 12  # maximum width of the ring, px, >= min_ring
-    max_points: int = 1000  # maximum number of points of a mask and its ring in the fit, >= 100
-    min_points: int = 30  # minimum number of points of a mask and of its ring, >= 10; smaller clusters stay unchanged
+    # maximum number of points of a mask and its ring for the fit, >= 100; all points are classified
+    max_points: int = 1000
+    min_points: int = 30  # minimum number of points of a mask and of its ring, >= 10; clusters below it stay unchanged
 
     def __post_init__(self) -> None:
         check_bounds(

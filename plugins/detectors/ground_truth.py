@@ -21,7 +21,8 @@ class GroundTruthDetector(Detector):
     Raises DataError for a sequence without instance ground truth.
     """
 
-    min_pixels: int = 64  # minimum number of pixels of a detected instance, >= 1; about the limit of real detectors
+    # minimum number of pixels of a detected instance, >= 1; 64 is about the limit of real detectors
+    min_pixels: int = 64
 
     def __post_init__(self) -> None:
         require(self.min_pixels >= 1, "detector.min_pixels", self.min_pixels, "at least 1 px")

@@ -68,16 +68,20 @@ class MaskRCNN2Go(Detector):
     ambiguous object does not create two instances.
     """
 
-    weights: Path = Path("plugins/detectors/maskrcnn2go_int8")  # folder, relative to the working or project folder
-    score_threshold: float = 0.1  # minimum score, in [0, 1); low, because weak detections can update instances
+    # folder of the network, absolute or relative to the working directory or the project folder
+    weights: Path = Path("plugins/detectors/maskrcnn2go_int8")
+    # minimum score of a detection, in [0, 1); low, because low-score detections can update existing instances
+    score_threshold: float = 0.1
     nms_iou: float = 0.3  # box IoU threshold of non-maximum suppression within a class, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
-    proposals: int = 120  # maximum number of region proposals for the box head, >= 1; 100 to 120 in training
+    # maximum number of region proposals for the box head, >= 1; the network was trained with 100 to 120
+    proposals: int = 120
     max_detections: int = 100  # maximum number of detections per image, >= 1
-    short_side: int = 320  # short side of the resized image, px, >= 32; 320 in training
+    short_side: int = 320  # short side of the resized image, px, >= 32; the network was trained with 320
     long_side: int = 640  # maximum long side of the resized image, px, >= short_side
     mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
-    int8: bool = True  # True = 8-bit arithmetic on CPUs with VNNI, three times as fast per core; False = float
+    # True = 8-bit integer arithmetic on CPUs with VNNI, three times as fast per core; False = floating-point arithmetic
+    int8: bool = True
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
 
     reads = ("color",)

@@ -35,9 +35,10 @@ class OpenVocabulary(Detector):
     text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # distinct text queries
     model: str = "google/owlv2-base-patch16-ensemble"  # OWLv2 model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model repository
-    mask_model: str = "facebook/sam2.1-hiera-tiny"  # SAM, SAM 2 or EdgeTAM: id or folder; "" = masks from depth
-    mask_model_revision: str = "main"  # branch, tag or commit of the mask model id
-    score_threshold: float = 0.1  # minimum probability of the best query for a box, in (0, 1)
+    # mask model (SAM, SAM 2, or EdgeTAM, which needs timm): id on huggingface.co or folder; "" = masks from depth
+    mask_model: str = "facebook/sam2.1-hiera-tiny"
+    mask_model_revision: str = "main"  # branch, tag or commit of the mask model repository
+    score_threshold: float = 0.1  # minimum probability of the most likely query for a box, in (0, 1)
     nms_iou: float = 0.5  # box IoU threshold of non-maximum suppression across queries, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across queries, in (0, 1]; 1 = off
     max_detections: int = 50  # maximum number of detections per image, >= 1

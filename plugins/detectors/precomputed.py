@@ -43,11 +43,15 @@ class Precomputed(Detector):
     had an entry, because the file then belongs to another sequence.
     """
 
-    path: Path  # COCO result file, or folder of masks
-    label_space: str = "coco"  # label space of the file, or a text file with one name per line
+    # COCO results file (e.g. from `instancemap detect`), or folder with NNNNNN.png and NNNNNN.json
+    path: Path
+    # class names: a label space (coco, nyu40, scenenn, ...), or a text file with one name per line
+    label_space: str = "coco"
     category_ids: CategoryIds = CategoryIds.COCO_91  # numbering of category_id
     score_threshold: float = 0.0  # minimum score of a detection, in [0, 1]
-    class_spread: float = 1.0  # fraction of (1 - score) for other classes of detections with one class, in [0, 1]
+    # fraction of (1 - score) distributed over the other classes, for detections with one class, in [0, 1]; 0 = certain
+    # label
+    class_spread: float = 1.0
 
     reads = ("index", "camera")
 

@@ -109,22 +109,24 @@ class SimulatedDetector(Detector):
 
     seed: int = 0  # seed of the simulated errors, >= 0
     min_pixels: int = 64  # minimum number of pixels of a detected instance, >= 1
-    clutter_rate: float = 0.0  # fraction of objects of unknown class that are detected, in [0, 1]
-    # probability of a common mask of an object and a touching object of unknown class, in [0, 1]
+    clutter_rate: float = 0.0  # fraction of the objects of unknown class that are detected, in [0, 1]
+    # probability that an object and a touching object of unknown class share one mask, in [0, 1]
     attach_rate: float = 0.0
-    merge_rate: float = 0.1  # probability of a common mask of two touching objects, in [0, 1]
+    merge_rate: float = 0.1  # probability that two touching objects share one mask, in [0, 1]
     miss_rate: float = 0.1  # probability of missing a large object inside the image, in [0, 1]
-    small_side: float = 24.0  # object side with a size-related miss probability of 1/e, px, >= 0; 0 = no effect
+    # object side at which the size-related miss probability is 1/e, px, >= 0; 0 = no effect of the size
+    small_side: float = 24.0
     truncated_miss_rate: float = 0.15  # additional probability of missing an object at the image border, in [0, 1]
     miss_spread: float = 0.0  # standard deviation of the logit of the detection rate over objects, >= 0
     split_rate: float = 0.05  # probability of splitting an object into two detections, in [0, 1]
     shift: float = 1.5  # standard deviation of the mask shift along x and y, px, >= 0
     bleed: float = 2.0  # offset of the mask border from the object border, px; positive = outside, negative = inside
-    boundary_noise: float = 2.5  # standard deviation of the mask border's displacement, px, >= 0
-    boundary_scale: float = 12.0  # correlation length of the mask border's displacement, px, >= 2
+    boundary_noise: float = 2.5  # standard deviation of the displacement of the mask border, px, >= 0
+    boundary_scale: float = 12.0  # correlation length of the displacement along the mask border, px, >= 2
     mask_grid: int = 28  # number of cells per side of a mask, >= 4; 0 = full resolution
-    confusion: float = 0.25  # mean probability of wrong classes, in [0, 1)
-    confusion_concentration: float = 3.0  # concentration of the Dirichlet distribution of classes, > 0
+    confusion: float = 0.25  # mean total probability of the wrong classes, in [0, 1)
+    # concentration of the Dirichlet distribution of classes, > 0; small values give confident but often wrong classes
+    confusion_concentration: float = 3.0
     confusion_consistency: float = 0.5  # fraction of an object's frames with the same class distribution, in [0, 1]
     score_scale: float = 1.0  # scale of the mean score (mask IoU times class probability), in (0, 1]
     score_concentration: float = 20.0  # concentration of the Beta distribution of scores, >= 0; 0 = no noise

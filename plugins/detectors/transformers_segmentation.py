@@ -71,11 +71,12 @@ class TransformersSegmentation(Detector):
 
     model: str = "facebook/mask2former-swin-tiny-coco-instance"  # model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model repository
-    score_threshold: float = 0.1  # minimum score, in [0, 1); low, because weak detections can update instances
+    # minimum score of a detection, in [0, 1); low, because low-score detections can update existing instances
+    score_threshold: float = 0.1
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
-    short_side: int = 0  # short side of the resized image, px, >= 32; 0 = as in the published model
-    long_side: int = 0  # maximum long side of the resized image, px, >= short_side; must be 0 if short_side is 0
+    short_side: int = 0  # short side of the resized image, px, 0 or >= 32; 0 = as in the published model
+    long_side: int = 0  # maximum long side of the resized image, px, 0 or >= short_side; must be 0 if short_side is 0
     mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
     half_precision: bool = True  # True = half precision on CUDA; the CPU always uses single precision
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available

@@ -31,10 +31,10 @@ class ClassOnlyFusion(MapFuser):
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     min_area: float = 0.01  # minimum surface area of an instance in the mesh, m^2, >= 0; smaller instances are omitted
     class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
-    # likelihood ratio of a pixel without a mask, P(no mask | any class) / P(no mask | background), in (0, 1]; 1 = no
+    # likelihood ratio for a pixel without a mask, P(no mask | any class) / P(no mask | background), in (0, 1]; 1 = no
     # evidence of absence
     missed: float = 0.7
-    smoothness: float = 0.0  # log-odds per neighboring vertex of the same class, >= 0; 0 = no regularization
+    smoothness: float = 0.0  # log-odds added per neighboring vertex of the same class, >= 0; 0 = no regularization
 
     def __post_init__(self) -> None:
         check_bounds(self, class_floor=(1e-6, 0.999), missed=MISSED, min_area=AREA, smoothness=SMOOTHNESS)

@@ -40,7 +40,7 @@ class ObjectVolumes(MapFuser):
     min_overlap: float = 0.2  # minimum overlap of a detection and an object to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.IOU  # denominator of the overlap
     require_same_class: bool = False  # True = match only objects with the same most likely class, as in MaskFusion
-    create_score: float = 0.3  # minimum score of a detection to create an object, in [0, 1]; updates have no minimum
+    create_score: float = 0.3  # minimum score of a detection to create an object, in [0, 1]; no minimum for updates
     # minimum number of pixels of a detection to create an object, >= 1; also the minimum denominator of the overlap
     create_points: int = 50
     min_existence: float = 0.1  # minimum existence probability of an object, in [0, 1]; objects below it are removed

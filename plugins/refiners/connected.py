@@ -28,8 +28,10 @@ class Connected(ClusterRefiner):
     max_gap: float = 0.1  # maximum depth step between connected pixels at depth 0, m, >= 0
     gap_per_depth: float = 0.02  # increase of the maximum depth step with depth, m per m, >= 0
     connection_radius: int = 2  # maximum distance between connected pixels, px, >= 1; 2 bridges single missing readings
-    min_piece_ratio: float = 0.05  # minimum size relative to the largest component, in [0, 1]; smaller ones are dropped
-    # maximum ratio of depth difference to lateral distance of two components, m per m, >= 0
+    # minimum ratio of a component's number of pixels to that of the largest component, in [0, 1]; smaller components
+    # are dropped
+    min_piece_ratio: float = 0.05
+    # maximum ratio of depth difference to lateral distance of a component from the nearest kept point, m per m, >= 0
     max_depth_slope: float = 2.0
 
     def __post_init__(self) -> None:

@@ -32,15 +32,18 @@ class GmmEm(ClusterRefiner):
     """
 
     object_components: int = 3  # number of Gaussians of the object, >= 1; about one per visible face
-    background_components: int = 6  # number of Gaussians of the background, >= 0; 0 = no ring
-    start_iterations: int = 5  # number of initial k-means iterations, >= 1; 1 = groups of equal size by depth
+    background_components: int = 6  # number of Gaussians of the background, >= 0; 0 = no background model
+    # number of k-means iterations for the initialization, >= 1; 1 = groups of equal size, ordered by depth
+    start_iterations: int = 5
     max_iterations: int = 8  # maximum number of EM iterations, >= 1
-    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
-    std_floor: float = 0.01  # minimum standard deviation of a Gaussian along any axis, m
-    outlier_fraction: float = 0.0  # initial fraction of outliers, in [0, 1); 0 = no uniform component
+    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point, >= 0
+    std_floor: float = 0.01  # minimum standard deviation of a Gaussian along any axis, m, in [0.0001, 1]
+    outlier_fraction: float = 0.0  # initial fraction of outliers, in [0, 1); 0 = no uniform component for outliers
     min_posterior: float = 0.5  # minimum posterior probability of the object to keep a point, in (0, 1)
-    mask_log_odds: float = 4.0  # prior log-odds of the object far inside the mask, nats, >= 0; 0 = initialization only
-    expected_bleed: float = 0.4  # distance inside the mask border with prior log-odds 0, in ring widths, in [0, 1)
+    # prior log-odds of the object far inside the mask, nats, in [0, 20]; 0 = the mask only initializes the mixture
+    mask_log_odds: float = 4.0
+    # distance inside the mask border at which the prior log-odds are 0, in ring widths, in [0, 1)
+    expected_bleed: float = 0.4
     ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:

@@ -33,15 +33,16 @@ class GmmTree(ClusterRefiner):
     levels: int = 2  # number of levels of the tree, >= 1
     children: int = 8  # number of children of a node, >= 2; J of Eckart et al. 2016
     max_iterations: int = 8  # maximum number of EM iterations in a node, >= 1
-    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
-    std_floor: float = 0.01  # minimum standard deviation of a node along any axis, m
+    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point, >= 0
+    std_floor: float = 0.01  # minimum standard deviation of a node along any axis, m, in [0.0001, 1]
     outlier_fraction: float = 0.02  # initial fraction of outliers in a node, in [0, 1)
-    min_support: float = 1e-4  # minimum fraction of the tree's points in a node, in [0, 1); other nodes are dropped
-    min_node: int = 32  # minimum number of points of a node with children, >= 8
-    parent_points: float = 4.0  # weight of the parent's object fraction as a prior, in points, >= 0
+    min_support: float = 1e-4  # minimum fraction of the tree's points in a node, in [0, 1); smaller nodes are dropped
+    min_node: int = 32  # minimum number of points to give a node children, >= 8
+    parent_points: float = 4.0  # weight of the parent node's object fraction as a prior, in points, >= 0
     min_posterior: float = 0.5  # minimum posterior probability of the object to keep a point, in (0, 1)
-    mask_log_odds: float = 2.0  # prior log-odds of the object far inside the mask, nats, >= 0
-    expected_bleed: float = 0.5  # distance inside the mask border with prior log-odds 0, in ring widths, in [0, 1)
+    mask_log_odds: float = 2.0  # prior log-odds of the object far inside the mask, nats, in [0, 20]
+    # distance inside the mask border at which the prior log-odds are 0, in ring widths, in [0, 1)
+    expected_bleed: float = 0.5
     ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:

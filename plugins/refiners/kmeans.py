@@ -25,7 +25,8 @@ class KMeans(ClusterRefiner):
     """
 
     object_centers: int = 5  # number of centers of the object, >= 1
-    background_centers: int = 5  # number of centers of the background, >= 0; 0 = no ring, all points are kept
+    # number of centers of the background, >= 0; 0 = no background model, all points are kept
+    background_centers: int = 5
     max_iterations: int = 20  # maximum number of iterations, >= 1; stops early if no assignment changes
     ring: Ring = field(default_factory=Ring)
 

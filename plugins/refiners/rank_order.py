@@ -33,9 +33,9 @@ class RankOrder(ClusterRefiner):
     points. Each other point joins the group of the nearest compared point.
     """
 
-    neighbors: int = 16  # number of nearest neighbors k, >= 2
+    neighbors: int = 16  # number k of nearest neighbors, in [2, 254]
     threshold: float = 1.0  # maximum rank-order distance of linked points, >= 0
-    max_points: int = 500  # maximum number of compared points of a cluster, >= 10
+    max_points: int = 500  # maximum number of points of a cluster that are compared, in [10, 5000]
 
     def __post_init__(self) -> None:
         # a square table stores ranks as bytes

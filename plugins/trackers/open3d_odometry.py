@@ -55,9 +55,10 @@ class Open3dOdometry(PoseTracker):
     iterations_fine: int = 3  # number of iterations at full resolution, >= 1
     max_depth: float = 5.0  # maximum depth of used readings, m, > 0
     max_distance: float = 0.07  # maximum depth difference of corresponding pixels, m, > 0
-    max_translation: float = 0.3  # maximum translation between frames, m, > 0; lost above it
-    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; lost above it
-    min_matched: float = 0.3  # minimum fraction of the frame's readings with a correspondence, in [0, 1]
+    max_translation: float = 0.3  # maximum translation between frames, m, > 0; above it, the pose is lost
+    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; above it, the pose is lost
+    # minimum fraction of the frame's readings with a correspondence, in [0, 1]; below it, the pose is lost
+    min_matched: float = 0.3
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -35,8 +35,9 @@ class TrajectoryFile(PoseTracker):
     """
 
     path: Path  # trajectory in TUM format
-    max_time_difference: float = 0.02  # maximum time difference from a frame to its pose, s, >= 0; skipped above it
-    time_offset: float = 0.0  # offset added to the file's timestamps, s
+    # maximum time difference between a frame and its pose, s, >= 0; frames without a pose are skipped
+    max_time_difference: float = 0.02
+    time_offset: float = 0.0  # offset added to the timestamps of the file, s
     world_frame: World = World.FIRST_FRAME  # world frame of the poses
 
     def __post_init__(self) -> None:

@@ -84,25 +84,30 @@ class VoxelHashingIcp(PoseTracker):
     iterations_coarse: int = 8  # number of iterations at 1/4 of the finest resolution, >= 0
     iterations_middle: int = 6  # number of iterations at 1/2 of the finest resolution, >= 0
     iterations_fine: int = 4  # number of iterations at the finest resolution, >= 1
-    max_distance: float = 0.1  # maximum distance of corresponding points, m, > 0; proportional to depth beyond 5 m
-    close_distance: float = 0.05  # maximum distance for agreement with the map, m, > 0; at least 3 sigma of depth noise
+    # maximum distance of corresponding points, m, > 0; increases with depth beyond 5 m (TUKEY)
+    max_distance: float = 0.1
+    # maximum distance of a point from the map's surface to agree with the map, m, > 0; at least 3 sigma of depth noise
+    close_distance: float = 0.05
     min_normal_dot: float = 0.7  # minimum cosine between corresponding normals, in [-1, 1]
-    geometric_scale: float = 4.0  # cut-off of distances, in standard deviations, > 0 (TUKEY)
+    geometric_scale: float = 4.0  # cut-off of point-to-plane distances, in standard deviations, > 0 (TUKEY)
     photometric_scale: float = 4.0  # cut-off of intensity differences, in standard deviations, > 0 (TUKEY)
     intensity_noise: float = 0.05  # standard deviation of intensity differences, for intensities in [0, 1], > 0 (TUKEY)
     max_intensity_difference: float = 0.1  # intensity difference with weight 0, for intensities in [0, 1], > 0 (LINEAR)
     color_weight: float = 0.1  # weight lambda of the photometric term, >= 0; 0 = ICP only
     color_levels: int = 3  # number of levels with color, from the coarsest, in [1, 3]
     depth_weight: float = 1.0  # weight of the point-to-plane term, in [0, 1]; 0 = color only
-    max_translation: float = 0.3  # maximum translation between frames, m, > 0; proportional to depth beyond 5 m (TUKEY)
-    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; lost above it
+    # maximum translation between frames, m, > 0; above it, the pose is lost; increases with depth beyond 5 m (TUKEY)
+    max_translation: float = 0.3
+    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; above it, the pose is lost
     min_visible: float = 0.05  # minimum fraction of a frame's points that are visible in the map, in [0, 1]
     min_matched: float = 0.4  # minimum fraction of the visible points with a nonzero weight, in [0, 1]
     # minimum ratio of smallest to mean eigenvalue of the dimensionless normal matrix, in [0, 1]; doubled while lost
     min_information: float = 1e-3
-    min_agreement: float = 0.92  # minimum fraction of visible points that agree with the map, in [0, 1]; 0 = off
-    max_occluded: float = 0.015  # maximum fraction of visible points behind the map's surface, in [0, 1]; 1 = off
-    raw_keyframe: bool = True  # True = align to a raw keyframe in addition to the map; False = map only
+    # minimum fraction of the visible points that agree with the map, in [0, 1]; 0 = no check
+    min_agreement: float = 0.92
+    # maximum fraction of the visible points behind the map's surface, in [0, 1]; 1 = no check
+    max_occluded: float = 0.015
+    raw_keyframe: bool = True  # True = align to a keyframe with raw depth in addition to the map; False = map only
     relocalize: bool = True  # True = relocalize against keyframes and visited poses; False = no relocalization
     seed: int = 0  # seed of the relocalization, >= 0
 

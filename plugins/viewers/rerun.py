@@ -46,16 +46,20 @@ class RerunViewer(Viewer):
     """
 
     mode: Mode = Mode.RECORD  # output: RECORD (file), WINDOW (rerun's viewer) or BROWSER (local web page)
-    file: str = ""  # .rrd file; "" = recording.rrd in the run directory for RECORD, none for other modes
-    frame_interval: int = 3  # interval between logged images, in frames, >= 1
+    # path of the .rrd file; "" = recording.rrd in the run directory for RECORD, no file for the other modes
+    file: str = ""
+    frame_interval: int = 3  # interval between logged images, in frames, >= 1; 1 = every frame
     mesh_interval: float = 2.0  # minimum interval between mesh snapshots, s, in [0.1, 3600]
-    stride: int = 2  # pixel step of the logged images, px, in [1, 16]
+    stride: int = 2  # step between the logged pixels of an image, px, in [1, 16]
     jpeg_quality: int = 75  # JPEG quality of the images, in [1, 100]
-    region_size: float = 1.0  # side of the cubic regions of the mesh, m, in [0.1, 1000]
-    min_confidence: float = 0.3  # minimum confidence of displayed objects and labeled detections, in [0, 1]
-    memory_limit: str = "2GB"  # maximum memory of WINDOW and BROWSER, e.g. 2GB or 25%; oldest data are dropped first
-    port: int = 9876  # port of the data stream, in [1024, 65535]; WINDOW reuses an open viewer on this port
-    web_port: int = 9090  # port of the web page of BROWSER, in [1024, 65535]
+    region_size: float = 1.0  # side of the cubic regions in which the mesh is updated, m, in [0.1, 1000]
+    # minimum confidence of displayed objects and minimum score of labeled detections, in [0, 1]
+    min_confidence: float = 0.3
+    # maximum viewer memory in the modes WINDOW and BROWSER, e.g. 2GB or 25% of system memory; the oldest data is
+    # dropped first
+    memory_limit: str = "2GB"
+    port: int = 9876  # port of the data stream, in [1024, 65535]; WINDOW reuses a viewer that is open on this port
+    web_port: int = 9090  # port of the web page in the mode BROWSER, in [1024, 65535]
 
     def __post_init__(self) -> None:
         check_bounds(

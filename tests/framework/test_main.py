@@ -108,7 +108,7 @@ def test_leave_working_folder_in_deleted_folder_exits(tmp_path: Path, monkeypatc
     (tmp_path / "gone").rmdir()
     with pytest.raises(
         SystemExit,
-        match=r"^error: working folder: expected an existing folder, got a deleted folder; change to another folder$",
+        match=r"^error: working directory: expected an existing folder, got a deleted folder; change to another",
     ):
         leave_working_folder([])
 

@@ -34,13 +34,17 @@ class DepthCamera(LiveVideo):
     brand: ClassVar[str]
     default_sensor: ClassVar[SensorKind]  # kind of the depth sensor in devices with unknown names
     serial: str = ""  # serial number of the device; "" = the first device found
-    width: int = 640  # width of the color image, px, in [64, 4096]
-    height: int = 480  # height of the color image, px, in [64, 4096]
-    fps: int = 30  # frame rate, Hz, in [1, 300]; size and rate must be a mode of the device
-    max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
-    # delay of color behind depth for images with equal timestamps, s, in [-0.2, 0.2]; positive = color captured later
-    color_delay: str = AUTO  # AUTO = estimated during the run, 0 while unknown
-    sensor: SensorChoice = SensorChoice.AUTO  # kind of depth sensor; AUTO = from the device, else the brand's default
+    width: int = 640  # width of the color image and of the registered depth image, px, in [64, 4096]
+    height: int = 480  # height of the color image and of the registered depth image, px, in [64, 4096]
+    # frame rate, Hz, in [1, 300]; width, height and fps must be a mode of the device
+    fps: int = 30
+    max_depth: float = 10.0  # maximum depth, m, >= 0; farther readings are dropped; 0 = unlimited
+    # delay of color relative to depth at equal timestamps, s, in [-0.2, 0.2]; positive = color captured later; AUTO =
+    # estimated during the run, 0 until then
+    color_delay: str = AUTO
+    # depth sensor, which selects the noise model: AUTO (from the device), EXACT (rendered depth), KINECT_V1,
+    # REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR
+    sensor: SensorChoice = SensorChoice.AUTO
 
     def __post_init__(self) -> None:
         check_bounds(self, width=(64, 4096), height=(64, 4096), fps=(1, 300))

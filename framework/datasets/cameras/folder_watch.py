@@ -50,8 +50,10 @@ class FolderWatch(LiveVideo):
     idle_timeout: float = 0.0  # maximum time without a new frame before the run ends, s, in [0, 86400]; 0 = unlimited
     camera_timeout: float = 30.0  # maximum wait for camera.json, s, in [0, 86400]
     poll_interval: float = 0.01  # interval between polls of the folder, s, in [0.001, 0.1]
-    max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
-    sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = from camera.json, else KINECT_V1
+    max_depth: float = 10.0  # maximum depth, m, >= 0; farther readings are dropped; 0 = unlimited
+    # depth sensor, which selects the noise model: AUTO (from camera.json, else KINECT_V1), EXACT (rendered depth),
+    # KINECT_V1, REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR
+    sensor: SensorChoice = SensorChoice.AUTO
 
     def __post_init__(self) -> None:
         waits = (0.0, LONGEST_WAIT)

@@ -114,17 +114,22 @@ class Recording(RGBDSequence):
     root: Path  # folder of the recording or of the scenes, relative to the working or project directory
     scene: str = ""  # subfolder of root; "" = root itself
     start: int = 0  # index of the first frame
-    stop: int = TO_THE_END  # index after the last frame; -1 = end of the sequence
-    stride: int = 1  # step between frames; 1 = every frame
+    stop: int = TO_THE_END  # index of the first frame after the selection, >= 0; -1 = end of the sequence
+    stride: int = 1  # step between selected frames, in frames, >= 1; 1 = every frame
     frame_fraction: float = 1.0  # randomly selected fraction of the frames, in (0, 1]; 1 = all frames
-    seed: int = 0  # seed of the random frame selection
-    max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
-    ground_truth: Path | None = None  # labeled mesh or run directory for the evaluation; None = the recording's own
-    sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = from the recording, else KINECT_V1
+    seed: int = 0  # seed of the random frame selection, >= 0
+    max_depth: float = 10.0  # maximum depth, m, >= 0; farther readings are dropped; 0 = unlimited
+    # ground truth for the evaluation: labeled mesh (PLY with instances.json) or run directory; None = ground truth of
+    # the recording
+    ground_truth: Path | None = None
+    # depth sensor, which selects the noise model: AUTO (from the recording, else KINECT_V1), EXACT (rendered depth),
+    # KINECT_V1, REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR
+    sensor: SensorChoice = SensorChoice.AUTO
     pose_reading: PoseReading = field(default_factory=PoseReading)
     depth_reading: DepthReading = field(default_factory=DepthReading)
-    # delay of color behind depth for images with equal timestamps, s, in [-0.2, 0.2]; positive = color captured later
-    color_delay: str = AUTO  # AUTO = estimated during the run, 0 while unknown
+    # delay of color relative to depth at equal timestamps, s, in [-0.2, 0.2]; positive = color captured later; AUTO =
+    # estimated during the run, 0 until then
+    color_delay: str = AUTO
 
     def __post_init__(self) -> None:
         check_selection(self.start, self.stop, self.stride, self.frame_fraction)

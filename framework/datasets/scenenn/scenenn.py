@@ -58,9 +58,11 @@ class SceneNN(LabeledRecording):
     pose for the frame.
     """
 
-    scene: str = "011"  # number of the sequence
+    scene: str = "011"  # number of the scene
     intrinsics: SceneNNIntrinsics = SceneNNIntrinsics.ASUS  # intrinsics file
-    release: str = ""  # name of the annotation release in tables; "" = content of ROOT/release.txt
+    # name of the annotation release, shown in tables, because the results of the two releases differ; "" = content of
+    # ROOT/release.txt
+    release: str = ""
 
     def open(self) -> Contents:
         if (self.root / MADE_BY).is_file():

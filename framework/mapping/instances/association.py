@@ -197,17 +197,20 @@ class Association:
     association: InstanceSource = InstanceSource.SURFACE_LOOKUP
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # denominator of the overlap
-    # minimum Bhattacharyya coefficient of the class distributions to match, in [0, 1]; 0 = any classes match
+    # minimum Bhattacharyya coefficient of the class distributions of a cluster and an instance to match, in [0, 1]; 0 =
+    # any classes match
     min_class_agreement: float = 0.0
-    create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; updates have no minimum
+    create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; no minimum for updates
     # minimum number of points of a cluster to create an instance, >= 1; also the minimum denominator of the overlap
     create_points: int = 50
     split_instances: bool = True  # True = create an instance for the second of two clusters that match an instance
     # minimum overlap of two instances with one cluster to merge them, in [0, 1]; 1 = no merging
     merge_overlap: float = 1.0
-    # minimum number of frames with a joint cluster, minus frames with separate clusters, to merge, >= 1
+    # minimum number of frames with a common cluster of two instances, minus frames with separate clusters, to merge
+    # them, >= 1
     merge_frames: int = 3
-    # minimum Bhattacharyya coefficient of the class distributions to merge, in [0, 1]; 0 = any classes are merged
+    # minimum Bhattacharyya coefficient of the class distributions of two instances to merge them, in [0, 1]; 0 = any
+    # classes are merged
     merge_agreement: float = 0.1
 
     def __post_init__(self) -> None:

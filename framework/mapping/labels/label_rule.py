@@ -76,12 +76,14 @@ class LabeledVoxels:
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    # maximum area ratio of overlapping clusters to assign pixels to the smaller cluster, in [0, 1]; 0 = off
+    # maximum area ratio (smaller / larger) of two overlapping clusters to assign their common pixels to the smaller one
+    # only, in [0, 1]; 0 = off
     occlusion_area_ratio: float = 0.25
-    # minimum fraction of an instance inside a larger mask of another class to apply the support rule, in [0, 1];
-    # 1 = off
+    # minimum fraction of an instance inside a larger mask of another class for the mask not to update the instance
+    # (e.g. a book on a table), in [0, 1]; 1 = off
     support_overlap: float = 0.6
-    update_unmatched: bool = False  # True = clusters without an instance also update class distributions
+    # True = clusters without a matched instance also update the class distributions of voxels
+    update_unmatched: bool = False
     instance_class: InstanceClass = InstanceClass.DETECTIONS  # source of an instance's class
     storage: Storage = Storage.COMPACT  # labels stored per voxel: COMPACT = top few labels, EXACT = all labels
 
