@@ -57,7 +57,7 @@ def _recorded(folder: Path, number: int) -> RecordedFrame:
 
 
 def _color_pose(path: Path) -> Float64:
-    """Return T_world_camera (4, 4) of the color camera. Raises DataError that names the file of an invalid pose."""
+    """Return T_world_camera (4, 4) of the color camera. Raises a DataError that names the file of an invalid pose."""
     T_depthcamera_camera = np.eye(4)
     T_depthcamera_camera[0, 3] = BASELINE
     return read_matrix(path).pose() @ T_depthcamera_camera

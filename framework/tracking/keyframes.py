@@ -52,10 +52,10 @@ class Keyframe:
 class Keyframes:
     """A bounded database of keyframes.
 
-    Call `add` with every frame with a reliable pose. It extracts the features of new views in a background thread. A
+    Call `add` for every frame that has a reliable pose. It extracts the features of new views in a background thread. A
     view is new if distance / min_distance + angle / min_angle >= 1 for all keyframes. All other methods wait for the
     thread first, so that results do not depend on timing. The cost of `relocalize` does not depend on the number of
-    keyframes, except for the comparison of bags of words.
+    keyframes, except for the comparison of bag-of-words vectors.
     """
 
     max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is removed

@@ -84,7 +84,7 @@ def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
     with (
         errors_of(contents.path),
         playable(contents, scratch) as path,
-        closing(play_apart(path, contents.streams)) as images,
+        closing(play_in_subprocess(path, contents.streams)) as images,
     ):
         yield from pair(images)
 
@@ -113,7 +113,7 @@ def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
             depths.popleft()
 
 
-def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
+def play_in_subprocess(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
     """Yield the images of `play`, which runs in a separate process.
 
     OpenNI 2 crashes on some damaged recordings. Raises DataError in this case.
