@@ -215,7 +215,10 @@ class Preprocessing:
         keys = {key for key, value in (size or {}).items() if value}
         known = ({"shortest_edge", "longest_edge"}, {"max_height", "max_width"}, {"height", "width"})
         if content.get("do_resize", True) and keys not in known:
-            raise DataError(f"{where}: size: expected height and width, or shortest_edge and longest_edge, got {size}")
+            raise DataError(
+                f"{where}: size: expected height and width, max_height and max_width, or shortest_edge and "
+                f"longest_edge, got {size}"
+            )
         normalizes = content.get("do_normalize", True)
         pads = content.get("do_pad") and str(content.get("image_processor_type", "")).startswith("Eomt")
         return cls(

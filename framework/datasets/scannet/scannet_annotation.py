@@ -66,8 +66,8 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
     strange = sorted({group.label for group in groups if _spelled(group.label, spellings) not in spellings})
     if nyu40 and strange:
         raise DataError(
-            f"{aggregation}: expected names of the label table, got "
-            f"{', '.join(f'{label!r:.60}' for label in strange)}; add a line to {LABEL_TABLE}, or put "
+            f"{aggregation}: expected labels from {LABEL_TABLE}, got "
+            f"{', '.join(f'{label!r:.60}' for label in strange)}; add a line for each of them, or put "
             f"{FIRST_LABEL_TABLE} next to it for annotations of ScanNet's first release"
         )
     unlabeled = max((group.object_id + 2 for group in groups), default=1)

@@ -64,9 +64,9 @@ def grow(
     """Grow a tree of at most `levels` levels over S points (S, 3), m, of `count` masks.
 
     `masks`: the mask (S,) of each point, in ascending order. Level 1 has `gaussians_per_mask` Gaussians for each mask,
-    with initial responsibilities by `initialization`. A node with at least MIN_SPLIT_POINTS points gets `children` children
-    (2, 4 or 8). A node is dropped in favor of its siblings if its weight is below `min_support` (fraction of all
-    points), or if it has too few points for a covariance.
+    with initial responsibilities by `initialization`. A node with at least MIN_SPLIT_POINTS points gets `children`
+    children (2, 4 or 8). A node is dropped in favor of its siblings if its weight is below `min_support` (fraction of
+    all points), or if it has too few points for a covariance.
     """
     labels = _start(points, masks, count, gaussians_per_mask, initialization, settings.max_iterations)
     components = count * gaussians_per_mask
