@@ -20,7 +20,7 @@ from framework.data import Array, Float32, Float64, Frame, UInt8, check_array, c
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import path_exists
 from framework.geometry import back_project, transform
-from framework.mapping.storage.map_file import map_file_errors, read_arrays, write_map
+from framework.mapping.storage.map_file import read_arrays, write_map
 from framework.runtime.cpu_budget import lower_priority
 from framework.tracking.absolute_pose import AbsolutePose, AbsolutePoseEstimator
 from framework.tracking.features import DESCRIPTOR_LENGTH, FeatureExtractor, Features, match
@@ -286,5 +286,4 @@ def read_keyframes(path: Path) -> dict[str, Array]:
     """Return the arrays written by `write_keyframes`; empty if there is no file. Raises DataError if it is invalid."""
     if not path_exists(path):
         return {}
-    with map_file_errors(path):
-        return read_arrays(path, FILE_FORMAT)
+    return read_arrays(path, FILE_FORMAT)
