@@ -18,7 +18,7 @@ import framework
 COMMANDS = {
     "tables": "write the tables of an experiment or sweep: Markdown, LaTeX, CSV",
     "figures": "draw the figures of an experiment",
-    "raycast": "draw a ray-cast view of a map: depth, normals, vertices, RGB, object indices",
+    "raycast": "draw a ray-cast view of a map: depth, normals, vertex map, RGB, object indices",
     "report": "write HTML reports of runs and compare them",
     "import": "convert a phone or sensor recording to an RGB-D folder for dataset=rgbd_folder",
     "check": "validate an RGB-D sequence and suggest parameter fixes",
@@ -33,7 +33,7 @@ COMMANDS = {
     "compile": "compile the kernels in advance, once per installation",
     "doctor": "check the installation and print the fix for each problem",
     "plugins": "list the plugins of each stage and their parameters",
-    "new-plugin": "create a repository with a working plugin: package, config option, tests, CI",
+    "new-plugin": "create a package with a working plugin: code, config option, tests, CI",
     "synthesize": "render a benchmark of synthetic scenes in SceneNN format",
     "train-detector": "train Mask R-CNN on rendered synthetic scenes",
     "convert-weights": "convert Mask R-CNN weights of torchvision or detectron2",

@@ -155,7 +155,8 @@ class Mapper(Map):
                 raise ConfigError(f"Mapper: expected overrides such as 'fuser.voxel_size=0.02', got {override!r}")
             if override.lstrip("+~").startswith(("dataset", "hydra", "experiment", "sequences", "launcher")):
                 raise ConfigError(
-                    f"Mapper: expected a supported override, got {override}; use it only on the command line"
+                    f"Mapper: expected an override of a stage or setting, got {override}; use dataset, experiment, "
+                    "sequences, launcher and hydra overrides only on the command line"
                 )
         config = composed("~dataset", *words)
         self._threads = Settings.of(config).threads

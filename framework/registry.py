@@ -228,7 +228,7 @@ def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
 def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, Any]:
     """Return the keyword arguments for `plugin_class` from `node`, each with the type of its dataclass field.
 
-    Raises ConfigError that names `where` for an unknown parameter, a wrong type or a missing value. The metadata key
+    Raises a ConfigError that names `where` for an unknown parameter, a wrong type or a missing value. The metadata key
     `source` of a field is a hint for obtaining its value.
     """
     stages = plugin_fields(plugin_class)

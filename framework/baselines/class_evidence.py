@@ -46,7 +46,7 @@ class ClassEvidence(NamedTuple):
 
     unmasked: UInt16  # (B, 512) number of frames in which the voxel was outside all masks, for B blocks
     class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
-    log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames counted by `masked`
+    log_ratio: Float32  # (R, 512, T) sum of log(P(class) / P(background)) over the frames counted by `masked`
     rest: Float32  # (R, 512) log_ratio of each unnamed class of the voxel
     masked: UInt16  # (R, 512) number of frames in which the voxel was under a mask
     first_frame: Int32  # (R, 512) first frame in which the voxel was under a mask, -1 = none
@@ -61,15 +61,15 @@ class MaskClasses(NamedTuple):
     """Evidence of one frame's N masks for C classes."""
 
     cluster: Int32  # (H * W,) cluster with the highest score at each pixel, -1 = none
-    log_ratio: Float32  # (N, C) log P(class) / P(background)
-    unnamed: Float32  # (N,) log of the mean P(unnamed class) / P(background) of each cluster
+    log_ratio: Float32  # (N, C) log(P(class) / P(background))
+    unnamed: Float32  # (N,) log(mean P(unnamed class) / P(background)) of each cluster
     named_classes: UInt8  # (N, NEW_CLASSES) most likely classes of each cluster
     named_bit: UInt8  # (N, NO_CLASS + 1) 2^m for the m-th named class of a cluster, 0 = unnamed
     frame: int  # index of the frame
 
 
 def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists, frame: int) -> MaskClasses:
-    """Return the evidence of a frame's clusters from their `log_ratio` (N, C), log P(class) / P(background).
+    """Return the evidence of a frame's clusters from `log_ratio` (N, C), log(P(class) / P(background)).
 
     `points` lists the clusters at each pixel, and `frame` is the index of the frame.
     """

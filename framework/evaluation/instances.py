@@ -119,7 +119,7 @@ class Outcome(Enum):
 
 
 @dataclass(frozen=True)
-class Judgment:
+class MatchResult:
     """One prediction compared with the ground truth."""
 
     id: int
@@ -213,7 +213,7 @@ def evaluate(
 
 def judge(
     predictions: PredictedInstances, truth: SceneTruth, threshold: float = 0.5
-) -> tuple[list[Judgment], dict[int, str]]:
+) -> tuple[list[MatchResult], dict[int, str]]:
     """Return the outcome of each prediction at an IoU threshold, and the class of each missed instance by id.
 
     Missed instances are evaluated ground-truth instances without a correct prediction. Predictions are in order of
@@ -223,7 +223,7 @@ def judge(
     everything = np.ones(len(overlaps.predicted_ids), np.bool_)
     same_class = overlaps.evaluated & (overlaps.predicted_classes[:, None] == overlaps.truth_classes[None, :])
     matches = overlaps.matches(threshold, everything, same_class)
-    judged = [overlaps.judgment(k, match, threshold) for k, match in matches]
+    judged = [overlaps.match_result(k, match, threshold) for k, match in matches]
     found = {one.truth_id for one in judged if one.outcome is Outcome.RIGHT}
     counted = zip(overlaps.truth_ids.tolist(), overlaps.truth_classes, overlaps.evaluated, strict=True)
     return judged, {key: name for key, name, counts in counted if counts and key not in found}
@@ -311,15 +311,18 @@ class _Overlaps:
                 found.append((k, IGNORED if unknown[k] else NO_MATCH))
         return found
 
-    def judgment(self, k: int, match: int, threshold: float) -> Judgment:
-        """Return the judgment of prediction k, given its match from `matches`."""
+    def match_result(self, k: int, match: int, threshold: float) -> MatchResult:
+        """Return the match result of prediction k: its outcome, ground-truth instance and IoU.
+
+        `match` is from `matches`; `threshold` is the IoU threshold.
+        """
         t = match if match >= 0 else int(self.iou[k].argmax()) if len(self.truth_ids) else -1
         iou = float(self.iou[k, t]) if t >= 0 else 0.0
         truth_id, truth_class = (int(self.truth_ids[t]), self.truth_classes[t]) if iou > 0 else (0, None)
         outcome = Outcome.RIGHT if match >= 0 else Outcome.IGNORED if match == IGNORED else Outcome.FALSE
         if match == NO_MATCH and iou >= threshold and truth_class != self.predicted_classes[k]:
             outcome = Outcome.WRONG_CLASS
-        return Judgment(int(self.predicted_ids[k]), outcome, truth_id, truth_class, iou)
+        return MatchResult(int(self.predicted_ids[k]), outcome, truth_id, truth_class, iou)
 
     def best(self) -> tuple[dict[int, float], dict[int, int]]:
         """Return the best IoU, and the prediction with it (0 = none), of each evaluated ground-truth instance by id."""

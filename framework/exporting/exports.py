@@ -57,7 +57,7 @@ class Chosen:
     triangles: int | None = None  # maximum triangle count of the scene and of each object file, >= 4; None = no limit
     coloring: Coloring = Coloring.APPEARANCE  # vertex colors
     collision: Collision = Collision.HULL  # collision shape of objects in USD files
-    resolution: float = 0.05  # cell size of a plan, m, in [0.01, 1]
+    resolution: float = 0.05  # cell size of a floor plan, m, in [0.01, 1]
     robot_height: float = 1.0  # minimum height of observed empty space above a free cell, m, in [0.1, 3]
 
     def __post_init__(self) -> None:

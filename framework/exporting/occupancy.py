@@ -33,7 +33,7 @@ LEVEL_STEP = 0.1  # vertical sampling of free space, m
 SLACK = 0.03  # minimum distance of a surface behind free space, m
 FARTHEST = 5.0  # range of the camera, m: the default of fuser.max_depth
 WALL_SPAN = 1.0  # minimum height of a wall, m
-MAX_CELLS = 2**24  # maximum number of cells of a plan
+MAX_CELLS = 2**24  # maximum number of cells of a floor plan
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
 
 
 def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
-    """Return the mask (H, W) of the free cells of a plan whose `free` is not yet known."""
+    """Return the mask (H, W) of the free cells of a floor plan whose `free` is not yet known."""
     free = drawn.floor & ~drawn.occupied
     rows, columns = np.nonzero(free)
     levels = np.arange(CLEARANCE, robot_height, LEVEL_STEP) + LEVEL_STEP / 2

@@ -1,4 +1,4 @@
-"""Rooms of a plan: parts of its known floor that are separated by walls or by openings of at most a door width.
+"""Rooms of a floor plan: parts of its known floor that are separated by walls or by openings of at most a door width.
 
 Areas farther than half a door width from every wall are the interiors of rooms. The interiors are grown until they meet
 in the doors. Only walls separate rooms, not furniture or unobserved areas: without observed walls, the plan has one
@@ -32,7 +32,7 @@ class Door:
 
 @dataclass(frozen=True)
 class Rooms:
-    """The rooms of a plan, numbered from 1 in descending order of area."""
+    """The rooms of a floor plan, numbered from 1 in descending order of area."""
 
     labels: Int32  # (H, W) room number of each cell, 0 = none
     doors: tuple[Door, ...]
@@ -61,7 +61,7 @@ class Rooms:
 
 
 def rooms(plan: Plan) -> Rooms:
-    """Return the rooms of a plan."""
+    """Return the rooms of a floor plan."""
     known = plan.floor | plan.free | plan.occupied
     margin = int(np.ceil(GAP / plan.resolution))
     round_ = _disk(GAP / plan.resolution)

@@ -78,7 +78,7 @@ def read_bytes(path: Path, most: int) -> bytes:
 
 
 def read_text(path: Path, most: int = MAX_TEXT) -> str:
-    """Read UTF-8 text of at most `most` bytes without its byte order mark. Raises DataError that names the file."""
+    """Read UTF-8 text of at most `most` bytes without its byte order mark. Raises a DataError that names the file."""
     try:
         return read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -35,7 +35,7 @@ def read_color(path: Path) -> UInt8:
 
 
 def decode_color(name: Path | str, data: bytes) -> UInt8:
-    """Return the color (H, W, 3), uint8 RGB, of the content of an image file. Raises FrameError that names `name`."""
+    """Return the color (H, W, 3), uint8 RGB, of the content of an image file. Raises a FrameError that names `name`."""
     check_image(name, data)
     if data.startswith(JPEG_START):
         try:
@@ -54,7 +54,7 @@ def read_uint16(path: Path) -> UInt16:
 
 
 def decode_uint16(name: Path | str, data: bytes) -> UInt16:
-    """Return the uint16 values (H, W) of the content of a PNG file. Raises FrameError that names `name`."""
+    """Return the uint16 values (H, W) of the content of a PNG file. Raises a FrameError that names `name`."""
     return np.asarray(_decode_channel(name, data, np.uint16), np.uint16)
 
 

@@ -42,7 +42,7 @@ def number(word: str) -> float:
 def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> list[float]:
     """Parse the words of a line as `count` numbers. NaN is valid.
 
-    Raises DataError that names `where` (file and line) and `names` (the columns).
+    Raises a DataError that names `where` (file and line) and `names` (the columns).
     """
     expected = f"{where}: expected {count} numbers{f' ({names})' if names else ''}"
     if len(words) != count:
@@ -76,7 +76,7 @@ def write_gravity(path: Path, ups: Sequence[Float64 | None]) -> None:
 def read_image_times(path: Path) -> list[tuple[float, float]]:
     """Return the timestamps of color and depth of each frame, s.
 
-    A line contains `color depth`. Empty lines, and comments after `#`, are skipped. Raises DataError that names the
+    A line contains `color depth`. Empty lines, and comments after `#`, are skipped. Raises a DataError that names the
     line.
     """
     words = [(n, COMMENT.sub("", line).split()) for n, line in enumerate(read_lines(path), start=1)]
@@ -137,7 +137,7 @@ class PrintedMatrix:
 
 
 def read_matrix(path: Path) -> PrintedMatrix:
-    """Read a 4x4 matrix from a file with four lines of four numbers. Raises DataError that names the line."""
+    """Read a 4x4 matrix from a file with four lines of four numbers. Raises a DataError that names the line."""
     lines = _numbered_lines(path)
     if len(lines) != 4:
         raise DataError(f"{path}: expected 4 lines of 4 numbers, got {len(lines)} lines")
@@ -145,7 +145,7 @@ def read_matrix(path: Path) -> PrintedMatrix:
 
 
 def read_matrix_lines(path: Path) -> list[PrintedMatrix]:
-    """Read a file with one 4x4 matrix (16 numbers, row-major) per line. Raises DataError that names the line."""
+    """Read a file with one 4x4 matrix (16 numbers, row-major) per line. Raises a DataError that names the line."""
     lines = _numbered_lines(path)
     return [PrintedMatrix(where, np.array(numbers(where, words, 16)).reshape(4, 4)) for where, words in lines]
 

@@ -47,7 +47,7 @@ def found_property(mesh: PlyMesh, values: Array | None) -> str:
 def read_ply(path: Path) -> PlyMesh:
     """Read the vertices, faces and vertex properties of a mesh. Polygons become triangle fans.
 
-    Other elements, and list properties of vertices, are ignored. Raises DataError that names the line or byte for a
+    Other elements, and list properties of vertices, are ignored. Raises a DataError that names the line or byte for a
     damaged file, vertices that are not finite, or invalid vertex indices.
     """
     header, elements = read_elements(path, read_bytes(path, LARGEST_FILE))

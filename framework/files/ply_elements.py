@@ -59,7 +59,7 @@ class Header:
 def read_elements(path: Path, data: bytes) -> tuple[Header, dict[str, Element]]:
     """Return the header of a PLY file, and the elements by name with their rows.
 
-    `data` is the content of the file. Raises DataError that names the line or byte if the file is damaged or does not
+    `data` is the content of the file. Raises a DataError that names the line or byte if the file is damaged or does not
     match its header.
     """
     header = _parse_header(path, data)

@@ -46,7 +46,7 @@ class TumLine:
 
 
 def rigid_pose(place: str, position: Sequence[float], quat_xyzw: Sequence[float]) -> Float64:
-    """Return T_world_camera (4, 4) from a position (3,), m, and a quaternion. Raises DataError that names `place`."""
+    """Return T_world_camera (4, 4) from a position (3,), m, and a quaternion. Raises a DataError that names `place`."""
     norm = math.hypot(*quat_xyzw)
     if not all(map(math.isfinite, (*position, norm))):
         found = " ".join(f"{value:g}" for value in (*position, *quat_xyzw))

@@ -23,7 +23,7 @@ _EventLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled loa
 
 
 def load_yaml(path: Path) -> Any:
-    """Return the DictConfig or ListConfig of a YAML file. Raises DataError that names the file."""
+    """Return the DictConfig or ListConfig of a YAML file. Raises a DataError that names the file."""
     text = read_text(path, LARGEST_FILE)
     with yaml_errors(path):
         check_yaml(path, text)

@@ -77,7 +77,10 @@ class Format:
 
 
 def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
-    """Return T_world_camera (4, 4) from a pose (4, 4) with ARKit's camera axes. Raises DataError that names `where`."""
+    """Return T_world_camera (4, 4) from a pose (4, 4) with ARKit's camera axes.
+
+    Raises a DataError that names `where` if the pose is invalid.
+    """
     with errors_of(where):
         return _ARKIT.pose(nearest_rigid(T_world_arkit))
 

@@ -131,7 +131,8 @@ def _vector(header: MapHeader, key: str) -> Float64:
     numbers = [float(value) for value in saved if isinstance(value, int | float)]
     if len(numbers) != 3 or len(saved) != 3 or not (np.abs(numbers) < MAX_FRAMES).all():
         raise DataError(
-            f"{key}: expected three numbers below {MAX_FRAMES:g} (a sum of unit vectors), got {saved!r:.60}"
+            f"{key}: expected three numbers with absolute value below {MAX_FRAMES:g} (a sum of unit vectors), "
+            f"got {saved!r:.60}"
         )
     return np.array(numbers)
 

@@ -45,7 +45,7 @@ def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int,
     `_score`, which favors many visible objects; directions similar to those of the mapping cameras are preferred.
 
     Args:
-        surface: Surface in view.
+        surface: Surface to show.
         instance_ids: (V,) instance ids of the surface's vertices, 0 = none.
         poses: (F, 4, 4) T_world_camera of the mapped frames.
         width: Width of the image in px.

@@ -82,12 +82,13 @@ class RunReport:
     def html(self) -> str:
         """Return the HTML page. The result is deterministic."""
         contents, metrics = self.contents, self.contents.record.metrics
-        judgments = self.check.judgments if self.check else {}
+        match_results = self.check.match_results if self.check else {}
         data: dict[str, Any] = {
             "likely": LIKELY,
             "maps": [] if self.scene is None else [{"name": contents.name, **self.scene.data()}],
             "objects": [
-                object_data(one, contents, self.pictures.get(one.id), judgments.get(one.id)) for one in contents.objects
+                object_data(one, contents, self.pictures.get(one.id), match_results.get(one.id))
+                for one in contents.objects
             ],
         }
         context = {
@@ -99,7 +100,7 @@ class RunReport:
             "mapped": self.scene is not None,
             "still": overview_url(contents.record.directory / "overview.png") if self.scene is not None else "",
             "checked": self.check is not None,
-            "objects": object_rows(contents, self.pictures, judgments),
+            "objects": object_rows(contents, self.pictures, match_results),
             "truth": truth_section(self.check, self.why_unchecked, contents, self.pictures),
             "trajectory": self._trajectory(),
             "progress": self._progress(),

@@ -72,7 +72,7 @@ def write_instances(
 
 
 def read_instances(path: Path) -> list[StoredInstance]:
-    """Read the objects that `write_instances` wrote. Raises DataError."""
+    """Read the objects that `write_instances` wrote. Raises DataError if the file is missing or invalid."""
     entries = read_json(path)
     if not isinstance(entries, list):
         raise DataError(f"{path}: expected a JSON array of instances, got {entries!r:.40}")

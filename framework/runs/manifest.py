@@ -34,7 +34,10 @@ class Manifest:
 
     @classmethod
     def of(cls, directory: Path, names: list[str], status: Status, inputs: Mapping[str, str]) -> Manifest:
-        """Return the manifest of the existing files with these names in a run directory. Raises DataError."""
+        """Return the manifest of the existing files with these names in a run directory.
+
+        Raises DataError if a file cannot be read.
+        """
         paths = [directory / name for name in names if (directory / name).exists()]
         return cls(status, {path.name: (path.stat().st_size, path_hash(path)) for path in paths}, inputs)
 
@@ -55,7 +58,7 @@ class Manifest:
             raise DataError(f"{path}: expected status, files and inputs, got an error ({error!r})") from error
 
     def write(self, directory: Path) -> None:
-        """Write the manifest atomically. Raises DataError."""
+        """Write the manifest atomically. Raises DataError if writing fails."""
         content: dict[str, Any] = {
             "status": self.status.name,
             "files": {name: {"bytes": size, "sha256": sha256} for name, (size, sha256) in self.files.items()},

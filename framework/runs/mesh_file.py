@@ -35,7 +35,7 @@ def write_mesh(path: Path, mesh: InstanceMesh) -> None:
 
 
 def read_mesh(path: Path) -> InstanceMesh:
-    """Read the mesh that `write_mesh` wrote. Raises DataError."""
+    """Read the mesh that `write_mesh` wrote. Raises DataError if the file is missing, damaged or not such a mesh."""
     ply = read_ply(path)
     for name, kind in TYPES.items():
         if name not in ply.properties or ply.properties[name].dtype != kind:

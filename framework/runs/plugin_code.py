@@ -25,8 +25,8 @@ def plugin_code(config: Mapping[str, Any]) -> dict[str, str]:
     """Return the package, version and hash of the plugins of each stage, by key of metrics.json.
 
     A stage with plugins of several packages, such as a chain of refiners, lists them all. The hash covers all files of
-    a package, or a single file. Files above MAX_HASHED bytes are represented by size and modification time. Of this
-    project, only the plugin's own file counts, without comments and docstrings.
+    a package, or a single file. Files above MAX_HASHED bytes are represented by size and modification time. For plugins
+    of this project, only the plugin's own file is hashed, without comments and docstrings.
 
     Args:
         config: The resolved config of a run.

@@ -44,7 +44,11 @@ class Truth:
         return cls(video.scene_truth(), video.annotation, None if named is None else str(named))
 
     def in_world_of(self, record: Record) -> SceneTruth | None:
-        """Return the ground truth in the world frame of a run. Raises DataError."""
+        """Return the ground truth in the world frame of a run; None = no ground truth.
+
+        Raises DataError if the trajectory of the run is missing or invalid, or has no time in common with the
+        ground-truth trajectory.
+        """
         return self.scene and in_map_world(self.scene, *read_tum(record.directory / TRAJECTORY))
 
 
@@ -125,7 +129,10 @@ class Reevaluation:
 
 
 def read_predictions(record: Record) -> PredictedInstances:
-    """Return the predictions that a run evaluated at its end. Raises DataError."""
+    """Return the predictions that a run evaluated at its end.
+
+    Raises DataError if mesh.ply or instances.json is missing, invalid or inconsistent with the other files of the run.
+    """
     mesh, instances = read_objects(record)
     return PredictedInstances.on_mesh(
         mesh,

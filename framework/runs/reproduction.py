@@ -110,7 +110,10 @@ class Reproduction:
 
     @classmethod
     def of(cls, before: Path, after: Path) -> Reproduction:
-        """Compare the run directories of a run and its repetition. Raises DataError."""
+        """Compare the run directories of a run and its repetition.
+
+        Raises DataError if a manifest or a file of digests is invalid.
+        """
         old, new = Manifest.read(before).files, Manifest.read(after).files
         names = [name for name in COMPARED if name in old or name in new]
         different = tuple(name for name in names if old.get(name) != new.get(name))
@@ -134,7 +137,7 @@ def _first_difference(before: Path, after: Path) -> tuple[int, str] | None:
 
 
 def _digests(path: Path) -> dict[tuple[int, str], str]:
-    """Return the digests by frame and stage. Raises DataError."""
+    """Return the digests by frame and stage. Raises DataError if the file cannot be read or is invalid."""
     try:
         rows = list(csv.DictReader(read_text(path).splitlines()))
         return {(int(row["frame"]), row["stage"]): row["digest"] for row in rows if row["stage"] in ORDER}

@@ -110,7 +110,10 @@ def read_record(directory: Path, check_config: bool = True) -> Record:
 
 
 def read_partial(directory: Path) -> tuple[Record, str]:
-    """Read the partial run in `directory`, and the reason for its early end. Raises DataError."""
+    """Read the partial run in `directory`, and the reason for its early end.
+
+    Raises DataError if its metrics or config are missing, invalid or from different runs.
+    """
     record = _read(directory, PARTIAL_METRICS)
     return record, str(record.metrics.get("partial"))
 
@@ -194,7 +197,10 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML mapping without resolving interpolations. Raises DataError."""
+    """Read a YAML mapping without resolving interpolations.
+
+    Raises DataError if the file is missing or does not contain a mapping.
+    """
     if not path.exists():
         raise DataError(f"{path}: expected a file, got none")
     try:
@@ -214,7 +220,10 @@ def _with_text_keys(node: Any) -> Any:
 
 
 def read_metrics(directory: Path) -> dict[str, Any]:
-    """Read metrics.json, or metrics.partial.json of a partial run. Raises DataError."""
+    """Read metrics.json, or metrics.partial.json of a partial run.
+
+    Raises DataError if neither file exists, or if the file is invalid.
+    """
     for name in (METRICS, PARTIAL_METRICS):
         if path_exists(directory / name):
             return _read_flat(directory / name)

@@ -41,7 +41,7 @@ def current_key(key: str) -> str:
 
 
 def read_timings(path: Path) -> StageTimes:
-    """Read the stage times of a run. Raises DataError."""
+    """Read the stage times of a run. Raises DataError if the file cannot be read, is invalid or has no times."""
     try:
         lines = list(csv.reader(read_text(path).splitlines(keepends=True)))
     except csv.Error as error:

@@ -1,7 +1,7 @@
 """Retention of freed memory in the process.
 
-The C library returns large freed blocks to the system. The next image of that size then needs new pages. A huge page
-(2 MiB) takes 0.1 ms, and up to 5 ms in a virtual machine.
+The C library returns large freed blocks to the system. The next large array then needs new pages. Allocating a huge
+page (2 MiB) takes 0.1 ms, or up to 5 ms in a virtual machine.
 """
 
 from __future__ import annotations

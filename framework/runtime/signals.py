@@ -93,7 +93,9 @@ _in_worker = ExitStack()  # never closed
 
 @contextmanager
 def signals_deferred(*numbers: int) -> Iterator[Interruption]:
-    """Record the first of the signals `numbers` in the yielded Interruption instead of raising in the body.
+    """Defer the signals `numbers`.
+
+    Record the first signal in the yielded Interruption instead of raising an exception in the `with` body.
 
     An exception within a frame would leave it partly integrated. A nested call yields the outer Interruption. Other
     threads, ignored signals and signals with other handlers are not affected.

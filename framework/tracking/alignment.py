@@ -117,7 +117,8 @@ class LinearWeights(NamedTuple):
     """Limits of VoxelHashing's weights, which replace Tukey's weights."""
 
     max_depth: np.float32  # maximum depth z_max, m
-    max_intensity_difference: np.float32  # intensity difference with weight 0; intensities are in [0, 1]
+    # intensity difference at which the weight reaches 0; intensities are in [0, 1]
+    max_intensity_difference: np.float32
 
 
 class NormalEquations(NamedTuple):

@@ -80,7 +80,10 @@ def _tukey(r, scale):
 
 @device
 def _load(frame, v, u0, points):
-    """Copy depth, intensity and normals of the BATCH pixels from (u0, v) on to `points`; depth is 0 past the row."""
+    """Copy depth, intensity and normals of BATCH pixels of row `v`, starting at column `u0`, to `points`.
+
+    Past the end of the row, depth is 0.
+    """
     depth, intensity, normals = frame.depth, frame.intensity, frame.normals
     for n in range(BATCH):
         u = u0 + n

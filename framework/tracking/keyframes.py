@@ -20,7 +20,7 @@ from framework.data import Array, Float32, Float64, Frame, UInt8, check_array, c
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import path_exists
 from framework.geometry import back_project, transform
-from framework.mapping.storage.map_file import map_file_errors, read_arrays, write_map
+from framework.mapping.storage.map_file import read_arrays, write_map
 from framework.runtime.cpu_budget import lower_priority
 from framework.tracking.absolute_pose import AbsolutePose, AbsolutePoseEstimator
 from framework.tracking.features import DESCRIPTOR_LENGTH, FeatureExtractor, Features, match
@@ -52,10 +52,10 @@ class Keyframe:
 class Keyframes:
     """A bounded database of keyframes.
 
-    Call `add` with every frame with a reliable pose. It extracts the features of new views in a background thread. A
+    Call `add` for every frame that has a reliable pose. It extracts the features of new views in a background thread. A
     view is new if distance / min_distance + angle / min_angle >= 1 for all keyframes. All other methods wait for the
     thread first, so that results do not depend on timing. The cost of `relocalize` does not depend on the number of
-    keyframes, except for the comparison of bags of words.
+    keyframes, except for the comparison of bag-of-words vectors.
     """
 
     max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is removed
@@ -286,5 +286,4 @@ def read_keyframes(path: Path) -> dict[str, Array]:
     """Return the arrays written by `write_keyframes`; empty if there is no file. Raises DataError if it is invalid."""
     if not path_exists(path):
         return {}
-    with map_file_errors(path):
-        return read_arrays(path, FILE_FORMAT)
+    return read_arrays(path, FILE_FORMAT)

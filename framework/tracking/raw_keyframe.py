@@ -77,10 +77,10 @@ class KeyframeTerm(NamedTuple):
         self, levels: Sequence[PyramidLevel], level: int, T_view_camera: Float64, weights: Weights, brightness: float,
         linear: LinearWeights | None,
     ) -> NormalEquations:  # fmt: skip
-        """Return the weighted normal equations of the keyframe for twists of the view's frame.
+        """Return the keyframe's weighted normal equations for a twist in the view's coordinate frame.
 
-        `levels`: the image pyramid of the frame, finest first. `level`: the level of the alignment, at most COMPARED.
-        See `linearize` for the other arguments.
+        `levels`: the image pyramid of the aligned image, finest first. `level`: the level of the alignment, at most
+        COMPARED. See `linearize` for the other arguments.
         """
         own = linearize(
             levels[COMPARED], self.keyframe.model, self.keyframe.intensity, self.T_key_view @ T_view_camera, weights,

@@ -45,13 +45,14 @@ class MaskRCNNDetector(Detector):
     score_threshold: float = 0.1
     nms_iou: float = 0.5  # box IoU threshold of non-maximum suppression within a class, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
-    proposals_before_nms: int = 1000  # maximum number of anchors per pyramid level before non-maximum suppression, >= 1
+    # maximum number of region proposals per pyramid level before non-maximum suppression, >= 1
+    proposals_before_nms: int = 1000
     proposals: int = 300  # maximum number of region proposals for the box head, >= 1; published networks use 1000
     max_detections: int = 100  # maximum number of detections per image, >= 1
     short_side: int = 0  # short side of the resized image, px, 0 or >= 32; 0 = as in training
     # maximum long side of the resized image, px, 0 or >= short_side; 0 = same ratio to the short side as in training
     long_side: int = 0
-    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
+    mask_threshold: float = 0.5  # minimum mask probability of a pixel in the mask, in (0, 1)
     half_precision: bool = True  # True = half precision on CUDA; the CPU always uses single precision
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
 

@@ -79,7 +79,7 @@ class MaskRCNN2Go(Detector):
     max_detections: int = 100  # maximum number of detections per image, >= 1
     short_side: int = 320  # short side of the resized image, px, >= 32; the network was trained with 320
     long_side: int = 640  # maximum long side of the resized image, px, >= short_side
-    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
+    mask_threshold: float = 0.5  # minimum mask probability of a pixel in the mask, in (0, 1)
     # True = 8-bit integer arithmetic on CPUs with VNNI, three times as fast per core; False = floating-point arithmetic
     int8: bool = True
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available

@@ -49,7 +49,7 @@ class OnnxSegmentation(Detector):
     nms_iou: float = 0.45  # box IoU threshold of non-maximum suppression within a class, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
-    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
+    mask_threshold: float = 0.5  # minimum mask probability of a pixel in the mask, in (0, 1)
     input_size: int = 0  # side of the square input, px, for networks with variable input size; 0 = size in the file
     placement: Placement = Placement.center  # position of the image in the input
     padding: int = 114  # gray value of the padding, in [0, 255]

@@ -35,7 +35,8 @@ class OpenVocabulary(Detector):
     text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # distinct text queries
     model: str = "google/owlv2-base-patch16-ensemble"  # OWLv2 model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model repository
-    # mask model (SAM, SAM 2, or EdgeTAM, which needs timm): id on huggingface.co or folder; "" = masks from depth
+    # promptable segmentation model for the masks, SAM, SAM 2 or EdgeTAM (requires timm): huggingface.co id or folder;
+    # "" = masks from depth
     mask_model: str = "facebook/sam2.1-hiera-tiny"
     mask_model_revision: str = "main"  # branch, tag or commit of the mask model repository
     score_threshold: float = 0.1  # minimum probability of the most likely query for a box, in (0, 1)

@@ -71,7 +71,7 @@ class Precomputed(Detector):
         probabilities, known = self._distributions(stored)
         if not known.any():
             raise DataError(
-                f"{self.path}: expected detections of COCO's classes, got none in {len(stored)} detections; check "
+                f"{self.path}: expected detections of COCO classes, got none in {len(stored)} detections; check "
                 "detector.label_space"
             )
         if not known.all():

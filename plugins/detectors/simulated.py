@@ -43,7 +43,7 @@ LARGEST_ATTACHED = 2.0
 INTERVALS = {
     **dict.fromkeys(("clutter_rate", "attach_rate", "merge_rate", "miss_rate", "truncated_miss_rate"), "[0, 1]"),
     **dict.fromkeys(("split_rate", "confusion_consistency", "recurring_fraction"), "[0, 1]"),
-    **dict.fromkeys(("small_side", "miss_spread", "shift", "boundary_noise", "score_concentration"), "[0, inf)"),
+    **dict.fromkeys(("miss_size_scale", "miss_spread", "shift", "boundary_noise", "score_concentration"), "[0, inf)"),
     **dict.fromkeys(("confusion", "score_threshold"), "[0, 1)"),
     "seed": "[0, inf)",
     "min_pixels": "[1, inf)",
@@ -94,8 +94,8 @@ class SimulatedDetector(Detector):
     - Objects of unknown class are detected as an arbitrary class (`clutter_rate`).
     - The mask of an object includes a touching object of unknown class, such as the cupboard of a sink (`attach_rate`).
     - Touching objects share one mask (`merge_rate`).
-    - Objects are missed, more often if small (`small_side`) or cut by the image border. Some objects are missed nearly
-      always and others never (`miss_spread`).
+    - Objects are missed, more often if small (`miss_size_scale`) or cut by the image border. Some objects are missed
+      nearly always and others never (`miss_spread`).
     - Objects are split in two (`split_rate`).
     - Masks are shifted, extend beyond the object, have a noisy border and are resampled on a coarse grid.
     - The class becomes a random distribution with a mean from a confusion matrix of similar classes (`confusion`). For
@@ -114,8 +114,8 @@ class SimulatedDetector(Detector):
     attach_rate: float = 0.0
     merge_rate: float = 0.1  # probability that two touching objects share one mask, in [0, 1]
     miss_rate: float = 0.1  # probability of missing a large object inside the image, in [0, 1]
-    # object side at which the size-related miss probability is 1/e, px, >= 0; 0 = no effect of the size
-    small_side: float = 24.0
+    # object side length at which the size-related miss probability is 1/e, px, >= 0; 0 = no effect of the size
+    miss_size_scale: float = 24.0
     truncated_miss_rate: float = 0.15  # additional probability of missing an object at the image border, in [0, 1]
     miss_spread: float = 0.0  # standard deviation of the logit of the detection rate over objects, >= 0
     split_rate: float = 0.05  # probability of splitting an object into two detections, in [0, 1]
@@ -232,7 +232,7 @@ class SimulatedDetector(Detector):
         side = float(np.sqrt(np.count_nonzero(mask)))
         truncated = bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
         p = 1 - self.miss_rate
-        p *= 1 - np.exp(-side / self.small_side) if self.small_side > 0 else 1.0
+        p *= 1 - np.exp(-side / self.miss_size_scale) if self.miss_size_scale > 0 else 1.0
         p *= 1 - self.truncated_miss_rate if truncated else 1.0
         if self.miss_spread > 0 and 0 < p < 1:
             own = self.miss_spread * self._random(Draw.DETECTABILITY, candidate.instance).standard_normal()

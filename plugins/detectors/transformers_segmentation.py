@@ -77,7 +77,7 @@ class TransformersSegmentation(Detector):
     max_detections: int = 100  # maximum number of detections per image, >= 1
     short_side: int = 0  # short side of the resized image, px, 0 or >= 32; 0 = as in the published model
     long_side: int = 0  # maximum long side of the resized image, px, 0 or >= short_side; must be 0 if short_side is 0
-    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
+    mask_threshold: float = 0.5  # minimum mask probability of a pixel in the mask, in (0, 1)
     half_precision: bool = True  # True = half precision on CUDA; the CPU always uses single precision
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
     reads = ("color",)
@@ -215,7 +215,10 @@ class Preprocessing:
         keys = {key for key, value in (size or {}).items() if value}
         known = ({"shortest_edge", "longest_edge"}, {"max_height", "max_width"}, {"height", "width"})
         if content.get("do_resize", True) and keys not in known:
-            raise DataError(f"{where}: size: expected height and width, or shortest_edge and longest_edge, got {size}")
+            raise DataError(
+                f"{where}: size: expected height and width, max_height and max_width, or shortest_edge and "
+                f"longest_edge, got {size}"
+            )
         normalizes = content.get("do_normalize", True)
         pads = content.get("do_pad") and str(content.get("image_processor_type", "")).startswith("Eomt")
         return cls(

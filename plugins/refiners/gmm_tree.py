@@ -37,7 +37,7 @@ class GmmTree(ClusterRefiner):
     std_floor: float = 0.01  # minimum standard deviation of a node along any axis, m, in [0.0001, 1]
     outlier_fraction: float = 0.02  # initial fraction of outliers in a node, in [0, 1)
     min_support: float = 1e-4  # minimum fraction of the tree's points in a node, in [0, 1); smaller nodes are dropped
-    min_node: int = 32  # minimum number of points to give a node children, >= 8
+    min_split_points: int = 32  # minimum number of points of a node to be split, >= 8
     parent_points: float = 4.0  # weight of the parent node's object fraction as a prior, in points, >= 0
     min_posterior: float = 0.5  # minimum posterior probability of the object to keep a point, in (0, 1)
     mask_log_odds: float = 2.0  # prior log-odds of the object far inside the mask, nats, in [0, 20]
@@ -48,7 +48,7 @@ class GmmTree(ClusterRefiner):
     def __post_init__(self) -> None:
         check_bounds(
             self, levels=(1, 8), children=(2, 64), max_iterations=(1, 1000), tolerance=(0.0, np.inf),
-            std_floor=(1e-4, 1.0), outlier_fraction=(0.0, 0.99), min_support=(0.0, 0.99), min_node=(8, 10**9),
+            std_floor=(1e-4, 1.0), outlier_fraction=(0.0, 0.99), min_support=(0.0, 0.99), min_split_points=(8, 10**9),
             parent_points=(0.0, 1e9), min_posterior=(1e-6, 1 - 1e-6), mask_log_odds=(0.0, 20.0),
             expected_bleed=(0.0, 0.99),
         )  # fmt: skip
@@ -59,7 +59,7 @@ class GmmTree(ClusterRefiner):
         tree = fit(
             sample.points_camera, sample.starts,
             EmSettings(self.max_iterations, self.tolerance, self.std_floor**2, self.outlier_fraction),
-            levels=self.levels, children=self.children, min_support=self.min_support, min_points=self.min_node,
+            levels=self.levels, children=self.children, min_support=self.min_support, min_points=self.min_split_points,
         )  # fmt: skip
         odds = sample.mask_log_odds(self.mask_log_odds, self.expected_bleed)
         ratios = object_ratios(tree, sample, odds, self.parent_points)

@@ -92,7 +92,8 @@ class VoxelHashingIcp(PoseTracker):
     geometric_scale: float = 4.0  # cut-off of point-to-plane distances, in standard deviations, > 0 (TUKEY)
     photometric_scale: float = 4.0  # cut-off of intensity differences, in standard deviations, > 0 (TUKEY)
     intensity_noise: float = 0.05  # standard deviation of intensity differences, for intensities in [0, 1], > 0 (TUKEY)
-    max_intensity_difference: float = 0.1  # intensity difference with weight 0, for intensities in [0, 1], > 0 (LINEAR)
+    # intensity difference at which the weight reaches 0, for intensities in [0, 1], > 0 (LINEAR)
+    max_intensity_difference: float = 0.1
     color_weight: float = 0.1  # weight lambda of the photometric term, >= 0; 0 = ICP only
     color_levels: int = 3  # number of levels with color, from the coarsest, in [1, 3]
     depth_weight: float = 1.0  # weight of the point-to-plane term, in [0, 1]; 0 = color only

@@ -53,7 +53,7 @@ def random_mask_rcnn(backbone: str, folder: Path) -> list[str]:
 def random_transformer(
     model: str, parameters: dict[str, Any], preprocessing: dict[str, Any], folder: Path
 ) -> list[str]:
-    """Return the overrides for a `transformers` model with COCO's classes."""
+    """Return the overrides for a `transformers` model with COCO classes."""
     transformers = pytest.importorskip("transformers")
     torch.manual_seed(0)
     model_class = getattr(transformers, model)

@@ -119,12 +119,12 @@ def test_pipeline_skips_unreadable_frame(prefetch: int, caplog: pytest.LogCaptur
 
 
 @PREFETCH
-def test_pipeline_skips_frame_after_detector_frame_error(room: CornerRoom, prefetch: int) -> None:
+def test_pipeline_skips_frame_on_detector_frame_error(room: CornerRoom, prefetch: int) -> None:
     result = pipeline(prefetch, detector=SphereDetector(broken_at=0)).run(room)
     assert (result.frames_skipped, len(result.tracked)) == (1, 5)
 
 
-def test_pipeline_skips_frame_after_refiner_frame_error(room: CornerRoom) -> None:
+def test_pipeline_skips_frame_on_refiner_frame_error(room: CornerRoom) -> None:
     @dataclass
     class Refuses(KeepAll):
         def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:

@@ -75,7 +75,7 @@ VARIANTS = {  # by stage: changed parameter of the example variant in the README
 def main() -> None:
     """Run the command `instancemap new-plugin`."""
     parser = argparse.ArgumentParser(
-        description="Create the files of a repository with a working plugin: package, config option, tests and CI."
+        description="Create a package with a working plugin: code, config option, tests and CI."
     )
     parser.add_argument("stage", metavar="STAGE", choices=GROUPS, help=f"stage of the plugin: {', '.join(GROUPS)}")
     parser.add_argument("name", metavar="NAME", help="name of the plugin, such as my_refiner for refiner=my_refiner")

@@ -37,7 +37,11 @@ def main() -> None:
     add("--color", metavar="TOPIC", default="", help="color images")
     add("--depth", metavar="TOPIC", default="", help="depth images")
     add("--camera-info", metavar="TOPIC", default="", help="intrinsics of the color camera")
-    add("--poses", metavar="TOPIC", default="", help="camera poses: nav_msgs/Odometry or geometry_msgs/PoseStamped")
+    poses = (
+        "camera poses: nav_msgs/Odometry or geometry_msgs/PoseStamped, in optical axes if the frame name contains "
+        '"optical" or is missing, otherwise in ROS axes (x forward)'
+    )
+    add("--poses", metavar="TOPIC", default="", help=poses)
     parsed = arguments(parser)
     with one_line_errors():
         writing = Writing(parsed.width, parsed.stride, parsed.confidence, parsed.rotate)

@@ -34,7 +34,8 @@ def main() -> None:
         choices=[transfer.value for transfer in Transfer],
         default=Transfer.TO_TRUTH.value,
         help="direction of the label transfer for the printed metrics: to_truth (each ground-truth point gets the "
-        "instance of the nearest map vertex) or to_map (the reverse); both are stored; default: to_truth",
+        "instance of the nearest map vertex) or to_map (each map vertex gets the instance of the nearest "
+        "ground-truth point); both are stored; default: to_truth",
     )
     parser.add_argument(
         "--ground-truth",

@@ -18,7 +18,7 @@ def main() -> None:
     add = parser.add_argument
     formats = ("glb", "ply", "usd", "obj", "floorplan", "graph")
     add("run", metavar="RUN", type=Path, help="run directory, complete or partial")
-    listed = f"one or more of {', '.join(formats)}; default: glb"
+    listed = f"one or more of {', '.join(formats)}; floorplan also writes the ROS map; default: glb"
     add("--to", metavar="FORMAT", nargs="+", default=["glb"], choices=formats, help=listed)
     add("--out", metavar="DIR", type=Path, help="output folder; default: RUN/export")
     only = "id or class of the exported objects; repeatable; default: all objects"

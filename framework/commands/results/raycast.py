@@ -23,8 +23,8 @@ PICTURE = "raycast.png"
 def main() -> None:
     """Run the command `instancemap raycast`."""
     parser = argparse.ArgumentParser(
-        description="Draw a ray-cast view of the map of a run in five panels: depth, normals, vertices, RGB and object "
-        "indices."
+        description="Draw a ray-cast view of the map of a run in five panels: depth, normals, vertex map, RGB and "
+        "object indices."
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="run directory")
     view = parser.add_mutually_exclusive_group()

@@ -50,7 +50,7 @@ OmegaConf.register_new_resolver("new_directory", new_directory, use_cache=True, 
 
 
 @dataclass
-class PlaceCallback(Callback):
+class DirectoryLockCallback(Callback):
     """Hydra callback that locks the directory of a run or sweep at its start.
 
     Hydra calls it in the main process before it writes any file, but not in workers.
@@ -63,20 +63,20 @@ class PlaceCallback(Callback):
         HydraConfig.instance().set_config(config)
         if self.of_run:
             self.take(
-                lambda: run_in(place_of("hydra.run.dir", config.hydra.run.dir), wait=config.skip_completed is True)
+                lambda: run_in(directory_of("hydra.run.dir", config.hydra.run.dir), wait=config.skip_completed is True)
             )
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         self.take(lambda: sweep_of(config, with_table=self.of_run))
 
-    def take(self, place: Callable[[], AbstractContextManager[None]]) -> None:
+    def take(self, lock: Callable[[], AbstractContextManager[None]]) -> None:
         try:
-            ending.enter_context(place())
+            ending.enter_context(lock())
         except (InstanceMapError, OSError, OmegaConfBaseException) as error:  # Hydra would only warn
             sys.exit(f"error: {one_line(error)}")
 
 
-def place_of(key: str, chosen: str) -> Path:
+def directory_of(key: str, chosen: str) -> Path:
     """Return the directory `chosen` for `key`. Raises ConfigError for an empty name (the working directory)."""
     if not chosen.strip():
         raise ConfigError(f"{key}: expected a folder, got an empty name; set {key}=. for the working directory")
@@ -108,7 +108,7 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
         workers = min(joblib_workers(own.launcher.n_jobs), runs)
         with flag_override(own, "readonly", False):
             own.launcher.n_jobs = workers
-    directory = place_of("hydra.sweep.dir", own.sweep.dir)
+    directory = directory_of("hydra.sweep.dir", own.sweep.dir)
     return sweep_in(directory, with_table, config.get("figure") is not None, workers > 1)
 
 

@@ -161,7 +161,7 @@ class Recording(RGBDSequence):
 
     @abstractmethod
     def open(self) -> Contents:
-        """Return the contents of `self.folder`. Raises DataError that names the file if the format is invalid."""
+        """Return the contents of `self.folder`. Raises a DataError that names the file if the format is invalid."""
 
     def truth_in(self, index: int) -> FrameTruth | None:
         """Return the recording's own ground-truth instances in stored frame `index`; None = unknown."""

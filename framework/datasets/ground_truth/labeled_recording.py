@@ -40,7 +40,7 @@ class LabeledRecording(Recording):
         if not missing:
             self.mesh = read(*files)
         elif self.frame_ground_truth:
-            expected = f"expected a labeled mesh {missing[0]}, got no such file"
+            expected = f"expected the labeled mesh {missing[0]}, got no such file"
             raise DataError(f"dataset.frame_ground_truth: {expected}; add the file, or set this key to false")
         elif len(missing) < len(files):
             log.warning("%s: expected a file of ground-truth instances, got none; instances not evaluated", missing[0])

@@ -60,7 +60,7 @@ class NamedTruth:
 def read_named_truth(path: Path) -> NamedTruth:
     """Return the ground truth in a run directory or a labeled mesh.
 
-    Raises ConfigError if the path does not exist. Raises DataError that names the file if it is invalid.
+    Raises ConfigError if the path does not exist. Raises a DataError that names the file if it is invalid.
     """
     files = truth_files(path)
     mesh, names = files[0], files[1]
@@ -102,7 +102,7 @@ def truth_files(path: Path) -> list[Path]:
 def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
     """Return the class of each instance id in the JSON file of a labeled mesh; None = unknown.
 
-    Raises DataError that names the file if it is invalid or contains an id above `largest_id`.
+    Raises a DataError that names the file if it is invalid or contains an id above `largest_id`.
     """
     content = read_json(path)
     if not isinstance(content, dict):

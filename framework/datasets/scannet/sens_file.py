@@ -128,7 +128,7 @@ class SensFile:
 
 
 def open_sens(path: Path) -> SensFile:
-    """Read the header and the frame positions. Raises DataError that names the byte of an invalid header."""
+    """Read the header and the frame positions. Raises a DataError that names the byte of an invalid header."""
     check_regular(path)
     try:
         with path.open("rb", buffering=0) as file:

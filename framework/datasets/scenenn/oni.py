@@ -84,7 +84,7 @@ def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
     with (
         errors_of(contents.path),
         playable(contents, scratch) as path,
-        closing(play_apart(path, contents.streams)) as images,
+        closing(play_in_subprocess(path, contents.streams)) as images,
     ):
         yield from pair(images)
 
@@ -113,7 +113,7 @@ def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
             depths.popleft()
 
 
-def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
+def play_in_subprocess(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
     """Yield the images of `play`, which runs in a separate process.
 
     OpenNI 2 crashes on some damaged recordings. Raises DataError in this case.
@@ -131,7 +131,8 @@ def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniIma
     except (EOFError, OSError):
         player.join()
         raise DataError(
-            f"expected an intact recording, got a crash of OpenNI 2 with status {player.exitcode}; download it again"
+            f"expected an intact recording, got an OpenNI 2 crash (exit status {player.exitcode}); download or record "
+            "it again"
         ) from None
     finally:
         player.terminate()
@@ -194,7 +195,7 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
         if status == TIME_OUT:
             reached = (f"{stream.name.lower()} image {last[stream]} of {streams[stream].last}" for stream in Stream)
             found = f"got a stall of OpenNI 2 after {' and '.join(reached)}"
-            raise DataError(f"expected an intact recording, {found}; download it again")
+            raise DataError(f"expected an intact recording, {found}; download or record it again")
         _check(status, openni, "play the recording")
         stream = list(Stream)[which.value]
         frame = ctypes.POINTER(_Frame)()

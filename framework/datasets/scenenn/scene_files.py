@@ -53,8 +53,8 @@ class _Line(NamedTuple):
 def read_trajectory_log(path: Path) -> TrajectoryLog:
     """Return the poses of a trajectory.log.
 
-    A frame with two different poses is unusable, and so is a truncated last frame. Raises DataError that names the file
-    and the line for other invalid lines.
+    A frame with two different poses is unusable, and so is a truncated last frame. Raises a DataError that names the
+    file and the line for other invalid lines.
     """
     content = read_bytes(path, MAX_TEXT).removeprefix(BOM_UTF8)
     numbered = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))
@@ -138,7 +138,7 @@ def _is_frame(word: str) -> bool:
 def read_timestamps(path: Path) -> Mapping[int, tuple[float, float]]:
     """Return the timestamps of color and depth (s) by image number.
 
-    Raises DataError that names the file and the line for an invalid line or a repeated image number.
+    Raises a DataError that names the file and the line for an invalid line or a repeated image number.
     """
     times: dict[int, tuple[float, float]] = {}
     for n, line in enumerate(read_lines(path), start=1):
@@ -173,8 +173,8 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
     """Return fx, fy, cx, cy in px, from lines `key value`, `key = value` or `key: value`.
 
     Keys may be in upper case. Comments (# or ;), section headers and other keys are ignored. Without cx or cy, half of
-    depth_width or depth_height is used, as in ethz-asl/scenenn_to_rosbag. Raises DataError that names the file and the
-    line for a missing or repeated key or a value that is not finite. Focal lengths and sizes must be positive.
+    depth_width or depth_height is used, as in ethz-asl/scenenn_to_rosbag. Raises a DataError that names the file and
+    the line for a missing or repeated key or a value that is not finite. Focal lengths and sizes must be positive.
     """
     values: dict[str, float] = {}
     lines = read_bytes(path, LARGEST_INTRINSICS).removeprefix(BOM_UTF8).decode("latin-1").splitlines()

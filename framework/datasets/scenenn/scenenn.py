@@ -121,7 +121,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
 
     Labels without a name or an annotation have the class None: detections there are not evaluated. Labels of other
     classes (wall, cabinet, ...) and label 0 become instance 0: detections of the nine classes there are false
-    positives. Raises DataError that names the file if a file cannot be read or the mesh has no labels.
+    positives. Raises a DataError that names the file if a file cannot be read or the mesh has no labels.
     """
     ply = read_ply(mesh)
     labels = ply.properties.get("label")

@@ -42,9 +42,9 @@ class Annotated:
 def read_annotation(path: Path) -> tuple[Annotated, ...]:
     """Return the labels of an annotation in file order.
 
-    Unknown elements and attributes are ignored. Raises DataError that names the line if the file is not XML or declares
-    a document type, which could define entities and default attributes. It also raises DataError for a file without
-    labels, a label without an integer id, or different labels with the same id.
+    Unknown elements and attributes are ignored. Raises a DataError that names the line if the file is not XML or
+    declares a document type, which could define entities and default attributes. It also raises DataError for a file
+    without labels, a label without an integer id, or different labels with the same id.
     """
     content = read_bytes(path, LARGEST_FILE)
     labels = _Labels(path)

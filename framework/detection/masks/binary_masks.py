@@ -37,7 +37,7 @@ def masks_from_prototypes(
     `coefficients`: (N, M). `prototypes`: (M, h, w), whose cells cover the complete input of the network. `borders`: (N,
     4) boxes x1 y1 x2 y2 px of the image, the limits of the masks. `letterbox`: the placement of the image in the input.
     `shape`: (height, width) px of the image. The sums are logits, interpolated bilinearly between cell centers.
-    `threshold`: minimum probability of a pixel inside a mask.
+    `threshold`: minimum mask probability of a pixel in the mask.
     """
     count, rows, columns = prototypes.shape
     logits = (coefficients @ prototypes.reshape(count, -1)).reshape(len(coefficients), rows, columns)

@@ -27,6 +27,9 @@ Run = Callable[..., Tensor]  # computes an operator's output from its blobs (N, 
 Window = tuple[list[int], list[int], list[int], int]  # strides, pads, dilations, groups
 
 CONVOLUTIONS = ("Int8Conv", "Int8ConvRelu")
+OPERATORS = (  # supported operators
+    *CONVOLUTIONS, "Int8ConvTranspose", "Int8FC", "Int8AveragePool", "Int8Sum", "Int8Relu", "Int8Quantize",
+)  # fmt: skip
 MAX_WEIGHT = 127  # largest int8 weight; oneDNN requires weights symmetric about 0
 
 
@@ -156,8 +159,10 @@ def _in_float(operator: Operator, tensors: Tensors) -> Run:
         return torch.relu
     if kind == "Int8Quantize":
         return lambda x: x
-    if kind not in (*CONVOLUTIONS, "Int8ConvTranspose", "Int8FC"):
-        raise DataError(f"graph.json: expected a supported operator, got {kind}")
+    if kind not in OPERATORS:
+        raise DataError(
+            f"graph.json: expected an operator out of {', '.join(OPERATORS)}, got {kind}; use another network"
+        )
     weight, bias = _weights(operator, tensors)
     if kind == "Int8FC":
         return lambda x: functional.linear(x.flatten(1), weight, bias)

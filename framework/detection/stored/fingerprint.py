@@ -45,7 +45,8 @@ def _code(kind: type) -> Iterator[str]:
         source = getattr(sys.modules.get(module), "__file__", None)
         if source is None:
             raise ConfigError(
-                f"{kind.__qualname__}: expected a class in a source file, got none; implement fingerprint()"
+                f"{kind.__qualname__}: expected a class defined in a source file, got one without; define a method "
+                "fingerprint()"
             )
         yield path_hash(Path(source))
     framework = Path(__file__).resolve().parents[2]

@@ -37,8 +37,8 @@ class InstanceOfImage(Segmentation):
         ids = _read_ids(self.path)
         if ids.shape != shape:
             raise DataError(
-                f"image: expected {shape[1]}x{shape[0]} px (as the frame), got {ids.shape[1]}x{ids.shape[0]} px; use "
-                "masks at the resolution of the sequence"
+                f"image: expected the frame's size, {shape[1]}x{shape[0]} px, got {ids.shape[1]}x{ids.shape[0]} px; "
+                "use masks at the resolution of the sequence"
             )
         return np.asarray(ids == self.id, np.bool_)
 

@@ -36,7 +36,7 @@ class RunLengths(Segmentation):
     def mask(self, shape: tuple[int, int]) -> Bool:
         if self.shape != shape:
             raise DataError(
-                f"mask: expected {shape[1]}x{shape[0]} px (as the frame), got {self.shape[1]}x{self.shape[0]} "
+                f"mask: expected the frame's size, {shape[1]}x{shape[0]} px, got {self.shape[1]}x{self.shape[0]} "
                 "px; use masks at the resolution of the sequence"
             )
         return np.asarray(decode([self.counts], shape)[0], np.bool_)

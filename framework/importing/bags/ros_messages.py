@@ -54,7 +54,7 @@ class RosBag:
     """A ROS 1 bag, or a ROS 2 bag as a folder, .mcap file or .db3 file."""
 
     def __init__(self, path: Path) -> None:
-        """Open a bag. Raises DataError that names the bag if it cannot be read."""
+        """Open a bag. Raises a DataError that names the bag if it cannot be read."""
         self.path = path
         import_optional("rosbags", "reads ROS bags", "ros")
         from rosbags import rosbag1, rosbag2, typesys
@@ -93,7 +93,7 @@ class RosBag:
         return None if message is None else self.decoded(message)
 
     def decoded(self, message: Message) -> Any:
-        """Return the content of a message. Raises FrameError that names the topic if the message is damaged."""
+        """Return the content of a message. Raises a FrameError that names the topic if the message is damaged."""
         decode = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
         try:
             return decode(message.raw, message.kind)
@@ -120,7 +120,7 @@ class RosBag:
 
 
 def color_of(where: str, message: Any) -> UInt8:
-    """Return the color (H, W, 3), RGB, of an Image or a CompressedImage. Raises FrameError that names `where`."""
+    """Return the color (H, W, 3), RGB, of an Image or a CompressedImage. Raises a FrameError that names `where`."""
     if hasattr(message, "format"):
         return decode_color(where, message.data.tobytes())
     if message.encoding not in COLOR_CHANNELS:
@@ -133,7 +133,7 @@ def color_of(where: str, message: Any) -> UInt8:
 def depth_of(where: str, message: Any, unit: float) -> Float32:
     """Return the depth (H, W) in m, 0 = no reading, of an Image or a CompressedImage.
 
-    `unit` is the unit of integer depth in m. Raises FrameError that names `where`.
+    `unit` is the unit of integer depth in m. Raises a FrameError that names `where`.
     """
     if hasattr(message, "format"):
         return _compressed_depth(where, message, unit)

@@ -82,7 +82,7 @@ def _read(folder: Path, stem: str) -> DeviceFrame:
 
 
 def _pose(path: Path, content: dict[str, Any]) -> Float64:
-    """Return T_world_camera (4, 4) in the content of a camera file. Raises DataError that names the file."""
+    """Return T_world_camera (4, 4) in the content of a camera file. Raises a DataError that names the file."""
     rows = np.reshape(numbers_of(path, content, *ROWS), (3, 4))
     return arkit_pose(path, np.vstack([rows, [[0, 0, 0, 1]]]))
 

@@ -94,7 +94,7 @@ class R3dFile:
     """Images of an .r3d file, with the methods of `ExrFolder`."""
 
     def __init__(self, path: Path) -> None:
-        """Open an .r3d file. Raises DataError that names the file if it is not a zip archive."""
+        """Open an .r3d file. Raises a DataError that names the file if it is not a zip archive."""
         self.path = path
         try:
             self._zip = zipfile.ZipFile(path)

@@ -206,8 +206,8 @@ class Association:
     split_instances: bool = True  # True = create an instance for the second of two clusters that match an instance
     # minimum overlap of two instances with one cluster to merge them, in [0, 1]; 1 = no merging
     merge_overlap: float = 1.0
-    # minimum number of frames with a common cluster of two instances, minus frames with separate clusters, to merge
-    # them, >= 1
+    # minimum number of frames in which two instances share a cluster, minus the frames in which they match separate
+    # clusters, for a merge, >= 1
     merge_frames: int = 3
     # minimum Bhattacharyya coefficient of the class distributions of two instances to merge them, in [0, 1]; 0 = any
     # classes are merged

@@ -33,6 +33,10 @@ MAX_ARRAYS = 100  # maximum number of arrays listed in the header of a file
 MAX_MEMORY_FRACTION = 0.5  # maximum fraction of the machine's memory for a loaded map
 
 
+class _TooLargeError(DataError):
+    """A map file that exceeds the memory limit. Its message contains the fix."""
+
+
 def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
     """Write the header and the arrays to a .npz file without timestamps, readable by np.load."""
     if not isinstance(cast(object, path), str | Path):
@@ -84,6 +88,8 @@ def map_file_errors(path: Path | str) -> Iterator[None]:
     """Convert errors during reading of a map file into a DataError that names the file."""
     try:
         yield
+    except _TooLargeError as error:
+        raise DataError(f"{path}: {error}") from error
     except InstanceMapError as error:
         raise DataError(f"{path}: {error}; map again") from error
     except Exception as error:  # zipfile and numpy raise many types for damaged archives
@@ -99,9 +105,9 @@ def _opened(path: Path | str) -> Iterator[zipfile.ZipFile]:
         unpacked = sum(info.file_size for info in archive.infolist())
         limit = MAX_MEMORY_FRACTION * machine_memory()
         if unpacked > limit:
-            raise DataError(
-                f"expected at most {limit:.0f} unpacked bytes (half of this machine's memory), got {unpacked}; raise "
-                "fuser.voxel_size or use a machine with more memory"
+            raise _TooLargeError(
+                f"expected at most {limit:.0f} unpacked bytes (half of this machine's memory), got {unpacked}; open it "
+                "on a machine with more memory, or map again with a larger fuser.voxel_size"
             )
         yield archive
 

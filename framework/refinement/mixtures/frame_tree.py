@@ -22,7 +22,7 @@ from framework.refinement.mixtures.mixture_tree import Level, MixtureTree, cut, 
 from framework.refinement.neighborhood_kernels import grouped
 
 NOWHERE = 1e6  # coordinates of the center of a mask without points, m
-MIN_NODE = 32  # minimum number of points of a node with children
+MIN_SPLIT_POINTS = 32  # minimum number of points of a node to be split
 
 
 class Initialization(Enum):
@@ -64,9 +64,9 @@ def grow(
     """Grow a tree of at most `levels` levels over S points (S, 3), m, of `count` masks.
 
     `masks`: the mask (S,) of each point, in ascending order. Level 1 has `gaussians_per_mask` Gaussians for each mask,
-    with initial responsibilities by `initialization`. A node with at least MIN_NODE points gets `children` children (2,
-    4 or 8). A node is dropped in favor of its siblings if its weight is below `min_support` (fraction of all points),
-    or if it has too few points for a covariance.
+    with initial responsibilities by `initialization`. A node with at least MIN_SPLIT_POINTS points gets `children`
+    children (2, 4 or 8). A node is dropped in favor of its siblings if its weight is below `min_support` (fraction of
+    all points), or if it has too few points for a covariance.
     """
     labels = _start(points, masks, count, gaussians_per_mask, initialization, settings.max_iterations)
     components = count * gaussians_per_mask
@@ -78,7 +78,7 @@ def grow(
         child = MixtureTree((level,)).best_nodes(0, points, starts)
         order, starts = grouped(child.astype(np.int32), len(level))
         points = points[order]
-        chosen = np.flatnonzero(np.diff(starts) >= MIN_NODE)
+        chosen = np.flatnonzero(np.diff(starts) >= MIN_SPLIT_POINTS)
         if not len(chosen):
             break
         own, own_starts = ranges(points, starts, chosen)

@@ -29,8 +29,8 @@ from framework.refinement.segmentation.convexity_kernels import (
     connected,
     count_edges,
     fit_planes,
+    mean_inverse_depth,
     pixel_labels,
-    sum_cells,
 )
 from framework.sensors.noise_models import SensorKind
 
@@ -60,7 +60,7 @@ def segments(
         [camera.fx / cell, camera.fy / cell, (camera.cx + 0.5) / cell - 0.5, (camera.cy + 0.5) / cell - 0.5], np.float32
     )
     noise = Noise(limits.noise_factor, limits.min_noise, *sensor.noise[:3])
-    inverse = sum_cells(depth, cell, noise, slope)
+    inverse = mean_inverse_depth(depth, cell, noise, slope)
     fits = fit_planes(inverse, window, noise, slope)
     planes = best_planes(inverse, fits, window, noise)
     edges = count_edges(planes, pinhole, noise, limits.max_angle, normal_sigma(1.0, window, cell, camera))

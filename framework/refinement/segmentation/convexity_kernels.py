@@ -44,7 +44,7 @@ def _noise_at(inverse: float, noise: Noise) -> np.float32:
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def sum_cells(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Float32:
+def mean_inverse_depth(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Float32:
     """Return the mean inverse depth (rows, columns), 1 / m, of the nearest surface in each cell; 0 = no reading.
 
     `depth`: (H, W), m. `cell`: side of a cell, px. `slope`: maximum relative change of depth on a surface per cell.

@@ -183,9 +183,10 @@ def _grow(
     cells: Float64, columns: int, seed: int, free: Bool, distance: float, noise: float, sensor: DepthNoise, m: Float64,
     region: Int64,
 ) -> int:  # fmt: skip
-    """Set `region` to the cells of a plane that grows from `seed`, and `m` to the plane; return the number of cells.
+    """Grow a plane from the cell `seed`.
 
-    The plane is fitted again with every new cell.
+    Set `region` (C,) to the indices of its cells and `m` (3,), 1/m, to the plane; return the number of cells. The plane
+    is refitted after each added cell. `cells`: (C, 10) moments from `sum_moments`.
     """
     seen, total = np.zeros(len(cells), np.bool_), cells[seed].copy()
     _solve(total, m)

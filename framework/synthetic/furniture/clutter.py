@@ -15,7 +15,7 @@ LAMP_GLOW = 2.2  # emission of a lampshade, 1 = radiance of a white wall in the 
 
 
 def cupboard(rng: Rng) -> Furniture:
-    """Return a wardrobe with two doors."""
+    """Return a cupboard with two doors."""
     piece = Furniture("cupboard")
     width, depth, height = rng.uniform(0.9, 1.2), rng.uniform(0.45, 0.58), rng.uniform(1.8, 2.05)
     body, knob = paints.wood(rng), paints.metal(rng)

@@ -109,7 +109,7 @@ def _scatter(
     in_the_way = [np.stack(piece.bounds()) for piece in lying[1:]]
     for thing in things:
         for _ in range(PLACES):
-            place = _random_place(thing, low, high, rng)
+            place = _placed_at_random(thing, low, high, rng)
             box = np.stack(place.bounds())
             if any(_overlap(box, other) for other in in_the_way):
                 continue
@@ -120,7 +120,7 @@ def _scatter(
             break
 
 
-def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Furniture:
+def _placed_at_random(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Furniture:
     """Return `thing` with a random rotation about z and a random position.
 
     The object is inside the area from the corner `low` (2,) to the corner `high` (2,), m. An object larger than the
@@ -227,7 +227,7 @@ def strew_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) 
     there: list[Float64] = []
     for thing in things:
         for _ in range(PLACES):
-            place = _random_place(thing, low[:2] + RIM, high[:2] - RIM, rng)
+            place = _placed_at_random(thing, low[:2] + RIM, high[:2] - RIM, rng)
             box = np.stack(place.bounds())
             over_edge = (box[0, :2] < low[:2]).any() or (box[1, :2] > high[:2]).any()
             if over_edge or any(_overlap(box, other) for other in there):

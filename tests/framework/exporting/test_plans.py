@@ -43,7 +43,7 @@ def room(run: Path) -> UprightRoom:
 
 @pytest.fixture(scope="module")
 def low(room: UprightRoom) -> Plan:
-    """Return a plan for a robot that fits under the table."""
+    """Return a floor plan for a robot that fits under the table."""
     return plan(room, RESOLUTION, 0.5)
 
 
@@ -344,7 +344,7 @@ def test_rooms_wide_opening_does_not_separate(tmp_path: Path) -> None:
 
 
 def by_hand(text: str) -> Plan:
-    """Return a plan with cells of 0.5 m from text: # = wall, . = free, o = occupied, space = unknown."""
+    """Return a floor plan with cells of 0.5 m from text: # = wall, . = free, o = occupied, space = unknown."""
     rows = np.array([list(row) for row in text.split("\n")])[::-1]
     free, wall, occupied = rows == ".", rows == "#", rows == "o"
     return Plan(0.5, np.zeros(2), occupied | wall, free, free, wall, np.zeros(rows.shape, np.int32))

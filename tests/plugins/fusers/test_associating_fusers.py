@@ -61,7 +61,7 @@ def test_fuser_weak_detection_creates_no_instance(new_fuser: NewFuser, frames: l
         ({"min_class_agreement": 1.0}, False),  # the class floor prevents complete agreement
     ],
 )
-def test_fuser_overlap_rule_and_class_agreement_limit_matches(
+def test_fuser_match_requires_overlap_and_class_agreement(
     new_fuser: NewFuser, frames: list[Frame], parameters: dict[str, Any], updates: bool
 ) -> None:
     fuser = new_fuser(**parameters)

@@ -103,7 +103,7 @@ def test_oni_player_crash_raises_one_line_error(tmp_path, monkeypatch):
     path = OniFile(recording()).write(tmp_path / "a.oni")
     with pytest.raises(DataError) as caught:
         frames_of(path)
-    assert f"got a crash of OpenNI 2 with status {-signal.SIGKILL}" in str(caught.value)
+    assert f"got an OpenNI 2 crash (exit status {-signal.SIGKILL})" in str(caught.value)
 
 
 def test_oni_missing_openni_error_names_package(tmp_path, monkeypatch):
