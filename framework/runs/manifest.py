@@ -17,8 +17,8 @@ from framework.files.json_file import read_json, write_json
 MANIFEST = "manifest.json"
 
 
-class Status(Enum):
-    """Status of a run directory."""
+class RunStatus(Enum):
+    """RunStatus of a run directory."""
 
     COMPLETE = "all frames are mapped and all files are written"
     PARTIAL = "the run ended early"
@@ -28,12 +28,12 @@ class Status(Enum):
 class Manifest:
     """Contents of manifest.json."""
 
-    status: Status
+    status: RunStatus
     files: Mapping[str, tuple[int, str]]  # size, bytes, and SHA-256 (hex) by file name
     inputs: Mapping[str, str]  # SHA-256 (hex) of the input files, by config key
 
     @classmethod
-    def of(cls, directory: Path, names: list[str], status: Status, inputs: Mapping[str, str]) -> Manifest:
+    def of(cls, directory: Path, names: list[str], status: RunStatus, inputs: Mapping[str, str]) -> Manifest:
         """Return the manifest of the existing files with these names in a run directory.
 
         Raises DataError if a file cannot be read.
@@ -53,7 +53,7 @@ class Manifest:
             raise DataError(f"{path}: expected the digest {_digest(content)[:12]}, got {digest!s:.12}; repeat the run")
         try:
             files = {str(name): (int(one["bytes"]), str(one["sha256"])) for name, one in content["files"].items()}
-            return cls(Status[content["status"]], files, {key: str(one) for key, one in content["inputs"].items()})
+            return cls(RunStatus[content["status"]], files, {key: str(one) for key, one in content["inputs"].items()})
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise DataError(f"{path}: expected status, files and inputs, got an error ({error!r})") from error
 

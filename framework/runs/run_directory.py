@@ -26,7 +26,7 @@ from framework.registry import STAGES
 from framework.rendering.overview import write_overview
 from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import write_instances
-from framework.runs.manifest import MANIFEST, Manifest, Status
+from framework.runs.manifest import MANIFEST, Manifest, RunStatus
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
 from framework.runs.plugin_code import plugin_code
@@ -140,7 +140,7 @@ class RunRecord:
             (self.directory / PARTIAL_METRICS).unlink(missing_ok=True)
         else:
             attempt(self._write_partial, video, figures, attempt.error)
-        attempt(self._write_manifest, Status.COMPLETE if attempt.error is None else Status.PARTIAL)
+        attempt(self._write_manifest, RunStatus.COMPLETE if attempt.error is None else RunStatus.PARTIAL)
         self._announce(title, labels if found is not None else {}, figures, attempt.error)
         return attempt.error
 
@@ -162,7 +162,7 @@ class RunRecord:
         why = "the outputs were not completed" if error is None else reason(error)
         write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
 
-    def _write_manifest(self, status: Status) -> None:
+    def _write_manifest(self, status: RunStatus) -> None:
         names = [*RESULT_FILES, METRICS, PARTIAL_METRICS]
         Manifest.of(self.directory, names, status, self.inputs).write(self.directory)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from framework.errors import DataError
-from framework.runs.manifest import Manifest, Status
+from framework.runs.manifest import Manifest, RunStatus
 
 
 @pytest.fixture
@@ -17,13 +17,13 @@ def directory(tmp_path: Path) -> Path:
     (tmp_path / "config.yaml").write_text("seed: 0\n")
     (tmp_path / "metrics.json").write_text("{}\n")
     inputs = {"detector.weights": "0f" * 32}
-    Manifest.of(tmp_path, ["config.yaml", "metrics.json", "map.npz"], Status.COMPLETE, inputs).write(tmp_path)
+    Manifest.of(tmp_path, ["config.yaml", "metrics.json", "map.npz"], RunStatus.COMPLETE, inputs).write(tmp_path)
     return tmp_path
 
 
 def test_manifest_round_trip_keeps_contents(directory: Path) -> None:
     found = Manifest.read(directory)
-    assert (found.status, dict(found.inputs)) == (Status.COMPLETE, {"detector.weights": "0f" * 32})
+    assert (found.status, dict(found.inputs)) == (RunStatus.COMPLETE, {"detector.weights": "0f" * 32})
     assert {name: size for name, (size, _) in found.files.items()} == {"config.yaml": 8, "metrics.json": 3}
     assert found.changed_files(directory) == []
 

@@ -23,7 +23,7 @@ from framework.files.tum_trajectory import read_tum
 from framework.pipeline import Pipeline
 from framework.runs import provenance, run_directory
 from framework.runs.instances_file import write_instances
-from framework.runs.manifest import Manifest, Status
+from framework.runs.manifest import Manifest, RunStatus
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import instance_metrics, run_metrics, trajectory_metrics
 from framework.runs.run_directory import RunRecord, headline
@@ -85,7 +85,7 @@ def test_run_directory_contains_all_documented_files(record: RunRecord, room: Co
 def test_manifest_lists_all_result_files(record: RunRecord, room: CornerRoom) -> None:
     record.write(room, mapped(room))
     manifest = Manifest.read(record.directory)
-    assert manifest.status is Status.COMPLETE
+    assert manifest.status is RunStatus.COMPLETE
     assert set(manifest.files) == {path.name for path in record.directory.iterdir()} - {"manifest.json"}
     assert manifest.changed_files(record.directory) == []
 
@@ -185,7 +185,7 @@ def test_run_directory_with_unusable_truth_keeps_map_files(record: RunRecord, ro
     assert str(record.write(room, result)) == "ground truth: a point lies far off"
     left = {path.name for path in record.directory.iterdir()}
     assert left == {"config.yaml", "digests.csv", "environment.txt", "manifest.json", "metrics.partial.json", *MAPPED}
-    assert Manifest.read(record.directory).status is Status.PARTIAL
+    assert Manifest.read(record.directory).status is RunStatus.PARTIAL
     metrics = metrics_of(record, "metrics.partial.json")
     assert metrics["partial"] == "ground truth: a point lies far off"
     assert (metrics["frames"], metrics["instances.count"], "instances.ap50" in metrics) == (6, 2, False)
