@@ -24,10 +24,7 @@ DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00,
 POINT_FIELDS = 21
 # ... and of its residual terms
 J0, J1, J2, J3, J4, J5, W, ERROR, DARKER, ADDED = (field * BATCH for field in range(10))
-ADDED_COLOR = ADDED + COLOR * LANES  # after the fields, the sums of the latest batches by lane, of both terms ...
-ADDED_BRIGHTNESS = ADDED_COLOR + COLOR * LANES  # ... and of the brightness
-TERM_SIZE = ADDED_BRIGHTNESS + LANES
-PRECISE = 8  # number of batches with sums in single precision
+TERM_SIZE = ADDED + COLOR * LANES  # after the fields, the batch's sums of one term by lane
 FAR = 2.0  # depth above which depth errors are correlated, m
 RANGE = 5.0  # largest depth of structured-light cameras, m; errors and gates are proportional to depth beyond it
 NEAREST = 0.05  # minimum depth of projected points in the view, m
@@ -285,15 +282,15 @@ def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J
 
 
 @device
-def _multiply(J, a, b, c, d, added):
-    """Add weighted products over a batch to the five sums in `J` from index `added` on, each of LANES lanes.
+def _multiply(J, a, b, c, d, row):
+    """Set the five sums of `row` in `J`, each of LANES lanes, to weighted products summed over a batch.
 
     They are the products of the field at offset `a` with the fields at `a`, `b`, `c` and `d` and with the error.
     """
+    zero = np.float32(0.0)
+    added = ADDED + row * ROW * LANES
     for lane in range(LANES):
-        product0, product1 = J[added + lane], J[added + LANES + lane]
-        product2, product3 = J[added + 2 * LANES + lane], J[added + 3 * LANES + lane]
-        product_error = J[added + 4 * LANES + lane]
+        product0 = product1 = product2 = product3 = product_error = zero
         for step in range(BATCH // LANES):  # the compiler unrolls this loop and vectorizes the loop over lanes
             n = step * LANES + lane
             weighted = J[W + n] * J[a + n]
@@ -310,51 +307,36 @@ def _multiply(J, a, b, c, d, added):
 
 
 @device
-def _add_products(J, added):
-    """Add the sums of one term over a batch to `J` from index `added` on.
+def _add_products(J, lanes, first):
+    """Add the sums of one term over a batch to `lanes` from index `first` on, in double precision.
 
     The sums are w J^T J (upper triangle and three more elements), w J^T r and w r^2.
     """
-    _multiply(J, J0, J1, J2, J3, added)
-    _multiply(J, J1, J2, J3, J4, added + ROW * LANES)
-    _multiply(J, J2, J3, J4, J5, added + 2 * ROW * LANES)
-    _multiply(J, J3, J4, J5, J0, added + 3 * ROW * LANES)
-    _multiply(J, J4, J5, J0, J1, added + 4 * ROW * LANES)
-    _multiply(J, J5, J0, J1, J2, added + 5 * ROW * LANES)
+    _multiply(J, J0, J1, J2, J3, 0)
+    _multiply(J, J1, J2, J3, J4, 1)
+    _multiply(J, J2, J3, J4, J5, 2)
+    _multiply(J, J3, J4, J5, J0, 3)
+    _multiply(J, J4, J5, J0, J1, 4)
+    _multiply(J, J5, J0, J1, J2, 5)
     for lane in range(LANES):
-        energy = J[added + ENERGY * LANES + lane]
+        energy = np.float32(0.0)
         for step in range(BATCH // LANES):
             n = step * LANES + lane
             energy += J[W + n] * J[ERROR + n] * J[ERROR + n]
-        J[added + ENERGY * LANES + lane] = energy
+        J[ADDED + ENERGY * LANES + lane] = energy
+    for n in range(COLOR * LANES):
+        lanes[first + n] += np.float64(J[ADDED + n])
 
 
 @device
-def _add_brightness(J):
-    """Add the sum of frame minus model intensity over a batch to `J`."""
+def _add_brightness(J, lanes):
+    """Add the sum of frame minus model intensity over a batch to `lanes`, in double precision."""
     for lane in range(LANES):
-        change = J[ADDED_BRIGHTNESS + lane]
+        change = np.float32(0.0)
         for step in range(BATCH // LANES):
             n = step * LANES + lane
             change += J[DARKER + n]
-        J[ADDED_BRIGHTNESS + lane] = change
-
-
-@device
-def _add_batches(J, lanes, color):
-    """Add the sums in `J` of the latest batches to `lanes` in double precision, and set the sums in `J` to 0.
-
-    `color` is the first lane of the photometric term.
-    """
-    for n in range(COLOR * LANES):
-        lanes[n] += np.float64(J[ADDED + n])
-        J[ADDED + n] = np.float32(0.0)
-    for n in range(COLOR * LANES):
-        lanes[color + n] += np.float64(J[ADDED_COLOR + n])
-        J[ADDED_COLOR + n] = np.float32(0.0)
-    for lane in range(LANES):
-        lanes[BRIGHTNESS * LANES + lane] += np.float64(J[ADDED_BRIGHTNESS + lane])
-        J[ADDED_BRIGHTNESS + lane] = np.float32(0.0)
+        lanes[BRIGHTNESS * LANES + lane] += np.float64(change)
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -376,16 +358,15 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, line
         total = np.zeros(TERMS, np.float64)
         lanes = np.zeros(SUMS * LANES, np.float64)
         points = np.zeros(POINT_FIELDS * BATCH, np.float32)
-        J = np.zeros(TERM_SIZE, np.float32)
+        J = np.empty(TERM_SIZE, np.float32)
         pixel = np.empty(BATCH, np.int32)
-        batches = 0
         for v in range(chunk * height // CHUNKS, (chunk + 1) * height // CHUNKS):
             for u0 in range(0, width, BATCH):
                 _load(frame, v, u0, points)
                 _project(frame, v, u0, model, shape, R, t, points, pixel)
                 _gather_model(flat_depth, flat_normals, size, pixel, points)
                 visible, matched, close, behind = _add_geometry(model, R, weights, linear, noise_model, points, J)
-                _add_products(J, ADDED)
+                _add_products(J, lanes, 0)
                 total[SUMS] += visible
                 total[SUMS + 1] += matched
                 total[SUMS + 2] += close
@@ -393,14 +374,10 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, line
                 if weights.color_weight > np.float32(0.0):
                     _gather_intensities(flat_intensity, level_shape, inverse_scale, points, pixel)
                     matched, compared = _add_photometry(model, inverse_scale, weights, linear, brightness, points, J)
-                    _add_products(J, ADDED_COLOR)
-                    _add_brightness(J)
+                    _add_products(J, lanes, color)
+                    _add_brightness(J, lanes)
                     total[SUMS + 4] += matched
                     total[SUMS + 5] += compared
-                batches += 1
-                if batches % PRECISE == 0:
-                    _add_batches(J, lanes, color)
-        _add_batches(J, lanes, color)
         for i in range(SUMS):
             for lane in range(LANES):
                 total[i] += lanes[i * LANES + lane]
