@@ -230,7 +230,7 @@ def test_named_truth_run_with_given_poses_is_not_aligned(folder: Path, tracked_r
         (
             lambda mesh: (mesh.parent / "instances.json").write_text('[{"id": "a"}]'),
             DataError,
-            "entry 1: expected an id",
+            "entry 1: expected a JSON object with an id",
         ),
         (lambda mesh: (mesh.parent / "instances.json").write_text("[]"), DataError, "got only instance 0"),
         (

@@ -165,7 +165,7 @@ def test_trajectory_log_missing_file_raises(path):
 
 @pytest.mark.parametrize(
     ("poses", "message"),
-    [({0: 2 * np.eye(4)}, "pose of frame 0: expected a rigid transform"), ({-1: np.eye(4)}, "got -1")],
+    [({0: 2 * np.eye(4)}, "frame 0: pose: expected a rigid transform"), ({-1: np.eye(4)}, "got -1")],
 )
 def test_trajectory_log_writing_invalid_pose_leaves_no_file(path, poses, message):
     with pytest.raises(DataError, match=message):
