@@ -14,6 +14,7 @@ group registers the plugin.
 
 from __future__ import annotations
 
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -248,7 +249,7 @@ class Gravity:
 class SceneMap(ABC):
     """The map of a fuser.
 
-    Implement `classes` and the six abstract members. Override the other six members to provide more data or a faster
+    Implement `classes` and the six abstract members. Override the other seven members to provide more data or a faster
     implementation.
     """
 
@@ -268,6 +269,13 @@ class SceneMap(ABC):
     def embedding_space(self) -> str:
         """The space of `Instance.embedding`, as in `Detections.embedding_space`; "" = no embeddings."""
         return ""
+
+    def digest(self) -> int:
+        """Return a checksum of the state of the map, to locate differences between runs; called once per frame.
+
+        The default is a CRC-32 of the statistics.
+        """
+        return zlib.crc32(repr(self.statistics).encode())
 
     def instance_ids(self) -> frozenset[int]:
         """Return the ids of the objects in the map. A `Mapper` calls it before and after each frame."""

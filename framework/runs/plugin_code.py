@@ -5,13 +5,12 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
-from collections.abc import Iterator, Mapping
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from framework.registry import STAGES
-from framework.runs.provenance import leaves
+from framework.runs.provenance import leaves, package_version
 
 CODE = "code."  # prefix of the keys of metrics.json: code.refiner = "my_package 0.1.0 3f2a9c41d0b7"
 OWN = ("framework", "plugins")  # packages of this project; tables list its commit
@@ -24,9 +23,10 @@ DIGITS = 12  # number of digits of a shown hash
 def plugin_code(config: Mapping[str, Any]) -> dict[str, str]:
     """Return the package, version and hash of the plugins of each stage, by key of metrics.json.
 
-    A stage with plugins of several packages, such as a chain of refiners, lists them all. The hash covers all files of
-    a package, or a single file. Files above MAX_HASHED bytes are represented by size and modification time. For plugins
-    of this project, only the plugin's own file is hashed, without comments and docstrings.
+    A stage with plugins of several packages, such as a chain of refiners, lists them all. The hash covers the first
+    MAX_FILES files of a package in alphabetical order, or a single file. Files above MAX_HASHED bytes are represented
+    by size and modification time. For plugins of this project, only the plugin's own file is hashed, without comments
+    and docstrings.
 
     Args:
         config: The resolved config of a run.
@@ -48,15 +48,7 @@ def targets_of(config: Mapping[str, Any]) -> list[tuple[str, str]]:
 def plugin_files(target: str) -> list[tuple[str, Path]]:
     """Return the relative names and the paths of the files of a third-party class; empty for this project's classes."""
     package = target.partition(".")[0]
-    if package in OWN:
-        return []
-    found = []
-    for path in _module_files(package):
-        if path.is_dir():
-            found += [(f"{package}/{file.relative_to(path).as_posix()}", file) for file in _files_below(path)]
-        else:
-            found.append((path.name, path))
-    return found
+    return [] if package in OWN else _files_of(package)
 
 
 def changed_code(metrics: Mapping[str, Any], now: Mapping[str, str]) -> list[str]:
@@ -82,44 +74,35 @@ def _described(target: str) -> str:
     module = target.rpartition(".")[0]
     package = module.partition(".")[0]
     own = package in OWN
-    paths = _module_files(module if own else package)
-    if not paths:
+    files = _files_of(module if own else package)
+    if not files:
         return f"{package} missing"
     digest = hashlib.sha256()
-    for name, content in _contents(paths, own):
+    for name, path in files[:MAX_FILES]:
+        content = _code_of(path) if own else _content_of(path)
         digest.update(f"{name} {len(content)};".encode())
         digest.update(content)
-    return " ".join(filter(None, (module if own else package, _version(package), digest.hexdigest()[:DIGITS])))
+    known = None if own else package_version(package)
+    return " ".join(filter(None, (module if own else package, known, digest.hexdigest()[:DIGITS])))
 
 
-def _module_files(name: str) -> list[Path]:
-    """Return the file of a module, or the folders of a package; empty if it is not found."""
+def _files_of(name: str) -> list[tuple[str, Path]]:
+    """Return the relative names and the paths of the files of a package or module; empty if it is not found."""
     try:
         spec = importlib.util.find_spec(name)
     except (ImportError, ValueError):  # the error of a broken package is reported when the plugin is built
         return []
     if spec is None:
         return []
-    if spec.submodule_search_locations:
-        return sorted(map(Path, spec.submodule_search_locations))
-    return [Path(spec.origin)] if spec.origin and Path(spec.origin).is_file() else []
-
-
-def _contents(paths: list[Path], own: bool) -> Iterator[tuple[str, bytes]]:
-    """Yield the relative name and the hashed content of each file."""
-    for path in paths:
-        files = [path] if path.is_file() else _files_below(path)
-        for file in files[:MAX_FILES]:
-            name = file.relative_to(path).as_posix() if path.is_dir() else file.name
-            yield name, _code_of(file) if own else _content_of(file)
-
-
-def _files_below(folder: Path) -> list[Path]:
-    return sorted(
-        file
-        for file in folder.rglob("*")
-        if file.is_file() and not IGNORED & set(file.relative_to(folder).parts) and file.suffix != ".pyc"
-    )
+    if not spec.submodule_search_locations:
+        return [(Path(spec.origin).name, Path(spec.origin))] if spec.origin and Path(spec.origin).is_file() else []
+    files = []
+    for folder in sorted(map(Path, spec.submodule_search_locations)):
+        for path in sorted(folder.rglob("*")):
+            inside = path.relative_to(folder)
+            if path.is_file() and path.suffix != ".pyc" and IGNORED.isdisjoint(inside.parts):
+                files.append((f"{name}/{inside.as_posix()}", path))
+    return files
 
 
 def _content_of(file: Path) -> bytes:
@@ -140,11 +123,3 @@ def _code_of(file: Path) -> bytes:
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
             del node.body[0]
     return ast.unparse(tree).encode()
-
-
-def _version(package: str) -> str:
-    """Return the version of the distribution with the package's name; "" = none."""
-    try:
-        return version(package) if package not in OWN else ""
-    except PackageNotFoundError:
-        return ""

@@ -7,6 +7,7 @@ import json
 import platform
 import subprocess
 from collections.abc import Iterator, Mapping
+from functools import cache
 from importlib.metadata import PackageNotFoundError, distributions, version
 from pathlib import Path
 from typing import Any
@@ -76,17 +77,18 @@ def environment() -> dict[str, str | int]:
         "environment.processor": processor(),
         "environment.cpus": available_cores(),
         "environment.instancemap": framework.__version__,
-        **{f"environment.{package}": _version(package) for package in PACKAGES},
+        **{f"environment.{package}": package_version(package) or "not installed" for package in PACKAGES},
     }
 
 
+@cache
 def frozen_environment() -> str:
-    """Return the Python version and the versions of all installed packages, as constraints for pip."""
-    packages = {
-        f"{name}=={package.version}"
-        for package in distributions()
-        if (name := package.metadata["Name"]) and package.version and not name.lower().startswith("instancemap")
-    }
+    """Return the Python version and the versions of all installed packages, as constraints for pip.
+
+    Leftovers of interrupted installations have no name and are omitted.
+    """
+    named = [package for package in distributions() if "Name" in package.metadata]
+    packages = {f"{package.name}=={package.version}" for package in named if package.name != "instancemap"}
     return "\n".join([f"# Python {platform.python_version()}", *sorted(packages, key=str.lower)]) + "\n"
 
 
@@ -108,8 +110,9 @@ def processor() -> str:
     return names[0] if names else platform.processor() or UNKNOWN
 
 
-def _version(package: str) -> str:
+def package_version(package: str) -> str | None:
+    """Return the version of an installed package; None = not installed."""
     try:
         return version(package)
     except PackageNotFoundError:
-        return "not installed"
+        return None

@@ -13,7 +13,7 @@ from framework.files.atomic_write import read_text
 from framework.runs.inputs import ROOT, input_hashes
 from framework.runs.manifest import Manifest
 from framework.runs.plugin_code import changed_code, plugin_code
-from framework.runs.provenance import code_version, leaves, relevant
+from framework.runs.provenance import code_version, leaves, package_version, relevant
 from framework.runs.stored_runs import (
     CONFIG,
     DIGESTS,
@@ -27,7 +27,7 @@ from framework.runs.stored_runs import (
     commit_of,
     read_yaml,
 )
-from framework.runtime.run_log import STAGES
+from framework.runtime.run_log import FUSION, STAGES
 
 COMPARED = (TRAJECTORY, INSTANCES, MESH, MAP, KEYFRAMES)  # files without times
 COMPOSED = Path(".hydra/config.yaml")  # the config as composed by Hydra
@@ -35,7 +35,7 @@ PACKAGES = ("numba", "numpy", "onnxruntime", "opencv-python-headless", "scipy", 
 """Packages that may change the last digits of results."""
 
 LARGE = (MAP, MESH, KEYFRAMES)  # files that a bundle contains only on request; their hashes are in the manifest
-ORDER = (*STAGES, "fusion")  # order of the stages within a frame
+ORDER = (*STAGES, FUSION)  # order of the stages within a frame
 
 
 def causes(record: Record) -> list[str]:
@@ -86,18 +86,16 @@ def _changed_commit(record: Record) -> Iterator[str]:
 
 def _changed_packages(path: Path) -> Iterator[str]:
     """Yield the numerical packages whose version differs from that in environment.txt."""
-    from importlib.metadata import PackageNotFoundError, version
-
     if not path.exists():
         return
     before = dict(line.split("==", 1) for line in read_text(path).splitlines() if "==" in line)
     for package in PACKAGES:
-        try:
-            now = version(package)
-        except PackageNotFoundError:
-            now = "none"
+        now = package_version(package)
         if package in before and before[package] != now:
-            yield f"{package}: expected version {before[package]}, got {now}; install with the constraints in {path}"
+            yield (
+                f"{package}: expected version {before[package]}, got {now or 'none'}; install with the constraints in "
+                f"{path}"
+            )
 
 
 @dataclass(frozen=True)
@@ -120,8 +118,13 @@ class Reproduction:
         first = _first_difference(before / DIGESTS, after / DIGESTS)
         return cls(different, *first) if first else cls(different)
 
+    @property
+    def is_identical(self) -> bool:
+        """True if all files and digests are equal."""
+        return not self.files and self.frame is None
+
     def __str__(self) -> str:
-        if not self.files and self.frame is None:
+        if self.is_identical:
             return "byte-identical"
         where = f"first difference: frame {self.frame}, {self.stage}; " if self.frame is not None else ""
         return f"{where}different files: {', '.join(self.files) or 'none'}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from framework.files.atomic_write import atomic_write
 from framework.runs.manifest import MANIFEST, Manifest
 from framework.runs.plugin_code import plugin_files, targets_of
 from framework.runs.reproduction import COMPOSED, LARGE
-from framework.runs.stored_runs import Record, find_records
+from framework.runs.stored_runs import completed_runs
 from framework.runs.sweep_file import SWEEP
 
 TABLES = (SWEEP, "table.md", "table.tex", "table.csv")
@@ -29,31 +29,30 @@ def write_bundle(folder: Path, path: Path, with_maps: bool = False) -> int:
 
     Returns the number of runs. Raises DataError if no run is complete, or if a run differs from its manifest.
     """
-    records, _ = find_records(folder)
-    if not records:
-        raise DataError(f"{folder}: expected a completed run, got none")
+    records, _ = completed_runs(folder)
+    targets = {pair for record in records for pair in targets_of(record.config)}
+    sources = {(stage, target): files for stage, target in sorted(targets) if (files := plugin_files(target))}
     with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
         for record in records:
-            if changed := Manifest.read(record.directory).changed_files(record.directory):
+            manifest = Manifest.read(record.directory)
+            if changed := manifest.changed_files(record.directory):
                 raise DataError(f"{changed[0]}; repeat the run")
-            _add_run(archive, record, folder, with_maps)
-        for name in TABLES:
-            if (folder / name).exists():
-                archive.write(folder / name, name)
-        targets = {pair for record in records for pair in targets_of(record.config)}
-        for name, file in sorted({pair for _, target in targets for pair in plugin_files(target)}):
+            names = [name for name in manifest.files if with_maps or name not in LARGE]
+            of_run = record.directory.relative_to(folder) if record.directory != folder else record.directory.name
+            _add_files(archive, record.directory, [*names, MANIFEST, str(COMPOSED)], Path(of_run))
+        _add_files(archive, folder, TABLES, Path())
+        for name, file in sorted({pair for files in sources.values() for pair in files}):
             archive.write(file, f"{PLUGINS}/{name}")
-        for k, (stage, target) in enumerate(sorted(targets)):
-            if plugin_files(target):
-                archive.writestr(f"{OPTIONS}/{stage}/bundled_{k}.yaml", f"_target_: {target}\n")
+        for k, (stage, target) in enumerate(sources):
+            archive.writestr(f"{OPTIONS}/{stage}/bundled_{k}.yaml", f"_target_: {target}\n")
     return len(records)
 
 
-def _add_run(archive: zipfile.ZipFile, record: Record, folder: Path, with_maps: bool) -> None:
-    inside = record.directory.relative_to(folder) if record.directory != folder else Path(record.directory.name)
-    for name in (*Manifest.read(record.directory).files, MANIFEST, str(COMPOSED)):
-        if (with_maps or name not in LARGE) and (record.directory / name).exists():
-            archive.write(record.directory / name, (inside / name).as_posix())
+def _add_files(archive: zipfile.ZipFile, folder: Path, names: Iterable[str], inside: Path) -> None:
+    """Add the existing files with these names in `folder` to the folder `inside` of the archive."""
+    for name in names:
+        if (folder / name).exists():
+            archive.write(folder / name, (inside / name).as_posix())
 
 
 @contextmanager

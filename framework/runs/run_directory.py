@@ -111,7 +111,7 @@ class RunRecord:
         attempt(write_tum, self.directory / TRAJECTORY, np.array([frame.timestamp for frame in trusted]), poses)
         attempt(write_timings, self.directory / "timings.csv", result)
         attempt(write_digests, self.directory / DIGESTS, result)
-        attempt(_write_text, self.directory / ENVIRONMENT, frozen_environment())
+        attempt(lambda: _write_text(self.directory / ENVIRONMENT, frozen_environment()))
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **(counts or {})}
         found = attempt(lambda: (scene.mesh(), scene.instances()))
         if found is not None:

@@ -6,7 +6,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -146,6 +146,25 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
         except DataError as error:
             others.append(Incomplete(directory, str(error)))
     return records, others
+
+
+def completed_runs(root: Path) -> tuple[list[Record], list[Incomplete]]:
+    """Return the completed and the incomplete runs as in `find_records`.
+
+    Raises DataError if `root` is not a folder or contains no completed run.
+    """
+    if not root.is_dir():
+        raise DataError(f"{root}: expected a folder of runs, got no folder")
+    records, incomplete = find_records(root)
+    if not records:
+        raise no_run_error(root, incomplete)
+    return records, incomplete
+
+
+def no_run_error(root: Path, incomplete: Sequence[Incomplete]) -> DataError:
+    """Return the error for a folder without a completed run, with the reasons of its incomplete runs."""
+    why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
+    return DataError(f"{root}: expected a completed run, got none{f' ({why})' if why else ''}")
 
 
 def is_recorded(directory: Path, config: DictConfig) -> bool:

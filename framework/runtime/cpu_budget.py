@@ -23,9 +23,11 @@ RECENT = 15  # number of frames in the median of the work per frame
 
 
 def lower_priority() -> None:
-    """Lower the priority of the calling thread. Only Linux supports this for single threads."""
+    """Lower the priority of the calling thread to LOW_PRIORITY. Only Linux supports this for single threads."""
     if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOW_PRIORITY)
+        thread = threading.get_native_id()
+        if os.getpriority(os.PRIO_PROCESS, thread) < LOW_PRIORITY:  # raising a priority requires privileges
+            os.setpriority(os.PRIO_PROCESS, thread, LOW_PRIORITY)
 
 
 def parallel_kernels_are_thread_safe() -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import singledispatch
 
 import numpy as np
@@ -44,14 +44,18 @@ def _(clusters: PointClusters) -> int:
 
 @digest_of.register
 def _(scene: SceneMap) -> int:
-    return zlib.crc32(repr((astuple(scene.statistics), sorted(scene.instance_ids()))).encode())
+    return scene.digest()
 
 
 def _of_arrays(*arrays: Array) -> int:
-    """Return a CRC-32 of the shapes and byte sums of arrays. A CRC of all bytes takes ten times as long."""
+    """Return a CRC-32 of the shape of each array and the sum of its 64-bit words.
+
+    A CRC of all bytes takes ten times as long.
+    """
     digest = 0
     for array in arrays:
-        words = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
-        words = words.view(np.uint32) if len(words) % 4 == 0 else words
-        digest = zlib.crc32(f"{array.shape}{int(words.sum(dtype=np.uint64))};".encode(), digest)
+        values = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+        end = len(values) // 8 * 8
+        total = int(values[:end].view(np.uint64).sum()) + int(values[end:].sum())
+        digest = zlib.crc32(f"{array.shape}{total};".encode(), digest)
     return digest

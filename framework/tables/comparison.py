@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from framework.config.validation import checked_block
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError
 from framework.runs.metrics import is_evaluation
 from framework.runs.run_rows import CHOICE, Mean, Run, RunRow, natural, rows_of
-from framework.runs.stored_runs import Incomplete, Record, find_records, read_yaml
+from framework.runs.stored_runs import Incomplete, Record, completed_runs, read_yaml
 from framework.runs.sweep_file import SWEEP, requested_runs, sweep_rows
 from framework.runs.timings_file import current_key
 from framework.tables.published import (
@@ -113,15 +113,10 @@ class ComparisonTable:
 
         Raises DataError if no run is complete, or if the experiment's config cannot be read.
         """
-        if not directory.is_dir():
-            raise DataError(f"{directory}: expected a folder of runs, got no folder")
+        records, incomplete = completed_runs(directory)
         sweep = read_yaml(directory / SWEEP) if (directory / SWEEP).exists() else {}
         choice = TableChoice.of(sweep.get("table") or {"columns": list(PLAIN)})
         overrides = sweep_rows(sweep)
-        records, incomplete = find_records(directory)
-        if not records:
-            why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
-            raise DataError(f"{directory}: expected a completed run, got none{f' ({why})' if why else ''}")
         keys = [*choice.average_over, choice.split_key] if choice.split_key else choice.average_over
         rows = rows_of(records, keys, overrides)
         requested = requested_runs(sweep, keys)

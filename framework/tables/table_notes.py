@@ -141,11 +141,15 @@ def _missing(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _mixed_code(comparison: ComparisonTable) -> Iterator[str]:
-    """Yield a note for each row whose runs have different plugin code."""
+    """Yield a note for each row whose runs have different code of the same option."""
     for row in comparison.rows:
-        keys = sorted({key for record in row.records.values() for key in record.metrics if key.startswith(CODE)})
-        codes = {key: counted(str(record.metrics.get(key)) for record in row.records.values()) for key in keys}
-        if mixed := [f"{key.removeprefix(CODE)} {code}" for key, code in codes.items() if "(" in code]:
+        codes: dict[tuple[str, str], list[str]] = {}  # by stage and its option
+        for record in row.records.values():
+            for key in filter(lambda key: key.startswith(CODE), record.metrics):
+                stage = key.removeprefix(CODE)
+                option = str(record.metrics.get(f"{CHOICE}{stage}"))
+                codes.setdefault((stage, option), []).append(str(record.metrics[key]))
+        if mixed := [f"{stage} {counted(found)}" for (stage, _), found in sorted(codes.items()) if len(set(found)) > 1]:
             yield f"Mixed plugin code in {row.name}: {'; '.join(mixed)}; repeat its runs with skip_completed=true."
 
 

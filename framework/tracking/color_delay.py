@@ -60,7 +60,7 @@ class _Tracked(NamedTuple):
 
 
 class DelayEstimator:
-    """Online estimator of the delay of color behind depth with equal timestamps, s; positive = color captured later."""
+    """Online estimator of the delay of color behind depth at equal timestamps, s; positive = color captured later."""
 
     def __init__(self) -> None:
         self.estimate = UNKNOWN

@@ -51,7 +51,7 @@ class ColorToDepth:
     """
 
     def __init__(self, delay: float | None) -> None:
-        """Set the delay of color behind depth with equal timestamps, s; None = estimated from the tracked frames."""
+        """Set the delay of color behind depth at equal timestamps, s; None = estimated from the tracked frames."""
         self._estimator = DelayEstimator() if delay is None else None
         self._usable = False  # True once the estimate was accurate enough
         self._given = 0.0 if delay is None else delay
@@ -105,7 +105,7 @@ class ColorToDepth:
             return
         self._usable = True
         self.displaced_before = abs(estimate.seconds) >= MIN_DISPLACING_DELAY
-        message = "frame %d: color is %.1f ms after depth with equal timestamps (standard deviation %.1f ms)"
+        message = "frame %d: color is %.1f ms after depth at equal timestamps (standard deviation %.1f ms)"
         log.info(message, frame.index, 1e3 * estimate.seconds, 1e3 * estimate.deviation)
 
     def _is_next(self, frame: Frame) -> bool:

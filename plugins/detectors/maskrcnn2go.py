@@ -179,7 +179,7 @@ class MaskRCNN2Go(Detector):
 
 
 def _find_weights(folder: Path) -> Path:
-    """Return the existing folder of the network. Raises DataError if there is none.
+    """Return the existing folder of the network. Raises DataError if the folder is missing.
 
     A relative path is searched in the working directory, then in the project folder.
     """

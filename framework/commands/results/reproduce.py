@@ -6,10 +6,9 @@ import argparse
 import logging
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -19,7 +18,7 @@ from framework.errors import ConfigError, DataError
 from framework.runs.reproduction import Reproduction, causes
 from framework.runs.run_bundle import opened_bundle
 from framework.runs.run_rows import CHOICE
-from framework.runs.stored_runs import METRICS, Record, find_records, read_record
+from framework.runs.stored_runs import METRICS, Record, find_records, no_run_error, read_record
 
 
 def main() -> None:
@@ -38,85 +37,86 @@ def main() -> None:
     parser.add_argument("--trust-code", action="store_true", help=trust)
     parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    with one_line_errors(), _folder(parsed.source, parsed.trust_code) as folder, _output(parsed.out) as out:
+    with one_line_errors(), ExitStack() as stack:
+        folder, out = parsed.source, parsed.out
+        if folder.suffix == ".zip":
+            folder = stack.enter_context(opened_bundle(folder, parsed.trust_code))
+        if out is None and not parsed.check_only:
+            out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="instancemap_")))
         different = reproduce_all(folder, parsed.overrides, parsed.cell, None if parsed.check_only else out)
     if different:
         sys.exit(EXIT_FAILED)
 
 
-@contextmanager
-def _folder(source: Path, trust_code: bool) -> Iterator[Path]:
-    """Yield the folder of the runs; a bundle is extracted to a temporary folder."""
-    if source.suffix == ".zip":
-        with opened_bundle(source, trust_code) as folder:
-            yield folder
-    else:
-        yield source
-
-
-@contextmanager
-def _output(chosen: Path | None) -> Iterator[Path]:
-    if chosen is not None:
-        yield chosen
-        return
-    with tempfile.TemporaryDirectory(prefix="instancemap_") as folder:
-        yield Path(folder)
-
-
 def reproduce_all(folder: Path, overrides: Sequence[str], row: str | None, out: Path | None) -> int:
     """Print the changes and the comparison of each completed run, and return the number of different runs.
 
-    `out` is the folder of the repeated runs; None = only list the changes.
+    A run whose config.yaml or metrics.json was edited is different, and is not run again. `row`: only the runs of this
+    row of an experiment; None = all runs. `out`: the folder of the repeated runs; None = only list the changes.
     """
     records, incomplete = find_records(folder)
     edited = [one for one in incomplete if (one.directory / METRICS).exists()]
+    if not records and not edited:
+        raise no_run_error(folder, incomplete)
+    if records and row is not None:
+        records = _of_row(records, row)
     for one in edited:
-        print_error(DataError(one.reason), "error: ")
-        for change in causes(read_record(one.directory, check_config=False)):
-            print(f"{one.directory.name}: changed: {change}")
-    if edited and not records:
-        return len(edited)
-    if row is not None:
-        rows = sorted({str(record.config.get("row")) for record in records})
-        records = [record for record in records if str(record.config.get("row")) == row]
-        if not records:
-            raise ConfigError(f"--cell: expected one of {', '.join(rows)}, got {row!r}")
-    if not records:
-        why = "; ".join(one.reason for one in incomplete[:3])
-        raise DataError(f"{folder}: expected a completed run, got none{f' ({why})' if why else ''}")
+        print_error(DataError(one.reason))
+        try:
+            _print_changes(read_record(one.directory, check_config=False))
+        except KNOWN_ERRORS as error:
+            print_error(error, f"error: {one.directory.name}: ")
     different = len(edited)
     for number, record in enumerate(records):
-        name = record.directory.name
+        repeated = None if out is None else out / f"{number:03d}_{record.directory.name}"[:200]
         try:
-            changes = causes(record)
-            for change in changes:
-                print(f"{name}: changed: {change}")
-            if out is None:
-                different += bool(changes)
-                continue
-            repeated = out / f"{number:03d}_{name}"[:200]
-            _run_again(record, overrides, repeated)
-            found = Reproduction.of(record.directory, repeated)
-            print(f"{name}: {found}", flush=True)
-            different += str(found) != "byte-identical"
+            different += _is_different(record, overrides, repeated)
         except KNOWN_ERRORS as error:
-            print_error(error, f"error: {name}: ")
+            print_error(error, f"error: {record.directory.name}: ")
             different += 1
     return different
 
 
+def _is_different(record: Record, overrides: Sequence[str], repeated: Path | None) -> bool:
+    """Return True if a run differs from its repetition in the folder `repeated`, and print both comparisons.
+
+    With `repeated` = None, the run is not repeated. It is then different if anything has changed since the run.
+    """
+    changed = _print_changes(record)
+    if repeated is None:
+        return changed
+    _run_again(record, overrides, repeated)
+    found = Reproduction.of(record.directory, repeated)
+    print(f"{record.directory.name}: {found}", flush=True)
+    return not found.is_identical
+
+
+def _print_changes(record: Record) -> bool:
+    """Print what has changed since a run. Return True if there are changes."""
+    changes = causes(record)
+    for change in changes:
+        print(f"{record.directory.name}: changed: {change}")
+    return bool(changes)
+
+
+def _of_row(records: Sequence[Record], row: str) -> list[Record]:
+    """Return the runs of a row of an experiment. Raises ConfigError if no run has this row."""
+    rows = [str(record.config.get("row")) for record in records]
+    if row not in rows:
+        raise ConfigError(f"--cell: expected one of {', '.join(sorted(set(rows)))}, got {row!r}")
+    return [record for record, of_record in zip(records, rows, strict=True) if of_record == row]
+
+
 def _run_again(record: Record, overrides: Sequence[str], directory: Path) -> None:
-    """Run the stored config, with overrides, in a new run directory."""
+    """Run the stored config, with overrides, in a new run directory. Raises ConfigError for an unknown key."""
     from framework.commands.running.run import run
 
-    config: Any = OmegaConf.create(dict(record.config))
+    config = OmegaConf.create(dict(record.config))
+    OmegaConf.set_struct(config, True)  # unknown keys are errors
     for override in overrides:
-        key, equals, value = override.partition("=")
-        if not equals or OmegaConf.select(config, key, default=config) is config:
-            raise ConfigError(f"{override}: expected KEY=VALUE with a key of the run's config, got an unknown key")
         try:
-            config = OmegaConf.merge(config, OmegaConf.from_dotlist([f"{key}={value}"]))
+            config.merge_with_dotlist([override])
         except OmegaConfBaseException as error:
-            raise ConfigError(f"{key}: expected a valid value, got {value!r}") from error
+            raise ConfigError(f"{override}: expected KEY=VALUE with a key of the run's config, got another") from error
     choices = {key.removeprefix(CHOICE): value for key, value in record.metrics.items() if key.startswith(CHOICE)}
     run(config, directory, choices)

@@ -52,8 +52,8 @@ def _tent(start, end, first, stop):
 def _foreground(window, weight_x, weight_y, significance):
     """Return the depth interval (near, far), m, of the nearest mode with at least `significance` of the weight.
 
-    If there is none, return the interval of the mode with the largest weight. `window`: depth (h, w), m. The weight of
-    pixel (u, v) is weight_x[u] * weight_y[v].
+    Without such a mode, return the interval of the mode with the largest weight. `window`: depth (h, w), m. The weight
+    of pixel (u, v) is weight_x[u] * weight_y[v].
     """
     bins = int(np.log(FARTHEST / NEAREST) / BIN) + 1
     histogram = np.zeros(bins + 2)

@@ -207,7 +207,7 @@ def _shape(tensor: NodeArg) -> Shape:
 
 
 def find_file(path: Path) -> Path:
-    """Return the path of an existing file. Raises DataError if there is none.
+    """Return the path of an existing file. Raises DataError if the file is missing.
 
     A relative path is searched in the working directory, then in the project folder.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -82,6 +83,9 @@ class InstanceTableMap(SceneMap):
     @property
     def embedding_space(self) -> str:
         return self.table.embedding_space
+
+    def digest(self) -> int:
+        return zlib.crc32(repr(sorted(self.instance_ids())).encode(), super().digest())
 
     def instance_ids(self) -> frozenset[int]:
         return frozenset(np.flatnonzero(self.confirmation.counts(self.table)).tolist())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -117,3 +119,14 @@ def test_cpu_budget_is_thread_safe() -> None:
     for thread in threads:
         thread.join()
     assert 0 <= sharing.prefetch_cores() <= sharing.cores
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="priorities of threads exist only on Linux")
+@pytest.mark.parametrize(("before", "calls"), [(0, 1), (10, 0), (19, 0)])
+def test_lower_priority_never_raises_it(before: int, calls: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raising a priority requires privileges, for example in `nice -n 19 instancemap`."""
+    monkeypatch.setattr(os, "getpriority", lambda *_: before)
+    setpriority = Mock()
+    monkeypatch.setattr(os, "setpriority", setpriority)
+    cpu_budget.lower_priority()
+    assert setpriority.call_count == calls

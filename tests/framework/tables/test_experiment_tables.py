@@ -138,6 +138,13 @@ def test_table_notes_name_rows_of_mixed_plugin_code(sweep: Path) -> None:
     )
 
 
+def test_table_code_of_several_options_is_not_mixed(sweep: Path) -> None:
+    for seed, dataset in enumerate(("desk", "replica", "desk")):
+        code = {"choice.dataset": dataset, "code.dataset": f"{dataset} 3f"}
+        run(sweep, "mean", seed, 0.5, 1.0, **code)
+    assert "Mixed plugin code" not in write_tables(sweep)
+
+
 def test_table_notes_replace_line_breaks(sweep: Path) -> None:
     (sweep / "row=chain,seed=1" / "metrics.json").unlink()
     partial = {"partial": "the map\nis\r\nfull"}

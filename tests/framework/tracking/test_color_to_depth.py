@@ -125,7 +125,7 @@ def test_color_to_depth_estimated_delay_is_used_and_logged(caplog: pytest.LogCap
     assert found.color_pixels is not None
     assert sum(displaced) == 1  # true only at the first use of the estimate
     assert len(caplog.messages) == 1
-    assert "ms after depth with equal timestamps" in caplog.messages[0]
+    assert "ms after depth at equal timestamps" in caplog.messages[0]
 
 
 def test_color_to_depth_short_delay_does_not_displace_colors() -> None:
