@@ -30,6 +30,7 @@ from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
 from framework.runs.provenance import code_version, config_hash, environment
 from framework.runs.stored_runs import (
+    CHOICE,
     CONFIG,
     INSTANCES,
     KEYFRAMES,
@@ -139,7 +140,7 @@ class RunRecord:
     def _metrics(self, video: RGBDVideo, figures: Metrics) -> Metrics:
         return {
             "sequence": video.name,
-            **{f"choice.{group}": self.choices.get(group) for group in STAGES},
+            **{f"{CHOICE}{group}": self.choices.get(group) for group in (*STAGES, "preset", "sequences")},
             **figures,
             "peak_rss_bytes": peak_memory(),
             "seed": self.config.get("seed"),

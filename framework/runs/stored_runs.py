@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -19,7 +20,15 @@ from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
 from framework.files.json_file import read_json
 from framework.files.yaml_file import load_yaml
 from framework.runs.inputs import INPUTS, inputs_sha256
-from framework.runs.provenance import code_version, config_hash, environment, shows_speed, speed_settings
+from framework.runs.provenance import (
+    code_version,
+    config_hash,
+    environment,
+    leaves,
+    relevant,
+    shows_speed,
+    speed_settings,
+)
 from framework.runs.timings_file import current_key
 
 CONFIG = "config.yaml"
@@ -38,6 +47,7 @@ MAPPED = (TRAJECTORY, "timings.csv", INSTANCES, MESH, MAP, "overview.png")
 EVALUATION = "evaluation."  # prefix of the code version of a re-evaluation
 GROUND_TRUTH = EVALUATION + "ground_truth"  # key of dataset.ground_truth in the last re-evaluation, if it was set
 
+CHOICE = "choice."  # prefix of the chosen options in metrics.json
 FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # prefixes of numeric metrics
 
 _LOG_LINE = re.compile(r"\S+ (?P<level>DEBUG|INFO|WARNING|ERROR|CRITICAL) +(?P<message>.*)")
@@ -76,6 +86,29 @@ class Record:
     def annotation(self) -> str:
         """Return the release of the ground truth; "" = unknown."""
         return str(self.metrics.get("annotation_release") or "")
+
+    @property
+    def row(self) -> str:
+        """Return the row of an experiment; "" = no experiment."""
+        row = self.config.get("row")
+        return "" if row is None else str(row)
+
+    @cached_property
+    def choices(self) -> dict[str, str]:
+        """Return the chosen option of each config group."""
+        chosen = {key.removeprefix(CHOICE): value for key, value in self.metrics.items() if key.startswith(CHOICE)}
+        return {group: str(option) for group, option in chosen.items() if option is not None}
+
+    @cached_property
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters that change results by dotted key."""
+        return dict(leaves(relevant(self.config)))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Return the row, the chosen options and the parameters by key."""
+        row = {"row": self.row} if self.row else {}
+        return {**row, **self.choices, **{k: v for k, v in self.parameters.items() if k not in self.choices}}
 
 
 @dataclass(frozen=True)
@@ -134,6 +167,20 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
         except DataError as error:
             others.append(Incomplete(directory, str(error)))
     return records, others
+
+
+def completed_runs(root: Path) -> tuple[list[Record], list[Incomplete]]:
+    """Return the completed and the incomplete runs as in `find_records`.
+
+    Raises DataError if `root` is not a folder or contains no completed run.
+    """
+    if not root.is_dir():
+        raise DataError(f"{root}: expected a folder of runs, got no folder")
+    records, incomplete = find_records(root)
+    if not records:
+        why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
+        raise DataError(f"{root}: expected a completed run, got none{f' ({why})' if why else ''}")
+    return records, incomplete
 
 
 def is_recorded(directory: Path, config: DictConfig) -> bool:
