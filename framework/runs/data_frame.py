@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from framework.runs.provenance import OF_SPEED
 from framework.runs.stored_runs import CHOICE, Record, completed_runs, is_number
 
 if TYPE_CHECKING:
@@ -61,11 +60,10 @@ def data_frame(records: Sequence[Record], root: Path) -> DataFrame:
 
 def _values(record: Record, root: Path) -> Iterator[tuple[str, Any]]:
     """Yield the columns of a run in order. A parameter has precedence over a metric of the same name."""
-    settings = {**record.settings, **{key: record.config.get(key) for key in OF_SPEED if key in record.config}}
     yield RUN, record.directory.relative_to(root).as_posix()
-    yield from settings.items()
+    yield from record.settings.items()
     for key, value in record.metrics.items():
-        if key not in settings and not key.startswith(CHOICE):
+        if key not in record.settings and not key.startswith(CHOICE):
             yield key, value
 
 

@@ -21,6 +21,7 @@ from framework.files.json_file import read_json
 from framework.files.yaml_file import load_yaml
 from framework.runs.inputs import INPUTS, inputs_sha256
 from framework.runs.provenance import (
+    OF_SPEED,
     code_version,
     config_hash,
     environment,
@@ -104,11 +105,17 @@ class Record:
         """Return the parameters that change results by dotted key."""
         return dict(leaves(relevant(self.config)))
 
-    @property
+    @cached_property
     def settings(self) -> dict[str, Any]:
-        """Return the row, the chosen options and the parameters by key."""
+        """Return the row, the chosen options, the parameters, and the settings that change times, by key."""
         row = {"row": self.row} if self.row else {}
-        return {**row, **self.choices, **{k: v for k, v in self.parameters.items() if k not in self.choices}}
+        speed = {key: self.config[key] for key in OF_SPEED if key in self.config}
+        return (
+            row
+            | self.choices
+            | {key: self.parameters[key] for key in self.parameters if key not in self.choices}
+            | speed
+        )
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,18 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 from framework.evaluation.instances import MAX_DISTANCE
 from framework.registry import STAGES
 from framework.runs.metrics import is_evaluation
-from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, following
+from framework.runs.run_rows import CONFIDENCE, DATA, Run, RunRow, dependent_keys
 from framework.runs.stored_runs import Record, is_number
-from framework.tables.comparison import ComparisonTable, mean_by_sequence
-from framework.tables.layouts import head
+from framework.tables.comparison import ComparisonTable, as_text, mean_by_sequence
+from framework.tables.metric_columns import Direction, direction, head
+
+OF_RESULTS = ("instances.", "trajectory.", "map.", "frames")  # prefixes of metrics that do not depend on the machine
+MOST_NAMES = 12  # maximum number of sequences that a note names
 
 
 def notes(comparison: ComparisonTable) -> Iterator[str]:
@@ -23,12 +27,16 @@ def notes(comparison: ComparisonTable) -> Iterator[str]:
 
 def _notes(comparison: ComparisonTable) -> Iterator[str]:
     yield from _averaging(comparison)
+    yield from _comparing(comparison)
+    yield from _identical(comparison)
     yield from _winners(comparison)
     if comparison.left_out:
         yield f"Omitted columns without values: {_with_needs(comparison.left_out)}."
     if comparison.overrides:
         changes = (f"{name}: {' '.join(changes) or 'none'}" for name, changes in comparison.overrides.items())
         yield f"Overrides of each row: {'; '.join(changes)}."
+    if comparison.command_line:
+        yield f"Overrides of all rows, on the command line: {' '.join(comparison.command_line)}."
     if fixed := _same(comparison.records):
         yield f"Common to all runs: {fixed}."
     yield from _protocol(comparison)
@@ -41,33 +49,79 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _averaging(comparison: ComparisonTable) -> Iterator[str]:
-    """Yield notes about the means and the comparison of rows."""
+    """Yield notes about the runs in the table and their means."""
     choice, over = comparison.choice, ", ".join(comparison.choice.average_over)
-    if others := following(comparison.records, choice.average_over):
-        yield f"Also averaged over keys whose value equals that of {over} in every run: {', '.join(others)}."
-    if choice.split_key:
-        yield (
-            f"Cells: mean ± sample standard deviation over {over}. mean: average of the sequences "
-            f"({choice.split_key}) with equal weights; its deviation is over the runs with all sequences. "
-            "Bold: highest value for the same poses and number of runs. missing: no complete run."
-        )
-    else:
-        yield f"Cells: mean ± sample standard deviation over {over}. runs: number of complete runs."
+    if choice.conditions:
+        yield f"Only runs with {as_text(choice.conditions)}."
+    if others := dependent_keys(comparison.records, choice.averaged, comparison.asked):
+        yield f"Also averaged over keys that depend on {', '.join(choice.averaged)}: {', '.join(others)}."
+    spread = f"mean ± sample standard deviation over {over}, without ± for equal values"
+    if not choice.split_key:
+        yield f"Cells: {spread}. runs: number of complete runs."
+        return
+    yield (
+        f"Cells: {spread}. mean: average of the sequences ({choice.split_key}) with equal weights; its deviation is "
+        f"over the runs with all sequences. {_bold(choice.columns)} missing: no complete run."
+    )
+
+
+def _bold(columns: Sequence[str]) -> str:
+    """Return the meaning of bold cells."""
+    of = {better: [head(key) for key in columns if direction(key) is better] for better in Direction}
+    parts = [f"{word} {', '.join(of[better])}" for better, word in _BEST if of[better]]
+    if not parts:
+        return ""
+    return f"Bold: {'; '.join(parts)} for the same poses and number of runs, unless several rows have it."
+
+
+_BEST = ((Direction.HIGHER, "highest"), (Direction.LOWER, "lowest"))
+
+
+def _comparing(comparison: ComparisonTable) -> Iterator[str]:
+    """Yield notes about the differences between rows."""
+    choice = comparison.choice
     if not comparison.has_base:
-        yield f"No differences: the baseline {comparison.base_name} has no complete run; set table.baseline=ROW."
-    elif len(comparison.rows) > 1:
-        keys = [*choice.average_over, *filter(None, [choice.split_key])]
-        error = "mean ± standard error"
-        if len(keys) > 1:
-            kinds = "the sequences" if choice.split_key else f"the values of {keys[-1]}"
-            error += f" over {kinds}, after averaging the runs of each"
+        yield f"No differences: the base {comparison.base_name} has no complete run; set table.base=ROW."
+    elif not comparison.compared:
+        if len(comparison.rows) > 1:
+            yield "No differences: no two rows have the same data."
+    else:
+        error, units = "mean ± standard error", ", ".join(choice.units)
+        paired = ", ".join(choice.pair_by or choice.averaged)
+        if choice.units != choice.averaged:
+            error += f" over {units}, after averaging the runs of each"
         yield (
-            f"Differences are paired by {', '.join(keys)}: {error}. "
+            f"Differences are paired by {paired}: {error}. pairs: number of values of {units} in both rows. "
             f"*: the {CONFIDENCE:.0%} interval of Student's t excludes 0."
         )
         bases = [base for _, base in comparison.compared]
         if alone := [row.name for row in comparison.rows if not (comparison.base_of(row) or row in bases)]:
-            yield f"Rows without a matching row of {comparison.base_name}: {'; '.join(alone)}."
+            yield f"Rows without a matching row of {comparison.base_called}: {'; '.join(alone)}."
+
+
+def _identical(comparison: ComparisonTable) -> Iterator[str]:
+    """Yield notes about averaged keys and rows without an effect on the results."""
+    for k, key in enumerate(comparison.choice.averaged):
+        if rows := [comparison.called(row) for row in comparison.rows if _has_no_effect(row, k)]:
+            yield f"Identical runs: the results do not depend on {key} in {'; '.join(rows)}."
+    for row, base in comparison.compared:
+        runs = row.records.keys() & base.records.keys()
+        if runs and all(_results(row.records[run]) == _results(base.records[run]) for run in runs):
+            yield f"Identical rows: the results of {comparison.called(row)} equal those of {base.name}."
+
+
+def _has_no_effect(row: RunRow, place: int) -> bool:
+    """Return True if runs that differ only in one averaged key have equal results, and there are such runs."""
+    groups: dict[Run, list[dict[str, Any]]] = {}
+    for run, record in row.records.items():
+        groups.setdefault((*run[:place], *run[place + 1 :]), []).append(_results(record))
+    several = [results for results in groups.values() if len(results) > 1]
+    return bool(several) and all(one == results[0] for results in several for one in results)
+
+
+def _results(record: Record) -> dict[str, Any]:
+    """Return the metrics that do not depend on the machine."""
+    return {key: value for key, value in record.metrics.items() if key.startswith(OF_RESULTS)}
 
 
 def _with_needs(columns: Sequence[str]) -> str:
@@ -80,7 +134,7 @@ def _with_needs(columns: Sequence[str]) -> str:
 
 
 def _winners(comparison: ComparisonTable) -> Iterator[str]:
-    """Yield, for each row, the numbers of sequences in which the baseline has a higher and a lower value."""
+    """Yield, for each row, the numbers of sequences in which the base has a higher and a lower value."""
     if not comparison.choice.columns_by:
         return
     [key] = comparison.choice.columns
@@ -129,7 +183,7 @@ def _missing(comparison: ComparisonTable) -> Iterator[str]:
     run_of = {run[-1] for row in comparison.rows for run in row.records}
     if absent := [sequence for sequence in comparison.sequences if sequence not in run_of]:
         yield f"Sequences without a complete run: {comparison.choice.split_key}={','.join(absent)}."
-    keys = [*comparison.choice.average_over, *filter(None, [comparison.choice.split_key])]
+    keys = comparison.choice.averaged
     for row, missing in comparison.missing():
         yield f"Missing in {row.name}: {_as_overrides(keys, missing)}."
     if comparison.superseded:
@@ -149,20 +203,27 @@ def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
 
 def _same(records: Sequence[Record]) -> str:
     """Return the options that all runs have in common, by stage."""
-    chosen = {stage: {record.metrics.get(f"{CHOICE}{stage}") for record in records} for stage in STAGES}
+    chosen = {stage: {record.choices.get(stage) for record in records} for stage in STAGES}
     agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}
     return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
 
 
 def data(records: Sequence[Record]) -> str:
-    """Return the datasets with their annotation releases, and the range of frame counts."""
+    """Return the datasets with their folders and annotation releases, the sequences, and the range of frame counts."""
     names = (
-        f"{record.metrics.get(f'{CHOICE}dataset')}{record.annotation and f', annotation {record.annotation}'}"
+        f"{record.choices.get('dataset')}"
+        + (f" in {root}" if (root := record.parameters.get(DATA)) else "")
+        + (f", annotation {record.annotation}" if record.annotation else "")
         for record in records
     )
+    parts = [f"dataset={counted(names)}"]
+    sequences = dict.fromkeys(str(record.metrics["sequence"]) for record in records if "sequence" in record.metrics)
+    if sequences:
+        shown = ", ".join(list(sequences)[:MOST_NAMES])
+        parts.append(f"sequences {shown}" + (f" and {more} more" if (more := len(sequences) - MOST_NAMES) > 0 else ""))
     frames = sorted(number for record in records if is_number(number := record.metrics.get("frames")))
     lengths = dict.fromkeys(f"{number:g}" for number in frames[:1] + frames[-1:])
-    return f"dataset={counted(names)}" + (f"; {' to '.join(lengths)} frames per run" if frames else "")
+    return "; ".join(parts + ([f"{' to '.join(lengths)} frames per run"] if frames else []))
 
 
 def machine(record: Record) -> str:

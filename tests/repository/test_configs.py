@@ -24,7 +24,7 @@ from framework.registry import (
     plugin_fields,
 )
 from framework.runs.provenance import WITHOUT_EFFECT
-from framework.tables.comparison import TableChoice
+from framework.tables.table_choice import TableChoice
 from framework.training.trainer import Schedule
 from tests.support import registered
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from framework.runs.run_rows import Mean, RunRow, following, rows_of
+from framework.runs.run_rows import Mean, RunRow, dependent_keys, rows_of
 from framework.runs.stored_runs import Record
 
 AP = "instances.ap50"
@@ -164,13 +164,13 @@ def test_rows_accept_numeric_names() -> None:
     assert list(names(records, "0", "20")) == ["0", "20"]
 
 
-def test_following_lists_parameters_that_vary_with_seed() -> None:
+def test_dependent_keys_list_parameters_that_vary_with_seed() -> None:
     records = [
         record({"seed": seed, "dataset": {"seed": seed, "stride": seed, "start": 1}, "fuser": {"voxel": 1}})
         for seed in (1, 2)
     ]
-    assert following(records, ["seed"]) == ["dataset.stride"]
-    assert following(records[:1], ["seed"]) == []
+    assert dependent_keys(records, ["seed"]) == ["dataset.stride"]
+    assert dependent_keys(records[:1], ["seed"]) == []
 
 
 def test_row_names_include_dataset_root_differences() -> None:

@@ -175,7 +175,7 @@ def test_new_plugin_and_builtin_option_share_sweep_table(place: Path) -> None:
     assert run(place, "instancemap", "tables", "outputs/first_sweep").strip() in message
     with (place / "outputs" / "first_sweep" / "table.csv").open() as table:
         rows = list(csv.DictReader(table))
-    assert [row["row"] for row in rows] == ["refiner=gmm_em", "refiner=my_refiner"]
+    assert [row["refiner"] for row in rows] == ["gmm_em", "my_refiner"]
     assert "refiner=my_refiner" in message
     listed = run(place, "instancemap", "plugins", "refiner", "my_refiner")
     assert "my_refiner  [from instancemap-my-refiner]" in listed
