@@ -95,10 +95,10 @@ class Pictured:
     @property
     def origin(self) -> str:
         """Return the data, the overrides on the command line, the machine and the code of the runs."""
-        overrides = f" Overrides of all rows: {' '.join(self.command_line)}." if self.command_line else ""
+        chosen = f" Command line: {' '.join(self.command_line)}." if self.command_line else ""
         runs = self.records
         code = counted(record.commit for record in runs)
-        return f"Data: {data(runs)}.{overrides} {counted(map(machine, runs))}; code {code}."
+        return f"Data: {data(runs)}.{chosen} {counted(map(machine, runs))}; code {code}."
 
     def called(self, run: Run) -> str:
         """Return the name of the run's sequence, with the seed if the runs have several seeds."""

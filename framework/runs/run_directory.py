@@ -22,7 +22,6 @@ from framework.files.atomic_write import atomic_write, remove_left_over
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import RGBDVideo
-from framework.registry import STAGES
 from framework.rendering.overview import write_overview
 from framework.runs.inputs import INPUTS, inputs_sha256
 from framework.runs.instances_file import write_instances
@@ -32,6 +31,7 @@ from framework.runs.provenance import code_version, config_hash, environment
 from framework.runs.stored_runs import (
     CHOICE,
     CONFIG,
+    GROUPS,
     INSTANCES,
     KEYFRAMES,
     MAP,
@@ -140,7 +140,7 @@ class RunRecord:
     def _metrics(self, video: RGBDVideo, figures: Metrics) -> Metrics:
         return {
             "sequence": video.name,
-            **{f"{CHOICE}{group}": self.choices.get(group) for group in (*STAGES, "preset", "sequences")},
+            **{f"{CHOICE}{group}": self.choices.get(group) for group in GROUPS},
             **figures,
             "peak_rss_bytes": peak_memory(),
             "seed": self.config.get("seed"),

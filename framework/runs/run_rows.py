@@ -85,6 +85,13 @@ class RunRow:
     def _distinct(self, key: str) -> str:
         return "/".join(sorted({str(record.metrics.get(key)) for record in self.records.values()}))
 
+    @property
+    def peers(self) -> tuple[str, ...]:
+        """Return the key of comparable rows: the variant in an experiment, otherwise the source of poses and data."""
+        if self.system:
+            return self.variant
+        return (self.pose_source, *(part for part in self.variant if is_of_data(part)))
+
     def values(self, column: str) -> dict[Run, float]:
         """Return the metric of each run, without undefined values."""
         found = {run: record.metrics.get(column) for run, record in self.records.items()}
@@ -112,6 +119,11 @@ def data_of(record: Record) -> tuple[Any, ...]:
     keys = ("sequence", "annotation_release", TRUTH)
     parameters = (record.parameters.get(key) for key in (DATA, "dataset.scene"))
     return (record.choices.get("dataset"), *parameters, *(record.metrics.get(key) for key in keys))
+
+
+def is_of_data(part: str) -> bool:
+    """Return True if a part of a row's variant, such as dataset=desk, describes its data."""
+    return is_below(part.partition("=")[0], ("dataset", ANNOTATION, "seed"))
 
 
 def value_of(record: Record, key: str) -> str:
@@ -224,14 +236,16 @@ def dependent_keys(records: Sequence[Record], over: Sequence[str], asked: Collec
     """Return the differing keys that are averaged because they depend on a key in `over`, for a note.
 
     These keys have the same value as a key in `over` in every record, even by chance, or are set by an averaged option.
-    Keys with the same last part as a key in `over`, such as dataset.seed for seed, and parameters of an averaged option
-    are omitted.
+    Keys with the same last part as a key in `over`, such as dataset.seed for seed, and the parameters of averaged and
+    returned options are omitted.
     """
     variants = [_Variant.of(record, over) for record in records]
     names = {key.rpartition(".")[2] for key in over}
     differing = set(_differing([("", one.values) for one in variants]))
     found = differing & _dependent(variants, over, None if asked is None else set(_all_changed(asked)))
-    return sorted(key for key in found if key.rpartition(".")[2] not in names and not is_below(key, over))
+    return sorted(
+        key for key in found if key.rpartition(".")[2] not in names and not is_below(key, {*over, *found} - {key})
+    )
 
 
 def _dependent(variants: Sequence[_Variant], over: Sequence[str], asked: Collection[str] | None) -> set[str]:

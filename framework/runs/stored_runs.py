@@ -19,6 +19,7 @@ from framework.errors import DataError, first_line
 from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
 from framework.files.json_file import read_json
 from framework.files.yaml_file import load_yaml
+from framework.registry import STAGES
 from framework.runs.inputs import INPUTS, inputs_sha256
 from framework.runs.provenance import (
     OF_SPEED,
@@ -49,6 +50,7 @@ EVALUATION = "evaluation."  # prefix of the code version of a re-evaluation
 GROUND_TRUTH = EVALUATION + "ground_truth"  # key of dataset.ground_truth in the last re-evaluation, if it was set
 
 CHOICE = "choice."  # prefix of the chosen options in metrics.json
+GROUPS = (*STAGES, "preset", "sequences")  # config groups whose chosen option is stored
 FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # prefixes of numeric metrics
 
 _LOG_LINE = re.compile(r"\S+ (?P<level>DEBUG|INFO|WARNING|ERROR|CRITICAL) +(?P<message>.*)")

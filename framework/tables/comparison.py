@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 
 from framework.errors import DataError
 from framework.runs.metrics import is_evaluation
-from framework.runs.run_rows import Mean, Run, RunRow, is_below, natural, rows_of
+from framework.runs.run_rows import Mean, Run, RunRow, is_below, is_of_data, natural, rows_of
 from framework.runs.stored_runs import Incomplete, Record, completed_runs, read_yaml
 from framework.runs.sweep_file import SWEEP, asked_keys, command_line, requested_runs, sweep_rows
 from framework.tables.published import (
@@ -112,7 +112,7 @@ class ComparisonTable:
         bases = {base.name: base for _, base in self.compared}
         if len(bases) == 1:
             return next(iter(bases))
-        without_data = {", ".join(part for part in base.variant if not _is_of_data(part)) for base in bases.values()}
+        without_data = {", ".join(part for part in base.variant if not is_of_data(part)) for base in bases.values()}
         return self.choice.base or (without_data.pop() if len(without_data) == 1 else "") or FIRST
 
     @property
@@ -251,11 +251,6 @@ class ComparisonTable:
     def _runs(self) -> list[Run]:
         """Runs of all rows, and requested runs."""
         return [*(run for row in self.rows for run in row.records), *self.requested]
-
-
-def _is_of_data(part: str) -> bool:
-    """Return True if a part of a row's variant, such as dataset=desk, describes its data."""
-    return is_below(part.partition("=")[0], ("dataset", "annotation", "seed"))
 
 
 def _is_selected(choice: TableChoice, run: Run) -> bool:

@@ -58,7 +58,7 @@ _Cell = tuple[str, float]  # text and compared value; NaN = not compared
 class _Line:
     labels: list[str]
     cells: list[_Cell]
-    variant: tuple[str, ...] = ()  # lines with the same variant are compared
+    peers: tuple[str, ...] = ()  # RunRow.peers; lines with the same value are compared
 
 
 class _SequenceFigures:
@@ -82,7 +82,7 @@ class _SequenceFigures:
         if not any(run[-1] == sequence for run in row.records):
             return MISSING, math.nan
         mean = self.means[row.name].get(sequence, Mean.of(()))
-        found = [self.means[other.name] for other in self._rows if other.variant == row.variant]
+        found = [self.means[other.name] for other in self._rows if other.peers == row.peers]
         most = max((of_row[sequence].count for of_row in found if sequence in of_row), default=0)
         text = _mean_cell(mean, self.digits, self._expected.get(sequence, 0))
         return text, mean.value if mean.count == most else math.nan
@@ -90,7 +90,7 @@ class _SequenceFigures:
     def mean_cell(self, row: RunRow, sequences: int) -> _Cell:
         """Return the mean ± standard deviation over seeds, with the number of sequences or runs if some are missing."""
         mean = self._overall[row.name]
-        others = [self._overall[other.name] for other in self._rows if other.variant == row.variant]
+        others = [self._overall[other.name] for other in self._rows if other.peers == row.peers]
         competes = (mean.count, mean.runs) == max((other.count, other.runs) for other in others)
         equal_runs = all(of_sequence.deviation == 0 for of_sequence in self.means[row.name].values())
         spread = math.nan if equal_runs else mean.deviation
@@ -106,7 +106,7 @@ def across_grid(comparison: ComparisonTable) -> TextTable:
     [key] = comparison.choice.columns
     figures, sequences = _SequenceFigures(comparison, key), comparison.sequences
     sections = []
-    for rows in _by_variant(comparison.rows):
+    for rows in _by_peers(comparison.rows):
         section = []
         for row in rows:
             cells = [figures.cell(row, sequence) for sequence in sequences]
@@ -122,7 +122,7 @@ def across_grid(comparison: ComparisonTable) -> TextTable:
 def by_grid(comparison: ComparisonTable) -> TextTable:
     """Return a table with a group of lines per sequence, and one line per row. The last group contains the means."""
     keys = comparison.choice.columns
-    rows = [row for rows in _by_variant(comparison.rows) for row in rows]
+    rows = [row for rows in _by_peers(comparison.rows) for row in rows]
     figures = [_SequenceFigures(comparison, key) for key in keys]
     begun = {run[-1] for row in rows for run in row.records}
 
@@ -153,7 +153,7 @@ def difference_across_grid(comparison: ComparisonTable) -> TextTable:
     sequences = [sequence for sequence in comparison.sequences if sequence in paired]
     digits = decimals(value for runs in differences.values() for value in runs.values())
     sections = []
-    for rows in _by_variant([row for row, _ in comparison.compared]):
+    for rows in _by_peers([row for row, _ in comparison.compared]):
         section = []
         for row in rows:
             means, mean = mean_by_sequence(differences[row.name]), comparison.difference(bases[row.name], row, key)
@@ -182,22 +182,22 @@ def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], columns: Sequen
 
 
 def _best(section: Sequence[_Line], column: int, better: Direction, digits: int) -> Iterator[int]:
-    """Yield the line of the best printed value of a column among the lines of each variant, unless it is a tie."""
+    """Yield the line of the best printed value of a column among comparable lines, unless it is a tie."""
     if better is Direction.NONE:
         return
     for k, line in enumerate(section):
-        competing = [other.cells[column][1] for other in section if other.variant == line.variant]
+        competing = [other.cells[column][1] for other in section if other.peers == line.peers]
         values = [round(better * value, digits) for value in competing if not math.isnan(value)]
         own = round(better * line.cells[column][1], digits)
         if len(values) > 1 and own == max(values) and values.count(own) == 1:
             yield k
 
 
-def _by_variant(rows: Sequence[RunRow]) -> list[list[RunRow]]:
+def _by_peers(rows: Sequence[RunRow]) -> list[list[RunRow]]:
     """Return groups of comparable rows, in the order of the first row of each group."""
     groups: dict[tuple[str, ...], list[RunRow]] = {}
     for row in rows:
-        groups.setdefault(row.variant, []).append(row)
+        groups.setdefault(row.peers, []).append(row)
     return list(groups.values())
 
 
@@ -208,7 +208,7 @@ def _labels(comparison: ComparisonTable, name: str, poses: str = "poses", annota
 
 def _row_line(comparison: ComparisonTable, row: RunRow, cells: list[_Cell]) -> _Line:
     name = comparison.called(row, without="tracker")
-    return _Line(_labels(comparison, name, row.poses, row.annotation or NOTHING), cells, row.variant)
+    return _Line(_labels(comparison, name, row.poses, row.annotation or NOTHING), cells, row.peers)
 
 
 def _published_line(

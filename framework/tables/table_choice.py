@@ -130,6 +130,8 @@ class TableChoice:
             for key in [value] if isinstance(value, str) else value or ():
                 yield name, key
         yield from (("where", key) for key in self.conditions)
+        parts = (self.base or "").split(", ")
+        yield from (("base", key) for key, equals, _ in (part.partition("=") for part in parts) if equals)
 
     def check_keys(self, known: Collection[str]) -> None:
         """Raise ConfigError for a key that is not in `known`."""
@@ -137,6 +139,15 @@ class TableChoice:
             close = get_close_matches(key, known, n=1)
             fix = f"did you mean {close[0]}?" if close else "set a group such as dataset, or a parameter of all runs"
             raise ConfigError(f"table.{name}: expected a group of options or a parameter, got {key}; {fix}")
+
+    def check_base(self, rows: Collection[str]) -> None:
+        """Raise ConfigError for a base that is not one of the experiment's `rows`, or KEY=VALUE in another sweep."""
+        if self.base is None:
+            return
+        if rows and self.base.split(", ")[0] not in rows:
+            raise ConfigError(f"table.base: expected one of {', '.join(rows)}, got {self.base}")
+        if not rows and not all("=" in part for part in self.base.split(", ")):
+            raise ConfigError(f"table.base: expected KEY=VALUE, such as refiner=identity, got {self.base}")
 
     def selects(self, record: Record) -> bool:
         """Return True if a run is in the table."""

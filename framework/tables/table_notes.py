@@ -36,7 +36,7 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
         changes = (f"{name}: {' '.join(changes) or 'none'}" for name, changes in comparison.overrides.items())
         yield f"Overrides of each row: {'; '.join(changes)}."
     if comparison.command_line:
-        yield f"Overrides of all rows, on the command line: {' '.join(comparison.command_line)}."
+        yield f"Command line: {' '.join(comparison.command_line)}."
     if fixed := _same(comparison.records):
         yield f"Common to all runs: {fixed}."
     yield from _protocol(comparison)
@@ -60,8 +60,8 @@ def _averaging(comparison: ComparisonTable) -> Iterator[str]:
         yield f"Cells: {spread}. runs: number of complete runs."
         return
     yield (
-        f"Cells: {spread}. mean: average of the sequences ({choice.split_key}) with equal weights; its deviation is "
-        f"over the runs with all sequences. {_bold(choice.columns)} missing: no complete run."
+        f"Cells: {spread}. mean: average over {choice.split_key} with equal weights; its deviation is over the runs "
+        f"with all values of {choice.split_key}. {_bold(choice.columns)} missing: no complete run."
     )
 
 

@@ -93,9 +93,9 @@ GOLDEN = """\
 | Prior (re-implementation) | ground truth | made up    | +0.100 | -0.100 | +0.000 ± 0.100 |     2 |
 | other                     | ground truth | made up    | +0.500 | +0.400 | +0.450 ± 0.050 |     2 |
 
-- Cells: mean ± sample standard deviation over seed, without ± for equal values. mean: average of the sequences \
-(dataset.scene) with equal weights; its deviation is over the runs with all sequences. Bold: highest AP50 for the same \
-poses and number of runs, unless several rows have it. missing: no complete run.
+- Cells: mean ± sample standard deviation over seed, without ± for equal values. mean: average over \
+dataset.scene with equal weights; its deviation is over the runs with all values of dataset.scene. Bold: highest AP50 \
+for the same poses and number of runs, unless several rows have it. missing: no complete run.
 - Differences are paired by seed, dataset.scene: mean ± standard error over dataset.scene, after averaging the runs of \
 each. pairs: number of values of dataset.scene in both rows. *: the 95% interval of Student's t excludes 0.
 - Identical runs: the results do not depend on seed in other.
