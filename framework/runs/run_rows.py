@@ -163,9 +163,13 @@ def rows_of(
         [(one.row, one.choices) for one in variants]
         + [("", {key: value for key, value in one.choices.items() if key not in changed}) for one in variants]
     )
+
+    def dataset_of(one: _Variant) -> Any:  # rows of several datasets are named by their dataset, not by its folder
+        return one.choices.get("dataset") if "dataset" in stages else ""
+
     parameters = _differing(
         [((one.row, *map(one.choices.get, stages)), one.parameters) for one in variants]
-        + [("", {DATA: one.parameters[DATA]}) for one in variants if DATA in one.parameters]
+        + [(dataset_of(one), {DATA: one.parameters[DATA]}) for one in variants if DATA in one.parameters]
         + [kept for one in variants if not one.row or one.row in overrides for kept in _kept(one, changed)]
     )
     rows: dict[tuple[str, tuple[str, ...]], dict[Run, Record]] = {}

@@ -211,7 +211,7 @@ def _same(records: Sequence[Record]) -> str:
 def data(records: Sequence[Record]) -> str:
     """Return the datasets with their folders and annotation releases, the sequences, and the range of frame counts."""
     names = (
-        f"{record.choices.get('dataset')}"
+        record.choices.get("dataset", "unknown")
         + (f" in {root}" if (root := record.parameters.get(DATA)) else "")
         + (f", annotation {record.annotation}" if record.annotation else "")
         for record in records

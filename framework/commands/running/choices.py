@@ -79,11 +79,12 @@ def check_table(config: DictConfig, overrides: Sequence[str], rows: Mapping[str,
 
     A key may exist only with one of the swept options or rows. These are composed if the key is not found otherwise.
     """
-    if config.get("table") is None:
+    table = config.get("table")
+    if table is None:
         return
     from framework.tables.table_choice import TableChoice
 
-    choice = TableChoice.of_sweep(OmegaConf.to_container(config.table))
+    choice = TableChoice.of_sweep(OmegaConf.to_container(table) if OmegaConf.is_config(table) else table)
     choice.check_base(rows)
     known = {*_keys_of(config), *swept_keys(overrides), *GROUPS, *(["row"] if rows else [])}
     for alternative in _alternatives(overrides, rows):

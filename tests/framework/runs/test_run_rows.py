@@ -212,3 +212,47 @@ def test_rows_of_presets_have_distinct_names() -> None:
     ]
     changes = {"default": ["preset=default"], "paper": ["preset=paper"]}
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["default", "paper"]
+
+
+def of_two_datasets(**other: str) -> list[Record]:
+    """Return runs of two rows on two datasets, each with its own detector."""
+    data = (("desk", {"root": "/d", "scene": "a"}, "net"), ("rooms", {"kind": "STUDIO"}, "simulated"))
+    return [
+        record({"seed": 0, "dataset": node, "detector": {"name": net}}, dataset=name, detector=net, refiner=refiner)
+        for refiner in ("chain", "identity")
+        for name, node, net in data
+    ]
+
+
+def test_rows_average_over_datasets() -> None:
+    """The parameters of a dataset and the detector that it sets depend on it."""
+    records = of_two_datasets()
+    asked = {"dataset", "refiner"}
+    rows = rows_of(records, ["seed", "dataset"], asked=asked)
+    runs = [("0", "desk"), ("0", "rooms")]
+    assert {row.name: list(row.records) for row in rows} == {"refiner=chain": runs, "refiner=identity": runs}
+    assert dependent_keys(records, ["seed", "dataset"], asked) == ["detector"]
+
+
+@pytest.mark.parametrize("asked", [None, {"dataset", "refiner", "detector"}])
+def test_rows_split_by_detector_unless_dataset_sets_it(asked: set[str] | None) -> None:
+    rows = rows_of(of_two_datasets(), ["seed", "dataset"], asked=asked)
+    assert [list(row.records) for row in rows] == [[("0", "desk")]] * 2 + [[("0", "rooms")]] * 2
+
+
+def test_rows_split_by_parameter_that_varies_within_dataset() -> None:
+    records = [record({"seed": 0, "dataset": {"stride": stride}}, dataset=name) for name in "ab" for stride in (1, 2)]
+    found = names(records, over=("dataset",))
+    assert found == {"dataset.stride=1": [("a",), ("b",)], "dataset.stride=2": [("a",), ("b",)]}
+
+
+def test_rows_share_data_of_equal_sequence_and_ground_truth() -> None:
+    def of(scene: str, truth: str = "t", stride: int = 1) -> RunRow:
+        config = {"dataset": {"scene": scene, "stride": stride}}
+        one = record(config, dataset="scenenn")
+        return RunRow("", {("0",): Record(one.directory, {**one.metrics, "truth_sha256": truth}, config, 0.0)})
+
+    assert of("011").shares_data(of("011", stride=4))
+    assert not of("011").shares_data(of("016"))
+    assert not of("011").shares_data(of("011", truth="u"))
+    assert not of("011").shares_data(RunRow("", {("1",): record({})}))

@@ -15,7 +15,6 @@ from framework.runs.data_frame import load_runs
 from framework.runs.provenance import config_hash
 from framework.synthetic.scenenn_scene import BenchmarkSettings
 from framework.tables.experiment_tables import write_tables
-from framework.tables.metric_columns import head
 from tests.support.forked_commands import completed
 
 pytestmark = pytest.mark.integration
@@ -357,11 +356,6 @@ def test_table_notes_name_data_without_evaluation(tmp_path: Path) -> None:
     for seed, frames in enumerate((600, 90)):
         run(tmp_path, "a", seed, None, 1.0, frames=frames, **{"choice.dataset": "desk"})
     assert "- Data: dataset=desk; 90 to 600 frames per run.\n" in write_tables(tmp_path)
-
-
-def test_table_headers_have_units() -> None:
-    keys = ("instances.ap50_agnostic", "stage_ms.update.median", "stage_ms.update.p95", "trajectory.ate_rmse_m", "x.y")
-    assert [head(key) for key in keys] == ["AP50 agnostic", "update (ms)", "update (ms, p95)", "ATE (m)", "x.y"]
 
 
 def test_tables_command_prints_table_or_error(sweep: Path) -> None:

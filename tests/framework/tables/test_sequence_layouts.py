@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from framework.runs.data_frame import load_runs
 from framework.runs.provenance import config_hash
 from framework.tables.experiment_tables import write_tables
+from tests.support.table_text import grids
 
 AP50 = "instances.ap50"
 ROWS = {"ours": [], "prior": ["refiner=geometric"], "other": ["refiner=identity"]}
@@ -71,12 +72,6 @@ def sweep(tmp_path: Path) -> Path:
                 (directory / "metrics.json").unlink()
                 (directory / "instancemap.log").write_text("12:00:00 ERROR   the map is full.\n")
     return root
-
-
-def grids(text: str) -> list[list[str]]:
-    """Return the lines of each table of a text, without padding."""
-    blocks = [block.splitlines() for block in text.split("\n\n") if block.startswith("|")]
-    return [[" ".join(line.split()) for line in block] for block in blocks]
 
 
 GOLDEN = """\
