@@ -27,7 +27,7 @@ from framework.tables.table_choice import TableChoice
 FIRST = "the first row with the same data"  # name of the base if groups of rows have different bases
 
 
-class Pair(NamedTuple):
+class PairedValues(NamedTuple):
     """The mean values of a row and of its base in one unit, such as a scene."""
 
     value: float
@@ -152,7 +152,7 @@ class ComparisonTable:
         pairs = ((row, self.base_of(row)) for row in self.rows)
         return [(row, base) for row, base in pairs if base is not None]
 
-    def pairs(self, row: RunRow, base: RunRow, column: str) -> dict[Run, Pair]:
+    def pairs(self, row: RunRow, base: RunRow, column: str) -> dict[Run, PairedValues]:
         """Return the values of a metric in two rows by unit (values of `choice.units`), for the units in both rows.
 
         Each value is a mean over the runs of the unit. Without table.pair_by, only runs in both rows are used.
@@ -162,7 +162,7 @@ class ComparisonTable:
             common = own.keys() & others.keys()
             own, others = ({run: value for run, value in one.items() if run in common} for one in (own, others))
         means, of_base = self._by_unit(own), self._by_unit(others)
-        return {unit: Pair(means[unit], of_base[unit]) for unit in means if unit in of_base}
+        return {unit: PairedValues(means[unit], of_base[unit]) for unit in means if unit in of_base}
 
     def difference(self, row: RunRow, base: RunRow, column: str) -> Mean:
         """Return the mean over units of the differences between a row and its base."""

@@ -43,7 +43,7 @@ def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, C
     if not rows:
         return config, choices
     from framework.figures.figure_choice import FigureChoice
-    from framework.tables.comparison import TableChoice
+    from framework.tables.table_choice import TableChoice
 
     TableChoice.of(config.table)
     if config.get("figure") is not None:

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from framework.errors import ConfigError, DataError
 from framework.runs.data_frame import load_runs
 from framework.runs.provenance import config_hash
-from framework.tables.comparison import ComparisonTable, Pair
+from framework.tables.comparison import ComparisonTable, PairedValues
 from framework.tables.experiment_tables import write_tables
 from tests.support.table_text import grids
 
@@ -129,7 +129,10 @@ def test_table_pairs_by_key_without_common_seeds(sweep: Path) -> None:
     comparison = ComparisonTable.below(sweep)
     chain, identity, other = comparison.rows
     assert comparison.pairs(other, chain, AP50) == {}
-    assert comparison.pairs(identity, chain, AP50) == {("desk",): Pair(0.4, 0.55), ("rooms",): Pair(0.6, 0.8)}
+    assert comparison.pairs(identity, chain, AP50) == {
+        ("desk",): PairedValues(0.4, 0.55),
+        ("rooms",): PairedValues(0.6, 0.8),
+    }
     table(sweep, **over, pair_by=["dataset"])
     comparison = ComparisonTable.below(sweep)
     chain, identity, other = comparison.rows

@@ -113,3 +113,18 @@ def test_check_table_experiment_base_is_row() -> None:
 def test_of_tables_lists_nested_keys() -> None:
     overrides = ["+table.where.dataset=desk", "dataset=desk", "table.columns=[fps]", "figure.names.a=b", "tablet=1"]
     assert of_tables(overrides) == ["table.where.dataset", "table.columns", "figure.names.a"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "fix"),
+    [
+        (["table.group_by=dataset"], "set +table.KEY=VALUE"),
+        (["experiment=ablation_refiner", "table.where.dataset=desk"], "set +table.where.dataset=VALUE"),
+        (["experiment=ablation_refiner", "table.baseline=chain"], "table.baseline was renamed; set table.base"),
+        (["experiment=ablation_refiner", "table.over=[seed]"], "table.over was renamed; set table.average_over"),
+    ],
+)
+def test_table_override_error_names_fix(overrides: list[str], fix: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        composed(*overrides)
+    assert str(caught.value).endswith(fix)

@@ -66,7 +66,7 @@ def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
     pandas.testing.assert_frame_equal(read, runs.replace("", pandas.NA))  # CSV has no empty strings
     text = (out / "table.md").read_text()
     assert text in first.stdout
-    assert "| half | 2 | -4.00 | 0.00 |" in " ".join(text.split()), "expected equal differences"
+    assert "| half | 2 | -4.00 | +0.000 |" in " ".join(text.split()), "expected equal differences"
     assert "Rows without a complete run: broken." in text
     assert "Incomplete: row=broken,seed=3: failed: dataset" in text
     assert "half: refiner=identity dataset.frames=4" in text
