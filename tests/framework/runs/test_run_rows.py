@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +180,13 @@ def test_row_names_include_dataset_root_differences() -> None:
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.root=/a", "b, dataset.root=/b"]
 
 
+def test_row_names_include_folder_of_datasets_that_rows_override() -> None:
+    """Rows on other data have no common variant, so that they are not compared."""
+    records = [record({"row": row, "seed": 0, "dataset": {"root": f"/{row}"}}, dataset=row) for row in "ab"]
+    changes = {"a": [], "b": ["dataset=b"]}
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.root=/a", "b, dataset.root=/b"]
+
+
 def test_row_poses_describe_pose_source() -> None:
     given = record({}, tracker="ground_truth")
     given = Record(given.directory, {**given.metrics, "pose_source": "ground_truth"}, {}, 0.0)
@@ -214,14 +222,15 @@ def test_rows_of_presets_have_distinct_names() -> None:
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["default", "paper"]
 
 
-def of_two_datasets(**other: str) -> list[Record]:
-    """Return runs of two rows on two datasets, each with its own detector."""
+def of_two_datasets() -> list[Record]:
+    """Return runs of two rows on two datasets, each with its own detector and annotation."""
     data = (("desk", {"root": "/d", "scene": "a"}, "net"), ("rooms", {"kind": "STUDIO"}, "simulated"))
-    return [
+    found = [
         record({"seed": 0, "dataset": node, "detector": {"name": net}}, dataset=name, detector=net, refiner=refiner)
         for refiner in ("chain", "identity")
         for name, node, net in data
     ]
+    return [replace(one, metrics={**one.metrics, "annotation_release": one.choices["dataset"]}) for one in found]
 
 
 def test_rows_average_over_datasets() -> None:
@@ -231,13 +240,21 @@ def test_rows_average_over_datasets() -> None:
     rows = rows_of(records, ["seed", "dataset"], asked=asked)
     runs = [("0", "desk"), ("0", "rooms")]
     assert {row.name: list(row.records) for row in rows} == {"refiner=chain": runs, "refiner=identity": runs}
-    assert dependent_keys(records, ["seed", "dataset"], asked) == ["detector"]
+    assert dependent_keys(records, ["seed", "dataset"], asked) == ["annotation", "detector"]
 
 
 @pytest.mark.parametrize("asked", [None, {"dataset", "refiner", "detector"}])
 def test_rows_split_by_detector_unless_dataset_sets_it(asked: set[str] | None) -> None:
     rows = rows_of(of_two_datasets(), ["seed", "dataset"], asked=asked)
     assert [list(row.records) for row in rows] == [[("0", "desk")]] * 2 + [[("0", "rooms")]] * 2
+
+
+def test_rows_average_over_annotations_of_datasets() -> None:
+    records = [
+        Record(Path(), {"choice.dataset": name, "annotation_release": name}, {"seed": 0}, 0.0) for name in ("a", "b")
+    ]
+    assert len(rows_of(records, ["dataset"])) == 1
+    assert len(rows_of(records, ["seed"])) == 2
 
 
 def test_rows_split_by_parameter_that_varies_within_dataset() -> None:
