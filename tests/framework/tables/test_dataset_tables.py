@@ -24,13 +24,26 @@ TASK = ["dataset=desk,rooms,scan", "refiner=chain,identity", "seed=0,1"]
 
 
 def run(
-    root: Path, dataset: str, refiner: str, seed: int, ap: float | None, detector: str = "net", **more: Any
+    root: Path,
+    dataset: str,
+    refiner: str,
+    seed: int,
+    ap: float | None,
+    detector: str = "net",
+    row: str | None = None,
+    **more: Any,
 ) -> None:
     """Write a run directory; the ground truth depends on the dataset and the seed."""
     directory = root / f"dataset={dataset},detector={detector},refiner={refiner},seed={seed}"
     directory.mkdir(parents=True)
     data = {"root": f"/{dataset}", "scene": f"{dataset} 1", "seed": seed}
-    config = {"seed": seed, "dataset": data, "refiner": {"kind": refiner}, "detector": {"kind": detector}}
+    config: dict[str, Any] = {
+        "seed": seed,
+        "dataset": data,
+        "refiner": {"kind": refiner},
+        "detector": {"kind": detector},
+    }
+    config |= {"row": row} if row else {}
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     chosen = {"dataset": dataset, "detector": detector, "refiner": refiner}
     metrics = {
@@ -172,6 +185,48 @@ def test_table_columns_are_detectors(sweep: Path) -> None:
     first, _ = grids(write_tables(sweep))
     assert first[0] == "| system | poses | annotation | net | other | mean |"
     assert first[2].startswith("| refiner=chain | ground truth | – | **0.550 ± 0.071** | **0.900** | **0.725")
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> Path:
+    """Return the folder of two rows of an experiment on two datasets with two detectors each."""
+    for dataset, ap in (("desk", 0.5), ("rooms", 0.7)):
+        for detector, more in (("net", 0.0), ("other", 0.1)):
+            run(tmp_path, dataset, "chain", 0, ap + more, detector, row="base")
+            run(tmp_path, dataset, "mine", 0, ap + 2 * more, detector, row="mine")
+    task = ["experiment=x", "dataset=desk,rooms", "detector=net,other"]
+    sweep = {"hydra": {"overrides": {"task": task}}, "rows": {"base": ["refiner=chain"], "mine": ["refiner=mine"]}}
+    (tmp_path / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(sweep)))
+    return tmp_path
+
+
+def set_table(root: Path, **choice: Any) -> None:
+    sweep = OmegaConf.load(root / "multirun.yaml")
+    (root / "multirun.yaml").write_text(OmegaConf.to_yaml({**sweep, "table": {"columns": [AP50], **choice}}))
+
+
+def test_experiment_columns_are_datasets_and_rows_have_detectors(experiment: Path) -> None:
+    set_table(experiment, columns_by="dataset")
+    first, second = grids(write_tables(experiment))
+    assert [line.split(" | ")[0] for line in first[2:]] == [
+        "| base, detector=net",
+        "| mine, detector=net",
+        "| base, detector=other",
+        "| mine, detector=other",
+    ]
+    assert [line.split(" | ")[0::3] for line in second[2:]] == [
+        ["| mine, detector=net", "+0.000", "2 |"],
+        ["| mine, detector=other", "-0.100", "2 |"],
+    ]
+
+
+def test_experiment_averages_over_datasets_and_detectors(experiment: Path) -> None:
+    set_table(experiment, average_over=["seed", "detector", "dataset"], pair_by=["dataset"])
+    text = write_tables(experiment)
+    first, second = grids(text)
+    assert first[2] == "| base | 4 | 0.650 ± 0.129 | ground_truth |"  # 0.5, 0.6, 0.7, 0.8
+    assert second[2] == "| mine | 2 | +0.050 |"
+    assert "- Differences are paired by dataset: mean ± standard error over dataset, after averaging the runs" in text
 
 
 def test_table_of_nested_keys_lists_no_impossible_runs(sweep: Path) -> None:
