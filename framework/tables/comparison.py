@@ -130,9 +130,16 @@ class ComparisonTable:
             named = [other for other in self.rows if other.name == self.base_name]
             bases = named or [r for r in self.rows if r.system == self.base_name and r.variant == row.variant]
         else:
-            same_data = [other for other in self.rows if other is row or other.shares_data(row)]
+            same_data = [other for other in self.rows if other is row or self._have_same_data(other, row)]
             bases = [other for other in same_data if self.choice.base is None or self._differs_only_in_base(other, row)]
         return bases[0] if bases and bases[0] is not row else None
+
+    def _have_same_data(self, row: RunRow, other: RunRow) -> bool:
+        """Return True if the pairs of two rows have the same data. The keys of table.pair_by identify data."""
+        if not self.choice.pair_by:
+            return row.shares_data(other)
+        parts = [list(filter(is_of_data, one.variant)) for one in (row, other)]
+        return parts[0] == parts[1] and bool(self.common_units(row, other))
 
     def _differs_only_in_base(self, other: RunRow, row: RunRow) -> bool:
         """Return True if `other` has the values of table.base, and all other values of `row`."""

@@ -87,15 +87,15 @@ def _comparing(comparison: ComparisonTable) -> Iterator[str]:
             yield "No differences: no two rows have the same data."
     else:
         error, units = "mean ± standard error", ", ".join(choice.units)
-        paired = ", ".join(choice.pair_by or choice.averaged)
+        keys = ", ".join(choice.pair_by or choice.averaged)
         if choice.units != choice.averaged:
             error += f" over {units}, after averaging the runs of each"
         yield (
-            f"Differences are paired by {paired}: {error}. pairs: number of values of {units} in both rows. "
+            f"Differences are paired by {keys}: {error}. pairs: number of values of {units} in both rows. "
             f"*: the {CONFIDENCE:.0%} interval of Student's t excludes 0."
         )
-        bases = [base for _, base in comparison.compared]
-        if alone := [row.name for row in comparison.rows if not (comparison.base_of(row) or row in bases)]:
+        paired = {one.name for pair in comparison.compared for one in pair}
+        if alone := [row.name for row in comparison.rows if row.name not in paired]:
             yield f"Rows without a matching row of {comparison.base_called}: {'; '.join(alone)}."
 
 

@@ -138,6 +138,7 @@ def test_table_pairs_by_key_without_common_seeds(sweep: Path) -> None:
         for seed in (5, 6):
             run(sweep, dataset, "other", seed, ap + 0.1 * (seed - 5), **{"truth_sha256": "x"})
     over = {"average_over": ["seed", "dataset"], "columns": [AP50], "base": "refiner=chain"}
+    over |= {"where": {"dataset": ["desk", "rooms"]}}
     table(sweep, **over)
     comparison = ComparisonTable.below(sweep)
     chain, identity, other = comparison.rows
@@ -154,7 +155,8 @@ def test_table_pairs_by_key_without_common_seeds(sweep: Path) -> None:
         ("desk",): pytest.approx((0.25, 0.55)),
         ("rooms",): pytest.approx((0.45, 0.8)),
     }
-    assert comparison.difference(other, chain, AP50).value == pytest.approx(-0.325)
+    _, second = grids(write_tables(sweep))
+    assert second[2:] == ["| refiner=identity | 2 | -0.175 ± 0.025 |", "| refiner=other | 2 | -0.325 ± 0.025 * |"]
 
 
 def test_table_groups_have_digits_and_best_value_of_each_column(sweep: Path) -> None:
