@@ -165,7 +165,7 @@ def rows_of(
     )
 
     def dataset_of(one: _Variant) -> Any:  # rows of several datasets are named by their dataset, not by its folder
-        return one.choices.get("dataset")
+        return one.choices.get("dataset") if "dataset" in stages else ""
 
     parameters = _differing(
         [((one.row, *map(one.choices.get, stages)), one.parameters) for one in variants]

@@ -6,11 +6,11 @@ from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, S
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from framework.errors import DataError
 from framework.runs.metrics import is_evaluation
-from framework.runs.run_rows import Mean, Run, RunRow, is_below, is_of_data, natural, rows_of
+from framework.runs.run_rows import DATA, Mean, Run, RunRow, is_below, is_of_data, natural, rows_of
 from framework.runs.stored_runs import Incomplete, Record, completed_runs, read_yaml
 from framework.runs.sweep_file import SWEEP, asked_keys, command_line, requested_runs, sweep_rows
 from framework.tables.published import (
@@ -135,11 +135,16 @@ class ComparisonTable:
         return bases[0] if bases and bases[0] is not row else None
 
     def _have_same_data(self, row: RunRow, other: RunRow) -> bool:
-        """Return True if the pairs of two rows have the same data. The keys of table.pair_by identify data."""
+        """Return True if the pairs of two rows have the same data; with table.pair_by, the same datasets."""
         if not self.choice.pair_by:
             return row.shares_data(other)
-        parts = [list(filter(is_of_data, one.variant)) for one in (row, other)]
-        return parts[0] == parts[1] and bool(self.common_units(row, other))
+        common = self.common_units(row, other)
+        return bool(common) and all(self._datasets(row, unit) == self._datasets(other, unit) for unit in common)
+
+    def _datasets(self, row: RunRow, unit: Run) -> set[tuple[Any, Any]]:
+        """Return the datasets of the runs of a unit, with their folders."""
+        records = (record for run, record in row.records.items() if self._unit(run) == unit)
+        return {(record.choices.get("dataset"), record.parameters.get(DATA)) for record in records}
 
     def _differs_only_in_base(self, other: RunRow, row: RunRow) -> bool:
         """Return True if `other` has the values of table.base, and all other values of `row`."""

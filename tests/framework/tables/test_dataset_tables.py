@@ -159,6 +159,17 @@ def test_table_pairs_by_key_without_common_seeds(sweep: Path) -> None:
     assert second[2:] == ["| refiner=identity | 2 | -0.175 ± 0.025 |", "| refiner=other | 2 | -0.325 ± 0.025 * |"]
 
 
+def test_table_pairs_by_seed_have_same_datasets(sweep: Path) -> None:
+    for seed in (0, 1):
+        run(sweep, "rooms", "other", seed, 0.1)
+    over = {"average_over": ["seed", "dataset"], "pair_by": ["seed"], "columns": [AP50]}
+    table(sweep, **over, where={"dataset": ["desk", "rooms"]})
+    text = write_tables(sweep)
+    _, second = grids(text)
+    assert [line.split(" | ")[:2] for line in second[2:]] == [["| refiner=identity", "2"]]
+    assert "- Rows without a matching row of refiner=chain: refiner=other." in text
+
+
 def test_table_groups_have_digits_and_best_value_of_each_column(sweep: Path) -> None:
     """Large values of one column do not remove the decimals of another. Lower times are better; ties are not bold."""
     for path in sweep.glob("*/metrics.json"):
@@ -269,7 +280,7 @@ def test_stored_table_with_old_keys_is_read(sweep: Path) -> None:
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
-        ({"average_over": ["datset"]}, r"table\.average_over: .*, got datset; did you mean dataset\?"),
+        ({"average_over": ["refner"]}, r"table\.average_over: .*, got refner; did you mean refiner\?"),
         ({"where": {"dataset.rot": 1}}, r"table\.where: .*, got dataset\.rot; did you mean dataset\.root\?"),
     ],
 )

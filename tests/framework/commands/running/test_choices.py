@@ -78,8 +78,8 @@ def test_check_table_accepts_options_and_parameters(table: str) -> None:
         ("+table.over=[seed]", "table.over was renamed; set table.average_over"),
         ("+table.baseline=x", "table.baseline was renamed; set table.base"),
         (
-            "+table.group_by=datset",
-            "table.group_by: expected a group of options or a parameter, got datset; did you mean",
+            "+table.group_by=refner",
+            "table.group_by: expected a group of options or a parameter, got refner; did you mean",
         ),
         ("+table.average_over=[seed,dataset.scenes]", "table.average_over: expected a group of options or a parameter"),
         ("+table.where.viewer=rerun", "table.where: expected a group of options or a parameter, got viewer"),
