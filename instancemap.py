@@ -21,8 +21,8 @@
     mesh = scene.mesh()  # vertices, triangles, color, instance and class of each vertex; scene.mesh(it) for one object
     view = scene.view(camera, T_world_camera)  # rendered depth, normals, color and instances
 
-`export("outputs/demo", "glb", "usd")` writes files for other programs. `query("outputs/demo", "a red chair").objects`
-lists the matching objects, best first. `load_runs("multirun/sweep")` returns the runs of a sweep as a data frame.
+`export("outputs/demo", "glb", "usd")` writes files in standard formats. `query("outputs/demo", "a red chair").objects`
+lists the matching objects, best match first. `load_runs("multirun/sweep")` returns the runs of a sweep as a data frame.
 
 A Mapper is thread-safe; queries wait until the current frame is mapped.
 
@@ -44,14 +44,14 @@ _own = Path(__file__).resolve().with_name("framework")
 _found = find_spec("framework")
 if _found is None or _own not in [Path(path).resolve() for path in _found.submodule_search_locations or ()]:
     raise ImportError(
-        f"framework: expected InstanceMap's package at {_own}, got {(_found and _found.origin) or 'none'}; rename the "
-        "other package or start Python in another folder"
+        f"framework: expected the package of InstanceMap at {_own}, got {(_found and _found.origin) or 'none'}; rename "
+        "the other package or start Python in another folder"
     )
 
 from framework import __version__
 from framework.runtime.process_settings import configure_process
 
-__path__ = [str(_own / "testing" / "public")]  # the folder of the submodule instancemap.testing
+__path__ = [str(_own / "testing" / "public")]  # folder of the submodule instancemap.testing
 _SHARED_WITH_PLUGINS = {
     "Association": "framework.mapping.instances.association",
     "Bool": "framework.data",
@@ -81,7 +81,7 @@ _SHARED_WITH_PLUGINS = {
     "transform": "framework.geometry",
     "vote_for_best": "framework.mapping.labels.label_rule",
 }
-"""Modules of the names that plugins may import and framework.api does not export."""
+"""Module of each name that plugins may import from `instancemap` and that framework.api does not export."""
 
 if TYPE_CHECKING:
     from framework.api import *

@@ -3,8 +3,8 @@ r"""ROS 2 node that maps the images of a depth camera and publishes the objects 
     python examples/ros2_node.py --ros-args -r color:=/camera/color/image_raw \
         -r depth:=/camera/aligned_depth_to_color/image_raw -r camera_info:=/camera/color/camera_info
 
-Depth must be registered to color. Each marker is the axis-aligned bounding box of one object in the world frame. Its
-text is the class name.
+Depth must be registered to color. Each marker on the topic `objects` is the axis-aligned bounding box of one object in
+the world frame, `map`. The text of a marker is the class name.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from instancemap import Camera, FrameError, Mapper
 
 
 class InstanceMapNode(Node):
-    """Node that maps synchronized color and depth images into one map."""
+    """Node that maps synchronized color and depth images. `overrides` are config overrides such as "device=cuda"."""
 
     def __init__(self, *overrides: str) -> None:
         super().__init__("instancemap")
@@ -30,7 +30,7 @@ class InstanceMapNode(Node):
         topics = (("color", Image), ("depth", Image), ("camera_info", CameraInfo))
         subscribers = [message_filters.Subscriber(self, kind, name) for name, kind in topics]
         synchronizer = message_filters.ApproximateTimeSynchronizer(subscribers, queue_size=2, slop=0.02)
-        synchronizer.registerCallback(self.map)  # during mapping, the queue keeps the two newest frames
+        synchronizer.registerCallback(self.map)  # while a frame is mapped, the queue keeps the two newest frames
 
     def map(self, color: Image, depth: Image, info: CameraInfo) -> None:
         camera = Camera(info.width, info.height, info.k[0], info.k[4], info.k[2], info.k[5])
@@ -41,7 +41,7 @@ class InstanceMapNode(Node):
             self.get_logger().warning(str(error))
             return
         if result.lost:
-            self.get_logger().warning(f"lost: {result.reason}", throttle_duration_sec=1.0)
+            self.get_logger().warning(f"pose lost: {result.reason}", throttle_duration_sec=1.0)
         elif result.new or result.removed:
             self.markers.publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL), *self.boxes()]))
 

@@ -1,4 +1,4 @@
-"""InstanceMap: incremental instance-oriented semantic 3D mapping from RGB-D video.
+"""InstanceMap builds object-level 3D maps from RGB-D video.
 
 In docstrings, *the paper* is "Incremental Instance-Oriented 3D Semantic Mapping via RGB-D Cameras for Unknown Indoor
 Scene" (Discrete Dynamics in Nature and Society, 2020, article 2528954). Numbers in brackets refer to the equations in

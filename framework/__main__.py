@@ -18,20 +18,22 @@ import framework
 COMMANDS = {
     "tables": "write the tables of an experiment or sweep: Markdown, LaTeX, CSV",
     "figures": "draw the figures of an experiment",
-    "raycast": "draw the ray-cast view of a map: depth, normals, vertices, RGB, object indices",
+    "raycast": "draw a ray-cast view of a map: depth, normals, vertex map, RGB, object indices",
     "report": "write HTML reports of runs and compare them",
-    "import": "convert a phone or sensor recording to a folder for dataset=rgbd_folder",
-    "check": "validate a recording and suggest parameter fixes",
+    "import": "convert a phone or sensor recording to an RGB-D folder for dataset=rgbd_folder",
+    "check": "validate an RGB-D sequence and suggest parameter fixes",
     "diff": "list objects that appeared, vanished or moved between two runs",
-    "export": "export a run as GLB, USD, PLY, OBJ, floor plan, ROS map or scene graph",
+    "export": "export a run to standard 3D and map formats: GLB, USD, PLY, OBJ, ROS map, scene graph",
+    "bundle": "pack the runs, tables and plugin code of an experiment into a ZIP file",
+    "reproduce": "run stored runs or a bundle again and compare the results",
     "query": 'rank the objects of a run by a text query: "a red chair"',
-    "evaluate": "re-evaluate stored runs without mapping them again",
-    "detect": "write the detections of a sequence as a COCO result file",
+    "evaluate": "re-evaluate stored runs without re-running them",
+    "detect": "write the detections of a sequence to a COCO results file",
     "show-refinement": "draw the masks of a frame before and after refinement",
     "compile": "compile the kernels in advance, once per installation",
     "doctor": "check the installation and print the fix for each problem",
     "plugins": "list the plugins of each stage and their parameters",
-    "new-plugin": "create a repository with a plugin: package, option, tests, CI",
+    "new-plugin": "create a package with a working plugin: code, config option, tests, CI",
     "synthesize": "render a benchmark of synthetic scenes in SceneNN format",
     "train-detector": "train Mask R-CNN on rendered synthetic scenes",
     "convert-weights": "convert Mask R-CNN weights of torchvision or detectron2",
@@ -41,16 +43,16 @@ COMMANDS = {
 
 FOLDERS = {
     "running": ("run", "detect", "show-refinement"),
-    "results": ("tables", "figures", "raycast", "report", "diff", "export", "query", "evaluate"),
+    "results": ("tables", "figures", "raycast", "report", "diff", "export", "query", "evaluate", "bundle", "reproduce"),
     "recordings": ("import", "check", "synthesize", "convert-oni"),
     "installation": ("compile", "doctor", "plugins", "new-plugin", "train-detector", "convert-weights"),
 }
 """Commands by the folder of framework.commands that contains their modules."""
 
-PRINTING = (*FOLDERS["results"], "plugins", "doctor")  # a closed pipe (`| head`) ends them silently
+PRINTING = (*FOLDERS["results"], "plugins", "doctor")  # commands that end silently on a closed pipe (`| head`)
 
 HELP = """\
-{program} [COMMAND] ...    instance-oriented semantic 3D mapping from RGB-D video
+{program} [COMMAND] ...    build object-level 3D maps from RGB-D video
 
 Without a command, KEY=VALUE ... starts a run. With -m or an experiment, it starts a sweep of runs:
   {program} dataset=rgbd_folder dataset.root=DIR
@@ -59,33 +61,41 @@ Without a command, KEY=VALUE ... starts a run. With -m or an experiment, it star
 Commands (COMMAND --help lists the arguments and defaults):
 {commands}
 
-Exit status: 0 = success; 1 = error; 2 = invalid command-line arguments; 3 = a run ended early after an error and
-wrote its partial outputs; 128 + N = ended by signal N (130 = Ctrl-C, 143 = SIGTERM), with the partial outputs of a run.
+Exit status:
+  0        success
+  1        error
+  2        invalid command-line arguments
+  3        run stopped early after an error; partial outputs written
+  128 + N  ended by signal N (130 = Ctrl-C, 143 = SIGTERM); a run writes partial outputs
 
-debug=true adds the traceback to errors of any command. --cfg job lists the config keys of a run. --hydra-help lists
-Hydra's options.
+Options:
+  debug=true    add the traceback to the error messages of any command
+  --cfg job     list the config keys of a run
+  --hydra-help  list the options of Hydra
 """
 
-RERUN = "--experimental-rerun"  # Hydra option that reads a pickle, which may contain code
+RERUN = "--experimental-rerun"  # Hydra option that reads a pickle file, which can execute code
 
 
 def module_of(command: str) -> str:
-    """Return the module of framework.commands that implements a command."""
+    """Return the name of the module that implements a command, such as framework.commands.results.report."""
     name = {"import": "import_recording"}.get(command, command.replace("-", "_"))  # `import` is a keyword
     folder = next(folder for folder, commands in FOLDERS.items() if command in commands)
     return f"framework.commands.{folder}.{name}"
 
 
 def leave_working_folder(arguments: list[str]) -> None:
-    """Remove the working folder from the module search path, because its files may be from an untrusted source.
+    """Remove the working directory from the module search path, because its files may be from an untrusted source.
 
-    With --config-dir, which registers the user's own plugins, the folder is moved to the end of the path instead.
+    With --config-dir, which registers the user's own plugins, the directory is moved to the end of the path instead.
     `python -P` always excludes it.
     """
     try:
         here = str(Path.cwd())
     except FileNotFoundError:
-        sys.exit("error: working folder: expected an existing folder, got a deleted folder; change to another folder")
+        sys.exit(
+            "error: working directory: expected an existing folder, got a deleted folder; change to another folder"
+        )
     if sys.flags.safe_path or Path(here) == Path(__file__).resolve().parents[1]:
         return
     if sys.path[0] in ("", here):  # added by `python -m`
@@ -116,8 +126,8 @@ def main() -> None:
     leave_working_folder(sys.argv[1:])
     if any(word.startswith("--e") and RERUN.startswith(word.partition("=")[0]) for word in sys.argv[1:]):
         sys.exit(
-            f"error: {RERUN}: expected KEY=VALUE overrides, got a pickle file, which is unsafe; pass the overrides of "
-            "the run"
+            f"error: {RERUN}: expected KEY=VALUE overrides, got a pickle file, which is unsafe; pass the run's "
+            "overrides instead"
         )
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # file names may contain invalid Unicode
@@ -151,7 +161,7 @@ def main() -> None:
 
 
 def flush_output(rest: str = "") -> None:
-    """Write `rest` and flush stdout. If this fails, exit with an error unless another error is being reported."""
+    """Write `rest` to stdout and flush it. If this fails, exit with an error unless another exception is active."""
     reported = sys.exc_info()[0] is not None
     try:
         sys.stdout.write(rest)

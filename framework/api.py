@@ -99,10 +99,10 @@ __all__ = [
 
 
 def begin(config: DictConfig) -> Pipeline:
-    """Build the stages of a config, load a map to resume or localize in, and compile the kernels.
+    """Build the pipeline of a config: build its stages, load the map to resume or localize in, and compile the kernels.
 
-    With a stored map, the tracker reports lost poses until it relocalizes. Raises ConfigError if the stages do not fit
-    the stored map, and DataError if the map cannot be read.
+    With a stored map, the tracker reports lost poses until it relocalizes. Raises ConfigError if the stages are
+    incompatible with the stored map, and DataError if the map cannot be read.
     """
     fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
     tracker = build(PoseTracker, config.get("tracker"))
@@ -122,7 +122,7 @@ def begin(config: DictConfig) -> Pipeline:
 
 
 def scene_of(key: str, run: Path) -> SceneMap:
-    """Read the map of a stored run. Raises DataError that names the config key or command `key`."""
+    """Read the map of a stored run. The message of a DataError begins with `key`, a config key or command."""
     if not (run / MAP).is_file():
         raise DataError(f"{key}: expected a run directory, got {run} without {MAP}")
     return load_scene(run / MAP)
@@ -133,7 +133,7 @@ class FrameResult(Pose):
     """The pose of a frame, its tracking state, and the new and removed objects."""
 
     new: tuple[int, ...] = ()  # ids of objects added by this frame
-    removed: tuple[int, ...] = ()  # ids of objects removed by this frame, because they were merged or outvoted
+    removed: tuple[int, ...] = ()  # ids of objects removed by this frame: merged, or no longer confirmed
 
 
 class Mapper(Map):
@@ -157,7 +157,8 @@ class Mapper(Map):
                 raise ConfigError(f"Mapper: expected overrides such as 'fuser.voxel_size=0.02', got {override!r}")
             if override.lstrip("+~").startswith(("dataset", "hydra", "experiment", "sequences", "launcher")):
                 raise ConfigError(
-                    f"Mapper: expected a supported override, got {override}; use it only on the command line"
+                    f"Mapper: expected an override of a stage or setting, got {override}; use dataset, experiment, "
+                    "sequences, launcher and hydra overrides only on the command line"
                 )
         config = composed("~dataset", *words)
         self._threads = Settings.of(config).threads
@@ -169,7 +170,7 @@ class Mapper(Map):
         viewer.begin(self.scene, "frames from Python", Path())
         finalize(self, viewer.end)  # when the mapper is deleted, or at exit
         self._camera: Camera | None = None  # camera of the last frame
-        self._sensor = SensorKind.KINECT_V1  # kind of the depth sensor of the last frame
+        self._sensor = SensorKind.KINECT_V1  # kind of depth sensor of the last frame
         self._T_world_color: Float64 | None = None  # (4, 4) pose of the color image of the last mapped frame
         self._frames = 0  # number of calls of `add`
 
@@ -194,7 +195,7 @@ class Mapper(Map):
             timestamp: Time of the color image, s; None = the frame number (from 0) / 30.
             up: (3,) unit vector opposite to gravity in the camera frame; None = unknown.
             depth_timestamp: Time of the depth image, s; None = the time of the color image.
-            sensor: The kind of the depth sensor; None = the kind of the last frame, initially KINECT_V1.
+            sensor: The kind of depth sensor; None = the kind of the last frame, initially KINECT_V1.
 
         Returns:
             The pose of the frame, and the new and removed objects.
@@ -225,7 +226,7 @@ class Mapper(Map):
                 )  # fmt: skip
             self._camera, self._sensor = frame.camera, frame.sensor
             self._frames += 1
-            self._journal.timings.clear()  # unused here; would grow without limit for a live camera
+            self._journal.timings.clear()  # unused here; the list would grow without limit for a live camera
             self._journal.tracked.clear()
             before = self.scene.instance_ids()
             found = self._map(frame)
@@ -251,7 +252,7 @@ class Mapper(Map):
     def at_pixel(
         self, u: int, v: int, camera: Camera | None = None, T_world_camera: Float64 | None = None
     ) -> Instance | None:
-        """Return the object at a pixel of the last mapped frame, or of another view.
+        """Return the object at a pixel of the last mapped frame, or of the view from another camera or pose.
 
         Args:
             u: The column of the pixel, px.
@@ -281,7 +282,7 @@ def _override(name: str, value: object) -> str:
 
 
 def open_dataset(name: str, **parameters: object) -> RGBDSequence:
-    """Open a recording: `open_dataset("rgbd_folder", root="DIR", stride=2)`.
+    """Open an RGB-D sequence: `open_dataset("rgbd_folder", root="DIR", stride=2)`.
 
     Args:
         name: An option of `dataset=` on the command line.
@@ -292,7 +293,7 @@ def open_dataset(name: str, **parameters: object) -> RGBDSequence:
 
     Raises:
         ConfigError: The option or a parameter is unknown.
-        DataError: The recording is unreadable.
+        DataError: The sequence cannot be read.
     """
     words = [_override("dataset", name), *(_override(f"dataset.{key}", value) for key, value in parameters.items())]
     return build(RGBDSequence, composed(*words).dataset)
@@ -358,7 +359,7 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
         model: Folder, file or huggingface.co id of the embedding model; None = the model of the run's detector.
 
     Returns:
-        The matching objects, best first, and the ranking method.
+        The matching objects, best match first, and the ranking method.
 
     Raises:
         ConfigError: The query is invalid.
@@ -371,7 +372,7 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
 
 
 def load_scene(path: Path | str) -> SceneMap:
-    """Read a map as a SceneMap, without the query interface of `load_map`."""
+    """Read a map as a SceneMap, without the queries of `Map`. Raises DataError if the file is not a map."""
     from framework.baselines import object_map, open3d_map, semantic_map
     from framework.mapping import instance_map
     from framework.mapping.storage.map_file import read_format

@@ -10,10 +10,10 @@ Conventions, used everywhere:
 - depth is float32 meters along z, not along the ray; 0 = no reading;
 - color is uint8 RGB;
 - instance 0 = no instance; class index -1 = no class; cluster -1 = the point belongs to no cluster;
-- `None` in place of a pose or of ground truth = unknown.
+- `None` for a pose or for ground truth = unknown.
 
-Every dataclass here is frozen and validates shapes, dtypes and finiteness. Data enter the pipeline through these types.
-Later stages do not check them again.
+Every dataclass here is frozen. The types of input data validate shapes, dtypes and finiteness, and later stages do not
+repeat these checks.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Bool = npt.NDArray[np.bool_]
 ROTATION_TOLERANCE = 1e-3  # maximum entry of |R R^T - I| of a rigid transform; some published poses have 4 digits
 COVARIANCE_TOLERANCE = 1e-9  # maximum rounding error of a covariance, relative to its largest entry
 MAX_PIXELS = 2**25  # maximum number of pixels of an image; a frame of 8K video is smaller
-WIDEST = 10.0  # maximum lateral distance per depth, m/m: half a field of view of 168.6 degrees
+WIDEST = 10.0  # maximum ratio of lateral distance to depth: half of a field of view of 168.6 degrees
 LONGEST_FOCAL_LENGTH = 1e6  # maximum focal length, px
 UNIT_TOLERANCE = 1e-3  # maximum | |v| - 1 | of a unit vector
 LONGEST_EMBEDDING = 65_536  # maximum number of dimensions; published networks have 500 to 4,000
@@ -115,8 +115,8 @@ class FrameTruth:
     """The ground-truth instances visible in a frame, for simulated detectors and evaluation only."""
 
     instance_ids: Int32 = field(repr=False)  # (H, W), 0 = no instance
-    class_names: Mapping[int, str | None]  # by instance id; None = unknown class, not evaluated
-    of_depth: bool = False  # True = seen from the pose of the depth image, False = from that of the color image
+    class_names: Mapping[int, str | None]  # class name by instance id; None = unknown class, not evaluated
+    of_depth: bool = False  # True = ids at the pose of the depth image, False = ids at the pose of the color image
 
     def __post_init__(self) -> None:
         check_array("FrameTruth.instance_ids", self.instance_ids, (None, None), np.int32)
@@ -138,7 +138,7 @@ class DeferredTruth(FrameTruth):
         render: Callable[[], Int32],
         shape: tuple[int, int],  # (height, width) of the ids
         class_names: Mapping[int, str | None],
-        origin: str,  # hash of all inputs of `render`, which identifies the ids before they are rendered
+        origin: str,  # hash of all inputs of `render`, which identifies the ids without rendering them
         of_depth: bool = True,
     ) -> None:
         self._render = render
@@ -172,12 +172,12 @@ class Frame:
     color: UInt8  # (H, W, 3) RGB
     depth: Float32  # (H, W) m along z, 0 = no reading
     camera: Camera
-    T_world_camera: Float64 | None = None  # (4, 4) ground truth
-    truth: FrameTruth | None = None
+    T_world_camera: Float64 | None = None  # (4, 4) ground-truth pose; None = unknown
+    truth: FrameTruth | None = None  # ground-truth instances; None = unknown
     up: Float64 | None = None  # (3,) unit vector opposite to measured gravity, camera frame; None = no sensor
     color_timestamp: float | None = None  # s, of the color image; None = timestamp
     depth_timestamp: float | None = None  # s, of the depth image; None = timestamp
-    sensor: SensorKind = SensorKind.KINECT_V1  # kind of the depth sensor, with its noise model
+    sensor: SensorKind = SensorKind.KINECT_V1  # kind of depth sensor, which determines the noise model
 
     def __post_init__(self) -> None:
         index, camera = cast(object, self.index), cast(object, self.camera)  # the caller may pass any type
@@ -203,7 +203,9 @@ class Frame:
                     f"{where}up: expected a unit vector, got a vector of length {np.linalg.norm(self.up):.4g}"
                 )
         if not isinstance(cast(object, self.sensor), SensorKind):
-            raise DataError(f"{where}sensor: expected a SensorKind, got {self.sensor!r}; pass SensorKind.KINECT_V1")
+            raise DataError(
+                f"{where}sensor: expected a SensorKind, got {self.sensor!r}; pass a member such as SensorKind.KINECT_V1"
+            )
         # kernels require contiguous writable arrays; views such as bgr[..., ::-1] and read-only arrays are copied
         object.__setattr__(self, "color", np.require(self.color, requirements=("C", "W")))
         object.__setattr__(self, "depth", np.require(self.depth, requirements=("C", "W")))
@@ -241,9 +243,9 @@ class Pose:
     lost: bool = False
     reason: str = ""  # reason for the loss, for the log
     covariance: Float64 | None = None  # (6, 6) m, rad, in the camera frame; None = unknown
-    """The covariance of xi = (translation, rotation), if T_world_camera exp(xi) is the true pose relative to the map.
+    """The covariance of the pose error xi = (translation, rotation); the true pose is T_world_camera exp(xi).
 
-    It does not contain the drift of the map. It is 0 for the pose that defines the world frame.
+    The covariance does not include the drift of the map. It is 0 for the pose that defines the world frame.
     """
 
     def __post_init__(self) -> None:
@@ -256,13 +258,13 @@ class Pose:
 class DelayEstimate:
     """An estimate of the delay between color and depth."""
 
-    seconds: float  # time from a depth image to the color image with the same timestamp, s
+    seconds: float  # delay of color relative to depth at equal timestamps, s; positive = color captured later
     deviation: float  # standard deviation, s; infinite = unknown
     frames: int  # number of compared frames
 
     @property
     def known(self) -> bool:
-        """True if there is an estimate, which may be inaccurate."""
+        """True if the delay has been estimated. The estimate may be inaccurate; see `deviation`."""
         return math.isfinite(self.deviation)
 
 
@@ -316,7 +318,7 @@ class PointClusters:
     scores: Float32  # (N,) in [0, 1]
     classes: tuple[str, ...]  # names of the C columns
     exact: bool = False  # as in Detections
-    structure: Bool | None = None  # (H, W) pixels on floors and walls, which belong to no object; None = unknown
+    structure: Bool | None = None  # (H, W) True on floors and walls, which belong to no object; None = unknown
     embeddings: Float32 | None = None  # (N, D), as in Detections
     embedding_space: str = ""  # as in Detections
     detected: bool = True  # as in Detections
@@ -340,18 +342,18 @@ class PointClusters:
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """The surface of a map from a camera pose, for tracking."""
+    """The surface of a map as seen from a camera pose, for tracking."""
 
     camera: Camera
     T_world_camera: Float64  # (4, 4)
     depth: Float32  # (H, W) m along z, 0 = no surface
-    normals_world: Float32  # (H, W, 3) unit length, towards the camera; 0 where depth is 0
+    normals_world: Float32  # (H, W, 3) unit vectors toward the camera; 0 where depth is 0
     color: UInt8  # (H, W, 3) RGB
 
 
 @dataclass(frozen=True)
 class View(SurfaceView):
-    """The surface of a map from a camera pose, with labels."""
+    """The surface of a map as seen from a camera pose, with labels."""
 
     instance_ids: Int32  # (H, W), 0 = no instance
     class_ids: Int32  # (H, W) index into the map's classes, -1 = no class
@@ -385,7 +387,7 @@ class Instance:
 
 @dataclass(frozen=True)
 class InstanceMesh:
-    """The surface of a map."""
+    """The surface of a map as a mesh with labeled vertices."""
 
     vertices: Float32  # (V, 3) m, world frame
     triangles: Int32  # (F, 3) vertex indices
@@ -423,7 +425,7 @@ class ReferenceTrajectory:
 
     timestamps: Float64  # (F,) s, increasing
     T_world_camera: Float64  # (F, 4, 4)
-    given: bool  # True = the run uses these poses; a map that starts at one of them is not aligned
+    given: bool  # True = the run uses these poses; its map is not aligned if it starts at one of them
 
     def __post_init__(self) -> None:
         f = len(self.timestamps)
@@ -456,7 +458,7 @@ class SceneTruth:
 
 
 def check_rigid(name: str, T: Float64) -> None:
-    """Raise DataError that names `name` unless `T` is a finite float64 rigid transform (4, 4)."""
+    """Raise DataError unless `T` is a finite float64 rigid transform (4, 4). The message begins with `name`."""
     check_array(name, T, (4, 4), np.float64)
     R = T[:3, :3]
     error = float(np.abs(R @ R.T - np.eye(3)).max())
@@ -469,7 +471,7 @@ def check_rigid(name: str, T: Float64) -> None:
 
 
 def check_view(camera: Camera, T_world_camera: Float64) -> None:
-    """Raise DataError unless `camera` and its pose are valid."""
+    """Raise DataError unless `camera` is a Camera and T_world_camera (4, 4) is a rigid transform."""
     if not isinstance(cast(object, camera), Camera):
         raise DataError(f"camera: expected a Camera, got {type(camera).__name__}")
     check_rigid("T_world_camera", T_world_camera)

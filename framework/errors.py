@@ -11,16 +11,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-LONGEST_WORD = 200  # maximum number of characters of an input, such as a name, in a message
+LONGEST_WORD = 200  # maximum number of characters of one word of a message, such as a name from the input
 LONGEST_MESSAGE = 1000  # maximum number of characters of a message; a list of all options or labels has about 500
 
 _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
 
 
 class InstanceMapError(Exception):
-    """Base class of all known errors. The command line prints one line; `debug=true` adds the traceback.
+    """Base class of all errors that a user can correct. Commands print the message on one line.
 
-    For any input, the message is printable and its length is limited.
+    The message is printable and has at most about 1000 characters, whatever its input. `debug=true` adds the traceback.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -36,23 +36,23 @@ class DataError(InstanceMapError):
 
 
 class FrameError(DataError):
-    """One unusable frame of a usable sequence. The pipeline counts it in `frames_skipped`."""
+    """An unusable frame of a usable sequence. The pipeline skips the frame and counts it in `frames_skipped`."""
 
 
 class NoPoseError(FrameError):
-    """A frame without a required pose, such as in a gap of motion capture. The pipeline skips it."""
+    """A frame without a required pose, such as in a gap of the ground-truth trajectory. The pipeline skips it."""
 
 
 class MapFullError(InstanceMapError):
-    """The map has reached its maximum number of blocks. The map up to this frame is kept."""
+    """The map needs more blocks than the maximum. The map of the earlier frames is kept."""
 
 
 class PartialRunError(InstanceMapError):
-    """An early end of a run with partial outputs. `__cause__` is the reason."""
+    """A run that ended early and wrote partial outputs. `__cause__` is the error that ended it."""
 
 
 def printable(message: object) -> str:
-    """Return a message with unprintable characters escaped, and the middle of long words and texts omitted."""
+    """Return a message with unprintable characters escaped, and with the middle of long words and messages omitted."""
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(message))
     return _shortened(_LONG_WORD.sub(lambda match: _shortened(match[0], LONGEST_WORD), text), LONGEST_MESSAGE)
 
@@ -64,18 +64,18 @@ def _shortened(text: str, most: int) -> str:
 
 
 def in_one_line(message: object) -> str:
-    """Return an error message of another library on one line, or the error class if the message is empty."""
+    """Return the message of an exception on one line, or the name of its class if the message is empty."""
     return " ".join(str(message).split()) or type(message).__name__
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error message, or the error class if the line is empty."""
+    """Return the first line of the message of an exception, or the name of its class if the line is empty."""
     return str(error).partition("\n")[0] or type(error).__name__
 
 
 @contextmanager
 def errors_of(where: object) -> Iterator[None]:
-    """Prepend a file, or a position in a file, to the message of a DataError."""
+    """Prepend `where`, a key, a file or a position in a file, to the message of a DataError inside the context."""
     try:
         yield
     except DataError as error:
@@ -83,7 +83,16 @@ def errors_of(where: object) -> Iterator[None]:
 
 
 def import_optional(module: str, purpose: str, extra: str) -> Any:
-    """Import a module of an optional package. Raises ConfigError that names the extra to install."""
+    """Import a module of an optional package, and return it.
+
+    Args:
+        module: The full name of the module.
+        purpose: The function of the package as a verb phrase, such as "reads ROS bags", for the message.
+        extra: The extra of InstanceMap that installs the package.
+
+    Raises:
+        ConfigError: The package is not installed. The message contains the command that installs it.
+    """
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -50,7 +50,7 @@ def skew(v: Float64) -> Float64:
 
 
 def adjoint(T: Float64) -> Float64:
-    """Return the adjoint Ad (6, 6) of a rigid motion T (4, 4): T exp(xi) = exp(Ad xi) T.
+    """Return the adjoint Ad (6, 6) of a rigid motion T (4, 4), with T exp(xi) = exp(Ad xi) T.
 
     The twist xi (6,) consists of translation, m, and rotation, rad.
     """
@@ -94,7 +94,7 @@ def rotation_angle(R: Float64) -> float:
 
 
 def pose_distance(T_world_a: Float64, T_world_b: Float64) -> float:
-    """Return the distance (m) or the rotation angle (rad) between two poses (4, 4), whichever value is larger."""
+    """Return the larger value of distance, m, and rotation angle, rad, between two poses (4, 4)."""
     T_a_b = inverse(T_world_a) @ T_world_b
     return max(float(np.linalg.norm(T_a_b[:3, 3])), rotation_angle(T_a_b[:3, :3]))
 
@@ -106,7 +106,10 @@ def nearest_rotation(R: Float64) -> Float64:
 
 
 def nearest_rigid(matrix: Float64) -> Float64:
-    """Return a pose (4, 4) with the rounding errors of its rotation removed. Raises DataError if it is not rigid."""
+    """Return the rigid transform (4, 4) nearest to a matrix (4, 4), for example to remove rounding errors of a file.
+
+    Raises DataError if the matrix is not finite, or not rigid within RIGID_WITHIN.
+    """
     if not np.isfinite(matrix).all():
         raise DataError("pose: expected finite values, got NaN or infinity")
     if not np.allclose(matrix[3], (0, 0, 0, 1)):
@@ -123,7 +126,7 @@ def nearest_rigid(matrix: Float64) -> Float64:
 
 
 def interpolate(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Float64:
-    """Return the pose (4, 4) at `fraction` of the motion from a to b; 0 = a, 1 = b.
+    """Return the pose (4, 4) at `fraction` of the motion from pose a to pose b, both (4, 4); 0 = a, 1 = b.
 
     The translation is interpolated linearly, and the rotation spherically (slerp).
     """
@@ -140,7 +143,7 @@ def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDAr
 
     Args:
         camera: The camera.
-        points_camera: The points (..., 3) in the camera frame, m.
+        points_camera: The points (..., 3) in the camera frame, m, with z > 0.
 
     Returns:
         The pixel coordinates (u, v) (..., 2), px.
@@ -166,7 +169,10 @@ def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Flo
 
 
 def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
-    """Raise DataError if a pixel is outside of an image of `shape` (height, width), px. Kernels check no bounds."""
+    """Raise DataError if a pixel of `clusters` is outside of an image of `shape` (height, width), px.
+
+    Kernels index images with these pixels, without bounds checks.
+    """
     u, v = clusters.pixels.T
     if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
         raise DataError(

@@ -76,9 +76,9 @@ class RGBDVideo(ABC):
         return None
 
     def constant_color_delay(self) -> float | None:
-        """Return the time from a depth image to the color image with the same timestamp, s; None = to be estimated.
+        """Return the delay of color relative to depth, s; positive = color captured later; None = to be estimated.
 
-        The true time of a color image is its timestamp plus this delay, on the clock of the depth images.
+        The capture time of a color image is its timestamp plus this delay, on the clock of the depth images.
         """
         return 0.0
 
@@ -86,7 +86,7 @@ class RGBDVideo(ABC):
 class RGBDSequence(RGBDVideo):
     """A recorded or rendered RGB-D sequence with random access.
 
-    Every implementation has the parameters `start`, `stop`, `stride` and `frame_fraction`, which select frames.
+    Every implementation has the parameters `start`, `stop`, `stride` and `frame_fraction`, which select the frames.
     """
 
     camera: Camera
@@ -110,7 +110,7 @@ class RGBDSequence(RGBDVideo):
 
 
 class LiveVideo(RGBDVideo):
-    """A running camera stream. If mapping falls behind, frames are dropped."""
+    """The stream of a running camera. If mapping falls behind, frames are dropped."""
 
     @abstractmethod
     def frames(self) -> Generator[FrameReader | None]:
@@ -131,9 +131,9 @@ class LiveVideo(RGBDVideo):
 class Detector(ABC):
     """Detector of object instances in one image."""
 
-    classes: tuple[str, ...]  # names of the columns of class_probabilities; set by the constructor
+    classes: tuple[str, ...]  # names of the columns of Detections.class_probabilities; set by the constructor
     concurrent: bool = False  # True = threads may call `detect` at the same time; each call uses about one core
-    domain: str = ""  # the only supported `RGBDVideo.domain`; "" = any
+    domain: str = ""  # `RGBDVideo.domain` that the detector was trained for; "" = any
 
     @abstractmethod
     def detect(self, frame: Frame) -> Detections:
@@ -184,7 +184,7 @@ class PoseTracker(ABC):
 
 
 class ClusterRefiner(ABC):
-    """Refiner of the point clusters of one frame: cleans, splits or merges them."""
+    """Refiner of the point clusters of one frame. A refiner cleans, splits or merges the clusters."""
 
     @abstractmethod
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
@@ -205,14 +205,14 @@ class MapFuser(ABC):
 
         If `clusters.detected` is false, `clusters` is empty and instances in view do not lose confidence.
         `timer` measures data association, the update of labels and instances, and the integration of depth and color.
-        If a fuser does not use `timer`, the run reports the total time as `fusion`.
+        If a fuser does not use `timer`, the total time is reported as `fusion`.
 
         Raises:
             MapFullError: The map has reached its maximum number of blocks.
         """
 
     def renew_colors(self) -> None:  # noqa: B027  # optional
-        """Let later observations replace the map's colors, which were displaced. By default, colors are averaged.
+        """Let later observations replace the colors of the map, which were displaced. By default, colors are averaged.
 
         Called once, when the estimated color delay is used for the first time.
         """
@@ -270,7 +270,7 @@ class SceneMap(ABC):
         return ""
 
     def instance_ids(self) -> frozenset[int]:
-        """Return the ids of the objects found so far; called after each frame of a `Mapper`."""
+        """Return the ids of the objects in the map. A `Mapper` calls it before and after each frame."""
         return frozenset(self.instances())
 
     def most_likely_classes(self) -> Mapping[int, tuple[int, float]]:
@@ -287,21 +287,24 @@ class SceneMap(ABC):
 
     @abstractmethod
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Return the view from `camera` at T_world_camera (4, 4). Raises DataError if this is not a rigid transform."""
+        """Return the view of the map from `camera` at T_world_camera (4, 4).
+
+        Raises DataError if T_world_camera is not a rigid transform.
+        """
 
     def render_near(
         self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
     ) -> SurfaceView:
-        """Return the surface near the measured depth, for tracking.
+        """Return the view of the surface near the measured depth, for tracking.
 
-        A map may start its search at the depth measurements. It may omit pixels without a measurement, and surfaces far
-        behind a measurement.
+        The implementation may start its search at the measured depth, and omit pixels without a measurement and
+        surfaces far behind the measured depth.
 
         Args:
             camera: The camera.
             T_world_camera: The pose (4, 4) of the camera.
             depth: (H, W) float32, m along z; 0 = no measurement.
-            sensor: The kind of the depth sensor, with its noise model.
+            sensor: The kind of depth sensor, which determines the noise model.
         """
         return self.render(camera, T_world_camera)
 
@@ -311,7 +314,7 @@ class SceneMap(ABC):
 
     @abstractmethod
     def instances(self) -> Mapping[int, Instance]:
-        """Return the objects found so far, by id. Vertex indices refer to `mesh()`."""
+        """Return the objects in the map by id. Their vertex indices refer to `mesh()`."""
 
     @abstractmethod
     def save(self, path: Path | str) -> None:
@@ -327,11 +330,14 @@ class Viewer:
     """Viewer of a run in progress. This class shows nothing; override the methods that a viewer needs.
 
     The pipeline waits for each call, so do slow work in a thread (`framework.live_view.drawing_thread`). Read the map
-    only within a call. A viewer never changes results.
+    only during a call. A viewer must not change results.
     """
 
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
-        """Start a video and write files to `directory`. Raises ConfigError if the viewer cannot start."""
+        """Start showing the run of the video named `video`. `directory` is the folder for files.
+
+        Raises ConfigError if the viewer cannot start.
+        """
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
         """Show a mapped frame, or a frame with a lost pose. `stage_ms` contains the stage times by name, ms."""
@@ -340,4 +346,4 @@ class Viewer:
         """Show the reason for a skipped frame."""
 
     def end(self) -> None:
-        """Finish the video. Called once after `begin`, also after an error of the run."""
+        """Finish showing the run. Called once after `begin`, also after an error of the run."""

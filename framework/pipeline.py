@@ -52,9 +52,9 @@ class Pipeline:
     tracker: PoseTracker
     refiner: ClusterRefiner
     fuser: MapFuser
-    prefetch: int = 2  # number of frames prefetched by other threads (live video: at most 1); 0 = none
+    prefetch: int = 2  # number of frames prefetched by other threads, >= 0 (live video: at most 1); 0 = none
     viewer: Viewer = field(default_factory=Viewer)
-    detection_interval: int = 1  # interval between detections, in frames; all frames are tracked and mapped
+    detection_interval: int = 1  # interval between detections, in frames, >= 1; all frames are tracked and mapped
 
     def __post_init__(self) -> None:
         if self.detection_interval < 1:
@@ -65,22 +65,22 @@ class Pipeline:
             raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}; set it to 0")
         self.viewer = GuardedViewer(self.viewer)
         self.color_to_depth = ColorToDepth(delay=None)
-        self.T_world_color: Float64 | None = None  # (4, 4) pose of the last frame's color camera
+        self.T_world_color: Float64 | None = None  # (4, 4) pose of the color camera in the last mapped frame
 
     def run(self, video: RGBDVideo) -> RunResult:
         """Map `video` frame by frame.
 
         Frames that raise FrameError are skipped, and lost frames are not fused. Both are counted. Ctrl-C (after the
-        current frame) and a full map end the loop early.
+        current frame) and a full map end the loop early. Other errors of stages are raised.
 
         Ctrl-C is the normal end of a live video. If mapping falls behind, frames of a live video are dropped and
-        counted. Other errors of stages are raised.
+        counted.
 
         Args:
             video: The sequence or live video.
 
         Returns:
-            The map and the statistics of the run. `stopped_by` is the reason for an early end.
+            The map and the statistics of the run. `stopped_by` is the reason for an early end; None = normal end.
 
         Raises:
             DataError: No frame was mapped.
@@ -125,7 +125,7 @@ class Pipeline:
         return replace(journal.result(), keyframes=keyframes, color_delay=self.color_to_depth.estimate)
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
-        """Return the keyframes of the tracker. A pending error of its thread is stored in `journal.stopped_by`."""
+        """Return the tracker's keyframes by array name. An error of its thread is stored in `journal.stopped_by`."""
         try:
             return self.tracker.keyframes()
         except Exception as error:
@@ -133,7 +133,7 @@ class Pipeline:
             return self.tracker.keyframes()
 
     def empty_map_reason(self, journal: Journal) -> str:
-        """Return the reason for an empty map, for an error message."""
+        """Return the reason for an empty map, as the text of an error message."""
         result = journal.result()
         if result.frames == 0:
             return "expected at least one frame, got none"
@@ -183,10 +183,10 @@ class Pipeline:
     def detect_prefetched(
         self, video: RGBDVideo, journal: Journal, interruption: Interruption, budget: CpuBudget, prefetch: int
     ) -> Generator[tuple[Frame, Detections]]:
-        """Yield the usable frames with their detections, in order.
+        """Yield the usable frames with their detections, in the order of the video.
 
-        Up to `prefetch` frames are read and detected while another frame is mapped, in parallel if the detector
-        supports it. The results of a recording do not depend on `prefetch`.
+        While the caller maps a frame, other threads process up to `prefetch` later frames, in parallel if the detector
+        supports it. The results of a stored sequence do not depend on `prefetch`.
         """
         stream = stream_of(video, lambda: interruption.received is not None)
         prefetch = prefetch if stream.max_prefetched is None else min(prefetch, stream.max_prefetched)
@@ -215,7 +215,7 @@ class Pipeline:
     def read_and_detect(
         self, stream: FrameStream, turn: AbstractContextManager[None], number: int
     ) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
-        """Read frame `number` of the video in its `turn`, and detect its objects.
+        """Read frame `number` (from 0) of the video in its `turn`, and detect its objects.
 
         Returns the frame with its detections and stage times, or the error of the frame; None = end of the video.
         """
@@ -233,7 +233,10 @@ class Pipeline:
         return frame, detections, [reading, *times]
 
     def detect(self, frame: Frame, number: int) -> tuple[Detections, list[StageTime]]:
-        """Return the detections of frame `number` (from 0) of the video, and the detection time if the detector ran."""
+        """Return the detections of frame `number` (from 0) of the video, and the detection time.
+
+        For frames between two detections, both are empty.
+        """
         if number % self.detection_interval:
             return Detections.none(frame.depth.shape, self.detector.classes, detected=False), []
         began = time.perf_counter()
@@ -241,11 +244,17 @@ class Pipeline:
         return detections, [StageTime(frame.index, "detection", 1e3 * (time.perf_counter() - began))]
 
     def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> Pose:
-        """Track, lift, refine and fuse one frame. Raises FrameError if it is unusable."""
+        """Track a frame, and lift, refine and fuse its detections unless the pose is lost. Return the pose.
+
+        Raises FrameError if the frame is unusable.
+        """
         with journal.timed(frame.index, "tracking"):
             pose = self.tracker.track(self.color_to_depth.predicted(frame), self.fuser.scene)
             if not isinstance(cast(object, pose), Pose):
-                raise DataError(f"frame {frame.index}: expected a Pose from the tracker, got {type(pose).__name__}")
+                raise DataError(
+                    f"frame {frame.index}: expected a Pose from the tracker, got {type(pose).__name__}; return a Pose "
+                    "from track()"
+                )
             frame, self.T_world_color, color_pixels = self.color_to_depth.tracked(frame, pose)
             if self.color_to_depth.displaced_before:
                 self.tracker.renew_colors()
@@ -254,19 +263,20 @@ class Pipeline:
         if pose.lost:
             return pose
         with journal.timed(frame.index, "lifting"):
-            clusters = lift(detections, frame, pose, color_pixels)
+            lifted = lift(detections, frame, pose, color_pixels)
         with journal.timed(frame.index, "refinement"):
-            clusters = refine(self.refiner, clusters, frame)
+            clusters = refine(self.refiner, lifted, frame)
         journal.frames_in_map += 1
         with journal.fusing(frame.index) as timer:
             self.fuser.fuse(frame, pose, clusters, timer)
         journal.frame_fused(frame)
+        journal.digest(frame.index, detection=detections, lifting=lifted, refinement=clusters, fusion=self.fuser.scene)
         return pose
 
 
 @contextmanager
 def watched(viewer: Viewer, scene: SceneMap, video: str, directory: Path) -> Iterator[None]:
-    """Start the viewer, and end it after the body of the context, even after an error."""
+    """Begin the viewer, and end it when the context exits, even after an error."""
     viewer.begin(scene, video, directory)
     try:
         yield

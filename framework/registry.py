@@ -35,7 +35,7 @@ STAGES: Mapping[str, type[Any]] = {
     "refiner": ClusterRefiner,
     "fuser": MapFuser,
 }
-"""Interface of the options in each config group. These groups affect results."""
+"""Interface of the options in each config group that affects results."""
 
 GROUPS: Mapping[str, type[Any]] = {**STAGES, "viewer": Viewer}
 """Interface of the options in each config group of plugins."""
@@ -79,13 +79,13 @@ def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
         with _errors_at(where):
             plugin: Plugin = assemble(plugin_class, **arguments)
     except (ImportError, ValueError) as error:
-        raise ConfigError(f"{where}: {first_line(error)}") from error
+        raise ConfigError(f"{where}: expected a working constructor, got an error ({first_line(error)})") from error
     return plugin
 
 
 @contextmanager
 def _errors_at(where: str) -> Iterator[None]:
-    """Prepend `where` to the message of an InstanceMapError, and keep its class."""
+    """Prepend `where` to the message of an InstanceMapError that is raised inside the context, and keep its class."""
     try:
         yield
     except InstanceMapError as error:
@@ -145,7 +145,7 @@ def stage_of(interface: Callable[..., object]) -> str:
 
 @contextmanager
 def _options_loader() -> Iterator[Any]:
-    """Yield the loader of the running Hydra if its search path has InstanceMap's configs, otherwise a new loader."""
+    """Yield the loader of the running Hydra application if it finds InstanceMap's configs, otherwise a new loader."""
     if (running := running_loader()) is not None:
         yield running
         return
@@ -228,7 +228,7 @@ def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
 def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, Any]:
     """Return the keyword arguments for `plugin_class` from `node`, each with the type of its dataclass field.
 
-    Raises ConfigError that names `where` for an unknown parameter, a wrong type or a missing value. The metadata key
+    Raises a ConfigError that names `where` for an unknown parameter, a wrong type or a missing value. The metadata key
     `source` of a field is a hint for obtaining its value.
     """
     stages = plugin_fields(plugin_class)
@@ -258,7 +258,7 @@ def check_option(where: str, plugin_class: type, node: DictConfig) -> None:
 
 
 def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
-    """Return the parameters of a plugin, with defaults for omitted ones, and its nested plugins by parameter."""
+    """Return the parameters of a plugin, with defaults for omitted parameters, and its nested plugins by parameter."""
     stages = plugin_fields(plugin_class)
     fields = parameter_fields(plugin_class)
     typed = [
@@ -292,7 +292,8 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
         try:
             value = node[key]
         except OmegaConfBaseException as error:  # interpolation of a missing key
-            raise ConfigError(f"{where}: {key}: {first_line(error)}") from error
+            reason = first_line(error)
+            raise ConfigError(f"{where}: {key}: expected a valid reference, got an error ({reason})") from error
         try:
             schema[key] = value
         except OmegaConfBaseException as error:
@@ -318,7 +319,7 @@ def holds_one(plugin_class: type, name: str) -> bool:
 
 
 def _inner(where: str, interface: type[Any], node: Any, one: bool) -> Any:
-    """Build a nested plugin, or a mapping of nested plugins without null entries."""
+    """Return a nested plugin if `one`, otherwise a mapping of nested plugins by name, without null entries."""
     if one:
         with _errors_at(where):
             return build(interface, node)
@@ -344,7 +345,7 @@ def _import(where: str, module_name: str) -> ModuleType:
     except Exception as error:  # third-party code
         kind = type(error).__name__
         raise ConfigError(
-            f"{where}: {module_name}: expected an importable module, got {kind}: {first_line(error)}"
+            f"{where}: {module_name}: expected an importable module, got an error ({kind}: {first_line(error)})"
         ) from error
 
 
@@ -373,7 +374,7 @@ def _check_module(where: str, module_name: str) -> None:
 
 
 def _check_plugins_package(plugins: ModuleSpec) -> None:
-    """Raise InstanceMapError if another package `plugins` precedes InstanceMap's on the module search path."""
+    """Raise InstanceMapError if another package named `plugins` precedes InstanceMap's on the module search path."""
     found = Path([*(plugins.submodule_search_locations or []), str(plugins.origin)][0]).resolve()
     if found != PROJECT_ROOT / "plugins":
         raise InstanceMapError(

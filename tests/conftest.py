@@ -37,7 +37,7 @@ if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_I
 
 MARKERS = ("unit", "integration", "acceptance")
 INTEGRATION_FIXTURES = {"shared", "shared_data", "benchmark"}
-SLOW_UNIT_TEST = 2.0  # s
+SLOW_UNIT_TEST = 2.0  # s, minimum duration of a unit test that is listed as slow
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m deselects tests

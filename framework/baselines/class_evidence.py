@@ -1,19 +1,23 @@
 """Class evidence of the voxels of a semantic map, including the background, and its update from a frame.
 
-The update follows SemanticFusion (McCormac et al. 2017, eq. 2). It is eq. (7) with one distribution per pixel:
+The update follows SemanticFusion (McCormac et al. 2017, eq. 2). It is eq. (7) of docs/method.md with one distribution
+per pixel:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t),   c = background or a class
+
+Here, I_t is image t, O_u is the label observed at the pixel u of the voxel, and Z normalizes the distribution.
 
 In log space, the update is a sum that starts from a uniform distribution. Only ratios matter, so a voxel stores the
 log ratio of each class to the background. If no log ratio is above 0, the voxel is background.
 
 A voxel is *under a mask* if it projects to a pixel of the mask. It then gets the class distribution of the mask. All
-pixels outside the masks are equal evidence for the background, so a voxel only counts the frames in which it is
-outside. Mask evidence is stored in rows of 512 voxels, one row for each block that was under a mask. A voxel in a row
-takes 14 bytes plus 5 bytes per class slot, at most 94 bytes.
+pixels outside the masks are equal evidence for the background, so a voxel only counts the frames in which it is not
+under a mask. Mask evidence is stored in rows of 512 voxels, one row for each block that was under a mask. A voxel in a
+row takes 14 bytes plus 5 bytes per class slot, at most 94 bytes.
 
 Each mask *names* its most likely classes. A voxel stores the CLASS_SLOTS most likely named classes; a newly named class
-replaces the least likely one. The unnamed classes share one sum, `rest`, with which a newly named class starts.
+replaces the least likely one. The unnamed classes share one log ratio, `rest`, which is the initial value of a newly
+named class.
 """
 
 from __future__ import annotations
@@ -34,22 +38,22 @@ from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-MAX_EXPONENT = 700.0  # maximum log ratio; float64 can represent exp(700)
+MAX_EXPONENT = 700.0  # maximum log ratio of unnamed classes; float64 can represent exp(700)
 
 
 class ClassEvidence(NamedTuple):
-    """Class evidence of all voxels. The best class of a voxel is in slot 0."""
+    """Class evidence of all voxels, with R rows and T class slots. The best class of a voxel is in slot 0."""
 
-    unmasked: UInt16  # (B, 512) number of frames in which the voxel was outside all masks; B as in Grid
+    unmasked: UInt16  # (B, 512) number of frames in which the voxel was outside all masks, for B blocks
     class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
-    log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames counted by `masked`
+    log_ratio: Float32  # (R, 512, T) sum of log(P(class) / P(background)) over the frames counted by `masked`
     rest: Float32  # (R, 512) log_ratio of each unnamed class of the voxel
     masked: UInt16  # (R, 512) number of frames in which the voxel was under a mask
     first_frame: Int32  # (R, 512) first frame in which the voxel was under a mask, -1 = none
     last_frame: Int32  # (R, 512) last frame in which the voxel was under a mask, -1 = none
 
 
-ROW_ARRAYS = ClassEvidence._fields[1:]
+ROW_ARRAYS = ClassEvidence._fields[1:]  # arrays with one entry per row
 NO_EVIDENCE = (NO_CLASS, 0, 0, 0, -1, -1)  # values of ROW_ARRAYS in a new row
 
 
@@ -57,17 +61,17 @@ class MaskClasses(NamedTuple):
     """Evidence of one frame's N masks for C classes."""
 
     cluster: Int32  # (H * W,) cluster with the highest score at each pixel, -1 = none
-    log_ratio: Float32  # (N, C) log P(class) / P(background)
-    unnamed: Float32  # (N,) log ratio of the mean P(unnamed class) of each cluster to P(background)
+    log_ratio: Float32  # (N, C) log(P(class) / P(background))
+    unnamed: Float32  # (N,) log(mean P(unnamed class) / P(background)) of each cluster
     named_classes: UInt8  # (N, NEW_CLASSES) most likely classes of each cluster
     named_bit: UInt8  # (N, NO_CLASS + 1) 2^m for the m-th named class of a cluster, 0 = unnamed
     frame: int  # index of the frame
 
 
 def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists, frame: int) -> MaskClasses:
-    """Return the evidence of a frame's clusters from their `log_ratio` (N, C), log P(class) / P(background).
+    """Return the evidence of a frame's clusters from `log_ratio` (N, C), log(P(class) / P(background)).
 
-    `points` lists the clusters at each pixel.
+    `points` lists the clusters at each pixel, and `frame` is the index of the frame.
     """
     relative, named, bits = named_classes(log_ratio, logarithmic=True)
     best = best_clusters(points.offsets, points.clusters, clusters.scores)
@@ -107,7 +111,7 @@ class ClassRows:
         self.evidence = _free_rows(min(classes, CLASS_SLOTS))
 
     def update(self, seen: SeenBlocks, masks: MaskClasses | None) -> None:
-        """Update the voxels near the measured surface; `masks` = None: no update, because the detector did not run."""
+        """Update the voxels near the measured surface. If the detector did not run (`masks` is None), do nothing."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.evidence.unmasked) < capacity:
             self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, zeros=True))
@@ -121,7 +125,7 @@ class ClassRows:
         self.evicted += int(evicted.sum())
 
     def saved(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the used part of each array, by name."""
+        """Return the arrays of a map file, without unused capacity, by name."""
         rows = {name: getattr(self.evidence, name)[: self.row_count] for name in ROW_ARRAYS}
         return {"unmasked": self.evidence.unmasked[: self.voxels.block_count], **rows}
 
@@ -132,7 +136,7 @@ class ClassRows:
         check_like(arrays, free, len(arrays["rest"]))
         check_known("class_ids", arrays["class_ids"], [*range(classes), NO_CLASS])
         if len(arrays["rest"]) and not classes:
-            raise DataError(f"rest: expected 0 rows in a map without classes, got {len(arrays['rest'])}")
+            raise DataError(f"unnamed_log_ratio: expected 0 rows in a map without classes, got {len(arrays['rest'])}")
         _check_order(arrays["class_ids"], arrays["log_ratio"], arrays["rest"], classes)
         self.evidence = ClassEvidence(**{name: arrays[name] for name in ClassEvidence._fields})
         self.row_count = len(self.evidence.rest)
@@ -153,20 +157,20 @@ class ClassRows:
 
 
 def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: int) -> None:
-    """Raise DataError unless the best class is in slot 0 and `rest` is small in voxels without unnamed classes."""
+    """Raise DataError unless slot 0 has the best class, and `rest` is limited in voxels without unnamed classes."""
     named = class_ids != NO_CLASS
     ratios = np.where(named, log_ratio, np.float32(-np.inf))
     best = ratios.max(axis=-1, initial=-np.inf)
     wrong = ratios[..., 0] < best
     if wrong.any():
         raise DataError(
-            f"log_ratio: expected the maximum of the voxel, {best[wrong][0]:g}, in slot 0, got {ratios[wrong][0, 0]:g}"
+            f"log_ratio: expected the maximum of a voxel in slot 0 ({best[wrong][0]:g}), got {ratios[wrong][0, 0]:g}"
         )
     excess = np.where(named.sum(axis=-1) == classes, rest - np.maximum(best, 0), np.float32(-np.inf))
     if (excess > MAX_EXPONENT).any():
         raise DataError(
-            f"rest: expected at most {MAX_EXPONENT:g} above the best class in voxels that name all classes, got "
-            f"{excess.max():g}"
+            f"unnamed_log_ratio: expected a log ratio at most {MAX_EXPONENT:g} above the best class in voxels without "
+            f"unnamed classes, got {excess.max():g}"
         )
 
 

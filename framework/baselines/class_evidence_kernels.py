@@ -29,7 +29,7 @@ def best_clusters(offsets, clusters, scores):
 
 @device
 def best_class(grid, evidence, log_missed, block, n):
-    """Return the most likely class of a voxel, -1 = background; ties go to the background.
+    """Return the most likely class of voxel n of a block, -1 = background; ties go to the background.
 
     `log_missed` is the log ratio of every class to the background for a frame in which the voxel is outside all masks.
     """
@@ -42,9 +42,10 @@ def best_class(grid, evidence, log_missed, block, n):
 
 @device
 def _add_class(labels, sums, label, total):
-    """Store a class in a free slot, or in the slot of the least likely class if the new class is more likely.
+    """Store a class with the log ratio `total` in a free slot of `labels` (T,) and `sums` (T,).
 
-    Returns 1 if no slot was free, so that a class was evicted or not stored.
+    If no slot is free, the class replaces the least likely class if that class has a smaller log ratio. Returns 1 if a
+    class was evicted or not stored, otherwise 0.
     """
     least = 0
     for s in range(len(labels)):
@@ -62,7 +63,10 @@ def _add_class(labels, sums, label, total):
 
 @device
 def observe_mask(evidence, row, n, masks, k):
-    """Apply the recursive update to a voxel under the mask of cluster k. Returns the number of evictions."""
+    """Apply the recursive update to voxel n of a row, which is under the mask of cluster k.
+
+    Returns the number of evictions.
+    """
     labels, sums = evidence.class_ids[row, n], evidence.log_ratio[row, n]
     known = 0  # bits of the named classes with a slot
     for s in range(len(labels)):
@@ -89,7 +93,7 @@ def observe_mask(evidence, row, n, masks, k):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_blocks_under_masks(grid, seen, cluster, wants_row):
-    """Set wants_row (A,) to True for each seen block that has a voxel under a mask but no row, else to False."""
+    """Set wants_row (A,) to True where a seen block has no row, but a voxel near the surface under a mask."""
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
         start = seen.near_start[a]
@@ -104,7 +108,8 @@ def find_blocks_under_masks(grid, seen, cluster, wants_row):
 def update_classes(grid, seen, evidence, masks, evicted):
     """Update the voxels near the measured surface in the seen blocks.
 
-    Sets evicted (A,) to the number of evictions in each block.
+    Voxels at a pixel of a mask get the evidence of the mask, and all other voxels count the frame as unmasked. Sets
+    evicted (A,) to the number of evictions in each block.
     """
     unmasked = evidence.unmasked  # numba 0.68 drops assignments to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):

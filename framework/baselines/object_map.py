@@ -2,7 +2,7 @@
 
 Fusion++ (McCormac et al. 2018) represents an object by 64^3 voxels, which are resampled as the object grows. It
 integrates every frame that shows the object, corrects object poses by loop closures, and tracks against a coarse
-background. MaskFusion (Runz et al. 2018) stores surfels under the masks only, and tracks moving objects.
+background. MaskFusion (Runz et al. 2018) stores surfels only at the pixels of masks, and tracks moving objects.
 
 Here, all volumes have voxels of the same size, objects are static, and a volume changes only in frames in which its
 object is detected.
@@ -42,7 +42,7 @@ from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 from framework.sensors.noise_models import SensorKind
 
 FORMAT = "object_volumes 4"  # format of the map file; increment it when the meaning of the contents changes
-OBJECT = "object_"  # prefix of the arrays with the concatenated volumes of all objects
+OBJECT = "object_"  # prefix of the names of the arrays with the concatenated volumes of all objects
 
 Part = tuple[Float32, Int32, UInt8, Int32]
 """Vertices (V, 3) m, triangles (F, 3), colors (V, 3) and instance ids (V,) of a part of the mesh."""
@@ -76,7 +76,7 @@ class ObjectMap(InstanceTableMap):
         return self.background.sensor.depth_range
 
     def create(self, frame_index: int) -> int:
-        """Create an object with an empty volume and return its id."""
+        """Create an object with an empty volume, first seen in frame `frame_index`, and return its id."""
         record = self.table.create(len(self.classes), frame_index)
         self.volumes[record.id] = self._empty_volume()
         return record.id
@@ -92,15 +92,15 @@ class ObjectMap(InstanceTableMap):
     def integrate(self, frame: Frame, T_world_camera: Float64, masks: Mapping[int, Bool], band: float) -> None:
         """Integrate `frame` into the background and into the volumes of the objects in `masks`.
 
-        `masks` maps object ids to masks (H, W). Voxels within `band` m of the measured surface count their
-        observations under and outside the object's mask. Raises MapFullError if the block budget is reached.
+        `masks` maps object ids to masks (H, W). Each voxel within `band` m of the measured surface counts its
+        observations inside and outside the mask of the object. Raises MapFullError if the block budget is reached.
         """
         self.background.integrate(frame, T_world_camera, band)
         for instance_id, mask in masks.items():
             self._integrate_object(self.volumes[instance_id], frame, T_world_camera, mask, band)
             if self.block_count > self.background.voxels.max_blocks:
                 raise MapFullError(
-                    f"the map is full: expected at most {self.background.voxels.max_blocks} blocks in the background "
+                    f"fuser.max_blocks: expected at most {self.background.voxels.max_blocks} blocks in the background "
                     f"and {len(self.volumes)} objects, got {self.block_count}; raise fuser.max_blocks or "
                     "fuser.voxel_size"
                 )
@@ -126,8 +126,8 @@ class ObjectMap(InstanceTableMap):
     def instances_seen(self, camera: Camera, T_world_camera: Float64, depth: Float32, stride: int) -> Int32:
         """Return the object ids (ceil(H / stride), ceil(W / stride)) at the measured surface, 0 = none.
 
-        Samples every stride-th depth reading of every stride-th row of `depth` (H, W), m. A reading in several volumes
-        belongs to the object with the highest foreground probability.
+        These are the objects at every stride-th depth reading of every stride-th row of `depth` (H, W), m. A reading in
+        several volumes belongs to the object with the highest foreground probability.
         """
         shape = tuple(-(-side // stride) for side in depth.shape)
         instance_ids, best = np.zeros(shape, np.int32), np.full(shape, np.float32(FOREGROUND))
@@ -143,7 +143,7 @@ class ObjectMap(InstanceTableMap):
         return instance_ids
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Return the surface of the background with the labels of the objects."""
+        """Return the view of the background surface, with the labels of the objects."""
         surface = self.background.render(camera, T_world_camera)
         instance_ids = self.instances_seen(camera, T_world_camera, surface.depth, stride=1)
         return View(**vars(surface), instance_ids=instance_ids, class_ids=self.table.class_ids()[instance_ids])
@@ -157,11 +157,12 @@ class ObjectMap(InstanceTableMap):
         return self.background.mesh(self._labeled)
 
     def _labeled(self, background: UnlabeledMesh) -> InstanceMesh:
-        """Return the background's surface, labeled with the most probable object, and the surfaces of the objects.
+        """Return the mesh of the background, labeled with the most probable objects, and the meshes of the objects.
 
         Both surfaces come from the same depth readings and nearly coincide. Without labels on the background, the
         nearest vertex to a ground-truth point could be unlabeled by chance. Without the background, there would be
-        seams, and holes where an object's volume has too few observations. Overlapping objects each keep their surface.
+        seams, and holes where an object's volume has too few observations. If objects overlap, the mesh contains the
+        surface of each.
         """
         counts = self.confirmation.counts(self.table)
         instance_ids = np.zeros(len(background.vertices), np.int32)
@@ -220,7 +221,7 @@ class ObjectMap(InstanceTableMap):
             objects = header.part("objects")
             if objects.values.keys() != {str(key) for key in scene.table.records}:
                 raise DataError(
-                    f"header.objects: expected the ids of the table, {', '.join(map(str, scene.table.records))!s:.60}, "
+                    f"header.objects: expected the object ids {', '.join(map(str, scene.table.records))!s:.60}, "
                     f"got {', '.join(objects.values)!s:.60}"
                 )
             counts = {int(key): objects.whole(key) for key in objects.values}
@@ -240,7 +241,10 @@ class ObjectMap(InstanceTableMap):
 
 
 def _part(surface: UnlabeledMesh, voxels: VoxelGrid, chosen: Bool, instance_ids: Int32) -> Part:
-    """Return the vertices marked in `chosen` (V,), with their `instance_ids` (V,), and the triangles between them."""
+    """Return the part of a surface with the vertices marked in `chosen` (V,), and the triangles between them.
+
+    `instance_ids` (V,) holds the instance of each vertex of the whole surface, and `voxels` provides the colors.
+    """
     new_index = np.cumsum(chosen, dtype=np.int32) - np.int32(1)
     triangles = surface.triangles[chosen[surface.triangles].all(axis=1)]
     nearest = surface.voxels[chosen]
@@ -250,7 +254,7 @@ def _part(surface: UnlabeledMesh, voxels: VoxelGrid, chosen: Bool, instance_ids:
 
 
 def _cropped(frame: Frame, u0: int, v0: int, u1: int, v1: int) -> Frame:
-    """Return the part of a frame from pixel (u0, v0) to pixel (u1, v1), exclusive."""
+    """Return the part of a frame from pixel (u0, v0), inclusive, to pixel (u1, v1), exclusive."""
     camera = frame.camera
     part = replace(camera, width=u1 - u0, height=v1 - v0, cx=camera.cx - u0, cy=camera.cy - v0)
     return Frame(

@@ -1,12 +1,13 @@
-"""Volume of one object: a TSDF that grows under the object's masks, and a mask count for each voxel.
+"""Volume of one object: a TSDF that grows inside the masks of the object, and two observation counts per voxel.
 
-As in Fusion++ (McCormac et al. 2018), a voxel counts its observations under a mask of the object, and all of its
-observations. Its foreground probability is the mean of Beta(1 + foreground, 1 + background). The object's surface is
-the part with a probability above 1/2. Therefore, occasional mask errors are outvoted, but systematic errors are not.
+As in Fusion++ (McCormac et al. 2018), a voxel counts its observations inside a mask of the object (foreground) and
+outside (background). Its foreground probability is the mean of Beta(1 + foreground, 1 + background). The surface of the
+object is the part of the TSDF surface with a probability above 1/2. Therefore, occasional mask errors average out, but
+systematic errors do not.
 
-Every depth reading in the blocks of the volume is integrated, masked or not. Therefore, distances at the outline are as
-accurate as elsewhere. Blocks are aligned with the blocks of other volumes. Counts take 4 bytes per voxel in addition to
-the 8 bytes of the TSDF.
+Every depth reading in the blocks of the volume is integrated, inside or outside the mask. Therefore, distances at the
+outline are as accurate as elsewhere. Blocks are aligned with the blocks of other volumes. Counts take 4 bytes per voxel
+in addition to the 8 bytes of the TSDF.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.mapping.voxels.voxel_grid import grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, BLOCK_VOXELS
 
-FOREGROUND = 0.5  # minimum foreground probability of the object's voxels
+FOREGROUND = 0.5  # exclusive minimum of the foreground probability of the surface of the object
 
 VOLUME_ARRAYS = (*(name for name in BLOCK_ARRAYS if name != "label_row"), *MaskCounts._fields)  # saved arrays
 
@@ -51,9 +52,9 @@ class ObjectVolume:
         return self.voxels.byte_count + sum(counts[: self.block_count].nbytes for counts in self.counts)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> None:
-        """Integrate `frame` into the volume. The volume grows only within the object's `mask` (H, W).
+        """Integrate `frame` into the volume. New blocks are allocated only inside the object's `mask` (H, W).
 
-        Voxels within `band` m of the measured surface count their observations under and outside the mask. Raises
+        Each voxel within `band` m of the measured surface counts its observations inside and outside the mask. Raises
         MapFullError if the block budget is reached; in this case nothing is integrated.
         """
         seen = self.volume.integrator.integrate_object(frame, T_world_camera, band, mask)
@@ -75,7 +76,7 @@ class ObjectVolume:
             self.low, self.high = coords.min(axis=0) * side, (coords.max(axis=0) + 1) * side
 
     def encloses(self, points_world: Float32) -> Bool:
-        """Return an array (P,), True for each point (P, 3), m, inside the bounding box of the blocks."""
+        """Return a Boolean array (P,), True where a world point (P, 3), m, is inside the bounding box of the blocks."""
         return np.asarray(((points_world >= self.low) & (points_world <= self.high)).all(axis=1))
 
     def foreground_at(self, points_world: Float32) -> Float32:
@@ -85,7 +86,7 @@ class ObjectVolume:
         return probability
 
     def arrays(self) -> dict[str, Array]:
-        """Return the arrays to save, by name."""
+        """Return the arrays of a map file, by name."""
         arrays = self.volume.saved()[1] | {n: counts[: self.block_count] for n, counts in self.counts._asdict().items()}
         return {name: arrays[name] for name in VOLUME_ARRAYS}
 
@@ -99,15 +100,15 @@ class ObjectVolume:
 
 
 def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: Float64, near: float) -> Int32:
-    """Return the pixel windows u0, v0, u1, v1 (N, 4) of boxes in the world frame, u1 and v1 exclusive.
+    """Return the pixel windows (N, 4), u0, v0, u1, v1, of axis-aligned boxes in the world frame; u1, v1 are exclusive.
 
     A window contains all of its box, but may be too large. A box out of view has u1 <= u0 or v1 <= v0.
 
     Args:
         camera: The camera.
-        T_world_camera: Pose (4, 4).
-        low: Lower corners (N, 3) of the boxes, m.
-        high: Upper corners (N, 3) of the boxes, m.
+        T_world_camera: Pose (4, 4) of the camera.
+        low: Minimum corners (N, 3) of the boxes, m.
+        high: Maximum corners (N, 3) of the boxes, m.
         near: Minimum visible depth, m.
     """
     T_camera_world = inverse(T_world_camera)
@@ -116,8 +117,8 @@ def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: F
     left, top, z0 = (center - half).T
     right, bottom, z1 = (center + half).T
     z0, z1 = np.maximum(z0, near), np.maximum(z1, near)
-    # perspective: a side projects farthest outwards at its minimum depth, or at its maximum depth if that side lies
-    # beyond the optical axis
+    # a side of the box projects farthest outward at its minimum depth, or at its maximum depth if the side is on the
+    # opposite side of the optical axis
     first = np.stack([camera.fx * np.minimum(left / z0, left / z1), camera.fy * np.minimum(top / z0, top / z1)])
     last = np.stack([camera.fx * np.maximum(right / z0, right / z1), camera.fy * np.maximum(bottom / z0, bottom / z1)])
     middle, size = np.array([[camera.cx], [camera.cy]]), np.array([[camera.width], [camera.height]])

@@ -16,9 +16,9 @@ from framework.mapping.voxels.voxel_grid_kernels import NO_LOOK_UP, device
 
 
 class MaskCounts(NamedTuple):
-    """Numbers of observations of each voxel in frames in which the object is detected."""
+    """Numbers of observations of each voxel, over the frames in which the object is detected."""
 
-    foreground: UInt16  # (B, 512) number of observations under a mask
+    foreground: UInt16  # (B, 512) number of observations inside a mask
     observed: UInt16  # (B, 512) number of all observations, at most 65535
 
 
@@ -31,7 +31,7 @@ def _probability(foreground, observed):
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_masks(seen, mask, counts):
-    """Count the observations of the voxels near the measured surface, in total and under `mask` (H, W)."""
+    """Count the observations of the voxels near the measured surface, in total and inside `mask` (H, W)."""
     foreground, observed = counts
     largest = np.uint16(65535)
     inside = mask.ravel()
@@ -57,11 +57,11 @@ def look_up_object(
     instance_ids: Int32,
     best: Float32,
 ) -> None:
-    """Assign readings to an object if its foreground probability is higher than `best` (h, w).
+    """Assign depth readings to an object where its foreground probability is higher than `best` (h, w).
 
-    Updates instance_ids (h, w) and `best`. Samples every stride-th depth reading of every stride-th row of `depth`
-    (H, W), m. Only samples inside `window` are updated: first row, first column, last row and last column in (h, w),
-    the last ones exclusive. `view` contains T_world_camera.
+    Updates instance_ids (h, w) and `best` at every stride-th depth reading of every stride-th row of `depth` (H, W), m.
+    Only samples inside `window` are updated: first row, first column, last row and last column of the samples, the last
+    ones exclusive. `view` contains T_world_camera.
     """
     top, left, bottom, right = window
     for row in prange(top, bottom):

@@ -26,12 +26,12 @@ from framework.mapping.voxels.voxel_grid import MAX_BLOCKS
 
 ATTRIBUTES = {  # name: (type, channels) of a voxel; Open3D's `integrate` expects the first three
     "tsdf": (o3d.core.float32, 1),  # in truncation distances
-    "weight": (o3d.core.float32, 1),  # number of frames
+    "weight": (o3d.core.float32, 1),  # number of observations
     "color": (o3d.core.float32, 3),  # in [0, 255]
     "instance": (o3d.core.int32, 1),  # 0 = no instance
     "votes": (o3d.core.float32, 1),  # votes for the instance minus votes against it
 }
-FIRST_BLOCKS = 1000  # initial capacity, blocks; Open3D allocates it immediately
+FIRST_BLOCKS = 1000  # maximum initial capacity, blocks; Open3D allocates it immediately
 FIRST_VOXELS = 2**23  # maximum initial capacity, voxels; 0.2 GB
 METERS = 1.0  # Open3D's depth_scale: units of a float image per meter
 TOUCH_STRIDE = 4  # pixel stride of Open3D's block search, px
@@ -60,7 +60,7 @@ class BlockGridSettings:
 
     @classmethod
     def of(cls, saved: MapHeader) -> BlockGridSettings:
-        """Return the settings in a map's header. Raises DataError or ConfigError if they are invalid."""
+        """Return the settings in the header of a map file. Raises DataError or ConfigError if they are invalid."""
         return cls(
             voxel_size=saved.number("voxel_size", BOUNDS["voxel_size"]),
             block_resolution=saved.whole("block_resolution"),
@@ -73,7 +73,7 @@ class BlockGridSettings:
 
 
 class BlockGrid:
-    """Voxel blocks with signed distances, colors and instance votes. Voxel indices refer to the arrays of `flat`."""
+    """Voxel blocks with signed distances, colors and instance votes. Flat indices of voxels are indices into `flat`."""
 
     def __init__(self, settings: BlockGridSettings) -> None:
         self.settings = settings
@@ -137,7 +137,7 @@ class BlockGrid:
         return np.where((depth >= s.min_depth) & (depth <= s.max_depth), depth, np.float32(0))
 
     def _touched(self, depth: Float32, camera: Camera, T_world_camera: Float64, band: float) -> Tensor:
-        """Return the coordinates (B, 3) of the blocks within `band` voxels of the readings of `depth` (H, W), m.
+        """Return the block coordinates (B, 3) of the blocks within `band` voxels of the readings of `depth` (H, W), m.
 
         Open3D samples every 4th pixel of every 4th row. If the samples are more than half a block apart, the image is
         enlarged to avoid holes in the map.
@@ -154,9 +154,9 @@ class BlockGrid:
         return self.blocks.compute_unique_block_coordinates(_image(depth), *view, METERS, s.max_depth, band)
 
     def _make_room(self, blocks: Tensor) -> None:
-        """Grow the hash map to fit the block coordinates `blocks` (B, 3).
+        """Grow the hash map so that it can store the blocks at the block coordinates `blocks` (B, 3).
 
-        Raises MapFullError if the block budget, which Open3D lacks, is exceeded.
+        Raises MapFullError if the block budget is exceeded. Open3D itself has no budget.
         """
         hashmap = self.blocks.hashmap()
         new = blocks.shape[0]
@@ -165,9 +165,9 @@ class BlockGrid:
         needed = hashmap.size() + new
         if needed > self.settings.max_blocks:
             raise MapFullError(
-                f"the map is full: expected at most {self.settings.max_blocks} blocks of "
-                f"{self.settings.block_resolution}^3 voxels, got {needed} ({self.byte_count / 2**20:.0f} MiB in use); "
-                "raise fuser.max_blocks or fuser.voxel_size"
+                f"fuser.max_blocks: expected at most {self.settings.max_blocks} blocks of "
+                f"{self.settings.block_resolution}^3 voxels in the map ({self.byte_count / 2**20:.0f} MiB in use), got "
+                f"{needed}; raise fuser.max_blocks or fuser.voxel_size"
             )
         if needed > hashmap.capacity():
             hashmap.reserve(min(max(needed, 2 * hashmap.capacity()), self.settings.max_blocks))
@@ -199,7 +199,7 @@ class BlockGrid:
         return voxels.numpy().ravel()[inside[near]], pixels[near]
 
     def voxels_at(self, points_world: Float32) -> Int64:
-        """Return the flat indices (P,) of the voxels nearest to the points (P, 3), m; -1 outside all blocks."""
+        """Return the flat indices (P,) of the voxels nearest to the world points (P, 3), m; -1 outside all blocks."""
         if not len(points_world) or not self.block_count:
             return np.full(len(points_world), -1)
         r = self.settings.block_resolution
@@ -214,7 +214,7 @@ class BlockGrid:
         return np.asarray(self.blocks.attribute(attribute).numpy()).reshape(-1)
 
     def ray_cast(self, camera: Camera, T_world_camera: Float64) -> SurfaceView:
-        """Return the visible surface. Raises DataError if the camera or its pose is invalid."""
+        """Return the visible surface, without labels. Raises DataError if the camera or its pose is invalid."""
         check_view(camera, T_world_camera)
         depth, normals, color = _blank(camera)
         blocks, far = self._blocks_in_view(camera, T_world_camera)
@@ -252,18 +252,18 @@ class BlockGrid:
         return {name: hit[name].numpy()[: camera.height, : camera.width] for name in names}
 
     def _distance(self, corners: Int64, weights: Float32) -> Float32:
-        """Return the interpolated signed distance (P,), m, of the voxels `corners` (P, 8) with `weights` (P, 8).
+        """Return the signed distance (P,), m, interpolated between voxels with flat indices `corners` (P, 8).
 
-        Voxels with weight 0 are unseen. Open3D's rays sample the distance at coordinates rounded down to voxels, and
-        end half a voxel too far along each axis. The distance decreases by about 1 m per m behind the surface, so
-        adding it to the depth is a Newton step.
+        `weights` (P, 8) are the interpolation weights, 0 = unobserved voxel. Open3D's rays sample the distance at
+        coordinates rounded down to voxels, and end half a voxel too far along each axis. The distance decreases by
+        about 1 m per m behind the surface, so adding it to the depth is a Newton step.
         """
         total = np.maximum(weights.sum(axis=1), np.float32(1e-6))
         tsdf = (self.flat("tsdf")[corners] * weights).sum(axis=1) / total
         return np.asarray(tsdf * np.float32(self.settings.truncation * self.settings.voxel_size), np.float32)
 
     def _blocks_in_view(self, camera: Camera, T_world_camera: Float64) -> tuple[Int32, float]:
-        """Return the block coordinates (B, 3) of the blocks in view, and their maximum depth, m."""
+        """Return the block coordinates (B, 3) of the blocks in view, and an upper bound of their depth, m."""
         coords = self.block_coords()
         side = self.settings.block_resolution * self.settings.voxel_size
         radius = side * np.sqrt(3) / 2
@@ -282,14 +282,14 @@ class BlockGrid:
         return coords[seen], float(z[seen].max(initial=0) + radius)
 
     def block_coords(self) -> Int32:
-        """Return the coordinates (B, 3) of the blocks in use, in Open3D's order, which differs between runs."""
+        """Return the block coordinates (B, 3) of the blocks in use, in Open3D's order, which differs between runs."""
         if not self.block_count:
             return np.zeros((0, 3), np.int32)
         hashmap = self.blocks.hashmap()
         return np.asarray(hashmap.key_tensor().numpy()[hashmap.active_buf_indices().numpy()], np.int32)
 
     def extract(self) -> tuple[Float32, Int32, UInt8]:
-        """Return vertices (V, 3), m, triangles (F, 3) and colors (V, 3) of the mesh, in a deterministic order."""
+        """Return vertices (V, 3), m, triangles (F, 3) and colors (V, 3), RGB, of the mesh, in a deterministic order."""
         if self.block_count:
             # weights are integers; the threshold is exclusive in marching cubes and inclusive in ray casting
             mesh = self.blocks.extract_triangle_mesh(self.min_weight - 0.5)
@@ -324,9 +324,10 @@ class BlockGrid:
 
 
 def _tensors(camera: Camera, T_world_camera: Float64, half: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Return the intrinsics (3, 3) and T_camera_world (4, 4), float64.
+    """Return the intrinsics (3, 3), px, and T_camera_world (4, 4), float64.
 
-    Open3D's `integrate` truncates pixel coordinates instead of rounding; `half` = 0.5 px compensates for this.
+    `half` is added to the principal point, px. Open3D's `integrate` truncates pixel coordinates instead of rounding
+    them; 0.5 px compensates for this.
     """
     K = camera.K
     K[:2, 2] += half
@@ -344,7 +345,7 @@ def _blank(camera: Camera) -> tuple[Float32, Float32, UInt8]:
 
 
 def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
-    """Return the ray (H, W, 3) of each pixel in the world frame, scaled to a depth of 1 m."""
+    """Return the rays (H, W, 3) of the pixels in the world frame, m per m of depth."""
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
     x, y = (u - np.float32(camera.cx)) / np.float32(camera.fx), (v - np.float32(camera.cy)) / np.float32(camera.fy)
     R = T_world_camera[:3, :3].astype(np.float32)
@@ -352,7 +353,7 @@ def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
 
 
 def points_of(surface: SurfaceView) -> Float32:
-    """Return the surface point (H, W, 3), m, of each pixel in the world frame; the camera center without a surface."""
+    """Return the surface points (H, W, 3), m, in the world frame; the camera center where there is no surface."""
     points = _rays(surface.camera, surface.T_world_camera)
     points *= surface.depth[..., None]
     points += surface.T_world_camera[:3, 3].astype(np.float32)
@@ -360,7 +361,7 @@ def points_of(surface: SurfaceView) -> Float32:
 
 
 def _towards(camera: Camera, T_world_camera: Float64, normals_camera: Float32) -> Float32:
-    """Transform Open3D's camera-frame normals (H, W, 3) to the world frame, and flip them towards the camera."""
+    """Return Open3D's camera-frame normals (H, W, 3) in the world frame, flipped to point toward the camera."""
     normals = normals_camera @ T_world_camera[:3, :3].T.astype(np.float32)
     away = np.einsum("hwi,hwi->hw", normals, _rays(camera, T_world_camera)) > 0
     normals[away] *= -1

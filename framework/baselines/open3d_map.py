@@ -1,4 +1,4 @@
-"""Map of object instances in Open3D's voxel blocks with one majority vote per voxel."""
+"""Map of object instances in Open3D's voxel blocks, with a majority vote for the instance of each voxel."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ class Open3DMap(InstanceTableMap):
         self.changed()
 
     def vote(self, frame: Frame, T_world_camera: Float64, instance_ids: Int32, band: float) -> None:
-        """Vote for instance_ids (H, W), 0 = no vote, in the voxels within `band` voxels of the measured depth.
+        """Vote for the instances `instance_ids` (H, W), 0 = no vote, in the voxels within `band` voxels of the depth.
 
-        A voxel stores one candidate and one counter. If a majority exists, it is found (Boyer and Moore, "MJRTY - a
-        fast majority vote algorithm", 1981).
+        A voxel stores one candidate and one counter. A label with more than half of the votes always wins (Boyer and
+        Moore, "MJRTY - a fast majority vote algorithm", 1981).
         """
         voxels, pixels = self.grid.voxels_seen(frame, T_world_camera, instance_ids > 0, band)
         ids = instance_ids.ravel()[pixels]
@@ -81,12 +81,15 @@ class Open3DMap(InstanceTableMap):
         self.__dict__.pop("_mesh", None)
 
     def instances_at(self, points_world: Float32) -> Int32:
-        """Return the instance ids (P,) of the voxels nearest to the points (P, 3), m, 0 = none."""
+        """Return the instance ids (P,), 0 = none, of the voxels nearest to the points (P, 3), m, in the world frame."""
         voxels = self.grid.voxels_at(points_world)
         return np.where(voxels >= 0, self.grid.flat("instance")[voxels], 0).astype(np.int32)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """Return the instance ids (ceil(H / stride), ceil(W / stride)) of a frame; see `LabeledMap.instances_seen`."""
+        """Return the most likely instance at every stride-th depth reading of every stride-th row of a frame, 0 = none.
+
+        See `LabeledMap.instances_seen`.
+        """
         v, u = np.nonzero(frame.depth[::stride, ::stride])
         pixels = np.stack([u * stride, v * stride], axis=1).astype(np.int32)
         points_camera = back_project(frame.camera, pixels, frame.depth[pixels[:, 1], pixels[:, 0]])

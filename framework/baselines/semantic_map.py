@@ -27,7 +27,7 @@ from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
-MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of the parameters; AREA in m^2
+MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of the fields of Elections
 SWEEPS = 20  # maximum number of sweeps of the regularization
 FORMAT = "semantic 4"  # format of the map file; increment it when the meaning of the contents changes
 
@@ -41,7 +41,7 @@ class Elections(NamedTuple):
 
 
 class ComponentStatistics(NamedTuple):
-    """Statistics of K instances by id, over the voxels nearest to the vertices of each; entry 0 is unused."""
+    """Statistics of K instances, indexed by id, over the voxels nearest to their vertices; entry 0 is unused."""
 
     probability_sums: Float64  # (K + 1, C) sums of P(class) over the vertices; the remainder is P(background)
     masked: Int32  # (K + 1,) maximum, over the voxels, of the number of frames under a mask
@@ -84,7 +84,7 @@ class SemanticMap(SceneMap):
         return np.float32(np.log(self.elections.missed))
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Return the surface and the classes; voxels have no instances."""
+        """Return the view with classes. All instance ids are 0, because voxels have no instances."""
         surface = self.volume.render(camera, T_world_camera)
         class_ids = np.empty(camera.shape, np.int32)
         view = pinhole(camera, T_world_camera)
@@ -100,7 +100,7 @@ class SemanticMap(SceneMap):
         return self.volume.mesh(self._labeled)
 
     def _labeled(self, surface: UnlabeledMesh) -> InstanceMesh:
-        """Return the surface with instances and classes. A majority vote determines the class of a vertex."""
+        """Return the mesh with instances and classes. The class of a vertex is a majority vote of its eight voxels."""
         colors, class_ids = np.empty((len(surface.voxels), 3), np.uint8), np.empty(len(surface.voxels), np.int32)
         label_classes(self.volume.voxels.grid, self.labels.evidence, self._log_missed, surface, colors, class_ids)
         if self.elections.smoothness > 0:
@@ -126,11 +126,12 @@ class SemanticMap(SceneMap):
                 break
 
     def instances(self) -> Mapping[int, Instance]:
-        """Return the components of the mesh.
+        """Return the connected components of the mesh as instances.
 
         The class distribution is the mean over the voxels nearest to the vertices, without the background. The
-        confidence is the mean probability of the class, including the background. The number of observations is the
-        largest number of frames in which one of these voxels was under a mask.
+        confidence is the mean probability of the class of the component over these voxels, in the distributions with
+        the background. The number of observations is the largest number of frames in which one of these voxels was
+        under a mask.
         """
         mesh, up, instances = self.mesh(), self.gravity().up, {}
         found = self._sum_components(self.volume.surface().voxels, mesh.instance_ids)
@@ -187,8 +188,8 @@ class SemanticMap(SceneMap):
 def connected_components(triangles: Int32, class_ids: Int32, min_vertices: int) -> Int32:
     """Return the component (V,) of each vertex. Components are numbered from 1 in the order of their first vertices.
 
-    Components are connected by edges of the triangles (F, 3) within one class. 0 = no class, or a component with fewer
-    than `min_vertices` vertices.
+    A component contains the vertices of one class in `class_ids` (V,), -1 = none, that are connected by edges of
+    `triangles` (F, 3). 0 = no class, or a component with fewer than `min_vertices` vertices.
     """
     components = np.empty(len(class_ids), np.int32)
     connect_vertices(triangles, class_ids, components)

@@ -15,7 +15,10 @@ from framework.refinement.segmentation.union_find import root, unite
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_view(grid, evidence, log_missed, view, depth, class_ids):
-    """Fill class_ids (H, W) with the classes of the voxels nearest to the surface at `depth` (H, W), m, -1 = none."""
+    """Fill class_ids (H, W), -1 = none, with the classes of the voxels nearest to the surface at `depth` (H, W), m.
+
+    `view` contains T_world_camera. See best_class() for `log_missed`.
+    """
     for v in prange(depth.shape[0]):
         key, region = NO_LOOK_UP
         for u in range(depth.shape[1]):
@@ -28,7 +31,7 @@ def label_view(grid, evidence, log_missed, view, depth, class_ids):
 
 @device
 def _elect(grid, evidence, log_missed, blocks, voxels, weights, labels):
-    """Return the majority class of the voxels around a vertex, -1 = background or no majority."""
+    """Return the majority class of the eight voxels around a vertex, -1 = background or no majority."""
     keep_near(grid, blocks, voxels, weights)
     for c in range(CORNERS):
         labels[c] = 1 + best_class(grid, evidence, log_missed, blocks[c], voxels[c]) if weights[c] > 0 else 0
@@ -52,7 +55,7 @@ def label_classes(grid, evidence, log_missed, surface, colors, class_ids):
 
 @device
 def _log_ratio(grid, evidence, log_missed, block, n, label):
-    """Return the log ratio of a voxel's class to the background; class -1 = the background itself."""
+    """Return the log ratio of class `label` to the background in voxel n of a block; label -1 = background, ratio 0."""
     if label < 0:
         return np.float32(0)
     absent = log_missed * np.float32(evidence.unmasked[block, n])
@@ -67,11 +70,12 @@ def _log_ratio(grid, evidence, log_missed, block, n, label):
 
 @njit(cache=True, nogil=True)
 def smooth_classes(grid, evidence, log_missed, voxels, starts, neighbors, smoothness, class_ids):
-    """Set each vertex, in order, to the class with the highest score.
+    """Set the class of each vertex in class_ids (V,), in order, to the class with the highest score.
 
     The score is the log ratio of the class to the background, plus `smoothness` for each neighbor of this class.
     Candidates are the background, the most likely class of the nearest voxel and the classes of the neighbors. Ties go
-    to the current class. Returns the number of changes.
+    to the current class. The neighbors of vertex v are neighbors[starts[v] : starts[v + 1]]. Returns the number of
+    changes.
     """
     changes = 0
     for v in range(len(class_ids)):
@@ -99,7 +103,10 @@ def smooth_classes(grid, evidence, log_missed, voxels, starts, neighbors, smooth
 
 @njit(cache=True, nogil=True)
 def connect_vertices(triangles, class_ids, components):
-    """Fill components (V,) with the first vertex of the connected component of each vertex."""
+    """Fill components (V,) with the first vertex of the connected component of each vertex.
+
+    Edges of `triangles` (F, 3) connect vertices with equal class_ids (V,).
+    """
     for v in range(len(components)):
         components[v] = v
     for t in range(len(triangles)):
@@ -113,7 +120,10 @@ def connect_vertices(triangles, class_ids, components):
 
 @njit(cache=True, nogil=True)
 def sum_components(grid, evidence, log_missed, voxels, instance_ids, found):
-    """Add the evidence of the voxel nearest to each vertex to the ComponentStatistics `found`, initially zero."""
+    """Add the evidence of the voxel nearest to each vertex to the ComponentStatistics `found`, which must be empty.
+
+    `voxels` (V,) are numbered as in an UnlabeledMesh, and `instance_ids` (V,) holds the component of each vertex.
+    """
     sums, masked, first_frame, last_frame = found.probability_sums, found.masked, found.first_frame, found.last_frame
     classes = sums.shape[1]
     unnamed_sums = np.zeros(len(sums))

@@ -7,7 +7,7 @@ from enum import Enum
 
 
 class Verdict(Enum):
-    """Effect of a finding on mapping."""
+    """Effect of a check result on mapping."""
 
     FINE = "ok"
     UNKNOWN = "?"  # the recording has too little information
@@ -21,7 +21,7 @@ class Finding:
 
     verdict: Verdict
     subject: str  # checked property, such as "depth"
-    text: str  # one line
+    text: str  # description in one line
     setting: str = ""  # fix, as KEY=VALUE for the command line; "" = no parameter fixes the problem
 
     def __str__(self) -> str:

@@ -17,7 +17,7 @@ SHORT = 0.003  # s, a shorter delay has no visible effect
 
 
 def check_color_delay(matcher: Matcher) -> Finding:
-    """Return the finding about the delay of color, estimated from the camera motion in parts of a sequence."""
+    """Check the delay of color behind depth, estimated from the camera motion in parts of a sequence."""
     delay = matcher.sequence.constant_color_delay()
     if delay is not None:
         return Finding(Verdict.FINE, SUBJECT, f"{1e3 * delay:g} ms, as set; dataset.color_delay=AUTO estimates it")
@@ -30,16 +30,16 @@ def check_color_delay(matcher: Matcher) -> Finding:
             )
         return Finding(Verdict.UNKNOWN, SUBJECT, text)
     text = (
-        f"color is {1e3 * estimate.seconds:.1f} ms after depth with equal timestamps (standard deviation "
+        f"color is {1e3 * estimate.seconds:.1f} ms after depth for images with equal timestamps (standard deviation "
         f"{1e3 * estimate.deviation:.1f} ms, {estimate.frames} frames)"
     )
     return Finding(Verdict.FINE, SUBJECT, text if abs(estimate.seconds) < SHORT else f"{text}; corrected in the run")
 
 
 def estimate_delay(matcher: Matcher) -> DelayEstimate:
-    """Return the delay of color, estimated from parts of the matcher's sequence.
+    """Return the delay of color behind depth, estimated from parts of the matcher's sequence.
 
-    Frames without a given pose are tracked by matched points.
+    For frames without a given pose, the camera motion is estimated from matched points.
     """
     sequence, estimator = matcher.sequence, DelayEstimator()
     length = min(PART_FRAMES, len(sequence))

@@ -34,7 +34,7 @@ class MatchedPair:
 
     @property
     def motion(self) -> float:
-        """Median motion of the points in px."""
+        """Median displacement of the matched points between the two images, px."""
         return float(np.median(np.linalg.norm(self.pixels_second - self.pixels_first, axis=1)))
 
 
@@ -48,7 +48,7 @@ class Matcher:
         self._features = lru_cache(maxsize=4 * len(STEPS))(self._extract)
 
     def pairs(self, starts: Sequence[int], steps: Sequence[int] = STEPS) -> Iterator[MatchedPair]:
-        """Yield the pairs from each frame index in `starts`, with increasing steps until the overlap is too small."""
+        """Yield the pairs (k, k + step) for each k in `starts`. Steps increase until the overlap is too small."""
         for k in starts:
             for step in steps:
                 pair = self.pair(k, step)

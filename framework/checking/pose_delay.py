@@ -34,7 +34,7 @@ class PoseDelay:
     alike: tuple[int, ...]  # frames, other delays that fit equally well
 
     def finding(self, applied: int, step: float) -> Finding:
-        """Return the finding for the configured delay `applied` (frames) and the frame interval `step` (s)."""
+        """Return the check result. `applied` is the configured delay in frames, and `step` the frame interval in s."""
         count, (when, where) = abs(self.frames), ("late", "later") if self.frames > 0 else ("early", "earlier")
         frames = f"{count} frame{'s' * (count > 1)}"
         text = (
@@ -50,7 +50,7 @@ class PoseDelay:
 def find_delay(
     pairs: Sequence[MatchedPair], poses: Sequence[Float64 | None], fits: Sequence[PoseFit]
 ) -> PoseDelay | None:
-    """Return the delay of the poses in the best-fitting convention, or None without a significant delay.
+    """Return the delay of the poses in the best-fitting convention; None = no significant delay.
 
     `poses` contains the stored poses (4, 4) of all frames by `Frame.index`, None = unknown. `fits` are the candidate
     conventions.

@@ -23,8 +23,9 @@ ALIKE, ALIKE_PX = 1.15, 0.2  # ratio, and offset in px, up to which two errors c
 MAX_OTHER_RATIO = 0.5  # maximum ratio of the error of another convention to the error of the configured convention
 # minimum uncertainty of the logarithm of the depth factor, due to inaccurate poses and depth in real recordings
 MIN_LOG_UNCERTAINTY = 0.07
-MAX_ERROR_INCREASE = 1.3  # maximum error ratio for a wrong scale; pure rotation hardly constrains the scale
-WRONG_SCALE = 2.5  # minimum ratio of a wrong scale; with rotation, the scale is uncertain by a factor of up to 1.6
+# maximum ratio of the errors with the estimated and the stored scale, for a clearly wrong scale
+MAX_ERROR_INCREASE = 1.3
+WRONG_SCALE = 2.5  # minimum factor of a clearly wrong scale; during rotation, the scale is uncertain by up to 1.6
 USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
 PLAUSIBLE = (0.2, 12.0)  # m, plausible median depth of a room
 
@@ -51,7 +52,7 @@ def readings(pose_unit: float = 1.0) -> Iterator[PoseReading]:
 
 
 def fit(pairs: Sequence[MatchedPair], reading: PoseReading, depth_factor: float | None = None) -> PoseFit:
-    """Return the fit of a pose convention to pairs with poses. `depth_factor=None` estimates the factor."""
+    """Return the fit of a pose convention to pairs with poses. The depth factor is estimated if it is None."""
     motions = [motion_of(pair, reading) for pair in pairs]
     factor, within = (depth_factor, 1.0) if depth_factor else _depth_factor(pairs, motions)
     errors = np.array([error_of(pair, motion, factor) for pair, motion in zip(pairs, motions, strict=True)])
@@ -72,7 +73,10 @@ def motion_between(T_world_first: Float64, T_world_second: Float64, reading: Pos
 
 
 def _depth_factor(pairs: Sequence[MatchedPair], motions: Sequence[Float64]) -> tuple[float, float]:
-    """Return the ratio of translations in the poses to those in the images, and its uncertainty; both 1 if unknown."""
+    """Return the ratio of translations in the poses to translations in the images, and its uncertainty factor.
+
+    Both are 1 if unknown.
+    """
     ratios = []
     for pair, T_second_first in zip(pairs, motions, strict=True):
         seen, moved = np.linalg.norm(pair.T_second_first[:3, 3]), np.linalg.norm(T_second_first[:3, 3])
@@ -96,7 +100,7 @@ def error_of(pair: MatchedPair, T_second_first: Float64, factor: float) -> float
 
 @dataclass(frozen=True)
 class PoseJudgment:
-    """Findings about a recording's poses and units."""
+    """Results of the checks of a recording's poses and units."""
 
     findings: tuple[Finding, ...]
     given: PoseFit | None  # fit of the configured convention; None = too few informative pairs
@@ -105,7 +109,7 @@ class PoseJudgment:
 
 
 def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, median_depth: float) -> PoseJudgment:
-    """Return findings about the stored poses, and the pose convention that fits the images best.
+    """Check the stored poses, and find the pose convention that fits the images best.
 
     `given` is the configured convention, `depth_scale` is in units per meter, and `median_depth` is in m.
     """
@@ -182,7 +186,7 @@ def _equal_to_best(fits: Sequence[PoseFit]) -> list[PoseFit]:
 
 
 def _settings(reading: PoseReading, given: PoseReading) -> tuple[str, ...]:
-    """Return the parameters that differ between the two conventions, as KEY=VALUE of `reading`."""
+    """Return the overrides KEY=VALUE that change the convention `given` to `reading`."""
     names = ("pose_kind", "camera_axes", "quaternion_order")
     changed = [name for name in names if getattr(reading, name) != getattr(given, name)]
     return tuple(f"dataset.{name}={getattr(reading, name).name}" for name in changed)

@@ -1,4 +1,4 @@
-"""Check of a recording before mapping."""
+"""Checks of a recording before mapping."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAX_MISSING = 0.7  # maximum fraction of pixels without a depth reading, for a g
 MAX_BEYOND = 0.3  # maximum fraction of depth readings beyond the mapped range, for a good map
 # maximum width of sharp color edges, as a fraction of the image width; real recordings have 4 to 9 px of 640
 MAX_EDGE_WIDTH = 12 / 640
-EDGE_WINDOW = 15 / 640  # fraction of the image width, size of the window for the contrast of an edge
+EDGE_WINDOW = 15 / 640  # side of the window for the contrast of an edge, as a fraction of the image width
 MAX_MOTION = 0.2  # fraction of the image width, maximum motion per frame for the trackers
 TYPICAL = 0.5, 4.5  # m, median depth of most rooms; real recordings have 1 to 3.5
 SHOWN_MOTION = 0.06  # fraction of the image width, motion of the pair in the figure; makes errors visible
@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RecordingCheck:
-    """Findings about a recording, and the data of the figure."""
+    """Results of the checks of a recording, and the data of the figure."""
 
     findings: tuple[Finding, ...]
     summary: str  # one line about the recording
@@ -54,7 +54,7 @@ class RecordingCheck:
 
 
 def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
-    """Return findings from some frames of a sequence and their neighbors, for a mapped range of `farthest` m.
+    """Check some frames of a sequence and their neighbors. `farthest` is the mapped range in m.
 
     Raises DataError if no frame is readable.
     """
@@ -113,7 +113,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
 def _judge_poses(
     sequence: RGBDSequence, pairs: Sequence[MatchedPair], given_reading: PoseReading, median_depth: float
 ) -> tuple[PoseJudgment, int]:
-    """Return the findings about the poses and the pose delay in frames."""
+    """Return the results of the pose checks, and the delay of the poses in frames; 0 = no delay."""
     given, scale = replace(given_reading, pose_delay=0), _scale_of(sequence)
     judgment = pose_fit.judge(pairs, given, scale, median_depth)
     if judgment.given is None or judgment.best is None:
@@ -195,13 +195,14 @@ def _read(sequence: RGBDSequence, chosen: Sequence[int]) -> tuple[list[Frame], l
             errors.append(error)
     if not frames:
         raise DataError(
-            f"{sequence.name}: expected readable frames, got none of {len(chosen)} checked; first error: {errors[0]}"
+            f"{sequence.name}: expected at least one readable frame, got none among {len(chosen)} checked frames; "
+            f"first error: {errors[0]}"
         )
     return frames, errors
 
 
 def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tuple[Finding, float]:
-    """Return the finding about depth and the median depth in m.
+    """Return the result of the depth check and the median depth in m.
 
     `farthest` is the mapped range in m, and `scale` the depth units per meter.
     """
@@ -226,7 +227,7 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
 
 
 def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
-    """Return the finding about the motion between neighboring frames.
+    """Check the image motion between neighboring frames.
 
     `steps` contains the motion of each matched pair as a fraction of `width` (px). `neighbors` is the number of all
     pairs.
@@ -245,7 +246,7 @@ def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
 
 
 def _check_sharpness(frames: Sequence[Frame]) -> Finding:
-    """Return the finding about image sharpness, measured by the width of color edges."""
+    """Check the image sharpness, measured by the width of color edges."""
     widths = [_edge_width(frame) for frame in frames]
     text = f"median edge width of {np.median(widths):.1f} px, maximum of {max(widths):.1f} px in {len(frames)} frames"
     blurred = sum(width > MAX_EDGE_WIDTH * frames[0].camera.width for width in widths)
@@ -265,7 +266,7 @@ def _edge_width(frame: Frame) -> float:
 
 
 def _check_times(sequence: RGBDSequence) -> list[Finding]:
-    """Return the finding about the timestamps of a recording, if any."""
+    """Check the timestamps of a recording. The result is empty for other sequences and fewer than 3 frames."""
     if not isinstance(sequence, Recording) or len(sequence) < 3:
         return []
     times: Float64 = np.array([sequence.contents.frames[k].timestamp for k in sequence.chosen])

@@ -21,8 +21,8 @@ from framework.tracking.color_delay import MAX_GRADIENT
 from framework.tracking.color_delay_kernels import DEPTH_STEP
 
 WIDTH = 320  # px, width of the compared images
-SEARCHED_SHIFT = 16  # px at WIDTH, in both directions
-MAX_DELAY = 6  # frames, in both directions
+SEARCHED_SHIFT = 16  # px at WIDTH, maximum searched shift in both directions
+MAX_DELAY = 6  # frames, maximum searched delay in both directions
 ZOOMS = (0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.11, 1.18, 1.25)  # scale of the depth image about its center
 MIN_FRAMES = 3  # minimum number of compared frames
 MIN_EDGES = 20.0  # px at WIDTH; frames with fewer edge pixels are ignored
@@ -104,7 +104,7 @@ class EdgeComparison:
 
 
 def color_gradient(frame: Frame) -> Float32:
-    """Return the gradient magnitude (H, W) of the gray values in Sobel units."""
+    """Return the gradient magnitude (H, W) of the gray values: 8 times the difference per px (3x3 Sobel filter)."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     return np.asarray(np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)), np.float32)
 
@@ -122,7 +122,7 @@ def depth_edges(depth: Float32) -> Bool:
 def judge(
     by_delay: Sequence[EdgeAlignment], by_zoom: Sequence[EdgeAlignment], applied_delay: int, step: float
 ) -> tuple[Finding, int]:
-    """Return the finding and the delay of the depth images in frames; 0 = no detected delay.
+    """Return the check result and the delay of the depth images in frames; 0 = no detected delay.
 
     `by_zoom` contains the alignments at the best delay. `applied_delay` is the configured delay in frames. `step` is
     the image motion per frame as a fraction of the width. A shift of at most half of `step` may be due to a time
@@ -147,7 +147,7 @@ def judge(
     if zoomed.zoom == 1.0 and zoomed.moved and apart <= step / 2:
         text = (
             f"edges are {100 * apart:.1f} % of the width apart, with an image motion of {100 * step:.1f} % per frame: "
-            "not synchronized or not registered; check a part with slower camera motion"
+            "not synchronized or not registered; run the check on a part with slower camera motion"
         )
         return Finding(Verdict.NOTE, subject, text), 0
     if zoomed.zoom != 1.0 or zoomed.moved:

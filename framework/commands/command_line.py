@@ -36,12 +36,12 @@ log = logging.getLogger(__name__)
 
 KNOWN_ERRORS = (InstanceMapError, HydraException, OmegaConfBaseException, OSError)
 EXIT_FAILED = 1
-EXIT_PARTIAL = 3  # a run ended early, and its partial outputs are written
+EXIT_PARTIAL = 3  # a run ended early and wrote partial outputs
 EXIT_SIGNAL = 128  # plus the signal's number, as in shells: 130 after Ctrl-C, 143 after SIGTERM
 
 
 def directory_name(overrides: str) -> str:
-    """Return a directory name for overrides, without separators and short enough for every file system."""
+    """Return a directory name for overrides, without path separators and with at most 200 characters."""
     name = overrides.replace(os.sep, "_") or "defaults"
     return name if len(name) <= 200 else f"{name[:180]}_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
 
@@ -52,14 +52,14 @@ OmegaConf.register_new_resolver("directory_name", directory_name, replace=True)
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Exit with a status and one line on stderr after a known error or Ctrl-C in the body."""
+    """Exit with an error status and print one line to stderr after a known error or Ctrl-C inside the context."""
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises its errors instead of printing them
     try:
         yield
     except KeyboardInterrupt as error:
         print(str(error) or "interrupted", file=sys.stderr)
         sys.exit(EXIT_SIGNAL + (error.number if isinstance(error, Interrupted) else signal.SIGINT))
-    except (*KNOWN_ERRORS, ValueError) as error:  # Hydra raises ValueError for some wrong arguments
+    except (*KNOWN_ERRORS, ValueError) as error:  # Hydra raises ValueError for some invalid arguments
         print_error(error)
         sys.exit(EXIT_FAILED)
 
@@ -72,7 +72,7 @@ def print_error(error: BaseException, prefix: str = "error: ") -> None:
 
 
 def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Parse the command line. All commands also accept `debug=true` and --config-dir."""
+    """Parse the command line with `parser`, which gets the option --config-dir. `debug=true` is also accepted."""
     for word in sys.argv[1:]:
         if word.startswith("debug=") and word not in ("debug=true", "debug=false"):
             parser.error(f"debug: expected true or false, got {word.partition('=')[2][:60]!r}")
@@ -107,12 +107,12 @@ def print_for_directories(description: str, directory_help: str, write: Callable
 
 @dataclass
 class Jobs:
-    """Error reports and exit status of the jobs of a run or sweep. An error does not stop the other jobs."""
+    """Error logging and exit status for the jobs of a run or sweep. An error does not stop the other jobs."""
 
     status: int = 0
 
     def reported(self, job: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
-        """Return `job` with error logging: one line for a known error, otherwise (or with `debug`) a traceback."""
+        """Return `job` with error logging: one line per error, with a traceback for unknown errors or `debug=true`."""
 
         @wraps(job)
         def reported_job(config: DictConfig) -> None:
@@ -134,7 +134,7 @@ class Jobs:
         """Run Hydra's `command`, and exit with an error status if a job has failed."""
         with one_line_errors():
             for folder in filter(Path.is_dir, _config_dirs(sys.argv[1:])):  # Hydra reports a missing folder
-                add_config_dir(folder)  # for steps after Hydra, such as the figure of a sweep
+                add_config_dir(folder)  # for steps after Hydra has finished, such as the figure of a sweep
             Plugins.instance().register(InstalledConfigs)
             command()
         if self.status:
@@ -154,7 +154,7 @@ def is_of_sweep(hydra_config: HydraConf) -> bool:
 
 
 def _config_dirs(words: list[str]) -> list[Path]:
-    """Return the folders of --config-dir on Hydra's command line."""
+    """Return the folders given by --config-dir (or -cd) on Hydra's command line."""
     folders = []
     for word, following in pairwise([*words, ""]):
         option, equals, value = word.partition("=")
@@ -164,7 +164,7 @@ def _config_dirs(words: list[str]) -> list[Path]:
 
 
 def _in_worker() -> bool:
-    """Return True in a job of a launcher with worker processes, i.e., any launcher but Hydra's basic one."""
+    """Return True in a worker process: in a job of a sweep with any launcher except Hydra's basic launcher."""
     hydra_config = HydraConfig.get()
     return is_of_sweep(hydra_config) and not str(hydra_config.launcher._target_).endswith(".BasicLauncher")
 

@@ -37,13 +37,13 @@ log = logging.getLogger(__name__)
 LIST = Path(__file__).with_name("kernels.txt")
 CHECKOUT = Path(__file__).resolve().parents[2]
 DEFAULT, OTHERS = "# a run with the default stages", "# additional kernels of other stages"
-MAX_WORKERS = 4  # maximum number of processes; each needs 0.5 GB and compiles shared functions again
+MAX_WORKERS = 4  # maximum number of worker processes; each needs 0.5 GB and compiles shared functions again
 SECONDS_EACH = 0.65  # s, compilation time of a kernel on one core (AMD EPYC, Zen 5)
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel with the argument types of one call."""
+    """A kernel, and the argument types of one of its calls."""
 
     module: str
     name: str
@@ -100,7 +100,7 @@ def listed(*sections: str) -> list[Kernel]:
 
 
 def line_of(dispatcher: Any, signature: Iterable[Any]) -> str:
-    """Return the line of kernels.txt for a call of a kernel."""
+    """Return the line of kernels.txt for a call of a kernel with the argument types `signature`."""
     function = dispatcher.py_func
     return f"{function.__module__}.{function.__name__}({', '.join(map(_text_of, signature))})"
 
@@ -108,7 +108,7 @@ def line_of(dispatcher: Any, signature: Iterable[Any]) -> str:
 def compile_for_run() -> None:
     """Compile the listed kernels of all imported modules. Logs a warning if a compilation fails.
 
-    A run calls this function after building its stages, and again after building its video.
+    A run calls this function after building its stages, and again after opening its dataset.
     """
     loaded = [kernel for kernel in listed(DEFAULT, OTHERS) if kernel.module in sys.modules]
     missing = [kernel for kernel in loaded if not kernel.is_compiled()]
@@ -119,7 +119,7 @@ def compile_for_run() -> None:
         if not missing:
             return
         seconds = SECONDS_EACH * len(missing) / _workers(missing)
-        log.info("compiling %d kernels, about %.0f s, once for this machine", len(missing), max(seconds, 2))
+        log.info("compiling %d kernels (about %.0f s, once per machine)", len(missing), max(seconds, 2))
         try:
             compile_all(missing)
         except DataError as error:
@@ -158,10 +158,10 @@ def _workers(kernels: list[Kernel]) -> int:
 
 
 def _worker() -> subprocess.Popen[str]:
-    """Start a process that compiles kernels, one per input line, and prints a line for each."""
+    """Start a process that compiles one kernel per input line, and prints an error or an empty line for each."""
     path = os.pathsep.join(filter(None, [str(CHECKOUT), os.environ.get("PYTHONPATH")]))
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", "framework.compilation.worker"],  # -P: import nothing from the working folder
+        [sys.executable, "-P", "-m", "framework.compilation.worker"],  # -P: import nothing from the working directory
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -173,7 +173,10 @@ def _worker() -> subprocess.Popen[str]:
 def _feed(
     process: subprocess.Popen[str], waiting: queue.SimpleQueue[list[Kernel]], events: queue.SimpleQueue[tuple[str, str]]
 ) -> None:
-    """Send kernels to a worker, module by module. Add events (begun, name) and (done, error); error "" = success."""
+    """Send kernels to a worker, module by module.
+
+    Adds the events ("begun", kernel name) and ("done", error message) to `events`; message "" = success.
+    """
     assert process.stdin is not None
     assert process.stdout is not None
     with suppress(queue.Empty):
@@ -189,13 +192,16 @@ def _feed(
                 error = (
                     answer.strip()
                     if answer
-                    else f"{kernel.module}.{kernel.name}: expected a result, got the end of the worker process"
+                    else f"{kernel.module}.{kernel.name}: expected a compiled kernel, got a terminated process"
                 )
                 events.put(("done", error))
 
 
 def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueue[tuple[str, str]]) -> list[str]:
-    """Show the number of remaining kernels as a bar or as log lines until all are done, and return the errors."""
+    """Report the number of remaining kernels until all are done, and return the error messages.
+
+    The report is a progress bar or, without a terminal, log lines.
+    """
     left = count
     errors: list[str] = []
     with Progress(count, " kernels") as bar:
@@ -231,7 +237,10 @@ def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
             log.info("another process is compiling kernels; waiting for it")
             lock.acquire()
     except OSError as error:  # without locks, several processes may compile the same kernels
-        log.warning("%s: expected a file system with locks, got %s; compiling without a lock", folder, error.strerror)
+        reason = error.strerror
+        log.warning(
+            "%s: expected a file system with locks, got an error (%s); compiling without a lock", folder, reason
+        )
     try:
         yield
     finally:

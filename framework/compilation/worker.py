@@ -24,7 +24,7 @@ TESTED = ("0.68.1",)
 
 
 def work() -> None:
-    """Read one kernel per line, compile it, and print an error or an empty line."""
+    """Read one kernel per line from stdin, compile it, and print an error or an empty line."""
     gc.freeze()  # numba's many permanent objects slow down garbage collection
     gc.set_threshold(200_000, 20, 20)
     wanted = {(kernel.module, kernel.name) for kernel in listed(DEFAULT, OTHERS)}
@@ -57,7 +57,7 @@ def work() -> None:
 
 
 def make_code_only_for(names: set[str]) -> None:
-    """Make numba generate machine code only for functions with these names. The code contains all called functions."""
+    """Make numba generate machine code only for functions with these names, including all functions that they call."""
     from numba.core.codegen import CPUCodeLibrary, JITCPUCodegen
     from numba.core.registry import cpu_target
 

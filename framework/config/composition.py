@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 def composed(*overrides: str) -> DictConfig:
-    """Compose the main config with these overrides. Raises ConfigError for an unknown name or value."""
+    """Return the main config with these overrides. Raises ConfigError for an unknown name or an invalid value."""
     try:
         with config_loader() as loader:
             return loader.compose([*overrides])
@@ -45,20 +45,21 @@ _added: list[Path] = []
 
 
 def add_config_dir(folder: Path) -> None:
-    """Register the options of another folder in this process, like --config-dir.
+    """Register the config options in `folder` for this process, as --config-dir does.
 
     Raises ConfigError if the folder does not exist.
     """
     if not folder.is_dir():
-        raise ConfigError(f"--config-dir: expected an existing folder, got {folder}")
+        raise ConfigError(f"--config-dir: expected an existing folder, got {folder}; correct the path")
     _added.append(folder.resolve())
 
 
 @cache
 def installed_config_dirs() -> dict[Path, str]:
-    """Return the config folders of the entry points `instancemap.configs`, with the names of their packages.
+    """Return the name of the package of each config folder that an installed package registers.
 
-    The value of an entry point is the dotted path of a folder. Nothing is imported.
+    A package registers a folder by an entry point in the group `instancemap.configs`, whose value is the dotted path of
+    the folder. No package is imported.
     """
     folders = {}
     for entry in entry_points(group="instancemap.configs"):
@@ -85,9 +86,9 @@ class InstalledConfigs(SearchPathPlugin):
 
 
 class FileConfigSource(hydra_api.FileConfigSource):
-    """Reader of YAML folders that checks each file.
+    """Config source for folders of YAML files that checks each file before Hydra reads it.
 
-    The class has the same name as Hydra's reader, because Hydra distinguishes sources by class name.
+    The class has the name of Hydra's own class, because Hydra distinguishes sources by class name.
     """
 
     def load_config(self, config_path: str) -> ConfigResult:
@@ -107,14 +108,15 @@ class FileConfigSource(hydra_api.FileConfigSource):
 
 
 class HydraNodes(hydra_api.StructuredConfigSource):
-    """Hydra's structured nodes, without nodes of the host application.
+    """Config source with the structured configs of Hydra, without those of the host application.
 
-    Hydra adds the basic launcher and sweeper only when it scans its plugins, which changes the host's store.
+    Hydra adds its basic launcher and sweeper to the global config store only when it scans its plugins. This class adds
+    them to its own store instead, so that the store of the host application does not change.
     """
 
     def __init__(self, provider: str, path: str) -> None:
         super().__init__(provider, path)
-        self.store = object.__new__(ConfigStore)  # the class itself returns the store of the host
+        self.store = object.__new__(ConfigStore)  # ConfigStore() would return the store of the host application
         self.store.repo = {"hydra": deepcopy(ConfigStore.instance().repo["hydra"])}
         for part in ("launcher", "sweeper"):
             if "basic.yaml" not in self.store.repo["hydra"].get(part, {}):
@@ -125,7 +127,7 @@ HydraNodes.__name__ = "StructuredConfigSource"  # Hydra finds the source of the 
 
 
 class Repository(hydra_api.ConfigRepository):
-    """Repository of configs in folders, packages and Hydra's structured nodes, without Hydra's registries."""
+    """Repository of configs in folders, in packages and of Hydra's structured configs, without Hydra's registries."""
 
     def initialize_sources(self, config_search_path: ConfigSearchPath) -> None:
         kinds = (FileConfigSource, hydra_api.ImportlibResourcesConfigSource, HydraNodes)
@@ -154,7 +156,10 @@ class ConfigLoader(hydra_api.ConfigLoaderImpl):
         self.repository = Repository(path)
 
     def compose(self, overrides: list[str]) -> DictConfig:
-        """Return the main config without Hydra's part. Raises HydraException."""
+        """Return the main config, composed with `overrides`, without the node `hydra`.
+
+        Raises HydraException for an invalid override.
+        """
         config = self.load_configuration("config", overrides, RunMode.RUN, from_shell=False)
         with open_dict(config):
             del config["hydra"]
@@ -163,13 +168,16 @@ class ConfigLoader(hydra_api.ConfigLoaderImpl):
 
 @contextmanager
 def config_loader() -> Iterator[ConfigLoader]:
-    """Yield the loader of InstanceMap's configs. Hydra uses their version base inside the context."""
+    """Yield a loader of InstanceMap's configs. Inside the context, the version base of Hydra is 1.3."""
     with hydra_api.version_base("1.3"):
         yield ConfigLoader()
 
 
 def running_loader() -> Any | None:
-    """Return the loader of the running Hydra application if InstanceMap's configs are on its search path."""
+    """Return the config loader of the running Hydra application.
+
+    None = no application runs, or InstanceMap's configs are not on its search path.
+    """
     hydra = hydra_api.running()
     if hydra is None:
         return None
@@ -178,7 +186,7 @@ def running_loader() -> Any | None:
 
 
 def one_line(error: BaseException) -> str:
-    """Return an error message on one line, with the fix."""
+    """Return the message of an error on one line. Messages of Hydra and OmegaConf are rewritten to include the fix."""
     return printable(_message_of(error))
 
 
@@ -192,7 +200,7 @@ def _message_of(error: BaseException) -> str:
         return f"{prefix}{_known_keys(error.__cause__)}"
     if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
         return _joined(f"{error} {error.__cause__}")
-    if isinstance(error, InterpolationResolutionError):  # the message of the resolver is between its type and the key
+    if isinstance(error, InterpolationResolutionError):  # the first line ends with the message of the resolver
         return _joined(
             str(error).partition("\n")[0].partition(" raised while resolving interpolation: ")[2] or str(error)
         )
@@ -202,7 +210,7 @@ def _message_of(error: BaseException) -> str:
 
 
 _EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "ray": "ray"}
-"""Extras to install, by Hydra's name of a launcher. InstanceMap's launchers have the names of the extras."""
+"""Extra that installs each optional launcher of Hydra. InstanceMap's launchers have the names of the extras."""
 
 
 def _no_such_option(error: MissingConfigException) -> str:
@@ -211,7 +219,7 @@ def _no_such_option(error: MissingConfigException) -> str:
         return _joined(str(error))
     if group == "hydra/launcher" and name in _EXTRAS:
         extra = _EXTRAS[name]
-        return f"launcher={extra}: expected its optional package, got none; run pip install instancemap[{extra}]"
+        return f"launcher: expected the installed extra {extra}, got none; run pip install instancemap[{extra}]"
     options = list(error.options or ())
     close = get_close_matches(name, options, n=1)
     suggestion = f"; did you mean {close[0]}?" if close else ""
@@ -219,12 +227,12 @@ def _no_such_option(error: MissingConfigException) -> str:
 
 
 def _known_keys(error: OmegaConfBaseException) -> str:
-    """Return the error message for an unknown key, with a similar key or all keys of its parent."""
+    """Return the error message for an unknown key, with its new name, a similar key or all keys of its parent."""
     keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
     close = get_close_matches(str(error.key), keys, n=1)
     path = str(error.full_key or error.key)
     if hint := rename_hint(path):
-        return hint
+        return f"{path}: expected a known key, got {error.key}; {hint}"
     if path == "table" or path.startswith("table.where."):  # new keys of a sweep
         key = f"+{path}.KEY" if path == "table" else f"+{path}"
         return f"{path}: expected a prefix + for a new key, got none; set {key}=VALUE"

@@ -42,7 +42,7 @@ _composing = RLock()
 
 @contextmanager
 def version_base(version: str) -> Iterator[None]:
-    """Set Hydra's version base in the body, and restore the value of the host application."""
+    """Set Hydra's version base inside the context, and restore the value of the host application afterward."""
     with _composing:
         before = Singleton._instances.pop(VersionBase, None)
         setbase(version)
@@ -55,7 +55,10 @@ def version_base(version: str) -> Iterator[None]:
 
 
 def running() -> Any | None:
-    """Return the Hydra application of this process, without creating one as GlobalHydra.instance() does."""
+    """Return the Hydra application of this process; None = no application.
+
+    Unlike GlobalHydra.instance(), the function does not create an application.
+    """
     return getattr(Singleton._instances.get(GlobalHydra), "hydra", None)
 
 
@@ -66,6 +69,6 @@ def search_path_plugins() -> list[Any]:
 
 
 def replace_file_source(source: type[FileConfigSource]) -> None:
-    """Make Hydra read YAML files with `source` in this process. Only for processes of the command line."""
+    """Make Hydra read YAML files with the class `source` in this process. For command-line processes only."""
     Plugins.instance()  # registers Hydra's own sources
     SourcesRegistry.instance().types[source.scheme()] = source

@@ -24,6 +24,7 @@ RENAMED = {
     "detector.nms": "detector.nms_iou",
     "detector.of": "detector.detector",
     "detector.significance": "detector.min_foreground_fraction",
+    "detector.small_side": "detector.miss_size_scale",
     "detector.spread": "detector.class_spread",
     "detector.surroundings": "detector.background_contrast",
     "detector.white": "detector.white_level",
@@ -41,6 +42,7 @@ RENAMED = {
     "refiner.gap": "refiner.max_gap",
     "refiner.max_behind": "refiner.max_behind_ratio",
     "refiner.max_own": "refiner.max_cluster_fraction",
+    "refiner.min_node": "refiner.min_split_points",
     "refiner.min_share": "refiner.min_frame_fraction (plane_removal) or refiner.min_piece_ratio (connected)",
     "refiner.noise": "refiner.inverse_depth_noise",
     "refiner.reach": "refiner.connection_radius",
@@ -64,12 +66,12 @@ RENAMED = {
 
 
 def new_name(key: str) -> str | None:
-    """Return the new name of a dotted key; None = not renamed."""
+    """Return the new name of a dotted config key; None = not renamed."""
     parts = key.split(".")
     return RENAMED.get(key) or (RENAMED.get(f"{parts[0]}.{parts[-1]}") if len(parts) > 2 else None)
 
 
 def rename_hint(key: str) -> str:
-    """Return the fix for an unknown key: its new name; "" = not renamed."""
+    """Return the fix for an unknown key, such as "set resume_from (new name of map)"; "" = not renamed."""
     found = new_name(key)
-    return f"{key} was renamed; set {found}" if found else ""
+    return f"set {found} (new name of {key})" if found else ""

@@ -16,7 +16,7 @@ from framework.errors import ConfigError
 
 MAX_DETECTIONS = 1000  # maximum number of detections per image; each has a mask of the image size; COCO evaluates 100
 MAX_PROPOSALS = 100_000  # maximum number of proposals of a network per image
-LONGEST_SIDE = 2**13  # px, maximum side of the input image of a network
+LONGEST_SIDE = 2**13  # px, maximum side length of the input image of a network
 PHRASES: Mapping[Any, str] = {
     bool: "true or false",
     int: "an integer",
@@ -32,10 +32,10 @@ PHRASES: Mapping[Any, str] = {
 
 
 def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
-    """Check that parameters are in closed intervals. NaN is in no interval.
+    """Check that parameters are in closed intervals. NaN is outside of every interval.
 
     Args:
-        plugin: The plugin.
+        plugin: The plugin, or a part of it, with the parameters as attributes.
         bounds: The interval (low, high) of each parameter by name.
 
     Raises:
@@ -47,7 +47,7 @@ def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
 
 
 def check_intervals(stage: str, plugin: object, **intervals: str) -> None:
-    """Raise ConfigError unless each parameter is in its interval, such as "(0, 1]". NaN is in no interval."""
+    """Raise ConfigError unless each parameter is in its interval, such as nms_iou="(0, 1]"; NaN never is."""
     for name, interval in intervals.items():
         low, high = map(float, interval[1:-1].split(","))
         value = getattr(plugin, name)
@@ -56,40 +56,46 @@ def check_intervals(stage: str, plugin: object, **intervals: str) -> None:
 
 
 def require(holds: bool, name: str, value: object, allowed: str) -> None:
-    """Raise ConfigError unless `holds`, such as "detector.nms_iou: expected a value in (0, 1], got 2"."""
+    """Raise ConfigError with the message "NAME: expected ALLOWED, got VALUE" unless `holds`."""
     if not holds:
         raise ConfigError(f"{name}: expected {allowed}, got {value}")
 
 
 def checked_path(name: str, value: object) -> Path:
-    """Return the absolute path in a config key. Raises ConfigError for a value that is not a string in YAML."""
+    """Return the value of the config key `name` as an absolute path.
+
+    Raises ConfigError unless the value is a nonempty string.
+    """
     require(isinstance(value, str) and value != "", name, repr(value), "a path (in quotes if it looks like a number)")
     return Path(str(value)).expanduser().absolute()
 
 
 def checked_file(name: str, value: object, suffix: str = "") -> Path:
-    """Return the absolute path of an output file in a config key. Raises ConfigError if it cannot be written."""
+    """Return the value of the config key `name` as the absolute path of an output file.
+
+    Raises ConfigError if the file name does not end with `suffix` ("" = any), or if its folder does not exist.
+    """
     path = checked_path(name, value)
     if suffix and path.suffix.lower() != suffix:
         raise ConfigError(f"{name}: expected a name with the suffix {suffix}, got {path.name}")
     if not path.parent.is_dir():
-        raise ConfigError(f"{name}: expected a file in an existing folder, got {path}; create {path.parent}")
+        raise ConfigError(f"{name}: expected an existing parent folder, got none; create {path.parent}")
     return path
 
 
 def check_count(name: str, value: int, most: int) -> None:
-    """Raise ConfigError unless a count is in [1, `most`]. The limit bounds memory."""
+    """Raise ConfigError unless the count `value` is in [1, most]. The upper limit bounds memory use."""
     require(1 <= value <= most, name, value, f"a value in [1, {most}]")
 
 
 def checked_rows(node: Any) -> dict[str, list[str]]:
-    """Return the overrides of each row of an experiment by name; empty if `node` is None.
+    """Return the overrides of each row by name; empty if `node`, the value of the config key `rows`, is None.
 
     Raises ConfigError if the overrides of a row are not a list of strings.
     """
     if node is not None and not isinstance(node, Mapping):
         raise ConfigError(
-            f"rows: expected names with overrides, got {node!r}; write, for example, mine: [refiner=identity]"
+            f"rows: expected a mapping of names to overrides, got {node!r}; for example, mine: [refiner=identity]"
         )
     rows = {str(name): overrides for name, overrides in (node or {}).items()}
     for name, overrides in rows.items():
@@ -102,17 +108,18 @@ def checked_rows(node: Any) -> dict[str, list[str]]:
 
 
 def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:
-    """Return the keyword arguments of the dataclass `kind` from the config block `name`, with defaults.
+    """Return the keyword arguments of the dataclass `kind` from the config node `name`, with its defaults.
 
-    Raises ConfigError for unknown keys and wrong types.
+    Raises ConfigError for an unknown key or a value of a wrong type.
     """
     if not isinstance(node, Mapping):
         raise ConfigError(f"{name}: expected keys and values, got {node!r}")
     block, types = OmegaConf.structured(kind), get_type_hints(kind)
     for key in map(str, node):
         if key not in types:
-            hint = rename_hint(f"{name}.{key}")
-            raise ConfigError(hint or f"{name}: expected one of {', '.join(types)}, got {key!r}")
+            if hint := rename_hint(f"{name}.{key}"):
+                raise ConfigError(f"{name}.{key}: expected a known key, got {key}; {hint}")
+            raise ConfigError(f"{name}: expected one of {', '.join(types)}, got {key!r}")
         try:
             block = OmegaConf.merge(block, OmegaConf.create({key: node[key]}))
         except OmegaConfBaseException as error:

@@ -3,7 +3,7 @@
     cam_params.json                     for all scenes: {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}
     room0/results/frame000000.jpg       8-bit color, numbered from 0
     room0/results/depth000000.png       uint16 along z, `scale` units per meter
-    room0/traj.txt                      line k: T_world_camera of frame k, 16 numbers row by row, m
+    room0/traj.txt                      line k: T_world_camera of frame k, 16 numbers, row-major, m
 
 The camera axes are x right, y down, z forward. NICE-SLAM converts the poses to OpenGL's axes when it reads them.
 """
@@ -24,16 +24,16 @@ CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 
 @dataclass
 class ReplicaNiceSlam(Recording):
-    """A Replica scene in NICE-SLAM's layout, with exact depth and poses but without instances."""
+    """A Replica scene in NICE-SLAM's layout, with exact depth and poses but without ground-truth instances."""
 
     def open(self) -> Contents:
-        path = self.folder.absolute().parent / "cam_params.json"  # not resolved: a scene may be a link
+        path = self.folder.absolute().parent / "cam_params.json"  # not resolved: the scene may be a symbolic link
         if not path.is_file():
             expected = "expected camera parameters next to the scene folders, got no such file"
             raise DataError(f"{path}: {expected}; set dataset.scene to a scene folder, such as room0")
         content = read_json_object(path).get("camera")
         if not isinstance(content, dict):
-            expected = f"expected an object with the keys {', '.join(CAMERA_KEYS)}"
+            expected = f"expected a JSON object with the keys {', '.join(CAMERA_KEYS)}"
             raise DataError(f"{path}: camera: {expected}, got {content!r:.60}")
         camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
         results, poses = self.folder / "results", read_matrix_lines(self.folder / "traj.txt")

@@ -40,7 +40,7 @@ from framework.files.image_files import decode_uint16, read_image_file
 from framework.files.number_lines import read_gravity, read_image_times
 from framework.files.tum_trajectory import TumLine, read_tum_lines
 
-LARGEST_ID = 2**16 - 1  # maximum instance id; instance images are uint16
+LARGEST_ID = 2**16 - 1  # maximum instance id; instance-ID images are uint16
 
 Entry = TypeVar("Entry")
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 class RgbdFolder(Recording):
     """An RGB-D video in a folder of images, with optional poses and instance ground truth."""
 
-    ground_truth_spacing: float = 0.02  # spacing of the ground-truth surface points, m
+    ground_truth_spacing: float = 0.02  # spacing of the ground-truth surface points, m, in [0.001, 1]
 
     def __post_init__(self) -> None:
         check_truth_voxel(self.ground_truth_spacing)
@@ -117,7 +117,10 @@ class RgbdFolder(Recording):
                 yield LabeledDepth(depth, ids, self.camera, recorded.T_world_camera)
 
     def _read_instances(self, color: dict[int, Path]) -> tuple[dict[int, str | None], list[Path]]:
-        """Return the class of each instance and the instance image of each frame; both are empty without labels."""
+        """Return the class of each instance id and the instance-ID image of each frame.
+
+        Both are empty if the folder has no ground truth or `ground_truth` is set.
+        """
         folder, names = self.folder / "instance", self.folder / "instances.json"
         if self.named_truth is not None or (not path_exists(folder) and not path_exists(names)):
             return {}, []

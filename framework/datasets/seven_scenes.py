@@ -43,7 +43,7 @@ class SevenScenes(Recording):
         names = (_IMAGE_NAME.fullmatch(path.name) for path in self.folder.iterdir())
         numbers = sorted({int(match[1]) for match in names if match})
         if not numbers:
-            expected = "expected frame-000000.color.png and other frames, got none"
+            expected = "expected images such as frame-000000.color.png, got none"
             raise DataError(f"{self.folder}: {expected}; set dataset.scene to a sequence such as chess/seq-01")
         frames = [_recorded(self.folder, number) for number in numbers]
         return Contents(COLOR_CAMERA, "the camera of 7-Scenes", DEPTH_SCALE, frames)
@@ -57,7 +57,7 @@ def _recorded(folder: Path, number: int) -> RecordedFrame:
 
 
 def _color_pose(path: Path) -> Float64:
-    """Return T_world_camera (4, 4) of the color camera. Raises DataError that names the file of an invalid pose."""
+    """Return T_world_camera (4, 4) of the color camera. Raises a DataError that names the file of an invalid pose."""
     T_depthcamera_camera = np.eye(4)
     T_depthcamera_camera[0, 3] = BASELINE
     return read_matrix(path).pose() @ T_depthcamera_camera

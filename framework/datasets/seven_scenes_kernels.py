@@ -10,10 +10,11 @@ from framework.datasets.calibration.raw_images import NO_READING
 
 @njit(cache=True, nogil=True)
 def register_depth(raw: UInt16, ratio: float, u_0: float, v_0: float, disparity_1: float, registered: UInt16) -> None:
-    """Move each pixel (u, v) with depth z to (ratio u + u_0 - disparity_1 / z, ratio v + v_0) in `registered`.
+    """Copy the readings of `raw` (h, w), mm, to the pixels of another camera in `registered` (H, W), mm, initially 0.
 
-    The depth in mm stays the same, and the nearest depth reading of a target pixel is kept. `disparity_1` is the
-    disparity in px at a depth of 1 mm.
+    A reading z at the pixel (u, v) is copied to the pixel nearest to (ratio u + u_0 - disparity_1 / z, ratio v + v_0).
+    If several readings are copied to a pixel, the nearest reading is kept. `ratio` is the ratio of the focal lengths,
+    and `disparity_1` is the disparity at a depth of 1 mm, px. `u_0` and `v_0` are in px.
     """
     height, width = registered.shape
     for v in range(raw.shape[0]):

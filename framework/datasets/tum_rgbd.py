@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 class Intrinsics(Enum):
     """Published calibration of the color camera."""
 
-    AUTO = "by the folder's name, or by its camera.json"
+    AUTO = "from the folder name or camera.json"
     FREIBURG1 = "freiburg1"
     FREIBURG2 = "freiburg2"
     FREIBURG3 = "freiburg3"
@@ -73,8 +73,9 @@ class TumRgbd(Recording):
     """
 
     intrinsics: Intrinsics = Intrinsics.AUTO  # intrinsics of the color camera
-    max_time_difference: float = 0.02  # maximum time difference between color and depth or pose, s, in (0, 1]
-    undistort: bool = True  # True = correct the published lens distortion; False = images as stored
+    # maximum time difference between color and depth, and between color and ground-truth pose, s, in (0, 1]
+    max_time_difference: float = 0.02
+    undistort: bool = True  # True = correct the published lens distortion; False = use the images as stored
 
     def __post_init__(self) -> None:
         difference = self.max_time_difference

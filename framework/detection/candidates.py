@@ -1,7 +1,6 @@
 """Box candidates: the output layouts of common box detectors, and the selection of the best candidates.
 
-Boxes are the positions x1 y1 x2 y2 of their borders, in px of the network's input. The left border of the first pixel
-is at 0.
+A box is x1 y1 x2 y2, in px of the network's input. The left border of the first pixel is at 0.
 """
 
 from __future__ import annotations
@@ -20,9 +19,13 @@ YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows
 
 
 class OutputLayout(Enum):
-    """The outputs of a box detector: K candidates, C classes, optionally with a leading axis of length 1."""
+    """The outputs of a box detector for K candidates and C classes; arrays may have a leading axis of length 1.
 
-    yolox = "yolox"  # (K, 5 + C): dx, dy, log w, log h in cells; objectness; C class scores
+    For the SSD layouts, scores and labels are (K,), and class scores are (K, C) or, with the background first, (K, C +
+    1).
+    """
+
+    yolox = "yolox"  # (K, 5 + C): center offset dx, dy and log w, log h, in cells; objectness; C class scores
     yolo = "yolo"  # (4 + C, K) or (K, 4 + C): center x, y, width, height in px; C class scores (Ultralytics, from v8)
     yolo_objectness = "yolo_objectness"  # (K, 5 + C) or (5 + C, K): as yolo, with objectness before the class scores
     ssd_tensorflow = "ssd_tensorflow"  # boxes (K, 4) y1 x1 y2 x2 in 0..1; scores and labels, or class scores
@@ -51,7 +54,7 @@ class Candidates:
 
 
 def decode(layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int) -> Candidates:
-    """Return the candidates in a network's `outputs`.
+    """Return the candidates in the outputs of a network.
 
     `outputs`: the arrays by name. `shape`: (height, width) px of the input. `classes`: the number of classes, C.
     Raises DataError if the outputs do not have the layout.
@@ -74,16 +77,16 @@ def _checked(boxes: Float32, class_scores: Float32) -> Candidates:
     return Candidates(boxes, class_scores)
 
 
-def check_scores(class_scores: Float32) -> None:
-    """Raise DataError unless all scores are in [0, 1].
+def check_scores(class_scores: Float32, key: str = "detector.layout", fix: str = "choose another layout, or ") -> None:
+    """Raise DataError unless all scores are in [0, 1], with a tolerance of 0.001.
 
-    Networks exported without their sigmoid or softmax have other scores.
+    Networks exported without their sigmoid or softmax have other scores. `key` and the optional first part of the `fix`
+    appear in the error.
     """
     if class_scores.size and (class_scores.min() < -1e-3 or class_scores.max() > 1 + 1e-3):
         raise DataError(
-            f"detector.layout: expected scores in [0, 1], got {class_scores.min():.3g} to "
-            f"{class_scores.max():.3g}; choose another layout, or export the network with its sigmoid or "
-            "softmax"
+            f"{key}: expected scores in [0, 1], got {class_scores.min():.3g} to {class_scores.max():.3g}; {fix}export "
+            "the network with its sigmoid or softmax"
         )
 
 
@@ -95,17 +98,17 @@ def described(outputs: Mapping[str, Float32]) -> str:
 def _rows(output: Float32, columns: int, other_layout: str) -> Float32:
     """Return the candidates (K, columns) of an output (K, columns) or (columns, K).
 
-    The output may have a leading axis of length 1.
+    The output may have a leading axis of length 1. `other_layout`: the layout named in the error; "" = none.
     """
     table = output[0] if output.ndim == 3 and output.shape[0] == 1 else output
     if table.ndim == 2 and table.shape[1] == columns:
         return table
     if table.ndim == 2 and table.shape[0] == columns:
         return table.T
-    hint = "detector.label_space" + (f" or detector.layout (perhaps {other_layout})" if other_layout else "")
+    fix = f", or detector.layout={other_layout}" if other_layout else ""
     raise DataError(
-        f"{hint}: expected {columns} columns for box and classes, got an output of shape {output.shape}; "
-        "set another value"
+        f"detector.label_space: expected {columns} columns for box and classes, got an output of shape {output.shape}; "
+        f"set another label_space{fix}"
     )
 
 
@@ -116,8 +119,9 @@ def corners(boxes: Float32) -> Float32:
 
 
 def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
-    """Decode boxes (K, 4) of center x, y, width, height in px.
+    """Return the boxes (K, 4), center x, y, width, height in px, of the rows (K, 5 + C) of a YOLOX output.
 
+    `shape`: (height, width) px of the input. Raises DataError unless K is the number of cells of this input.
     Source: Ge et al., "YOLOX", 2021; github.com/Megvii-BaseDetection/YOLOX, yolox/utils/demo_utils.py.
     """
     cells, strides = [], []
@@ -139,7 +143,7 @@ def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
 def _decode_ssd(
     layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int
 ) -> Candidates:
-    """Return the candidates of an SSD.
+    """Return the candidates of an SSD; the arguments are those of `decode`.
 
     The class scores are outputs of the network or are derived from one score and one label per box. Outputs are
     identified by name. TensorFlow's object detection API uses detection_boxes, detection_classes, detection_scores and
@@ -160,8 +164,8 @@ def _decode_ssd(
         if not by_class and len(scores) == len(labels) == 1:
             return _checked(_ssd_boxes(layout, boxes[0], shape), _spread(scores[0], labels[0], classes))
     raise DataError(
-        f"detector.layout: expected outputs boxes (K, 4) and either scores (K, {classes}) or (K, {classes + 1}), or "
-        f"scores (K,) and labels (K,), for {layout.value}, got {described(outputs)}; choose another layout"
+        f"detector.layout: expected boxes (K, 4) with scores (K, {classes}) or (K, {classes + 1}), or boxes (K, 4) "
+        f"with scores (K,) and labels (K,), for {layout.value}, got {described(outputs)}; choose another layout"
     )
 
 
@@ -177,8 +181,8 @@ def _ssd_boxes(layout: OutputLayout, boxes: Float32, shape: tuple[int, int]) -> 
 def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
     """Return the class scores (K, C) of K boxes with one score and one label each.
 
-    Labels start at 1. The remainder, 1 - score, is distributed evenly over the other classes, but each gets at most the
-    score. Rows of the background and rows with score 0 (padding) are 0.
+    Label 0 is the background, and label k is class k - 1. The remainder, 1 - score, is distributed evenly over the
+    other classes, but each gets at most the score. Rows of the background and rows with score 0 (padding) are 0.
     """
     column = np.rint(labels).astype(np.int64) - 1
     used = (column != -1) & (scores > 0)
@@ -197,8 +201,8 @@ def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
 def spread_rest(one_hot: Float32, scores: Float32, spread: float) -> Float32:
     """Return the class distributions (N, C) for one-hot labels (N, C) and scores (N,).
 
-    The label gets 1 - spread * (1 - score), but at least 1 / C. The other classes share the remainder equally.
-    `spread` is in [0, 1]: with 1, the probability of the label is its score; with 0, the label is certain.
+    The label gets 1 - spread * (1 - score), but at least 1 / C. The other classes share the remainder equally. `spread`
+    is in [0, 1]: with 1, the probability of the label is its score; with 0, the label is certain.
     """
     c = one_hot.shape[1]
     if c == 1:

@@ -17,18 +17,19 @@ KEYS = 2**30  # number of keys; negated keys serve as instance ids, which are ot
 
 @dataclass(frozen=True)
 class FalsePositiveCell:
-    """A visible cell of the world frame, with the mean of its depth readings."""
+    """A visible cell of a grid in the world frame, with the mean position of its depth readings in the image."""
 
     key: int  # hash of the cell, in [1, KEYS]; cells are sorted by key
-    u: float  # px
-    v: float  # px
-    z: float  # m
+    u: float  # px, mean column of the readings
+    v: float  # px, mean row of the readings
+    z: float  # m, mean depth of the readings
 
 
 def false_positive_cells(frame: Frame, seed: int, count: int) -> list[FalsePositiveCell]:
     """Return at most `count` visible cells outside of objects of known class, sorted by key.
 
-    The list is empty if the frame has no pose or no ground truth.
+    `seed` determines the keys of the cells, and thus the order in which locations are chosen in all frames. The list is
+    empty if the frame has no pose or no ground truth.
     """
     if count == 0 or frame.T_world_camera is None or frame.truth is None:
         return []

@@ -1,7 +1,7 @@
 """Output layouts of segmentation networks with prototypes, as in exports of the YOLO family.
 
-A network has two outputs: prototypes and a table. Usually the table has a row with C class scores for every cell. If
-the network contains non-maximum suppression and the choice of the class, the table has a row for each detection.
+A network has two outputs: mask prototypes and a table of candidates. Usually the table has a row with C class scores
+for every cell. If the network contains non-maximum suppression, the table has a row with one class for each detection.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SCORE, LABEL, COEFFICIENTS = 4, 5, 6  # columns of a table with suppression, aft
 
 
 class BoxKind(Enum):
-    """Meaning of the four numbers of a box."""
+    """Meaning of the four numbers of a box in the outputs."""
 
     AUTO = "detected from the outputs for a black image"
     CENTER = "center x, y, width, height"
@@ -71,11 +71,14 @@ class SegmentationLayout:
             class_scores, coefficients = rows[:, start : start + self.classes], rows[:, start + self.classes :]
             if self.objectness:
                 class_scores = class_scores * rows[:, start - 1 : start]
-        check_scores(class_scores)
+        check_scores(class_scores, "detector.weights", fix="")
         return SegmentationOutput(Candidates(self._boxes_px(rows, class_scores), class_scores), coefficients, maps)
 
     def determined_by(self, outputs: Outputs) -> SegmentationLayout:
-        """Return the layout with `boxes` and `unit` determined from outputs. Raises DataError if they are ambiguous."""
+        """Return the layout with `boxes` and `unit` determined from outputs.
+
+        A given `boxes` is kept. Raises DataError if the boxes of cells are ambiguous.
+        """
         table, _ = _table_and_prototypes(outputs)
         rows = self._rows(table)
         used = rows[rows[:, SCORE] > 0] if self.suppressed else rows
@@ -91,15 +94,15 @@ class SegmentationLayout:
         labels = rows[:, LABEL]
         if not _are_labels(labels, self.classes):
             raise DataError(
-                f"detector.label_space: expected labels 0 to {self.classes - 1} in the network's sixth column, "
-                f"got {labels.min():g} to {labels.max():g}; set another label_space"
+                f"detector.label_space: expected integer labels 0 to {self.classes - 1} in column 6 of the network's "
+                f"output, got {labels.min():g} to {labels.max():g}; set another label_space"
             )
         class_scores = np.zeros((len(rows), self.classes), np.float32)
         class_scores[np.arange(len(rows)), labels.astype(np.int64)] = rows[:, SCORE]
         return class_scores
 
     def _boxes_px(self, rows: Float32, class_scores: Float32) -> Float32:
-        """Return the boxes (K, 4) x1 y1 x2 y2 in px of the input."""
+        """Return the boxes (K, 4) x1 y1 x2 y2, px of the input, of table rows (K, columns) and their class scores."""
         boxes = rows[:, :4]
         unit = _is_unit(boxes[rows[:, SCORE] > 0], self.shape, self.suppressed) if self.unit is None else self.unit
         confident = class_scores.max(axis=1, initial=0.0) >= CONFIDENT
@@ -125,9 +128,10 @@ def detect_layout(
 ) -> SegmentationLayout:
     """Return the layout of a network from its outputs for a black image. Raises DataError if no layout matches.
 
-    `shape`: (height, width) px of the input. The shapes of the outputs determine everything except the kind of boxes.
-    The values of the boxes determine their kind. Cells cover the image, so most centers are larger than the sizes of
-    their boxes, and few of these boxes could be corners.
+    `shape`: (height, width) px of the input. `boxes`: AUTO = determined from the values of the boxes. The shapes of the
+    outputs determine everything else except the unit of the boxes. The values of the boxes determine their kind,
+    because cells cover the image. So most centers are larger than the sizes of their boxes, and few of these boxes
+    could be corners.
     """
     table, prototypes = _table_and_prototypes(outputs)
     channels_last = _is_channels_last(prototypes, shape, input_channels_last, metadata)
@@ -151,8 +155,8 @@ def _table_and_prototypes(outputs: Outputs) -> tuple[Float32, Float32]:
     maps = [output for output in outputs.values() if output.ndim == 4 and output.shape[0] == 1]
     if len(outputs) != 2 or len(tables) != 1 or len(maps) != 1:
         raise DataError(
-            "detector.weights: expected two outputs, (1, 4 + classes + M, K) or with suppression (1, K, 6 + "
-            f"M), and (1, M, h, w), got {described(outputs)}"
+            "detector.weights: expected two outputs, a table (1, 4 + classes + M, K), or (1, K, 6 + M) with "
+            f"suppression, and prototypes (1, M, h, w), got {described(outputs)}"
         )
     return tables[0], maps[0]
 
@@ -160,7 +164,7 @@ def _table_and_prototypes(outputs: Outputs) -> tuple[Float32, Float32]:
 def _is_channels_last(
     prototypes: Float32, shape: tuple[int, int], input_channels_last: bool, metadata: ExportMetadata
 ) -> bool:
-    """Return True if the channels of the prototypes are last.
+    """Return True if the channels of the prototypes are last; `shape`: (height, width) px of the input.
 
     Cells are square, so the prototypes have the input's aspect ratio in only one order of the axes.
     """
@@ -184,10 +188,10 @@ def _are_labels(column: Float32, classes: int) -> bool:
 
 
 def _looks_suppressed(rows: Float32, classes: int, shape: tuple[int, int]) -> bool:
-    """Return True if an ambiguous table contains detections.
+    """Return True if a table that could contain cells or detections contains detections.
 
-    Detections have integer labels, and their number differs from the number of cells. Labels alone are not
-    sufficient in 8-bit networks, where most scores are 0.
+    Detections have integer labels, and their number differs from the number of cells. Labels alone are not sufficient
+    in 8-bit networks, where most scores are 0 and so resemble labels.
     """
     cells = [-(-shape[0] // stride) * -(-shape[1] // stride) for stride in STRIDES]
     counts = {boxes * sum(cells[:levels]) for boxes in BOXES_PER_CELL for levels in (3, 4)}
@@ -210,9 +214,9 @@ def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness:
 
 
 def _box_kind(boxes: Float32, suppressed: bool) -> BoxKind | None:
-    """Return CENTER or CORNER for boxes (K, 4), None for ambiguous detections.
+    """Return CENTER or CORNER for boxes (K, 4), None if the boxes of detections (`suppressed`) are ambiguous.
 
-    Raises DataError for ambiguous cells.
+    Raises DataError if the boxes of cells are ambiguous.
     """
     if suppressed and len(boxes) < MIN_ROWS:
         return None

@@ -13,7 +13,7 @@ from framework.errors import DataError
 
 @dataclass(frozen=True)
 class TrueInstances:
-    """The N visible ground-truth instances of known class, largest first; ties are sorted by id."""
+    """The N visible ground-truth instances of known class, sorted by decreasing number of pixels, then by id."""
 
     ids: Int32  # (N,)
     class_ids: Int32  # (N,) index into the detector's classes
@@ -39,7 +39,8 @@ def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) ->
     unknown = sorted({name for name in names.values() if name not in index})
     if unknown:
         raise DataError(
-            f"detector: expected classes for all ground-truth objects, got no class for {', '.join(unknown)}"
+            f"frame {frame.index}: expected ground-truth classes among the {len(classes)} classes of the detector, got "
+            f"{', '.join(map(repr, unknown))}; map them to COCO names"
         )
 
     found, areas = np.unique(frame.truth.instance_ids, return_counts=True)

@@ -10,11 +10,11 @@ from pathlib import Path
 
 
 class Status(Enum):
-    """The status of a check. The value is its mark in the output."""
+    """The status of a check. The value is the mark in front of the check in the output."""
 
     OK = "ok"
-    MISSING = "--"  # optional
-    ERROR = "!!"  # required by a run with the default stages
+    MISSING = "--"  # missing or failed, but optional
+    ERROR = "!!"  # missing or broken, and required by a run with the default stages
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Check:
     name: str
     status: Status
     detail: str
-    fix: str = ""  # command that fixes the problem; "" = not needed or unknown
+    fix: str = ""  # command or instruction that fixes the problem; "" = not needed or unknown
 
     @classmethod
     def of(cls, name: str, passed: bool, detail: str, fix: str = "", required: bool = False) -> Check:
@@ -49,12 +49,12 @@ def run_checks(*checks: Callable[[], Iterable[Check]]) -> list[Check]:
 
 
 def one_line(error: BaseException) -> str:
-    """Return an error message as one line."""
+    """Return the class and message of an exception on one line of at most 300 characters."""
     return anonymous(f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": "))[:300]
 
 
 def anonymous(text: str | Path) -> str:
-    """Return the text without the home folder and name of the user, for pasting into an issue."""
+    """Return the text with the home folder replaced by ~ and the user name by USER, for pasting into an issue."""
     home, text = str(Path.home()), str(text)
     if home != "/":
         text = text.replace(home, "~")

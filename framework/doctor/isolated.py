@@ -13,15 +13,15 @@ from pathlib import Path
 
 from framework.doctor.check_result import anonymous
 
-TIMEOUT_S = 120.0
+TIMEOUT_S = 120.0  # s, maximum run time of a process
 ROOT = Path(__file__).resolve().parents[2]
 ACCELERATION, KERNELS = (f"from {__name__} import {name}; {name}()" for name in ("acceleration", "kernels"))
 
-Outcomes = Mapping[str, tuple[str, str]]  # by code: last printed line and error ("" = success)
+Outcomes = Mapping[str, tuple[str, str]]  # last printed line and error ("" = success) by code
 
 
 def run_all(codes: Iterable[str]) -> Outcomes:
-    """Run pieces of Python code, each in a separate process, and return their outcomes."""
+    """Run each piece of Python code in a separate process, and return the outcomes."""
     codes = [*codes]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return dict(zip(codes, pool.map(_run, codes), strict=True))
@@ -31,7 +31,7 @@ def _run(code: str) -> tuple[str, str]:
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(":")
     }
-    command = [sys.executable, "-P", "-c", code]  # -P: import nothing from the working folder
+    command = [sys.executable, "-P", "-c", code]  # -P: import nothing from the working directory
     try:
         done = subprocess.run(command, env=environment, input="", capture_output=True, text=True, timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
@@ -44,7 +44,7 @@ def _run(code: str) -> tuple[str, str]:
 
 
 def acceleration() -> None:
-    """Print the GPUs and the support of 8-bit integers as JSON."""
+    """Print JSON: `gpus`, the name and memory size of each GPU; `int8`, True if the CPU has 8-bit kernels."""
     import torch
 
     from framework.detection.runtimes.caffe2_network import has_int8_kernels
@@ -55,7 +55,7 @@ def acceleration() -> None:
 
 
 def kernels() -> None:
-    """Print the cache folder and the counts of compiled and listed kernels, of default and other stages, as JSON."""
+    """Print JSON with `folder`, the kernel cache, and `counts`, (compiled, all) kernels of default and other stages."""
     from framework.compilation.catalog import DEFAULT, OTHERS, listed
 
     sections = [listed(DEFAULT), listed(OTHERS)]

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from framework.doctor.check_result import Check, Status, anonymous
 
-MIN_DISK_GB = 2.0  # a run writes 20 to 200 MB; a synthetic benchmark writes several GB
-MIN_MEMORY_GIB = 2.0  # the demo requires 1.2 GiB
+MIN_DISK_GB = 2.0  # minimum free disk space; a run writes 20 to 200 MB, a synthetic benchmark several GB
+MIN_MEMORY_GIB = 2.0  # minimum available memory; the demo requires 1.2 GiB
 SYSTEM_LIBRARIES = {
     "libGL.so.1": ("libgl1", "Open3D"),
     "libEGL.so.1": ("libegl1", "Open3D"),
@@ -24,10 +24,11 @@ SYSTEM_LIBRARIES = {
 """Debian package of each library, and the component that requires it. Open3D is required by every run."""
 
 PREFIXES = ("HF_", "INSTANCEMAP_", "NUMBA_", "OMP_", "TRANSFORMERS_", "CUDA_VISIBLE", "XDG_CACHE", "PYTHONPATH")
+"""Prefixes of the names of the listed environment variables."""
 
 
 def hardware() -> Iterator[Check]:
-    """Check the processor and the memory."""
+    """Report the processor, and check the available memory."""
     from framework.runs.provenance import processor
     from framework.runtime.process_settings import available_cores
 
@@ -40,13 +41,13 @@ def hardware() -> Iterator[Check]:
 
 
 def disk() -> Iterator[Check]:
-    """Check free disk space."""
+    """Check that the folders for outputs, caches and temporary files are writable and have enough free space."""
     import platformdirs
 
     for name, folder, fix in (
         ("outputs", Path.cwd(), "set hydra.run.dir=DIR and hydra.sweep.dir=DIR"),
-        ("cache", platformdirs.user_cache_path("instancemap", appauthor=False), "set XDG_CACHE_HOME"),
-        ("temporary", Path(tempfile.gettempdir()), "set TMPDIR"),
+        ("cache", platformdirs.user_cache_path("instancemap", appauthor=False), "set XDG_CACHE_HOME=DIR"),
+        ("temporary", Path(tempfile.gettempdir()), "set TMPDIR=DIR"),
     ):
         existing, writable = writable_parent(folder)
         free = shutil.disk_usage(existing).free / 1e9
@@ -61,7 +62,7 @@ def writable_parent(folder: Path) -> tuple[Path, bool]:
 
 
 def system_libraries() -> Iterator[Check]:
-    """Check the system libraries of Linux."""
+    """Check on Linux that the system libraries can be loaded."""
     for file, (package, user) in SYSTEM_LIBRARIES.items() if platform.system() == "Linux" else ():
         try:
             found = bool(ctypes.CDLL(file))

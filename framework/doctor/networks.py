@@ -13,12 +13,12 @@ import yaml
 from framework.doctor.check_result import Check, anonymous
 from framework.files.search_paths import CONF, PROJECT_ROOT
 
-INCLUDED = "plugins/"  # prefix of the paths of included weights
-MODEL_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")  # on huggingface.co
+INCLUDED = "plugins/"  # prefix of the paths of weights that the project includes
+MODEL_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")  # id of a model on huggingface.co
 
 
 def included_and_hub() -> Iterator[Check]:
-    """Check the weights included in the project, and the options' models in the cache of huggingface_hub."""
+    """Check the weights included in the project, and the download of the options' models from huggingface.co."""
     from framework.detection.hub.hub_model import forbidden_by
 
     choices = _content(CONF / "config.yaml")["defaults"]
@@ -40,7 +40,7 @@ def included_and_hub() -> Iterator[Check]:
 
 
 def published() -> Iterator[Check]:
-    """Check the published networks."""
+    """Check the download of the published networks of detector=mask_rcnn."""
     from framework.detection.mask_rcnn.published_weights import OFFLINE, PUBLISHED
 
     offline = f", but {OFFLINE} is set" if os.environ.get(OFFLINE) else ""
@@ -54,7 +54,10 @@ def published() -> Iterator[Check]:
 
 
 def _named() -> Iterator[tuple[str, str]]:
-    """Yield the name and the path or model id of each option's weights; the name is OPTION.PARAMETER for several."""
+    """Yield a name, and the path or model id, of the weights of each detector option.
+
+    The name is OPTION, or OPTION.PARAMETER if several parameters of the option name weights.
+    """
     for path in sorted((CONF / "detector").glob("*.yaml")):
         content = _content(path).items()
         values = {key: value for key, value in content if isinstance(value, str) and MODEL_ID.match(value)}

@@ -22,14 +22,14 @@ MODULES = {
     "pyyaml": "yaml",
     "scikit-learn": "sklearn",
 }
-"""Import names that differ from the package names."""
+"""Import name of each package whose import name differs from its package name."""
 
 
 @cache
 def declared() -> tuple[str, list[Requirement], dict[str, list[Requirement]]]:
     """Return the Python version range, the required packages, and the packages of each extra.
 
-    Reads pyproject.toml of a checkout, otherwise the metadata of the installed package.
+    The source is pyproject.toml in a checkout, otherwise the metadata of the installed package.
     """
     if PYPROJECT.is_file():
         project: dict[str, Any] = tomllib.loads(PYPROJECT.read_text(encoding="utf-8"))["project"]
@@ -51,7 +51,7 @@ def import_statement(package: str) -> str:
 
 
 def libraries(outcomes: Outcomes) -> Iterator[Check]:
-    """Check every required package, and the outcome of its import."""
+    """Check the version of every required package, and the outcome of its import."""
     for line in declared()[1]:
         fits, detail = _installed(line)
         fix = f"pip install '{line.name}{line.specifier}'"
@@ -63,7 +63,7 @@ def libraries(outcomes: Outcomes) -> Iterator[Check]:
 
 
 def extras() -> Iterator[Check]:
-    """Check the packages of every extra."""
+    """Check the versions of the packages of every extra."""
     for name, lines in declared()[2].items():
         found = {line.name: _installed(line) for line in lines}
         detail = ", ".join(f"{package} {detail}" for package, (_, detail) in found.items())

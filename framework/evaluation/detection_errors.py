@@ -28,10 +28,10 @@ ON_ONE = 0.6  # minimum fraction of a false detection's pixels on one object of 
 class Appearance(NamedTuple):
     """One object of a known class in one frame, with its best detection if any."""
 
-    instance: int
+    instance: int  # id of the object
     side: float  # px, square root of the area
-    parts: int  # number of detections mostly on the object
-    iou: float = 0.0
+    parts: int  # number of detections mostly on the object; see PART_INSIDE and PART_COVERS
+    iou: float = 0.0  # of the object and its best detection; the other values are 0 without a detection
     inside: float = 0.0  # fraction of the detection's pixels on the object
     covered: float = 0.0  # fraction of the object's pixels in the detection
     score: float = 0.0
@@ -44,7 +44,7 @@ class FalseDetection(NamedTuple):
 
     score: float
     side: float  # px, square root of the area
-    on_thing: bool  # True: mostly on one object of unknown class
+    on_thing: bool  # True: more than ON_ONE of its pixels are on one object of unknown class
 
 
 @dataclass
@@ -56,7 +56,7 @@ class DetectionErrors:
     false_detections: list[FalseDetection] = field(default_factory=list)
 
     def add(self, truth: FrameTruth, detections: Detections) -> None:
-        """Compare one frame's detections (masks of the image's size) with its ground-truth instances."""
+        """Compare the detections of one frame with its ground-truth instances; masks have the size of the image."""
         self.frames += 1
         ids, shared = overlaps(truth, detections.masks)
         areas, shared = shared[0], shared[1:]

@@ -53,7 +53,9 @@ class PredictedInstances:
     def __post_init__(self) -> None:
         counts = {name: len(getattr(self, name)) for name in ("ids", "confidences", "class_names")}
         if len(set(counts.values())) > 1:
-            raise DataError(f"PredictedInstances: expected equal lengths, got {counts}")
+            raise DataError(
+                f"PredictedInstances: expected ids, confidences and class_names of equal length, got {counts}"
+            )
         shape = len(self.instance_ids), 3
         if self.points_world.shape != shape:
             raise DataError(f"PredictedInstances.points_world: expected shape {shape}, got {self.points_world.shape}")
@@ -63,7 +65,7 @@ class PredictedInstances:
             raise DataError("PredictedInstances.confidences: expected finite values, got NaN or infinity")
         unlisted = np.setdiff1d(self.instance_ids, np.append(self.ids, 0))
         if len(unlisted):
-            raise DataError(f"PredictedInstances.instance_ids: expected labels in `ids`, got {unlisted[0]}")
+            raise DataError(f"PredictedInstances.instance_ids: expected 0 or a value of `ids`, got {unlisted[0]}")
 
     @classmethod
     def of_map(
@@ -98,7 +100,7 @@ class Score:
     false_positives: int
     ignored: int  # number of ignored predictions
     truths: int  # number of evaluated ground-truth instances, at least 1
-    matched_iou: float  # sum of the IoU over the true positives
+    matched_iou: float  # sum of the IoUs of the true positives
 
     @property
     def panoptic_quality(self) -> float:
@@ -113,11 +115,11 @@ class Outcome(Enum):
     RIGHT = "correct"  # matched with a ground-truth instance of its class
     WRONG_CLASS = "wrong class"  # IoU with a ground-truth instance of another class reaches the threshold
     FALSE = "false positive"  # insufficient IoU, or a duplicate of a more confident prediction
-    IGNORED = "ignored"  # the ground truth is unknown
+    IGNORED = "ignored"  # not evaluated; see the rules in the docstring of this module
 
 
 @dataclass(frozen=True)
-class Judgment:
+class MatchResult:
     """One prediction compared with the ground truth."""
 
     id: int
@@ -187,9 +189,11 @@ def evaluate(
     max_distance: float = MAX_DISTANCE,
     min_points: int = MIN_POINTS,
 ) -> InstanceEvaluation:
-    """Return the evaluation of a map's instances by the rules in the module's docstring.
+    """Return the evaluation of the instances of a map by the rules in the docstring of this module.
 
-    The result does not depend on the order of points or predictions. Ties in confidence are ranked by id.
+    `transfer` and `max_distance`, m, define the label transfer; ground-truth instances with fewer than `min_points`
+    points are ignored. The result does not depend on the order of points or predictions. Ties in confidence are ranked
+    by id.
     """
     overlaps = _Overlaps.between(predictions, truth, transfer, max_distance, min_points)
     names = sorted(set(overlaps.truth_classes[overlaps.evaluated]))
@@ -209,16 +213,17 @@ def evaluate(
 
 def judge(
     predictions: PredictedInstances, truth: SceneTruth, threshold: float = 0.5
-) -> tuple[list[Judgment], dict[int, str]]:
-    """Return the outcome of each prediction, and the class of each missed ground-truth instance by id.
+) -> tuple[list[MatchResult], dict[int, str]]:
+    """Return the outcome of each prediction at an IoU threshold, and the class of each missed instance by id.
 
-    Predictions are in order of decreasing confidence. They are matched as for `InstanceEvaluation.overall`.
+    Missed instances are evaluated ground-truth instances without a correct prediction. Predictions are in order of
+    decreasing confidence. They are matched as for `InstanceEvaluation.overall`.
     """
     overlaps = _Overlaps.between(predictions, truth, Transfer.TO_TRUTH, MAX_DISTANCE, MIN_POINTS)
     everything = np.ones(len(overlaps.predicted_ids), np.bool_)
     same_class = overlaps.evaluated & (overlaps.predicted_classes[:, None] == overlaps.truth_classes[None, :])
     matches = overlaps.matches(threshold, everything, same_class)
-    judged = [overlaps.judgment(k, match, threshold) for k, match in matches]
+    judged = [overlaps.match_result(k, match, threshold) for k, match in matches]
     found = {one.truth_id for one in judged if one.outcome is Outcome.RIGHT}
     counted = zip(overlaps.truth_ids.tolist(), overlaps.truth_classes, overlaps.evaluated, strict=True)
     return judged, {key: name for key, name, counts in counted if counts and key not in found}
@@ -232,12 +237,12 @@ class _Overlaps:
     """The overlaps of K predictions, in order of decreasing confidence, with T ground-truth instances."""
 
     iou: Float64  # (K, T)
-    ignorable: Bool  # (K,) more than half of the points on ignored instances, or class not annotated
+    ignorable: Bool  # (K,) True where most points are on ignored instances, or the class was not annotated
     predicted_ids: Int64  # (K,)
     predicted_classes: npt.NDArray[np.object_]  # (K,)
     truth_ids: Int64  # (T,)
     truth_classes: npt.NDArray[np.object_]  # (T,) name or None
-    evaluated: Bool  # (T,) True: known class and sufficient size; False: ignored
+    evaluated: Bool  # (T,) True where the class is known and the size sufficient; False = ignored
 
     @classmethod
     def between(
@@ -288,9 +293,9 @@ class _Overlaps:
         )
 
     def matches(self, threshold: float, predicted: Bool, allowed: Bool) -> list[tuple[int, int]]:
-        """Return (prediction, match) pairs in order of decreasing confidence.
+        """Return (row, match) pairs of the predictions in `predicted` (K,), in order of decreasing confidence.
 
-        A match is a column of `allowed`, NO_MATCH or IGNORED.
+        A match is a column of `allowed` (K, T), NO_MATCH or IGNORED.
         """
         ignored_iou = self.iou[:, ~self.evaluated].max(axis=1, initial=0.0)
         unknown = self.ignorable | (ignored_iou >= threshold)
@@ -306,18 +311,21 @@ class _Overlaps:
                 found.append((k, IGNORED if unknown[k] else NO_MATCH))
         return found
 
-    def judgment(self, k: int, match: int, threshold: float) -> Judgment:
-        """Return the judgment of prediction k, given its match from `matches`."""
+    def match_result(self, k: int, match: int, threshold: float) -> MatchResult:
+        """Return the match result of prediction k: its outcome, ground-truth instance and IoU.
+
+        `match` is from `matches`; `threshold` is the IoU threshold.
+        """
         t = match if match >= 0 else int(self.iou[k].argmax()) if len(self.truth_ids) else -1
         iou = float(self.iou[k, t]) if t >= 0 else 0.0
         truth_id, truth_class = (int(self.truth_ids[t]), self.truth_classes[t]) if iou > 0 else (0, None)
         outcome = Outcome.RIGHT if match >= 0 else Outcome.IGNORED if match == IGNORED else Outcome.FALSE
         if match == NO_MATCH and iou >= threshold and truth_class != self.predicted_classes[k]:
             outcome = Outcome.WRONG_CLASS
-        return Judgment(int(self.predicted_ids[k]), outcome, truth_id, truth_class, iou)
+        return MatchResult(int(self.predicted_ids[k]), outcome, truth_id, truth_class, iou)
 
     def best(self) -> tuple[dict[int, float], dict[int, int]]:
-        """Return the best IoU of each evaluated ground-truth instance and the prediction with it, for any class."""
+        """Return the best IoU, and the prediction with it (0 = none), of each evaluated ground-truth instance by id."""
         columns = {int(self.truth_ids[t]): self.iou[:, t] for t in np.flatnonzero(self.evaluated)}
         ious = {key: float(column.max(initial=0.0)) for key, column in columns.items()}
         ids = {key: int(self.predicted_ids[columns[key].argmax()]) if iou > 0 else 0 for key, iou in ious.items()}
@@ -325,7 +333,7 @@ class _Overlaps:
 
 
 def average_precision(hits: Bool, truths: int) -> float:
-    """Return the area under the precision-recall curve of ranked predictions `hits` (K,), True = right.
+    """Return the area under the precision-recall curve of ranked predictions `hits` (K,), True = correct.
 
     `truths` is the number of ground-truth instances. All-point interpolation: each hit contributes the maximum
     precision at its own or a later position in the ranking, divided by `truths`.
@@ -354,7 +362,7 @@ def transfer_labels(points: Float32, labels: Int32, targets: Float32, max_distan
 
 
 def _contingency(predicted: Int32, true: Int32, predicted_ids: Int64, truth_ids: Array) -> Int64:
-    """Return the number of points (1 + K, 1 + T) with each pair of labels; row and column 0 are for no instance."""
+    """Return the number of points (1 + K, 1 + T) with each pair of labels; row 0 and column 0 are for no instance."""
     rows, columns = _positions(predicted, predicted_ids), _positions(true, truth_ids)
     shape = 1 + len(predicted_ids), 1 + len(truth_ids)
     return np.bincount(rows * shape[1] + columns, minlength=shape[0] * shape[1]).reshape(shape)

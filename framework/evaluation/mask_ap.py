@@ -37,7 +37,8 @@ def mask_ap(
     pixels count neither for nor against a detection (COCO's `iscrowd`).
 
     Args:
-        pictures: Ground-truth masks (N, H, W), their class names (N,), None = unknown, and detections of each image.
+        pictures: For each image, the ground-truth masks (N, H, W), their class names (N,), None = unknown, and the
+            detections.
         classes: Names of the evaluated classes. Objects and detections of other classes are omitted.
         min_pixels: Minimum area of an evaluated object, px.
     """
@@ -81,7 +82,7 @@ def mask_ap(
 
 
 def _annotation(image: int, category: int, mask: Bool) -> dict[str, Any]:
-    """Return the COCO fields of a mask (H, W), run-length encoded."""
+    """Return the COCO fields of a mask (H, W), with a run-length encoding; see pycocotools."""
     segmentation = rle.encode(np.asfortranarray(mask, np.uint8))
     return {"image_id": image, "category_id": category, "segmentation": segmentation}
 

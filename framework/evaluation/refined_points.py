@@ -91,13 +91,13 @@ class Refinement:
 
     @cached_property
     def judged_before(self) -> Bool:
-        """Array (N,), True for clusters that are not on an object of unknown class; all False without ground truth."""
+        """Boolean array (N,), True where no object of unknown class fits best; all False without ground truth."""
         fit = self.fit_before
         return np.zeros(len(self.before), np.bool_) if fit is None else ~fit.unknown
 
     @cached_property
     def judged_after(self) -> Bool:
-        """Array (M,), True for refined clusters whose original cluster is evaluated; all False without ground truth."""
+        """Boolean array (M,), True where the original cluster is evaluated; all False without ground truth."""
         fit = self.fit_after
         if fit is None:
             return np.zeros(len(self.after), np.bool_)
@@ -110,7 +110,7 @@ class TrueFit:
 
     iou: Float64  # (N,) intersection over union with the object; 0 for an empty cluster
     points_inside: Int32  # (N,) number of the cluster's points on the object
-    unknown: Bool  # (N,) True: not evaluated, because an object of unknown class fits better
+    unknown: Bool  # (N,) True where an object of unknown class fits better, so that the cluster is not evaluated
 
 
 def point_counts(clusters: PointClusters) -> Int32:
@@ -124,14 +124,14 @@ def pixel_index(clusters: PointClusters, frame: Frame) -> Int32:
 
 
 def _membership(clusters: PointClusters, frame: Frame) -> csr_array:
-    """Return the indicator matrix (N, H * W): 1 if a cluster has a point at the pixel."""
+    """Return the indicator matrix (N, H * W): 1 where a cluster has a point at a pixel."""
     held = clusters.cluster >= 0
     entries = clusters.cluster[held], pixel_index(clusters, frame)[held]
     return csr_array((np.ones(held.sum(), np.int32), entries), (len(clusters), frame.depth.size))
 
 
 def true_fit(clusters: PointClusters, frame: Frame, truth: FrameTruth) -> TrueFit:
-    """Return the fit of clusters to the ground-truth objects.
+    """Return the fit of each cluster to its best-fitting ground-truth object.
 
     Only pixels with a depth reading are compared, because clusters contain no other pixels.
     """

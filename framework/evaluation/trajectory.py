@@ -73,9 +73,10 @@ def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> 
 
 
 def umeyama(x: Float64, y: Float64) -> tuple[Float64, Float64]:
-    """Return the R (3, 3) and t (3,) that minimize sum |y_i - (R x_i + t)|^2: Umeyama 1991, eqs. (40) to (43).
+    """Return the rotation R (3, 3) and translation t (3,) that minimize sum |y_i - (R x_i + t)|^2.
 
-    The points are (n, 3). For fewer than three points, or points on a line, R is one of several solutions.
+    The points x and y are (n, 3). The method is Umeyama 1991, eqs. (40) to (43). For fewer than three points, or points
+    on a line, R is one of several solutions.
     """
     mu_x, mu_y = x.mean(axis=0), y.mean(axis=0)
     U, _, Vt = np.linalg.svd((y - mu_y).T @ (x - mu_x) / len(x))
@@ -85,7 +86,7 @@ def umeyama(x: Float64, y: Float64) -> tuple[Float64, Float64]:
 
 
 def align(P: Float64, Q: Float64) -> Float64:
-    """Return the rigid T (4, 4) that best aligns the poses P (n, 4, 4) with Q (n, 4, 4), n >= 1.
+    """Return the rigid transform T (4, 4) that best aligns the poses P (n, 4, 4) with Q (n, 4, 4), n >= 1.
 
     `umeyama` is applied to the positions and the points 1 m along each camera's axes. The additional points determine
     the rotation of a camera that only rotates.

@@ -11,14 +11,14 @@ from framework.errors import DataError
 from framework.evaluation.trajectory import align
 from framework.geometry import transform
 
-SAME_POSE = 1e-6  # maximum difference between the entries of equal poses, because a file stores rounded poses
+SAME_POSE = 1e-6  # maximum difference between the entries of equal poses; files store rounded poses
 
 
 def in_map_world(truth: SceneTruth, timestamps: Float64, poses: Float64) -> SceneTruth:
-    """Return the ground truth in the world frame of the map with this trajectory.
+    """Return the ground truth in the world frame of the map whose trajectory is `poses`.
 
-    If the run may use the ground-truth poses, and the first common pose is equal in both trajectories, they share one
-    world frame. Otherwise, the ground truth is aligned rigidly to the map by the poses at common times.
+    If the ground-truth poses are available to the run, and the first common pose is equal in both trajectories, they
+    share one world frame. Otherwise, the ground truth is aligned rigidly to the map by the poses at common times.
 
     Args:
         truth: The ground truth.

@@ -43,7 +43,7 @@ def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Decimate a mesh to at most about `triangles` triangles. Objects are finer than the background.
+    """Decimate a mesh to approximately `triangles` triangles in total. Objects are finer than the background.
 
     Objects and background are decimated separately to preserve their border. Vertices outside objects get the label 0.
     """
@@ -63,7 +63,8 @@ def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_of_triangle: int) -> InstanceMesh:
     """Cluster the vertices of a mesh until its stored size is at most `most_bytes` bytes.
 
-    Unlike edge collapse, clustering also merges triangles without a common edge.
+    `bytes_of_vertex` and `bytes_of_triangle` are the stored sizes of one vertex and one triangle. Unlike edge collapse,
+    clustering also merges triangles without a common edge.
     """
     cell = 0.5 * _cell(mesh, max(1, len(mesh.triangles)))
     while bytes_of_vertex * len(mesh.vertices) + bytes_of_triangle * len(mesh.triangles) > most_bytes:
@@ -73,7 +74,7 @@ def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_o
 
 
 def triangle_labels(triangles: Int32, labels: Int32) -> Int32:
-    """Return the majority label (F,) of the corners, or that of the first corner if all differ.
+    """Return the majority label (F,) of the corners of each triangle; if all differ, the label of the first corner.
 
     `triangles` (F, 3) contains vertex indices, and `labels` (V,) the label of each vertex.
     """
@@ -82,9 +83,10 @@ def triangle_labels(triangles: Int32, labels: Int32) -> Int32:
 
 
 def _collapsed(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Return the mesh after edge collapse by quadrics. A brightness relief preserves the texture of flat surfaces.
+    """Return the mesh with at most `triangles` triangles, after edge collapse by quadrics.
 
-    Each remaining vertex is replaced by the nearest original vertex with its color and labels.
+    A brightness relief preserves the texture of flat surfaces. Each remaining vertex is replaced by the nearest
+    original vertex with its color and labels.
     """
     model = _open3d(mesh)
     model.compute_vertex_normals()

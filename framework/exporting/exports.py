@@ -1,4 +1,4 @@
-"""Export of a run to file formats of other programs."""
+"""Export of a run to standard 3D and map formats."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from framework.runs.run_directory import LIKELY
 
 log = logging.getLogger(__name__)
 
-OBJ_DIGITS = 5  # decimal places of an OBJ file: 0.01 mm
+OBJ_DIGITS = 5  # decimal places of coordinates in OBJ files (0.01 mm)
 
 
 class ExportFormat(Enum):
@@ -45,7 +45,7 @@ class ExportFormat(Enum):
 
 
 MESHES = {ExportFormat.GLB: ".glb", ExportFormat.PLY: ".ply", ExportFormat.USD: ".usdc", ExportFormat.OBJ: ".obj"}
-"""File extensions of surface formats."""
+"""File extensions of the formats that contain surfaces."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ class Chosen:
     objects: Sequence[str] = ()  # ids or classes; () = the whole room
     min_confidence: float = LIKELY  # minimum confidence of an object, in [0, 1]; LIKELY = as in figures
     triangles: int | None = None  # maximum triangle count of the scene and of each object file, >= 4; None = no limit
-    coloring: Coloring = Coloring.APPEARANCE
-    collision: Collision = Collision.HULL
-    resolution: float = 0.05  # cell size of a plan, m, in [0.01, 1]
+    coloring: Coloring = Coloring.APPEARANCE  # vertex colors
+    collision: Collision = Collision.HULL  # collision shape of objects in USD files
+    resolution: float = 0.05  # cell size of a floor plan, m, in [0.01, 1]
     robot_height: float = 1.0  # minimum height of observed empty space above a free cell, m, in [0.1, 3]
 
     def __post_init__(self) -> None:
@@ -102,7 +102,7 @@ def export(
     up: Sequence[float] | None = None,
     floor: float | None = None,
 ) -> list[Path]:
-    """Export a run to file formats of other programs. The files are deterministic and written atomically.
+    """Export a run to standard 3D and map formats. The files are deterministic and written atomically.
 
     Args:
         run: Run directory.
@@ -186,7 +186,7 @@ def _write_parts(path: Path, kind: ExportFormat, shown: Sequence[Part], chosen: 
 
 
 def _placed(shown: Sequence[Part], coloring: Coloring) -> dict[str, InstanceMesh]:
-    """Return the colored meshes of the parts by name, in the room frame."""
+    """Return the meshes of the parts by name, in the room frame and with the colors of `coloring`."""
     meshes = {}
     for part, colors in zip(shown, part_colors(shown, coloring), strict=True):
         vertices = transform(part.T_room_part, part.mesh.vertices.astype(np.float64)).astype(np.float32)

@@ -41,13 +41,13 @@ TEXT_PT, SMALL_PT = 8.0, 7.0
 BARS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # possible lengths of the scale bar, m
 MAX_BAR_FRACTION = 0.25  # maximum length of the scale bar, as a fraction of the plan's width
 MOVES = ((0, 0), (0, 1), (0, -1), (0, 2), (0, -2), (0.6, 1), (-0.6, 1), (0.6, -1), (-0.6, -1))
-"""Candidate offsets of a name, as multiples of its width and height."""
+"""Candidate offsets of a name in x and y, as multiples of its width and height."""
 COORDINATES = "x, y in meters in the room frame (z up, floor at z = 0), not longitude and latitude"
 DIGITS = 4  # decimal places, of meters
 
 
 def write_floor_plan(path: Path, room: UprightRoom, plan: Plan, robot_height: float) -> None:
-    """Draw the plan as a PNG file. The file is deterministic."""
+    """Draw the plan as a PNG file. `robot_height` (m) is for the legend. The file is deterministic."""
     with warnings.catch_warnings(), atomic_write(path) as temporary:
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)  # drawn as boxes
         _drawn(room, plan, robot_height).savefig(temporary, dpi=DPI)
@@ -186,7 +186,10 @@ def write_geojson(path: Path, room: UprightRoom) -> None:
 
 
 def outline(room: UprightRoom, one: RoomObject) -> Float64:
-    """Return the counterclockwise outline (N, 2) m of an object in top view: its convex hull, or its box if flat."""
+    """Return the counterclockwise outline (N, 2), m, of an object in top view, in the room frame.
+
+    The outline is the convex hull of the vertices, or the footprint of the box if the hull has no area.
+    """
     points = room.mesh.vertices[one.vertices, :2]
     hull = cv2.convexHull(np.ascontiguousarray(points), clockwise=False)[:, 0].astype(np.float64)
     return hull if len(hull) >= 3 else one.footprint

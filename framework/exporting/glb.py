@@ -46,7 +46,7 @@ def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> byte
 
 
 def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
-    """Return the content of a GLB file with lit or unlit nodes. The result is deterministic."""
+    """Return the content of a GLB file with lit or unlit materials. The result is deterministic."""
     scene: Any = trimesh.Scene(base_frame="world")
     for node in nodes:
         extras = dict(node.extras)
@@ -83,19 +83,19 @@ def extras(part: Part) -> dict[str, Any]:
 
 
 def _unit(normals: Float32) -> Float32:
-    """Return normals (V, 3) without the zero normals of degenerate triangles, which glTF forbids."""
+    """Return normals (V, 3) with (0, 1, 0) in place of the zero normals of degenerate triangles. glTF forbids zeros."""
     return np.where(np.abs(normals).max(axis=1, keepdims=True) > 0.1, normals, np.array([0, 1, 0], np.float32))
 
 
 def _shorts(colors: UInt8) -> UInt16:
-    """Return the colors as linear 16-bit RGBA (V, 4)."""
+    """Return sRGB colors (V, 3) as linear 16-bit RGBA (V, 4)."""
     full = np.full((len(colors), 4), np.iinfo(np.uint16).max, np.uint16)
     full[:, :3] = np.rint(linear(colors) * np.float32(np.iinfo(np.uint16).max))
     return full
 
 
 def _with_materials(tree: dict[str, Any], lit: bool, one_sided: set[str]) -> None:
-    """Declare the vertex colors and add the materials."""
+    """Declare COLOR as the vertex color of each mesh in the glTF `tree`, and add the materials."""
     plain: dict[str, Any] = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
     if not lit:
         plain["extensions"] = {UNLIT: {}}

@@ -36,7 +36,7 @@ class Part:
 
 
 def parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
-    """Return the rest of the room and its objects, with about `triangles` triangles in total; None = no limit."""
+    """Return the rest of the room and its objects, decimated to about `triangles` triangles in total; None = all."""
     found = [rest(room), *(object_part(room, one) for one in room.objects)]
     total = sum(len(part.mesh.triangles) for part in found)
     if triangles is None or total <= triangles:
@@ -45,7 +45,7 @@ def parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
 
 
 def object_parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
-    """Return the objects, each with at most about `triangles` triangles; None = no limit."""
+    """Return the objects, each in its own frame and decimated to about `triangles` triangles; None = no decimation."""
     found = [object_part(room, one) for one in room.objects]
     return found if triangles is None else _decimated(found, [triangles] * len(found))
 
@@ -61,7 +61,7 @@ def object_part(room: UprightRoom, one: RoomObject) -> Part:
 
 
 def rest(room: UprightRoom) -> Part:
-    """Return the rest of the room, including the triangles between objects to avoid gaps."""
+    """Return the rest of the room. It includes the triangles between objects, to avoid gaps."""
     owner = _marked(room.mesh, room.objects)
     corners = owner[room.mesh.triangles]
     outside = (corners[:, 0] == 0) | (corners != corners[:, :1]).any(axis=1)
@@ -77,7 +77,10 @@ def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
 
 
 def _decimated(found: Sequence[Part], most: Sequence[int]) -> list[Part]:
-    """Return parts decimated to at most `most` triangles each, with a progress bar: a million triangles take 10 s."""
+    """Return each part, decimated to at most the number of triangles in `most` (at least MIN_TRIANGLES).
+
+    A progress bar is shown, because a million triangles take 10 s.
+    """
     fewer = []
     total = sum(len(part.mesh.triangles) for part in found)
     with Progress(total, " triangles", unit_scale=True, leave=False) as bar:

@@ -8,8 +8,8 @@ along the whole trajectory. A cell is free if
 - all space between these heights was observed as free.
 
 A cell with a surface between these heights is occupied. All other cells are unknown. A run does not store the field of
-view of its camera, so that of a Kinect is used (`queries.changes.EYE`). Depth cameras do not observe glass and mirrors,
-which may therefore be classified as free.
+view of its camera, so the field of view of a Kinect is used (`queries.changes.EYE`). Depth cameras do not observe glass
+and mirrors, which may therefore be classified as free.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LEVEL_STEP = 0.1  # vertical sampling of free space, m
 SLACK = 0.03  # minimum distance of a surface behind free space, m
 FARTHEST = 5.0  # range of the camera, m: the default of fuser.max_depth
 WALL_SPAN = 1.0  # minimum height of a wall, m
-MAX_CELLS = 2**24  # maximum number of cells of a plan
+MAX_CELLS = 2**24  # maximum number of cells of a floor plan
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,10 @@ class Plan:
 
     resolution: float  # m, > 0, side of a cell
     origin: Float64  # (2,) m, lower left corner of the first cell
-    occupied: Bool  # (H, W)
-    free: Bool  # (H, W)
+    occupied: Bool  # (H, W) surface between CLEARANCE and the robot height
+    free: Bool  # (H, W) observed floor with free space above, up to the robot height
     floor: Bool  # (H, W) observed floor
-    wall: Bool  # (H, W)
+    wall: Bool  # (H, W) vertical surface at least WALL_SPAN high
     highest: Int32  # (H, W) id of the object with the highest surface, 0 = none
 
     @property
@@ -66,7 +66,7 @@ class Plan:
 
 
 def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
-    """Return the plan of a room with a known floor height; cell size and robot height in m.
+    """Return the plan of a room with a known floor height. `resolution` (cell size) and `robot_height` are in m.
 
     Raises DataError for an empty map or more than MAX_CELLS cells.
     """
@@ -95,7 +95,7 @@ def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
 
 
 def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
-    """Return the mask (H, W) of the free cells."""
+    """Return the mask (H, W) of the free cells of a floor plan whose `free` is not yet known."""
     free = drawn.floor & ~drawn.occupied
     rows, columns = np.nonzero(free)
     levels = np.arange(CLEARANCE, robot_height, LEVEL_STEP) + LEVEL_STEP / 2
@@ -107,7 +107,7 @@ def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
 
 
 def looked_through(room: UprightRoom, places: Float64) -> Bool:
-    """Return a mask (P,), True for points (P, 3) m in the room frame that were observed as free space."""
+    """Return a mask (P,), True where the points `places` (P, 3), m, room frame, were observed as free space."""
     through = np.zeros(len(places), np.bool_)
     rasterizer = Rasterizer(room.mesh.vertices, room.mesh.triangles)
     for k in np.unique(np.linspace(0, len(room.poses) - 1, LOOKS).round().astype(int)) if len(room.poses) else []:
@@ -126,7 +126,10 @@ def looked_through(room: UprightRoom, places: Float64) -> Bool:
 
 
 def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
-    """Return the mask (cells,) of cells where vertical surfaces outside of objects are at least WALL_SPAN high."""
+    """Return the mask (cells,) of cells with vertical surfaces of at least WALL_SPAN in height, outside of objects.
+
+    `number` (P,) is the cell of each point.
+    """
     chosen = found.upright & (found.owner == 0)
     step = np.floor(found.points[chosen, 2] / LEVEL_STEP).astype(np.int64)
     lowest, highest = step.min(initial=0), step.max(initial=0)
@@ -135,7 +138,10 @@ def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
 
 
 def _highest(found: SurfacePoints, number: Int64, cells: int) -> Int32:
-    """Return the id (cells,) of the object with the highest surface in each cell, 0 = none."""
+    """Return the id (cells,) of the object with the highest surface in each cell, 0 = none.
+
+    `number` (P,) is the cell of each point.
+    """
     chosen = np.flatnonzero(found.owner > 0)
     rising = chosen[np.argsort(found.points[chosen, 2], kind="stable")]
     ids = np.zeros(cells, np.int32)
@@ -144,7 +150,7 @@ def _highest(found: SurfacePoints, number: Int64, cells: int) -> Int32:
 
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # gray levels of map_saver
-OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # of (255 - level) / 255; UNKNOWN is just above FREE_THRESHOLD
+OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # limits of (255 - level) / 255; UNKNOWN is just above FREE_THRESHOLD
 
 
 def write_ros_map(directory: Path, found: Plan) -> list[Path]:

@@ -1,7 +1,7 @@
-"""Spatial relations between objects by geometry alone: on, in, next to, attached to a wall.
+"""Spatial relations between objects, from geometry alone: on, in, next to, attached to a wall.
 
-Contact surfaces are occluded: the table under a cup is not in the map. An object is therefore on another object in two
-cases: the top of the other object is at the height of its base, or a level surface around its foot is at this height.
+Contact surfaces are occluded: the table under a cup is not in the map. An object A is therefore on an object B in two
+cases: the top of B is at the height of A's base, or B has a level surface at this height around the foot of A.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ CELL = 0.03  # cell size of footprints, m
 TOUCHING = 0.05  # maximum distance of a base from its support, m: depth is noisy at edges
 ON_FLOOR = 0.10  # maximum height of the observed part of an object above the floor, m; thin legs are incomplete
 FOOT = 0.10  # height of the foot above the base, m
-AROUND = 2  # width of the ring around a foot, cells
-COVERED = 0.35  # minimum fraction of the ring with a level surface at the height of the base
+AROUND = 2  # width of the border around a foot, cells
+COVERED = 0.35  # minimum fraction of the border with a level surface at the height of the base
 STACKED = 0.5  # minimum fraction of the foot above the support
 WITHIN = 0.9  # minimum fraction of a surface in the box of its container
 SECTORS = 36  # number of sectors around an object; the legs of a table fill only a few
-ALL_ROUND, UNDER_ROOF = 30, 16  # minimum number of filled sectors in an open container, and on a covered shelf
+ALL_ROUND, UNDER_ROOF = 30, 16  # minimum number of filled sectors of an open container, and of a covered shelf
 MAX_NEIGHBOR_DISTANCE = 0.3  # maximum distance of neighbors, m
 ON_WALL = 0.10  # maximum distance from a wall, m
 HANGING = 0.7  # minimum fraction of points near a wall
-STRAY = 2.0  # %, fraction of the points ignored as noise at the lower and at the upper end of a surface
-MAX_POINTS = 3000  # maximum number of points of an object for distances
+STRAY = 2.0  # percentage of the points ignored as noise at the bottom and at the top of a surface
+MAX_POINTS = 3000  # approximate maximum number of points of an object for distances
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Relation:
 
 
 def relations(room: UprightRoom, plan: Plan | None) -> list[Relation]:
-    """Return all relations of a room's objects. Without a plan, relations to floor and walls are omitted."""
+    """Return all relations of a room's objects. Relations to floor and walls are omitted if `plan` is None."""
     found = surface_points(room, SPACING)
     things = []
     for one in room.objects:
@@ -103,7 +103,7 @@ class _Thing:
 
 
 def _standing(thing: _Thing, things: list[_Thing], plan: Plan | None) -> Relation | None:
-    """Return the support, container or wall of an object; None = unknown."""
+    """Return the relation of an object to its support, container or wall; None = unknown."""
     others = [other for other in things if other.id != thing.id]
     holder = next((other for other in others if _is_in(thing, other)), None)
     if holder is not None:
@@ -123,7 +123,7 @@ def _standing(thing: _Thing, things: list[_Thing], plan: Plan | None) -> Relatio
 
 
 def _carries(below: _Thing, above: _Thing) -> float:
-    """Return the support score of one object for another, in [0, 1]; 0 = no support."""
+    """Return a score, in [0, 1], for `below` as the support of `above`; 0 = no support."""
     if below.base >= above.base or below.tree.n < 1:
         return 0.0
     near = below.level & (np.abs(below.points[:, 2] - above.base) <= TOUCHING)
@@ -137,7 +137,7 @@ def _carries(below: _Thing, above: _Thing) -> float:
 
 
 def _is_in(inner: _Thing, outer: _Thing) -> bool:
-    """Return True if an object is in the box of another object and surrounded or covered by its surface."""
+    """Return True if `inner` is in the box of `outer` and surrounded or covered by the surface of `outer`."""
     box = outer.box.box
     local = np.abs((inner.points - box.center) @ box.rotation)
     if float(np.mean((local <= box.extent / 2 + SPACING).all(axis=1))) < WITHIN:
@@ -155,7 +155,7 @@ def _is_in(inner: _Thing, outer: _Thing) -> bool:
 
 
 def _gap(a: _Thing, b: _Thing) -> float:
-    """Return the distance between two surfaces, m.
+    """Return the distance between the surfaces of two objects, m.
 
     The distance is infinite if their height ranges are disjoint or if it exceeds MAX_NEIGHBOR_DISTANCE.
     """

@@ -1,4 +1,4 @@
-"""Rooms of a plan: its known floor, separated by walls with openings of at most a door width.
+"""Rooms of a floor plan: parts of its known floor that are separated by walls or by openings of at most a door width.
 
 Areas farther than half a door width from every wall are the interiors of rooms. The interiors are grown until they meet
 in the doors. Only walls separate rooms, not furniture or unobserved areas: without observed walls, the plan has one
@@ -25,16 +25,16 @@ MIN_INSIDE = 0.5  # minimum interior area of a room, m^2
 class Door:
     """The opening between two rooms."""
 
-    rooms: tuple[int, int]
+    rooms: tuple[int, int]  # numbers of the two rooms
     place: Float64  # (2,) m, center of the opening in the room frame
     width: float  # m
 
 
 @dataclass(frozen=True)
 class Rooms:
-    """The rooms of a plan, numbered from 1 in descending order of area."""
+    """The rooms of a floor plan, numbered from 1 in descending order of area."""
 
-    labels: Int32  # (H, W) 0 = none
+    labels: Int32  # (H, W) room number of each cell, 0 = none
     doors: tuple[Door, ...]
     plan: Plan
 
@@ -47,11 +47,11 @@ class Rooms:
         return float(np.count_nonzero(self.labels == room)) * self.plan.resolution**2
 
     def center(self, room: int) -> Float64:
-        """Return the center (2,) of a room, m, in the room frame."""
+        """Return the mean position (2,) of the cells of a room, m, in the room frame."""
         return _place(self.plan, self.labels == room)
 
     def of(self, xy: Float64) -> int:
-        """Return the number of the room nearest to most of the points (P, 2), m, P > 0; 0 = no rooms."""
+        """Return the number of the room nearest to most of the points (P, 2), m, room frame, P > 0; 0 = no rooms."""
         if not self.count:
             return 0
         nearest = ndimage.distance_transform_edt(self.labels == 0, return_distances=False, return_indices=True)
@@ -61,7 +61,7 @@ class Rooms:
 
 
 def rooms(plan: Plan) -> Rooms:
-    """Return the rooms of a plan."""
+    """Return the rooms of a floor plan."""
     known = plan.floor | plan.free | plan.occupied
     margin = int(np.ceil(GAP / plan.resolution))
     round_ = _disk(GAP / plan.resolution)
@@ -106,7 +106,7 @@ def _doors(labels: Int32, plan: Plan) -> tuple[Door, ...]:
 
 
 def _place(plan: Plan, cells: Bool) -> Float64:
-    """Return the center (2,) of masked cells (H, W), m, in the room frame."""
+    """Return the mean position (2,), m, room frame, of the cells in the mask `cells` (H, W)."""
     rows, columns = np.nonzero(cells)
     return np.asarray((np.array([columns.mean(), rows.mean()]) + 0.5) * plan.resolution + plan.origin)
 

@@ -17,7 +17,10 @@ DIGITS = 4  # decimal places of meters
 
 
 def write_scene_graph(path: Path, room: UprightRoom, plan: Plan | None) -> None:
-    """Write the scene graph of a room. Without a plan (unknown floor), floor, walls and rooms are omitted."""
+    """Write the scene graph of a room.
+
+    Without a floor plan (unknown floor height), floor, walls and rooms are omitted.
+    """
     write_json(path, scene_graph(room, plan))
 
 

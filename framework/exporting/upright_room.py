@@ -95,9 +95,10 @@ class UprightRoom:
         return Surface(self.mesh.vertices, self.mesh.triangles)
 
     def chosen(self, selection: Sequence[str], min_confidence: float) -> UprightRoom:
-        """Return the room with the objects of the given ids or classes; () = all.
+        """Return the room with the objects of the given ids or classes; () = all classes.
 
-        Objects selected by class need the minimum confidence. Raises DataError for an unknown id or class.
+        Objects below the minimum confidence are omitted, except objects selected by id. Raises DataError for an unknown
+        id or class.
         """
         likely = [one for one in self.objects if one.confidence >= min_confidence]
         if not selection:
@@ -113,7 +114,7 @@ class UprightRoom:
                 best = max(one.confidence for one in by_class)
                 raise DataError(
                     f"object: expected a confidence >= {min_confidence:g} of {word!r}, got at most {best:.2f}; "
-                    "lower the minimum confidence"
+                    "lower min_confidence"
                 )
             found |= {one.id: one for one in (*by_id, *of_class)}
         return replace(self, objects=tuple(found[key] for key in sorted(found)))
@@ -126,9 +127,10 @@ def plain_name(class_name: str, key: int) -> str:
 
 
 def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None = None) -> UprightRoom:
-    """Read the room of a completed or partial run; `up` (3,) and `floor` (m along up) override its metrics.
+    """Read the room of a completed or partial run.
 
-    Raises DataError for missing, invalid or inconsistent files.
+    `up` (3,), in the world frame, and `floor`, the floor height along `up` in m, override the stored values. Raises
+    DataError for missing, invalid or inconsistent files.
     """
     figures = read_metrics(run)
     instances: Sequence[StoredInstance] = []
@@ -233,7 +235,7 @@ def _unit(name: str, values: Sequence[Any]) -> Float64:
     vector = np.array(values, np.float64)
     length = float(np.linalg.norm(vector))
     if vector.shape != (3,) or not np.isfinite(vector).all() or length < SHORTEST_UP:
-        raise DataError(f"{name}: expected a direction of 3 numbers (finite, not all 0), got {values!r:.60}")
+        raise DataError(f"{name}: expected a nonzero direction of 3 finite numbers, got {values!r:.60}")
     return vector / length
 
 
@@ -276,7 +278,7 @@ def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
     if float((cuts**2).sum()) > MAX_POINTS:
         raise DataError(
             f"surface: expected at most {MAX_POINTS} points at a spacing of {spacing:g} m, got "
-            f"{float((cuts**2).sum()):.0f}; increase resolution (cell size), or map with larger voxels"
+            f"{float((cuts**2).sum()):.0f}; increase resolution (cell size), or map with a larger fuser.voxel_size"
         )
     normals = room.surface.face_normals
     normal_z = (normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-20)).astype(np.float32)

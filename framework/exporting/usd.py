@@ -26,7 +26,7 @@ from framework.exporting.object_meshes import Coloring, Part, linear, part_color
 from framework.files.atomic_write import atomic_write
 
 MISSING = "usd: expected the package usd-core, got none; run pip install instancemap[usd]"
-NOT_WRITTEN = "a failure of the USD library"
+NOT_WRITTEN = "the USD library failed"
 THINNEST = 0.002  # minimum side of a collision box, m; an object observed from one side may be flat
 GRAVITY = 9.81  # m/s^2
 
@@ -49,7 +49,7 @@ def check_usd() -> None:
 def write_usd(
     path: Path, parts: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE, collision: Collision = Collision.HULL
 ) -> None:
-    """Write parts as one stage in the room frame. The file is deterministic. Raises DataError if USD is missing."""
+    """Write parts as one stage in the room frame. The file is deterministic. Raises DataError without usd-core."""
     check_usd()
     from pxr import Gf, Kind, Tf, Usd, UsdGeom, UsdPhysics
 
@@ -109,7 +109,7 @@ def _add_object(stage: Any, part: Part, colors: UInt8, collision: Collision) -> 
 
 
 def _add_proxy(stage: Any, path: str, vertices: Float32, collision: Collision) -> None:
-    """Add the invisible collision shape of an object."""
+    """Add the invisible collision shape of an object with vertices (M, 3), m, at the prim path `path`."""
     from pxr import Gf, UsdGeom, UsdPhysics
 
     hull = convex_hull(vertices) if collision is Collision.HULL else None

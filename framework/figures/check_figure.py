@@ -22,7 +22,7 @@ from framework.geometry import back_project, project, transform
 
 SIZE_IN, DPI = (15.0, 9.4), 100
 TITLE_PT, TEXT_PT = 10.0, 9.0
-LINE = 180  # maximum number of characters per line of findings
+LINE = 180  # maximum number of characters per line of the list of checks
 COLORS = {Verdict.FINE: "#1a7f37", Verdict.UNKNOWN: "#787e86", Verdict.NOTE: "#9a6700", Verdict.ERROR: "#cf222e"}
 CHOSEN, OTHER = "#1a7f37", "#b0b6be"
 
@@ -72,7 +72,7 @@ def _edges_on_color(frame: Frame) -> UInt8:
 
 
 def _warped(axes: Axes, title: str, pair: MatchedPair | None, fit: PoseFit | None) -> None:
-    """Draw a frame in red, and a second frame, warped onto the first, in cyan. Aligned pixels are gray."""
+    """Draw the first frame in red and the second frame, warped to the first, in cyan. Aligned pixels are gray."""
     if pair is None:
         _say(axes, "no pair of frames with enough overlap")
         return
@@ -119,7 +119,7 @@ def _readings(axes: Axes, poses: PoseJudgment) -> None:
 
 
 def _delays(axes: Axes, check: RecordingCheck) -> None:
-    """Draw the agreement of depth and color edges for each delay."""
+    """Draw the agreement of depth and color edges for each delay of depth, in frames."""
     if not check.by_delay:
         _say(axes, "too few edges to compare depth and color")
         return

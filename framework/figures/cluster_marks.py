@@ -22,8 +22,8 @@ class ClusterMarks:
     clusters: PointClusters
     colors: UInt8  # (K, 3) RGB
     owner: Int32  # (H, W) smallest cluster that contains the pixel, -1 = none
-    dropped: Bool  # (H, W) True: pixel in a cluster only before refinement
-    added: Bool  # (H, W) True: pixel not in the original cluster of the owner
+    dropped: Bool  # (H, W) True where a pixel is in a cluster before refinement, but not after it
+    added: Bool  # (H, W) True where a pixel is not in the original cluster of its owner
 
     @classmethod
     def before(cls, refinement: Refinement) -> ClusterMarks:
@@ -65,14 +65,14 @@ class ClusterMarks:
 
 
 def _colors(count: int) -> UInt8:
-    """Return colors (count, 3) that differ from each other and from DROPPED."""
+    """Return RGB colors (count, 3) that differ from each other and from DROPPED."""
     palette = instance_colors(np.zeros((2 * count + 8, 3)))
     unlike = np.abs(palette.astype(np.int64) - DROPPED).sum(axis=1) > DROPPED_DISTANCE
     return np.asarray(palette[unlike][:count])
 
 
 def _colors_after(refinement: Refinement) -> UInt8:
-    """Return the colors (M, 3). The largest part of a cluster keeps its color; all other parts get new colors."""
+    """Return the RGB colors (M, 3). The largest part of a cluster has its color; all other parts have new colors."""
     n, m = len(refinement.before), len(refinement.after)
     color_index = np.full(m, -1)
     known = np.flatnonzero(refinement.main_part >= 0)

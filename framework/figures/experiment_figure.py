@@ -119,7 +119,7 @@ def _stage_times(pictured: Pictured) -> Page:
     means = {name: MeanTimes.of(list(times.values())) if times else None for name, times in read.items()}
     shown = [one for one in means.values() if one is not None]
     if not shown:
-        raise DataError("timings.csv: expected a readable file, got none; the log lists the reasons")
+        raise DataError("timings.csv: expected a readable file, got none; see the log for the reasons")
     counts = "/".join(map(str, dict.fromkeys(one.count for one in shown)))
     sequences = [pictured.called(run) for run in pictured.runs if any(run in times for times in read.values())]
     stages = "; ".join(f"{name}: {' and '.join(added)}" for name, added in COLUMNS.items())
@@ -129,7 +129,7 @@ def _stage_times(pictured: Pictured) -> Page:
         "frames divided by the median of the first third."
     )
     if any(one.longest > one.frames[-1] for one in shown):
-        note += " Lines end with the shortest sequence."
+        note += " Lines end at the last frame of the shortest sequence."
     return stage_times_figure(means, f"{note} {pictured.origin}")
 
 
@@ -160,7 +160,7 @@ def _maps(pictured: Pictured) -> Page:
         captions.append(f"{line.true_count} instances" if truth else "")
         lines.append(CaptionedLine(pictured.called(run), line, captions))
     if not lines:
-        raise DataError("maps: expected a readable map, got none; the log lists the reasons")
+        raise DataError("map.npz: expected a readable map, got none; see the log for the reasons")
     note = (
         "An object has the same color in all images of a row. Dark: no match with a ground-truth object. "
         "Beige: ground-truth object of unknown class, not evaluated."

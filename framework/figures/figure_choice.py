@@ -23,7 +23,7 @@ class FigureChoice:
     kind: str = "maps"  # kind of the figure, one of KINDS
     sequences: str = "dataset.scene"  # config key of the sequence
     names: dict[str, str] = field(default_factory=dict)  # display names of rows
-    zoom: bool = False  # close-up of the largest difference between the columns, for `maps`
+    zoom: bool = False  # True = add a close-up of the largest difference between the columns; only for `maps`
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

@@ -19,7 +19,7 @@ from framework.files.atomic_write import atomic_write
 from framework.rendering.labels import place_labels
 
 COLUMN_MM, PAGE_MM = 88.0, 181.0  # widths of one and two columns of a journal
-TEXT_PT, SMALL_PT, NOTE_PT = 7.0, 6.0, 5.0
+TEXT_PT, SMALL_PT, NOTE_PT = 7.0, 6.0, 5.0  # font sizes
 INK, FAINT_INK = "#20242a", "#787e86"
 INCH_MM = 25.4
 PNG_DPI = 200
@@ -42,7 +42,7 @@ class Page:
         self.text(MARGIN_MM, MARGIN_MM - self._foot, "\n".join(lines), fontsize=NOTE_PT, color=FAINT_INK, va="bottom")
 
     def axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        """Add axes without ticks, in a thin frame."""
+        """Add axes without ticks, in a thin frame; the arguments are in mm."""
         x, y = self._fraction(left, bottom)
         axes = self.figure.add_axes((x, y, width / self._size[0], height / self._size[1]))
         axes.set(xticks=[], yticks=[])
@@ -53,7 +53,10 @@ class Page:
         self.figure.text(*self._fraction(x, y), text, **style)
 
     def write(self, path: Path) -> list[Path]:
-        """Write `path`.png and `path`.pdf, and return their paths. The files are byte-identical in repeated calls."""
+        """Write the page to `path` with the suffixes .png and .pdf, and return both paths.
+
+        Repeated calls write byte-identical files.
+        """
         png, pdf = path.with_suffix(".png"), path.with_suffix(".pdf")
         with atomic_write(png) as temporary:
             self.figure.savefig(temporary, dpi=PNG_DPI)
@@ -66,7 +69,7 @@ class Page:
 
 
 def text_width(text: str, size: float) -> float:
-    """Return the printed width, mm, of a text in the font size `size`, pt."""
+    """Return the printed width, mm, of a text with font size `size`, pt."""
     width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)
     return float(width) / 72 * INCH_MM
 
@@ -87,7 +90,7 @@ def draw_names(axes: Axes, ids: Int32, names: Mapping[int, str], size: float, wi
     """Write names on the objects of an image, or next to small objects with a leader line.
 
     Args:
-        axes: Axes of the image, in pixels.
+        axes: Axes of the image; their unit is px.
         ids: (H, W) object ids of the pixels, 0 = none.
         names: Name by object id; names that do not fit are omitted.
         size: Font size, pt.

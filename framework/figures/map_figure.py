@@ -26,7 +26,7 @@ from framework.figures.figure_page import (
 from framework.figures.map_panels import Panel, PanelLine
 from framework.rendering.camera_path import ProjectedPath
 
-HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # space above the columns, below a line, and between panels
+HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # space above the columns, below a line of panels, and between panels
 LEFT_MM, RIGHT_MM = 3.5, 0.3  # space to the left and to the right of the panels
 ASPECT = 0.78  # height of a panel divided by its width
 

@@ -16,8 +16,8 @@ from framework.rendering.surface import FrontSides, Surface
 from framework.rendering.viewpoint import best_view, fitted
 from framework.runs.stored_map import StoredMap
 
-ZOOM = 2.5  # magnification of the window with the largest differences
-FRAMING_SCALE = 0.1  # scale of the image that is rendered to frame a view
+ZOOM = 2.5  # magnification of the window with the most differing pixels
+FRAMING_SCALE = 0.1  # scale of the image rendered to determine the framing of a view
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def panel_line(
         maps: Map of each column, None = no map; at least one map is required.
         truth: Ground truth; None = the last map is used as the reference.
         size: Width and height of a panel, px.
-        zoom: True: also draw the window with the largest differences.
+        zoom: True = also draw the window with the most pixels that differ between the maps.
     """
     last = [one for one in maps if one is not None][-1]
     reference = truth or SceneTruth(last.mesh.vertices, last.ids, last.class_names)

@@ -26,7 +26,7 @@ def write_raycast(path: Path, view: View, names: Mapping[int, str], centers: Map
     Args:
         path: PNG file.
         view: Ray-cast view.
-        names: Class of each object, by id; all other ids are gray.
+        names: Class name of each object, by id; pixels of all other ids are gray.
         centers: Center (3,), m, of each object, by id; it determines the color of the object.
         note: Note at the bottom of the page.
     """
@@ -50,7 +50,7 @@ def raycast_page(view: View, names: Mapping[int, str], centers: Mapping[int, Flo
     extent = " x ".join(f"{size:.1f}" for size in high - low)
     panels: list[tuple[str, str, Array]] = [
         ("depth", f"{mapped.mean():.0%} of the pixels are mapped", np.where(mapped, view.depth, np.nan)),
-        ("normals", "red: right, green: up, blue: towards the camera", normal_colors(view)),
+        ("normals", "red: right, green: up, blue: toward the camera", normal_colors(view)),
         ("vertices", f"red: x, green: y, blue: z ({extent} m)", position_colors(positions, low, high)),
         ("RGB", "", view.color),
         ("object indices", f"{len(set(ids.ravel().tolist()) - {0})} objects", index_colors(ids, centers)),

@@ -27,8 +27,8 @@ MAX_IMAGE_IN, SIDE_IN, TITLE_IN, ROW_IN = 6.6, 4.6, 0.4, 0.3  # heights of image
 TITLE_PT, TEXT_PT, SMALL_PT = 15.0, 12.0, 10.5
 MAX_TITLE, MAX_REFINER, MAX_NAME = 90, 45, 18  # maximum numbers of characters
 TABLE_COLUMNS, MAX_ROWS = 3, 8
-NAME_AT, POINTS_AT = 0.016, 0.12  # positions in a column, relative to the width of the table
-BETTER, WORSE = "#188048", "#be2828"
+NAME_AT, POINTS_AT = 0.016, 0.12  # positions in a column, as fractions of the width of the table
+BETTER, WORSE = "#188048", "#be2828"  # text colors of increased and decreased IoU
 
 
 def write_refinement(path: Path, refinement: Refinement, title: str, refiner: str) -> None:

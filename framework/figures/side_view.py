@@ -16,18 +16,19 @@ from framework.rendering.lit_view import NOTHING
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import looking, upward
 
-AZIMUTH_RAD, ELEVATION_RAD = np.deg2rad(75), np.deg2rad(14)  # side view; at 90 degrees, planes would become lines
-MARGIN = 0.09  # margin around the clusters, relative to the size of the view
+# direction of the view; at an azimuth of 90 degrees, surfaces that face the camera would become lines
+AZIMUTH_RAD, ELEVATION_RAD = np.deg2rad(75), np.deg2rad(14)
+MARGIN = 0.09  # margin around the clusters, as a fraction of the size of the view
 MIN_HEIGHT_M = 0.4  # minimum height of the view
 CELLS = 300  # number of grid cells across the view for counting visible points
-POINT_SIZE = 1.2  # size of a drawn point, relative to the distance between readings
-MIN_POINT_PT, MAX_POINT_PT = 0.7, 2.2
+POINT_SIZE = 1.2  # size of a drawn point, as a multiple of the distance between readings
+MIN_POINT_PT, MAX_POINT_PT = 0.7, 2.2  # minimum and maximum size of a drawn point
 GRID_CELLS = 120  # number of grid cells across the coarse surface for estimating the up direction
 LEVEL_RAD = np.deg2rad(6)  # maximum slope of a floor
 PITCHES_RAD = np.deg2rad([0, 30])  # initial downward pitches of the camera in the floor search
-MAX_DEPTH_STEP = 0.1  # maximum difference between readings of one surface, relative to depth
-SCALE_BARS_M = np.array([0.1, 0.2, 0.5, 1.0, 2.0, 5.0])
-SCALE_BAR = 0.15  # approximate length of the scale bar, relative to the width of the view
+MAX_DEPTH_STEP = 0.1  # maximum difference between neighboring readings of one surface, as a fraction of the depth
+SCALE_BARS_M = np.array([0.1, 0.2, 0.5, 1.0, 2.0, 5.0])  # possible lengths of the scale bar
+SCALE_BAR = 0.15  # approximate length of the scale bar, as a fraction of the width of the view
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def _up(frame: Frame) -> Float64:
 
 
 def _turned(up: Float64, azimuth: float) -> Float64:
-    """Return R_camera_view (3, 3): a rotation by `azimuth`, rad, about `up` (3,), and a slight downward pitch."""
+    """Return R_camera_view (3, 3): a rotation by `azimuth`, rad, about `up` (3,), and a pitch ELEVATION_RAD down."""
     forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
     if np.linalg.norm(forward) < 0.1:  # the camera looks straight down or up
         forward = np.array([0.0, -1.0, 0.0]) + up[1] * up

@@ -17,14 +17,14 @@ from framework.data import Float64, Int64
 from framework.figures.figure_page import COLUMN_MM, FAINT_INK, INK, NOTE_PT, SMALL_PT, TEXT_PT, Page, write_message
 from framework.runs.timings_file import StageTimes
 
-WINDOW = 9  # number of frames of the running median
+WINDOW = 9  # number of frames in the window of the running median
 COLUMNS = {
     "Mask R-CNN": ("detection",),
     "data association": ("lifting", "association"),
     "GMM": ("refinement",),
     "map integration": ("update", "integration"),
 }
-"""Stages of each line, by its name in the paper. The assignment of stages to names is our interpretation."""
+"""Stages of each line, by the name of the line in the paper. The assignment of the stages is our interpretation."""
 COLORS = dict(zip(COLUMNS, ("#0072b2", "#8c6bb1", "#d55e00", "#b5830a"), strict=True))  # color-blind safe
 RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # names of the reference lines, by ms per frame
 PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights of a diagram, its heading and its axis labels
@@ -66,11 +66,14 @@ class MeanTimes:
 
     @property
     def columns(self) -> list[str]:
-        """Names of the columns with known times."""
+        """Names in COLUMNS with known times."""
         return [name for name, values in self.mean.items() if np.isfinite(values).any()]
 
     def growth(self, name: str) -> float:
-        """Return the median over the last third of the frames, divided by the median over the first; NaN if unknown."""
+        """Return the median time of the last third of the frames divided by the median time of the first third.
+
+        Return NaN if a median is unknown.
+        """
         third = max(1, len(self.frames) // 3)
         first, last = self.mean[name][:third], self.mean[name][-third:]
         if not np.isfinite(first).any() or not np.isfinite(last).any():
@@ -92,7 +95,7 @@ def running_median(values: Float64, window: int) -> Float64:
 
 
 def spread(positions: Sequence[float], gap: float) -> list[float]:
-    """Return positions at least `gap` apart, with the smallest sum of squared displacements."""
+    """Return positions in the same order, at least `gap` apart, with the smallest sum of squared displacements."""
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(len(order))
     result = np.empty(len(order))

@@ -21,12 +21,12 @@ def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary path next to `path`. The file replaces `path` on success and is deleted on failure.
 
     The temporary name has the same suffix, because image and mesh writers derive the format from the suffix. If `path`
-    is a link, its target is replaced. Raises DataError if writing fails or `path` is not a regular file.
+    is a symbolic link, its target is replaced. Raises DataError if writing fails or `path` is not a regular file.
     """
     path = Path(os.path.realpath(path))
     if path.exists():
         check_regular(path)
-    # processes in containers with a shared folder may have the same id
+    # processes in containers that share a folder may have the same process id
     temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.partial{path.suffix}")
     try:
         yield temporary
@@ -35,14 +35,14 @@ def atomic_write(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     except OSError as error:
         reason = error.strerror or f"{error}; the disk may be full"  # NumPy reports only the number of items
-        raise DataError(f"{path}: expected a writable file, got {reason}") from error
+        raise DataError(f"{path}: expected a writable file, got an error ({reason})") from error
     finally:
         with suppress(OSError):  # the disk may be read-only
             temporary.unlink(missing_ok=True)
 
 
 def path_exists(path: Path) -> bool:
-    """Return True if the path of an optional file exists, even as a broken link, which then fails to be read."""
+    """Return True if an optional file exists, or if it is a broken symbolic link, so that reading it then fails."""
     return os.path.lexists(path)
 
 
@@ -54,11 +54,12 @@ def remove_left_over(directory: Path) -> None:
 
 
 def check_regular(path: Path) -> os.stat_result:
-    """Return the status of a regular file. Raises DataError for other types: reading a pipe may block forever."""
+    """Return the status of a regular file. Raises DataError for other types, because reading a pipe may block."""
     try:
         found = path.stat()
     except (OSError, ValueError) as error:
-        raise DataError(f"{path}: expected a readable file, got {getattr(error, 'strerror', None) or error}") from error
+        reason = getattr(error, "strerror", None) or error
+        raise DataError(f"{path}: expected a readable file, got an error ({reason})") from error
     if not stat.S_ISREG(found.st_mode):
         kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
         raise DataError(f"{path}: expected a regular file, got {kind}")
@@ -66,21 +67,21 @@ def check_regular(path: Path) -> os.stat_result:
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """Read a file of at most `most` bytes. Raises DataError."""
+    """Read a file of at most `most` bytes. Raises DataError if it is larger or cannot be read."""
     size = check_regular(path).st_size
     if size > most:
         raise DataError(f"{path}: expected at most {most} bytes, got {size}")
     try:
         return path.read_bytes()
     except OSError as error:
-        raise DataError(f"{path}: expected a readable file, got {error.strerror or error}") from error
+        raise DataError(f"{path}: expected a readable file, got an error ({error.strerror or error})") from error
 
 
 def read_text(path: Path, most: int = MAX_TEXT) -> str:
-    """Read UTF-8 text and remove the byte order mark. Raises DataError."""
+    """Read UTF-8 text of at most `most` bytes without its byte order mark. Raises a DataError that names the file."""
     try:
         return read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object.count(b"\n", 0, error.start) + 1
-        found = f"got byte {error.object[error.start]:#04x} in line {line}"
+        found = f"got byte {error.object[error.start]:#04x} on line {line}"
         raise DataError(f"{path}: expected UTF-8 text, {found}") from error

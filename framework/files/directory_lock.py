@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 from framework.errors import DataError
 from framework.files.atomic_write import atomic_write, read_text
 
-# the owner has its own file, because locked files cannot be read on Windows
+# the name of the owner has its own file, because locked files cannot be read on Windows
 LOCK, HOLDER = ".lock", ".lock_holder"
 
 log = logging.getLogger(__name__)
@@ -36,16 +36,16 @@ def new_directory(wanted: str) -> str:
                 number += 1
                 path = Path(f"{wanted}_{number}")
     except OSError as error:
-        raise DataError(f"{path}: expected a writable parent folder, got {error.strerror}") from error
+        raise DataError(f"{path}: expected a writable parent folder, got an error ({error.strerror})") from error
 
 
 @contextmanager
 def locked(directory: Path, wait: bool = False) -> Iterator[None]:
     """Lock `directory` while the body of the `with` statement runs.
 
-    The lock ends with the process, even after `kill -9`. If another process holds the lock, this function waits for
-    that process to exit if `wait` is True. Otherwise it raises DataError. A warning is logged on file systems without
-    locks.
+    The lock is released when the process ends, even after `kill -9`. If another process holds the lock, this function
+    waits for that process if `wait` is True, and raises DataError otherwise. On file systems without locks, a warning
+    is logged and the directory is not locked.
     """
     directory.mkdir(parents=True, exist_ok=True)
     lock = FileLock(directory / LOCK, fallback_to_soft=False)
@@ -63,7 +63,7 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
             lock.acquire()
     except OSError as error:
         log.warning(
-            "%s: expected a file system with locks, got %s; do not start other runs in this directory",
+            "%s: expected a file system with locks, got an error (%s); do not start other runs in this directory",
             directory,
             error.strerror,
         )

@@ -22,7 +22,7 @@ from framework.files.atomic_write import read_bytes
 
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
-JPEG_PADDING = b"\0\r\n"  # some cameras append zeros; some programs append a line break
+JPEG_PADDING = b"\0\r\n"  # bytes after the end marker; some cameras append zeros; some programs append a line break
 LARGEST_FILE = 2**28  # bytes, size of MAX_PIXELS with four 16-bit channels
 
 
@@ -35,7 +35,7 @@ def read_color(path: Path) -> UInt8:
 
 
 def decode_color(name: Path | str, data: bytes) -> UInt8:
-    """Decode the content of a color image as in `read_color`. `name` is for error messages."""
+    """Return the color (H, W, 3), uint8 RGB, of the content of an image file. Raises a FrameError that names `name`."""
     check_image(name, data)
     if data.startswith(JPEG_START):
         try:
@@ -54,7 +54,7 @@ def read_uint16(path: Path) -> UInt16:
 
 
 def decode_uint16(name: Path | str, data: bytes) -> UInt16:
-    """Decode the content of a PNG file as in `read_uint16`. `name` is for error messages."""
+    """Return the uint16 values (H, W) of the content of a PNG file. Raises a FrameError that names `name`."""
     return np.asarray(_decode_channel(name, data, np.uint16), np.uint16)
 
 

@@ -23,12 +23,12 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path, most: int = MAX_TEXT) -> Any:
-    """Read a JSON file of at most `most` bytes. Raises DataError."""
+    """Read a JSON file of at most `most` bytes. Raises a DataError that names the file."""
     return parse_json(path, read_bytes(path, most))
 
 
 def parse_json(where: object, content: bytes | str) -> Any:
-    """Parse JSON with or without a byte order mark. Raises DataError that names `where`."""
+    """Parse JSON with or without a byte order mark. Raises a DataError that names `where`."""
     try:
         with errors_of(where):
             found = json.loads(content, parse_int=_whole, object_pairs_hook=_once)

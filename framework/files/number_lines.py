@@ -28,7 +28,7 @@ _NO_NUMBER = re.compile(r"[+-]?(1\.#\w+|nan\(\w+\))", re.ASCII | re.IGNORECASE)
 
 
 def read_lines(path: Path, missing: str = "expected a text file, got no such file") -> list[str]:
-    """Return the lines of a text file. Raises DataError, with the message `missing` for a nonexistent file."""
+    """Return the lines of a text file. Raises DataError, with the message `missing` if the file does not exist."""
     if not path.exists():
         raise DataError(f"{path}: {missing}")
     return read_text(path).splitlines()
@@ -40,7 +40,10 @@ def number(word: str) -> float:
 
 
 def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> list[float]:
-    """Parse the words of a line as `count` numbers. NaN is valid. Raises DataError that names `where`."""
+    """Parse the words of a line as `count` numbers. NaN is valid.
+
+    Raises a DataError that names `where` (file and line) and `names` (the columns).
+    """
     expected = f"{where}: expected {count} numbers{f' ({names})' if names else ''}"
     if len(words) != count:
         raise DataError(f"{expected}, got {len(words)}")
@@ -54,9 +57,10 @@ def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> li
 
 
 def read_gravity(path: Path) -> list[Float64 | None]:
-    """Read the up direction of each frame in the camera frame: `x y z` per line, `nan nan nan` = unknown.
+    """Return the unit up vector (3,) of each frame in the camera frame; None = unknown.
 
-    Returns unit vectors (3,), None = unknown. Empty lines, and comments after `#`, are skipped. Raises DataError.
+    A line contains `x y z`, or `nan nan nan` if unknown. Empty lines, and comments after `#`, are skipped. Raises
+    DataError that names the line.
     """
     words = [COMMENT.sub("", line).split() for line in read_lines(path)]
     return [_direction(f"{path}, line {n}", found) for n, found in enumerate(words, start=1) if found]
@@ -70,9 +74,10 @@ def write_gravity(path: Path, ups: Sequence[Float64 | None]) -> None:
 
 
 def read_image_times(path: Path) -> list[tuple[float, float]]:
-    """Read the timestamps of the two images of each frame, s: `color depth` per line.
+    """Return the timestamps of color and depth of each frame, s.
 
-    Empty lines, and comments after `#`, are skipped. Raises DataError.
+    A line contains `color depth`. Empty lines, and comments after `#`, are skipped. Raises a DataError that names the
+    line.
     """
     words = [(n, COMMENT.sub("", line).split()) for n, line in enumerate(read_lines(path), start=1)]
     times = []
@@ -100,7 +105,8 @@ def _direction(where: str, words: Sequence[str]) -> Float64 | None:
         return None
     length = math.hypot(*values)
     if not MIN_LENGTH <= length <= MAX_LENGTH:
-        raise DataError(f"{where}: expected a direction, or nan nan nan if unknown, got {' '.join(words)!r}")
+        expected = f"expected a direction x y z of length {MIN_LENGTH:g} to {MAX_LENGTH:g}, or nan nan nan if unknown"
+        raise DataError(f"{where}: {expected}, got {' '.join(words)!r}")
     return np.array(values) / length
 
 
@@ -117,7 +123,10 @@ class PrintedMatrix:
             return nearest_rigid(self.values)
 
     def camera(self, width: int, height: int) -> Camera:
-        """Return the pinhole camera with this intrinsic matrix and image size in px. Raises DataError."""
+        """Return the camera with these intrinsics, px, and an image of `width` x `height` px.
+
+        Raises DataError if the matrix is not an intrinsic matrix.
+        """
         (fx, _, cx, _), (_, fy, cy, _) = self.values[:2].tolist()
         if not np.allclose(self.values, [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]]):
             found = " / ".join(" ".join(f"{value:g}" for value in row) for row in self.values)
@@ -128,7 +137,7 @@ class PrintedMatrix:
 
 
 def read_matrix(path: Path) -> PrintedMatrix:
-    """Read a 4x4 matrix from a file with four lines of four numbers. Raises DataError."""
+    """Read a 4x4 matrix from a file with four lines of four numbers. Raises a DataError that names the line."""
     lines = _numbered_lines(path)
     if len(lines) != 4:
         raise DataError(f"{path}: expected 4 lines of 4 numbers, got {len(lines)} lines")
@@ -136,11 +145,11 @@ def read_matrix(path: Path) -> PrintedMatrix:
 
 
 def read_matrix_lines(path: Path) -> list[PrintedMatrix]:
-    """Read a file with one 4x4 matrix (16 numbers, row by row) per line. Raises DataError."""
+    """Read a file with one 4x4 matrix (16 numbers, row-major) per line. Raises a DataError that names the line."""
     lines = _numbered_lines(path)
     return [PrintedMatrix(where, np.array(numbers(where, words, 16)).reshape(4, 4)) for where, words in lines]
 
 
 def _numbered_lines(path: Path) -> list[tuple[str, list[str]]]:
-    """Return the file and line number, for messages, and the words of each nonempty line."""
+    """Return "FILE, line N", for messages, and the words of each nonempty line."""
     return [(f"{path}, line {n}", line.split()) for n, line in enumerate(read_lines(path), start=1) if line.strip()]

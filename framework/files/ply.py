@@ -34,10 +34,20 @@ class PlyMesh:
     comments: tuple[str, ...]  # comments of the header, in file order
 
 
-def read_ply(path: Path) -> PlyMesh:
-    """Read a mesh. Polygons become triangle fans.
+def found_property(mesh: PlyMesh, values: Array | None) -> str:
+    """Return the type of a vertex property with the wrong type, or the existing properties if `values` is None.
 
-    Other elements, and list properties of vertices, are ignored. Raises DataError that names the line or byte for a
+    The result is the part of an error message after "got".
+    """
+    if values is not None:
+        return str(values.dtype)
+    return f"only the properties {', '.join((*AXES, *sorted(mesh.properties)))}"
+
+
+def read_ply(path: Path) -> PlyMesh:
+    """Read the vertices, faces and vertex properties of a mesh. Polygons become triangle fans.
+
+    Other elements, and list properties of vertices, are ignored. Raises a DataError that names the line or byte for a
     damaged file, vertices that are not finite, or invalid vertex indices.
     """
     header, elements = read_elements(path, read_bytes(path, LARGEST_FILE))
@@ -52,7 +62,7 @@ def read_ply(path: Path) -> PlyMesh:
 def write_ply(
     path: Path, vertices: Float32, triangles: Int32, properties: Mapping[str, Array], comments: Sequence[str] = ()
 ) -> None:
-    """Write vertices (V, 3) in m, triangles (F, 3) and vertex properties (V,).
+    """Write vertices (V, 3) in m, triangles (F, 3) and vertex properties (V,) by name, atomically.
 
     Raises DataError for a mesh that `read_ply` would reject, or for a failed write.
     """
@@ -118,7 +128,10 @@ def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
 
 
 def _fans(corners: Int32, lengths: Int64) -> Int32:
-    """Return the triangles (F, 3) of polygons with `lengths` (P,) corners: corners 0 1 2, 0 2 3, ..."""
+    """Return the triangles (F, 3) of P polygons: the corners 0 1 2, 0 2 3, ... of each polygon.
+
+    `corners` contains the vertex indices of all polygons in order, and `lengths` (P,) their numbers of corners.
+    """
     if (lengths == 3).all():
         return corners.reshape(-1, 3)
     triangles = lengths - 2  # number of triangles of each polygon
@@ -134,8 +147,8 @@ def _starts(lengths: Int64) -> Int64:
 def _check_mesh(path: Path, vertices: Float32, triangles: Int32) -> None:
     for name, array, dtype in (("vertices", vertices, np.float32), ("triangles", triangles, np.int32)):
         if array.dtype != dtype or array.ndim != 2 or array.shape[1] != 3:
-            expected = f"expected (N, 3) of {np.dtype(dtype)}"
-            raise DataError(f"{path}: {name}: {expected}, got {array.shape} of {array.dtype}")
+            expected = f"expected shape (N, 3) and type {np.dtype(dtype)}"
+            raise DataError(f"{path}: {name}: {expected}, got {array.shape} and {array.dtype}")
     if not np.isfinite(vertices).all():
         raise DataError(f"{path}: vertices: expected finite coordinates, got NaN or infinity")
     if triangles.size and (triangles.min() < 0 or triangles.max() >= len(vertices)):
@@ -153,7 +166,7 @@ def _vertex_dtype(path: Path, vertices: int, properties: Mapping[str, Array]) ->
             raise DataError(f"{path}: {expected}, got {name!r}")
         if values.shape != (vertices,) or values.dtype.char not in TYPE_NAMES:
             raise DataError(
-                f"{path}: property {name}: expected ({vertices},) of a PLY type, got {values.shape} of {values.dtype}"
+                f"{path}: {name}: expected shape ({vertices},) and a PLY type, got {values.shape} and {values.dtype}"
             )
         fields.append((name, values.dtype.newbyteorder("<").str))
     return np.dtype(fields)

@@ -15,7 +15,7 @@ from framework.data import Array, Float64, Int64
 from framework.errors import DataError
 
 LARGEST_HEADER = 2**16  # bytes; a header has tens of lines
-LONGEST_LINE = 2**20  # bytes of a line in a text file; splitting a line takes tens of times its size in memory
+LONGEST_LINE = 2**20  # bytes of a line in a text file; splitting a line takes tens of times as much memory
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
 TYPES = {
     **dict(zip(("char", "uchar", "short", "ushort", "int", "uint", "float", "double"), "bBhHiIfd", strict=True)),
@@ -59,7 +59,7 @@ class Header:
 def read_elements(path: Path, data: bytes) -> tuple[Header, dict[str, Element]]:
     """Return the header of a PLY file, and the elements by name with their rows.
 
-    `data` is the content of the file. Raises DataError that names the line or byte if the file is damaged or does not
+    `data` is the content of the file. Raises a DataError that names the line or byte if the file is damaged or does not
     match its header.
     """
     header = _parse_header(path, data)
@@ -88,7 +88,8 @@ def _parse_header(path: Path, data: bytes) -> Header:
                     format_name = name
                 case ["element", name, rows]:
                     if not (rows.isascii() and rows.isdigit() and len(rows) <= MAX_DIGITS):
-                        raise ValueError(f"element {shown(name)}: expected a number of rows, got {shown(rows)}")
+                        expected = f"expected a row count of at most {MAX_DIGITS} digits"
+                        raise ValueError(f"element {shown(name)}: {expected}, got {shown(rows)}")
                     if name in (element.name for element in elements):
                         raise ValueError(f"expected unique elements, got {shown(name)} twice")
                     elements.append(Element(name, int(rows)))
@@ -144,7 +145,7 @@ def _dtype(name: str) -> np.dtype[Any]:
 
 
 def _check_size(path: Path, header: Header, body: int) -> None:
-    """Raise DataError if the rows do not fit into the `body` bytes after the header. This limits the size of arrays."""
+    """Raise DataError if the rows do not fit into the `body` bytes after the header. This limits memory use."""
     least = 0
     for element in header.elements:
         if element.rows and not element.properties:
@@ -230,7 +231,10 @@ class _Body:
         return 1 if self._text else dtype.itemsize
 
     def _row(self, element: Element, row: int, start: int) -> list[int]:
-        """Return the number of values of each column in the row at position `start`."""
+        """Return the number of values of each column in a row.
+
+        The row has the index `row` and begins at the position `start`. Raises DataError for an incomplete row.
+        """
         position, lengths = start, []
         where = f"{shown(element.name)} {row}"
         for column in element.properties:
@@ -259,7 +263,10 @@ class _Body:
         return lengths
 
     def _view(self, dtype: np.dtype[Any], start: int, rows: int, length: int, stride: int) -> npt.NDArray[Any]:
-        """Return the numbers (rows, length) from position `start`, with `stride` between rows; empty beyond the end."""
+        """Return the numbers (rows, length) from the position `start`, with `stride` between rows.
+
+        The result is empty if a row exceeds the end of the file.
+        """
         if start + (rows - 1) * stride + length * self._size(dtype) > self._end:
             return np.empty((0, 0))
         stored = np.dtype(np.float64) if self._text else dtype.newbyteorder(self._order)
@@ -339,7 +346,7 @@ class _Body:
         return replace(element, scalars=scalars, lists=lists, place=lambda row: self._place(int(starts[row])))
 
     def _native(self, column: Property, stored: npt.NDArray[Any], positions: Int64 | None) -> Array:
-        """Return the flattened numbers in the type of the column. Arrays of scalars own their memory.
+        """Return the flattened numbers in the type of the column. Scalar columns are copied.
 
         Raises DataError if a number of a text file is out of range for the type.
         """

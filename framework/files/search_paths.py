@@ -11,9 +11,9 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else PROJECT_ROOT / "co
 
 
 def candidates(path: Path) -> tuple[Path, ...]:
-    """Return the candidates for a path. A relative path is searched in the working folder, then in the project folder.
+    """Return the candidates for a path.
 
-    `~` is expanded.
+    A relative path is searched in the working directory, then in the project directory. `~` is expanded.
     """
     path = expanded(path)
     if path.is_absolute():
@@ -24,7 +24,7 @@ def candidates(path: Path) -> tuple[Path, ...]:
 
 
 def folder_of(path: Path) -> Path:
-    """Return the folder at a path, found in the working folder or the project folder.
+    """Return the folder at a path, found in the working directory or the project directory.
 
     Args:
         path: Path of a folder, absolute or relative; `~` is expanded.

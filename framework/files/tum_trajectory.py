@@ -46,7 +46,7 @@ class TumLine:
 
 
 def rigid_pose(place: str, position: Sequence[float], quat_xyzw: Sequence[float]) -> Float64:
-    """Return T_world_camera (4, 4) from a position (3,), m, and a quaternion. Raises DataError that names `place`."""
+    """Return T_world_camera (4, 4) from a position (3,), m, and a quaternion. Raises a DataError that names `place`."""
     norm = math.hypot(*quat_xyzw)
     if not all(map(math.isfinite, (*position, norm))):
         found = " ".join(f"{value:g}" for value in (*position, *quat_xyzw))
@@ -81,7 +81,7 @@ def read_tum_lines(path: Path) -> list[TumLine]:
 
 
 def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence[Float64] | Float64) -> None:
-    """Write timestamps in s and poses T_world_camera (4, 4).
+    """Write timestamps in s and poses T_world_camera (4, 4) atomically.
 
     `read_tum` returns these values with an absolute error of at most 1e-9. Raises DataError for different lengths, a
     pose that is not rigid, or a failed write.

@@ -1,4 +1,4 @@
-"""YAML files, validated before loading, because a few lines of aliases can expand to gigabytes."""
+"""Reader of YAML files, which are validated before loading: a few lines of aliases can expand to gigabytes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _EventLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled loa
 
 
 def load_yaml(path: Path) -> Any:
-    """Return the DictConfig or ListConfig of a YAML file. Raises DataError."""
+    """Return the DictConfig or ListConfig of a YAML file. Raises a DataError that names the file."""
     text = read_text(path, LARGEST_FILE)
     with yaml_errors(path):
         check_yaml(path, text)
@@ -50,7 +50,7 @@ def _events(where: object, text: str) -> Iterator[Any]:
 
 
 def check_yaml(where: object, text: str) -> None:
-    """Raise DataError if YAML is too large or nested too deeply, and YAMLError if it is invalid."""
+    """Raise DataError for YAML above MAX_VALUES values or MAX_DEPTH levels, and YAMLError if it is invalid."""
     counts = [0]  # number of values of each open mapping and list, outermost first
     open_anchors: list[Hashable] = []
     anchors: dict[Hashable, int] = {}

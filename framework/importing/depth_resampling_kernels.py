@@ -8,15 +8,15 @@ from numba import njit
 from framework.data import Float32, Float64, UInt8
 
 ONE_SURFACE = 0.05  # maximum range of four depth readings on one surface, as a fraction of the nearest reading
-COLOR_SIGMA = 15.0  # RGB distance due to noise and shading of one object, with channels from 0 to 255
+COLOR_SIGMA = 15.0  # standard deviation of RGB distances within one object, for channels from 0 to 255
 
 
 @njit(cache=True, nogil=True)
 def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, registered: Float32) -> None:
-    """Fill `registered` (H, W) with `depth` (h, w), m, as seen by the target camera.
+    """Fill `registered` (H, W), m, with the readings of `depth` (h, w), m, in the target camera; 0 = no reading.
 
-    `T` (4, 4) maps coordinates in the depth camera to coordinates in the target camera. The nearest depth reading has
-    precedence.
+    `registered` must be 0. `K` and `K_target` (3, 3) are the intrinsics, px. `T` (4, 4) maps coordinates in the depth
+    camera to coordinates in the target camera. If several readings project to a pixel, the nearest reading is kept.
     """
     height, width = registered.shape
     for v in range(depth.shape[0]):
@@ -41,9 +41,10 @@ def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, reg
 
 @njit(cache=True, nogil=True)
 def upsample(depth: Float32, guide: UInt8, u: Float64, v: Float64, color: UInt8, found: Float32) -> None:
-    """Fill `found` (H, W), m, with `depth` (h, w), m, resampled at the pixel coordinates u (W,), v (H,) of `depth`.
+    """Fill `found` (H, W), m, with `depth` (h, w), m, resampled as described in `upsampled`; 0 = no reading.
 
-    `guide` (h, w, 3) is the color at the resolution of `depth`, and `color` (H, W, 3) the color of the target.
+    The pixel (row, column) of `found` has the coordinates (u[column], v[row]), px, in `depth`. `guide` (h, w, 3) is the
+    color (RGB) at the resolution of `depth`, and `color` (H, W, 3) is the color of the target.
     """
     height, width = depth.shape
     for row in range(len(v)):

@@ -15,7 +15,7 @@ from framework.config.validation import require
 from framework.data import MAX_PIXELS, Array, Camera, Float64
 from framework.datasets.calibration.camera_json import DISTORTION, SENSOR
 from framework.datasets.calibration.color_registration import ColorRegistration
-from framework.errors import DataError
+from framework.errors import DataError, errors_of
 from framework.files.atomic_write import atomic_write
 from framework.files.json_file import write_json
 from framework.files.number_lines import write_gravity, write_image_times
@@ -46,7 +46,7 @@ class Writing:
 
     @property
     def turned(self) -> Turn:
-        """Rotation of the images."""
+        """Rotation of the written images."""
         return Turn(self.rotate // QUARTER)
 
     def camera(self, stored: Camera) -> Camera:
@@ -94,7 +94,8 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
             camera = writing.camera(frame.camera)
             for name in ("color", "depth"):
                 (directory / name).mkdir(parents=True, exist_ok=True)
-        color = ColorRegistration(frame.camera, camera).apply(frame.color)
+        with errors_of(frame.name):
+            color = ColorRegistration(frame.camera, camera).apply(frame.color)
         sure = frame.depth
         if frame.confidence is not None:
             sure = np.where(frame.confidence >= writing.confidence, frame.depth, np.float32(0))

@@ -1,4 +1,4 @@
-"""Device recordings to import. Depth often has a lower resolution than color."""
+"""Recordings of phones and sensors for import. Depth often has a lower resolution than color."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class DeviceFrame:
             expected = f"expected depth of at least {SMALLEST_SIDE}x{SMALLEST_SIDE} px"
             raise FrameError(f"{self.name}: {expected}, got {self.depth.shape[1]}x{self.depth.shape[0]} px")
         if self.confidence is not None and self.confidence.shape != self.depth.shape:
-            expected = f"expected confidence of shape {self.depth.shape}, as for depth"
+            expected = f"expected confidence of shape {self.depth.shape} as for depth"
             raise FrameError(f"{self.name}: {expected}, got {self.confidence.shape}")
 
 
@@ -77,7 +77,10 @@ class Format:
 
 
 def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
-    """Return T_world_camera (4, 4) from a pose (4, 4) with ARKit's camera axes. Raises DataError that names `where`."""
+    """Return T_world_camera (4, 4) from a pose (4, 4) with ARKit's camera axes.
+
+    Raises a DataError that names `where` if the pose is invalid.
+    """
     with errors_of(where):
         return _ARKIT.pose(nearest_rigid(T_world_arkit))
 

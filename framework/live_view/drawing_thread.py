@@ -1,8 +1,8 @@
 """A thread that draws a run without blocking the pipeline.
 
-Frames that arrive during drawing are drawn next. Only the newest image and the newest map are drawn. The fuser may
-write the map at any time, so the pipeline's thread takes snapshots between two frames. The time for snapshots and
-drawing is limited to fixed fractions of the run time, regardless of the map's size.
+The poses and times of all frames are drawn, but only the newest image and the newest map. The fuser may write the map
+at any time, so the pipeline's thread takes snapshots of it between two frames. The time for snapshots and drawing is
+limited to fixed fractions of the run time, regardless of the size of the map.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LAST_S = 30.0  # maximum wait for the last drawing at the end of a run
 
 @dataclass(frozen=True)
 class FrameNote:
-    """The data recorded for every frame."""
+    """The data drawn for every frame."""
 
     index: int  # Frame.index
     timestamp: float  # s
@@ -54,7 +54,7 @@ class MapSnapshot:
     """An immutable copy of the map after a frame."""
 
     index: int  # Frame.index of the last integrated frame
-    timestamp: float  # s
+    timestamp: float  # s, of the last integrated frame
     mesh: InstanceMesh
     objects: Mapping[int, tuple[int, float]]  # as returned by SceneMap.most_likely_classes
     up: Float64 | None  # (3,) last estimate of the up direction, world frame; None = unknown
@@ -64,7 +64,7 @@ class Drawing(Protocol):
     """Receiver of updates, called from one thread only."""
 
     def draw_frames(self, notes: Sequence[FrameNote], skipped: Sequence[str], picture: FrameUpdate | None) -> None:
-        """Draw the frames since the last call, the reasons for skipped frames, and a new image if available."""
+        """Draw the frames since the last call, the reasons for skipped frames, and a new image; None = no image."""
 
     def draw_map(self, snapshot: MapSnapshot) -> None:
         """Draw the current map."""
@@ -84,12 +84,12 @@ class _Pending:
 
 
 class DrawingThread:
-    """Thread that draws every `frame_interval`-th image, and the map at intervals of at least `map_interval` s."""
+    """Thread that draws every `frame_interval`-th image, and `scene` at intervals of at least `map_interval` s."""
 
     def __init__(self, scene: SceneMap, drawing: Drawing, frame_interval: int, map_interval: float) -> None:
         self._scene, self._drawing, self._frame_interval = scene, drawing, frame_interval
         self._snapshots = Pace(map_interval, SNAPSHOT_FRACTION)
-        self._taken, self._next_up = 0, FIRST_UP  # snapshots so far; next snapshot that estimates the up direction
+        self._taken, self._next_up = 0, FIRST_UP  # number of snapshots; next snapshot that estimates up
         self._pictures = Pace(0.0, PICTURE_FRACTION, time.thread_time)
         self._maps = Pace(map_interval, MAP_FRACTION, time.thread_time)
         self._frames = 0
@@ -103,7 +103,7 @@ class DrawingThread:
         self._thread.start()
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
-        """Add a frame. Call it only from the thread that writes the map."""
+        """Add a frame. Call this method only from the thread that writes the map."""
         note = FrameNote(frame.index, frame.timestamp, pose, stage_ms)
         if not pose.lost:
             self._last = note
@@ -120,7 +120,7 @@ class DrawingThread:
             self._wanted.set()
 
     def skip(self, reason: str) -> None:
-        """Add an unusable frame."""
+        """Add an unusable frame with the reason for skipping it."""
         with self._lock:
             if not self._failed:
                 self._pending.skipped.append(reason)
@@ -187,7 +187,7 @@ class DrawingThread:
 
 
 class Pace:
-    """Rate limiter: at most once per `interval` s, and at most `fraction` of the time measured by `clock`."""
+    """Rate limiter of an operation: at most once per `interval` s, and at most `fraction` of the time of `clock`."""
 
     def __init__(self, interval: float, fraction: float, clock: Callable[[], float] = time.perf_counter) -> None:
         self.interval = interval  # s
@@ -200,7 +200,7 @@ class Pace:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Measure the operation, and schedule the next one."""
+        """Measure the time of the operation inside the context, and delay the next operation accordingly."""
         began, before = time.perf_counter(), self.clock()
         self._next = began + self.interval
         yield

@@ -11,7 +11,7 @@ import numpy as np
 from framework.data import Float32, Int32, Int64, UInt8
 
 Region = tuple[int, int, int]
-"""Index of a cube."""
+"""Index (x, y, z) of a cube: vertex position divided by the side, rounded down."""
 
 
 @dataclass(frozen=True)
@@ -19,12 +19,12 @@ class MeshPart:
     """The triangles whose first vertex is in a region, with all of their vertices."""
 
     vertices: Float32  # (V, 3) m, in the world frame
-    triangles: Int32  # (F, 3); no vertices and no triangles = removed part
+    triangles: Int32  # (F, 3) vertex indices; no vertices and no triangles = removed part
     colors: UInt8  # (V, 3) RGB
 
 
 class MeshRegions:
-    """Cubes of side `side`, m, with digests of the last mesh part in each."""
+    """Partition of a mesh into cubes of side `side`, m, that detects the parts that change."""
 
     def __init__(self, side: float) -> None:
         self.side = side

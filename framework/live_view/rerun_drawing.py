@@ -28,14 +28,14 @@ UNKNOWN = 65535  # label of masks without an instance of the map
 UNKNOWN_COLOR = np.array([235, 235, 235], np.uint8)
 MASK_OPACITY = 0.5
 PATH_COLOR, LOST_COLOR = (40, 160, 255), (230, 60, 50)
-NAME_RADIUS = 0.005  # m, radius of the point of an object name
+NAME_RADIUS = 0.005  # m, radius of the point that carries an object name
 PATH_RADIUS = 0.004  # m, radius of the line of the camera path
 FRUSTUM_M = 0.25  # m, distance of the image plane from the camera
-MIN_TURN = 0.01  # minimum change of a component of the up direction (unit vector) for a redraw
+MIN_TURN = 0.01  # minimum change of a component of the up direction (unit vector) to rotate the scene again
 
 
 class RerunDrawing:
-    """Drawing into a rerun recording stream, with the parameters of `RerunViewer`."""
+    """Drawing into a rerun recording stream, with the parameters of `RerunViewer`; `region` is `region_size`."""
 
     def __init__(
         self, recording: rr.RecordingStream, stride: int, jpeg_quality: int, region: float, min_confidence: float
@@ -103,7 +103,7 @@ class RerunDrawing:
         return timestamp - self._first_s
 
     def _turn(self, up: Float64) -> None:
-        """Rotate the world frame to align `up` (3,) with the z axis of the view."""
+        """Rotate the world frame so that `up` (3,), a unit vector in the world frame, is the z axis of the view."""
         if self._up is None or not np.allclose(self._up, up, atol=MIN_TURN):
             self._up = up
             self._recording.log(at.WORLD, self._rr.Transform3D(mat3x3=turned(up, self._forward)))
@@ -179,7 +179,7 @@ class RerunDrawing:
         classes = found.class_probabilities.argmax(axis=1)
         labels = [f"{found.classes[classes[k]]} {found.scores[k]:.2f}" for k in named]
         colors = [self._colors.get(int(ids[k]), UNKNOWN_COLOR) for k in named]
-        boxes = (found.boxes[named] + 0.5) / stride  # in rerun, integer coordinates are corners of pixels
+        boxes = (found.boxes[named] + 0.5) / stride  # integer coordinates are pixel corners in rerun
         form = self._rr.Box2DFormat.XYXY
         self._recording.log(at.FOUND, self._rr.Boxes2D(array=boxes, array_format=form, colors=colors))
         middles = (boxes[:, :2] + boxes[:, 2:]) / 2  # rerun may place the label of a box outside of the image
@@ -242,7 +242,8 @@ class RerunDrawing:
 def turned(up: Float64, forward: Float64) -> Float64:
     """Return the rotation R_view_world (3, 3) for a view with z up.
 
-    It maps the unit vector `up` (3,) to z, and the horizontal component of `forward` (3,) to y.
+    It maps the unit vector `up` (3,) to z, and the horizontal component of `forward` (3,) to y; both are in the world
+    frame.
     """
     across = np.cross(forward, up)
     across = across / np.linalg.norm(across) if across.any() else np.linalg.svd(up[None])[2][1]

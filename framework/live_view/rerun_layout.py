@@ -20,7 +20,7 @@ MASKS, FOUND, NAMES = f"{CAMERA}/masks", f"{CAMERA}/found", f"{CAMERA}/names"
 STAGE_MS = "milliseconds"
 LOG = "log"
 
-FRAME, SECONDS = "frame", "seconds"  # timelines: Frame.index, and s since the first frame
+FRAME, SECONDS = "frame", "seconds"  # names of the timelines: Frame.index, and seconds since the first frame
 
 STAGE_COLORS = {
     "reading": (120, 126, 134),
@@ -33,7 +33,7 @@ STAGE_COLORS = {
     "integration": (181, 131, 10),
     "fusion": (125, 102, 8),
 }
-"""RGB by stage, as in a report."""
+"""RGB color of the run time of each stage, as in reports."""
 
 TIMES_SHOWN = 300  # number of displayed stage times before the current frame, in frames
 EYE_BACK, EYE_ABOVE = 1.2, 0.8  # m, from the first camera to the view's position

@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 HERE = "127.0.0.1"
-TIMEOUT_S = 60.0  # maximum startup time on a busy machine
-POLL_S = 0.05
+TIMEOUT_S = 60.0  # s, maximum startup time, also on a busy machine
+POLL_S = 0.05  # s, interval between connection attempts
 
 
 def program() -> str:
@@ -28,14 +28,14 @@ def program() -> str:
     places += [place / "Rerun.app" / "Contents" / "MacOS" for place in places]
     path = shutil.which("rerun", path=os.pathsep.join(map(str, places)))
     if path is None:
-        raise OSError("rerun: expected its executable, got none; run pip install --force-reinstall rerun-sdk")
+        raise OSError("rerun: expected an executable, got none; run pip install --force-reinstall rerun-sdk")
     return path
 
 
 def open_window(port: int, memory_limit: str) -> None:
     """Open rerun's viewer without usage statistics, unless a program already listens on `port`.
 
-    Raises OSError or SubprocessError on failure.
+    `memory_limit` is a size or fraction, such as 2GB or 25%. Raises OSError or SubprocessError on failure.
     """
     subprocess.run([program(), "analytics", "disable"], check=True, capture_output=True, timeout=TIMEOUT_S)
     if listens(port):
@@ -53,7 +53,7 @@ def open_window(port: int, memory_limit: str) -> None:
 
 @contextmanager
 def page_server() -> Iterator[str]:
-    """Run rerun's web server and return its address. Raises OSError on failure.
+    """Run rerun's web server inside the context, and yield its address. Raises OSError on failure.
 
     Each call uses a new home folder, because rerun sends usage statistics from the second start in a home folder.
     """
@@ -76,13 +76,13 @@ def page_server() -> Iterator[str]:
 
 
 def listens(port: int) -> bool:
-    """Return True if a program listens on a port of this machine."""
+    """Return True if a program listens on a TCP port of this machine."""
     with socket.socket() as probe:
         return probe.connect_ex((HERE, port)) == 0
 
 
 def free_port() -> int:
-    """Return an unused port."""
+    """Return an unused TCP port of this machine."""
     with socket.socket() as probe:
         probe.bind((HERE, 0))
         port: int = probe.getsockname()[1]

@@ -14,15 +14,15 @@ from urllib.request import ProxyHandler, build_opener
 
 from framework.live_view.rerun_program import HERE, page_server
 
-FILES = ("/", "/re_viewer.js", "/re_viewer_bg.wasm", "/sw.js")  # 43 MB
+FILES = ("/", "/re_viewer.js", "/re_viewer_bg.wasm", "/sw.js")  # paths of the files of the page, 43 MB in total
 SOURCES = "'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:"
-SOURCE_TIMEOUT_S = 30.0
+SOURCE_TIMEOUT_S = 30.0  # s, maximum wait for a file from rerun's server
 
 
 class SealedPage:
-    """HTTP server of the page at 127.0.0.1:`port`. `close` stops it. The page may connect only to `data_port`.
+    """HTTP server of rerun's web page at 127.0.0.1:`port`. The page may connect only to `data_port` of this machine.
 
-    Raises OSError if the port is in use or the page is not available.
+    `close` stops the server. Raises OSError if the port is in use or the page is not available.
     """
 
     def __init__(self, port: int, data_port: int) -> None:
@@ -50,7 +50,7 @@ class SealedPage:
             def log_message(self, format: str, *args: object) -> None:
                 """Suppress the request log."""
 
-        self._server = ThreadingHTTPServer((HERE, port), Handler)  # before the download, as the port may be in use
+        self._server = ThreadingHTTPServer((HERE, port), Handler)  # before the download, because the port may be in use
         try:
             files |= page_files()
         except BaseException:
@@ -65,7 +65,7 @@ class SealedPage:
 
 
 def page_files() -> dict[str, tuple[bytes, str]]:
-    """Return the content and type of the page's files by path. Raises OSError if rerun's server fails."""
+    """Return the content and content type of each file of the page by path. Raises OSError if rerun's server fails."""
     opener = build_opener(ProxyHandler({}))  # no proxy for 127.0.0.1
     files = {}
     with page_server() as address:

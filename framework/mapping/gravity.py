@@ -1,8 +1,9 @@
 """Direction of gravity and height of the floor.
 
 If the sensor measures the direction of gravity, the mean over all frames is used. Otherwise, the direction is estimated
-from the surface: most of the surface is perpendicular or parallel to the up direction. Two cues distinguish floors from
-walls: the mean direction of the upper edges of the images, and the surfaces that face up.
+from the surface, because most of a room's surface is level (perpendicular to the up direction) or upright (parallel to
+it). In a box-shaped room, three perpendicular axes fit equally well. Two cues select the up direction among them: the
+mean direction toward the upper image edge, and the area of the surfaces that face up.
 """
 
 from __future__ import annotations
@@ -17,39 +18,39 @@ from framework.errors import DataError
 from framework.interfaces import Gravity
 from framework.mapping.storage.map_header import MapHeader
 
-MAX_FRAMES = 1e9  # maximum number of frames of a map
-AGREED = 0.95  # minimum length of the mean of the sensor's unit vectors; 0.95 if all are 18 degrees from the mean
-DIGITS = 6  # number of decimals of a frame's contribution; the last digits of float64 depend on the memory layout
-SAMPLED = 20_000  # number of triangles that refine a direction; every VOTING-th of them votes for candidates
-VOTING = 5
+MAX_FRAMES = 1e9  # maximum number of frames of a map, and thus maximum length of a sum of unit vectors
+AGREED = 0.95  # minimum length of the mean of the measured unit vectors; 0.95 if each is 18 degrees from the mean
+DIGITS = 6  # number of decimals of each added vector; the last digits of float64 depend on the memory layout
+SAMPLED = 20_000  # approximate number of triangles sampled to refine the direction
+VOTING = 5  # every VOTING-th sampled triangle votes for the candidate directions
 DIRECTIONS = 3000  # number of candidate directions on a hemisphere, about 2.6 degrees apart
 SPREAD = np.radians(4.0)  # standard deviation of the normals of level and upright surfaces, rad
-NEAR = np.radians(10.0)  # maximum deviation from level or upright of surfaces that refine the direction, rad
-HELD_WITHIN = np.radians(50.0)  # maximum angle between up and the mean upper edge of the images, rad
-FACING_UP = 2.0  # weight of surfaces that face up; with weight 1, the axes of a box-shaped room would get equal votes
-MIN_FRACTION = 0.15  # minimum fraction of the surface that is level or upright; a heap of objects has less
+NEAR = np.radians(10.0)  # maximum deviation from level or upright of a triangle used to refine the direction, rad
+MAX_CAMERA_TILT = np.radians(50.0)  # maximum angle between up and the mean direction toward the upper image edge, rad
+FACING_UP = 2.0  # weight of level surfaces that face up; with 1, all axes of a box-shaped room would get equal votes
+MIN_FRACTION = 0.15  # minimum fraction of the surface area that is level or upright; a heap of objects has less
 LEVEL = np.cos(np.radians(18.0))  # minimum dot product of up and the normal of a floor
 STEP = 0.05  # bin size of heights, m
 FLOOR_FRACTION = 0.05  # minimum area at the height of the floor, as a fraction of the area of all level surfaces
-BELOW_FLOOR = 0.02  # maximum fraction of the surface below the floor, caused by noise, windows and mirrors
+BELOW_FLOOR = 0.02  # maximum fraction of the surface area below the floor; caused by noise, windows and mirrors
 
 
 log = logging.getLogger(__name__)
 
 
 class GravityEstimator:
-    """Accumulator of camera orientations and of the sensor's gravity directions over frames."""
+    """Accumulator of camera orientations and of measured gravity directions over frames."""
 
     def __init__(self) -> None:
-        self.camera_up: Float64 = np.zeros(3)  # (3,) sum of unit vectors towards upper image edges, world frame
-        self.sensed_up: Float64 = np.zeros(3)  # (3,) sum of the sensor's unit vectors against gravity, world frame
-        self.sensed_frames = 0  # number of frames with a gravity direction from the sensor
+        self.camera_up: Float64 = np.zeros(3)  # (3,) sum of unit vectors toward the upper image edge, world frame
+        self.sensed_up: Float64 = np.zeros(3)  # (3,) sum of measured unit vectors opposite to gravity, world frame
+        self.sensed_frames = 0  # number of frames with a measured gravity direction
         self._warned = False
 
     def add_frame(self, T_world_camera: Float64, up_camera: Float64 | None = None) -> None:
-        """Add one frame.
+        """Add the camera orientation of one frame, and its gravity direction if it was measured.
 
-        `up_camera` is the sensor's unit vector (3,) against gravity in the camera frame, None = no sensor.
+        `up_camera` is the measured unit vector (3,) opposite to gravity, in the camera frame; None = not measured.
         """
         self.camera_up -= np.round(T_world_camera[:3, 1], DIGITS)
         if up_camera is not None:
@@ -80,7 +81,10 @@ class GravityEstimator:
         return found
 
     def sensed(self) -> Float64 | None:
-        """Return the sensor's up vector (3,) in the world frame; None without a sensor, or if the frames disagree."""
+        """Return the mean of the measured unit vectors (3,) opposite to gravity, normalized, in the world frame.
+
+        Return None without measurements, or if the mean is shorter than AGREED.
+        """
         length = float(np.linalg.norm(self.sensed_up))
         if not self.sensed_frames:
             return None
@@ -95,9 +99,9 @@ class GravityEstimator:
         return self.sensed_up / length
 
     def estimate(self, vertices: Float32, triangles: Int32) -> Gravity:
-        """Return the direction of gravity from the sensor, or an estimate from the surface.
+        """Return the measured direction of gravity; without a usable measurement, an estimate from the surface.
 
-        The surface consists of `vertices` (V, 3), m, in the world frame and `triangles` (T, 3). The direction is
+        The surface consists of `vertices` (V, 3), m, in the world frame and `triangles` (F, 3). The direction is
         unknown if too little of the surface is level or upright.
         """
         sensed = self.sensed()
@@ -115,7 +119,7 @@ class GravityEstimator:
         camera_up = self.camera_up / length
         directions = half_sphere(DIRECTIONS)
         directions *= np.where(directions @ camera_up < 0, -1.0, 1.0)[:, None]
-        directions = directions[directions @ camera_up > np.cos(HELD_WITHIN)]
+        directions = directions[directions @ camera_up > np.cos(MAX_CAMERA_TILT)]
         votes = level_or_upright(normals[::VOTING], areas[::VOTING], directions, FACING_UP)
         best = directions[int(votes.argmax())]
         fraction = level_or_upright(normals[::VOTING], areas[::VOTING], best[None])
@@ -126,12 +130,18 @@ def _vector(header: MapHeader, key: str) -> Float64:
     saved = header.items(key)
     numbers = [float(value) for value in saved if isinstance(value, int | float)]
     if len(numbers) != 3 or len(saved) != 3 or not (np.abs(numbers) < MAX_FRAMES).all():
-        raise DataError(f"{key}: expected three numbers (a sum of unit vectors), got {saved!r:.60}")
+        raise DataError(
+            f"{key}: expected three numbers with absolute value below {MAX_FRAMES:g} (a sum of unit vectors), "
+            f"got {saved!r:.60}"
+        )
     return np.array(numbers)
 
 
 def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float64]:
-    """Return the unit normals (N, 3), areas (N,), m^2, and centers (N, 3), m, of the triangles with nonzero area."""
+    """Return the unit normals (N, 3), areas (N,), m^2, and centers (N, 3), m, of the N triangles with nonzero area.
+
+    `vertices` (V, 3) are in m, and `triangles` (F, 3) contains vertex indices.
+    """
     a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
@@ -150,8 +160,9 @@ def half_sphere(count: int) -> Float64:
 def level_or_upright(normals: Float64, areas: Float64, directions: Float64, facing_up: float = 1.0) -> Float64:
     """Return the fraction (D,) of the surface that is level or upright, for each candidate in `directions` (D, 3).
 
-    Level surfaces that face the direction have the weight `facing_up`. The surface is given by the unit normals (N, 3)
-    and areas (N,) of its triangles.
+    Each candidate is a unit vector, assumed to point up. The surface is given by the unit normals (N, 3) and areas (N,)
+    of its triangles. A triangle counts in part, by a Gaussian of its deviation from level or upright with standard
+    deviation SPREAD. Level triangles that face the candidate direction have the weight `facing_up`.
     """
     signed = normals.astype(np.float32) @ directions.T.astype(np.float32)
     cosines = np.abs(signed)
@@ -162,7 +173,10 @@ def level_or_upright(normals: Float64, areas: Float64, directions: Float64, faci
 
 
 def _refined(up: Float64, normals: Float64, areas: Float64) -> Float64:
-    """Return the up direction (3,) near `up` that best fits the normals of level surfaces and of walls."""
+    """Return the unit vector (3,) near `up` that best fits the triangles that are level or upright within NEAR.
+
+    The fit is an iterated least-squares fit to the unit `normals` (N, 3), weighted by `areas` (N,).
+    """
     for _ in range(5):
         cosines = normals @ up
         level, upright = np.abs(cosines) > np.cos(NEAR), np.abs(cosines) < np.sin(NEAR)
@@ -173,9 +187,10 @@ def _refined(up: Float64, normals: Float64, areas: Float64) -> Float64:
 
 
 def floor_height(vertices: Float32, triangles: Int32, up: Float64) -> float | None:
-    """Return the height of the floor along `up`, m; None if the floor was not seen.
+    """Return the height of the floor above the world origin along the unit vector `up` (3,), m; None if not seen.
 
-    The floor is the lowest large level surface, with almost no surface below it.
+    The floor is the lowest large level surface, with almost no surface below it. `vertices` (V, 3), m, and `up` are in
+    the world frame; `triangles` (F, 3) contains vertex indices.
     """
     normals, areas, centers = faces(vertices, triangles)
     heights = centers @ up

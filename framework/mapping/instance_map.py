@@ -35,7 +35,7 @@ from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVo
 from framework.sensors.noise_models import SensorKind
 
 FORMAT = 8  # format of the map file; increment it when the meaning of the contents changes
-LARGEST_SCALE = 2**40  # maximum scale of quantized class scores
+LARGEST_SCALE = 2**40  # maximum score_scale of a map file (quantized class score for evidence of 1)
 
 
 class InstanceMap(InstanceTableMap):
@@ -71,14 +71,17 @@ class InstanceMap(InstanceTableMap):
         super().begin(classes)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """Return the instance ids (ceil(H / stride), ceil(W / stride)) of a frame; see `LabeledMap.instances_seen`."""
+        """Return the most likely instance at every stride-th depth reading of every stride-th row of a frame, 0 = none.
+
+        See `LabeledMap.instances_seen`.
+        """
         instance_ids = np.empty(tuple(-(-side // stride) for side in frame.depth.shape), np.int32)
         view = pinhole(frame.camera, T_world_camera)
         look_up_instances(self.volume.voxels.grid, self.labels.evidence, frame.depth, view, stride, instance_ids)
         return instance_ids
 
     def class_evidence(self) -> dict[int, Float64]:
-        """Return the class evidence (C,) of each confirmed instance by id, from its detections or its voxels."""
+        """Return the class evidence (C,) of each confirmed instance by id, from the source set by `instance_class`."""
         if self.instance_class is InstanceClass.DETECTIONS:
             return super().class_evidence()
         counts = self.confirmation.counts(self.table)

@@ -24,7 +24,7 @@ from framework.interfaces import SceneMap
 LOOKS = 60  # number of evenly spaced poses for rendering the map of a visit
 EYE = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)  # assumed camera of a visit: half the resolution of a Kinect
 SAMPLED = 400  # maximum number of sampled vertices of an object
-MIN_GAP, MIN_GAP_PER_DEPTH = 0.06, 0.02  # m, m per m of depth; minimum distance from free space to the surface behind
+MIN_GAP, MIN_GAP_PER_DEPTH = 0.06, 0.02  # m, m per m of depth; minimum distance of the surface behind free space
 MIN_SEEN = 0.3  # minimum fraction of an object's vertices observed in the other visit
 MAX_DISTANCE = 0.05  # m, maximum distance to a vertex of the other map at the same position
 STAY_PROBABILITY = 0.9  # prior probability that an object stays from one visit to the next
@@ -150,15 +150,15 @@ def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
 
 
 def probability_gone(confidence: float, there: Bool, through: Bool, matched: bool) -> float:
-    """Return the probability of an object's absence, by Bayes' rule.
+    """Return the probability that an object is absent, by Bayes' rule.
 
     A present object has a surface and is detected as often as before. An absent object has a surface and a detection
     only by clutter.
 
     Args:
-        confidence: Confidence of the object.
-        there: (M,) mask of the surface points with an observed surface.
-        through: (M,) mask of the surface points with observed free space.
+        confidence: Confidence of the object, in [0, 1].
+        there: (M,) True where the other visit has an observed surface at the sampled vertex.
+        through: (M,) True where the other visit has observed free space at the sampled vertex.
         matched: True if the other visit has an object at the same position.
     """
     observed = int(np.count_nonzero(there | through))
@@ -182,7 +182,7 @@ def _nearest_labels(mesh: InstanceMesh, points: Float32) -> Int32:
 
 
 def _match(labels: Int32) -> int | None:
-    """Return the most frequent object id of the labels (M,); None if its fraction is below SAME_THING."""
+    """Return the most frequent nonzero label of the vertices (M,); None if its fraction is below SAME_THING."""
     ids, counts = np.unique(labels[labels > 0], return_counts=True)
     if not len(ids) or counts.max() < SAME_THING * len(labels):
         return None
@@ -190,7 +190,7 @@ def _match(labels: Int32) -> int | None:
 
 
 def _moved(old: Sequence[_Object], new: Sequence[_Object]) -> list[tuple[_Object, _Object, float]]:
-    """Return pairs of vanished and appeared objects of similar class and size, with their probabilities."""
+    """Return pairs of a vanished and an appeared object of similar class and size, with the probability of a move."""
     vanished, appeared = [one for one in old if one.is_gone], [one for one in new if one.is_gone]
     if not vanished or not appeared:
         return []
@@ -205,7 +205,7 @@ def _moved(old: Sequence[_Object], new: Sequence[_Object]) -> list[tuple[_Object
 
 
 def _similarity(a: Instance, b: Instance) -> float:
-    """Return the similarity, in [0, 1], of two objects in class distribution (Bhattacharyya) and size."""
+    """Return the similarity, in [0, 1], of two objects: Bhattacharyya coefficient of the classes times size ratio."""
     same_class = float(np.sqrt(a.class_probabilities * b.class_probabilities).sum())
     sizes = np.sort(a.obb.extent), np.sort(b.obb.extent)
     ratio = float(np.abs(np.log(np.maximum(sizes[0], 0.02) / np.maximum(sizes[1], 0.02))).mean())

@@ -17,7 +17,7 @@ from framework.vocabulary.color_names import COLOR_NAMES, fits, nearest_names
 from framework.vocabulary.text_queries import object_words
 
 BY = ("embeddings", "names")
-MIN_MATCH = 0.1  # minimum similarity by names
+MIN_MATCH = 0.1  # minimum similarity of a match by names
 LONGEST_QUERY = 1000  # maximum number of characters of a query
 NAME_IT = "set --model (Python: model=)"
 WITH_EMBEDDINGS = "detector=with_embeddings (CLIP or SigLIP: pip install instancemap[transformers])"
@@ -82,7 +82,7 @@ def search(scene: Map, query: TextQuery, run: Path | None = None) -> QueryResult
 
 
 def _embedded(query: TextQuery, space: str, run: Path | None) -> Float32:
-    """Return the embedding (D,) of the query in the map's space."""
+    """Return the text embedding (D,) of the query. Raises DataError if the model differs from the map's model."""
     from framework.detection.hub.image_text import ImageTextModel
 
     name, revision = _model_of(run) if query.model is None else (query.model, "main")
@@ -141,7 +141,7 @@ def by_names(scene: Map, query: str) -> list[Match]:
 
 
 def color_fit(mesh: InstanceMesh, instance: Instance, colors: Sequence[str]) -> float:
-    """Return the highest fit, in [0, 1], of one of `colors` to an object, averaged over its vertices."""
+    """Return the mean fit, in [0, 1], of the vertex colors of an object to the best-fitting name in `colors`."""
     observed = _colors(mesh, instance)
     return max((float(fits(observed, name).mean()) for name in colors), default=0.0) if len(observed) else 0.0
 

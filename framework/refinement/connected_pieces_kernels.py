@@ -28,7 +28,11 @@ def find_pieces(
     pixels: Int32, firsts: Int64, depth: Float32, connection: Connection, min_ratio: np.float32, max_slope: np.float32,
     schedule: ThreadSchedule, stays: Bool,
 ) -> None:  # fmt: skip
-    """Set `stays` (M,) to True for the points that `in_near_pieces` keeps; `max_slope` is divided by fx, 1 / px."""
+    """Set `stays` (M,) to True for the points that `in_near_pieces` keeps, and to False for the others.
+
+    `pixels`: the u, v (M, 2) of the points, cluster by cluster. `firsts`: the start (N + 1,) of each cluster.
+    `max_slope`: the maximum slope, m per m, divided by the focal length, so 1 / px.
+    """
     for thread in prange(len(schedule.starts) - 1):
         for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:
             if firsts[k + 1] > firsts[k]:
@@ -40,7 +44,7 @@ def find_pieces(
 def _find_pieces_of(
     pixels: Int32, depth: Float32, connection: Connection, min_ratio: np.float32, max_slope: np.float32, stays: Bool
 ) -> None:
-    """Find the components of one cluster by union-find over runs of connected pixels in each row.
+    """Set `stays` for one cluster, with components found by union-find over runs of connected pixels in each row.
 
     Cells are in flat arrays, row by row, with empty cells at the end of each row. Therefore, offsets to neighbors are
     constant, and no run continues in the next row.
@@ -84,7 +88,11 @@ def _keep_near(
     pixels: Int32, piece: Int32, sizes: Int32, largest: int, min_ratio: np.float32, depth: Float32,
     connection: Connection, max_slope: np.float32, stays: Bool,
 ) -> None:  # fmt: skip
-    """Set `stays` to True for each component at a similar depth to the kept components, largest component first."""
+    """Set `stays` to True for each component at a similar depth to the kept components, largest component first.
+
+    `piece`: the component of each pixel. `sizes`: the number of pixels of each component. `largest`: the index of the
+    largest component. Components with fewer than min_ratio * sizes[largest] pixels are not considered.
+    """
     least = min_ratio * np.float32(sizes[largest])
     candidates, waiting, count = np.empty(len(sizes), np.int64), np.zeros(len(sizes), np.bool_), 0
     for other in range(len(sizes)):
@@ -106,7 +114,10 @@ def _keep_near(
 
 @njit(cache=True, nogil=True)
 def _largest(pieces: Int64, sizes: Int32, waiting: Bool) -> int:
-    """Return the largest waiting component; ties go to the first. A scan avoids np.argsort, which compiles slowly."""
+    """Return the largest component of `pieces` that is still `waiting`; ties go to the first.
+
+    A scan avoids np.argsort, which compiles slowly.
+    """
     largest = -1
     for piece in pieces:
         if waiting[piece] and (largest < 0 or sizes[piece] > sizes[largest]):
@@ -116,7 +127,7 @@ def _largest(pieces: Int64, sizes: Int32, waiting: Bool) -> int:
 
 @njit(cache=True, nogil=True)
 def _sample(pixels: Int32, piece: Int32, wanted: int, most: int, samples: Int32) -> int:
-    """Write up to `most` evenly spaced pixels of a component to samples; return their number."""
+    """Write up to `most` evenly spaced pixels of the component `wanted` to `samples`; return their number."""
     size = 0
     for i in range(len(pixels)):
         size += piece[i] == wanted

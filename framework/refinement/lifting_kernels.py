@@ -36,7 +36,11 @@ def gather_readings(
     masks: Bool, depth: Float32, camera: tuple[float, float, float, float], T: Float64, starts: Int64,
     points_world: Float32, pixels: Int32, cluster: Int32,
 ) -> None:  # fmt: skip
-    """Set points_world (P, 3), m, pixels (P, 2) and cluster (P,), row by row of each mask; T is T_world_camera."""
+    """Set points_world (P, 3), m, pixels (P, 2), u and v, and cluster (P,) from the depth readings in the masks.
+
+    Points are in the order of the masks, and row by row. `camera`: fx, fy, cx, cy, px. `T`: T_world_camera. `starts`:
+    the index (N * H + 1,) of the first point of each row of each mask.
+    """
     height = depth.shape[0]
     fx, fy, cx, cy = camera
     for row in prange(masks.shape[0] * height):

@@ -30,12 +30,12 @@ MAX_RING_WIDTH = 80  # maximum width of a ring, px; wider rings add no informati
 
 @dataclass(frozen=True)
 class Neighborhoods:
-    """Points of N masks in one flat array, each mask followed by its ring.
+    """Points of N masks in one flat array of S points, each mask followed by its ring.
 
     Neighborhood k is `points_camera[starts[k]:starts[k + 1]]`. Its first `mask_counts[k]` points belong to the mask.
     """
 
-    points_camera: Float32  # (S, 3) m
+    points_camera: Float32  # (S, 3) m, camera frame
     depth_in_mask: Float32  # (S,) distance to the mask's border, px, positive in the mask, negative in the ring
     starts: Int64  # (N + 1,) start of each neighborhood
     mask_counts: Int64  # (N,) number of points of each mask
@@ -57,7 +57,7 @@ class Neighborhoods:
         return np.repeat(np.arange(len(parts)) % 2 == 1, parts)
 
     def mask_log_odds(self, largest: float, expected_bleed: float) -> Float32:
-        """Return the log-odds (S,) of a point being on the object: `largest` deep in the mask, -`largest` far outside.
+        """Return the log-odds (S,) that a point is on the object: `largest` deep in the mask, -`largest` far outside.
 
         The linear ramp in between is 0 at a distance of `expected_bleed` ring widths inside the mask's border. It ends
         (1 - 2 * `expected_bleed`) ring widths outside the border. A thin mask gets a shorter ramp, so that its center
@@ -88,7 +88,10 @@ class Surroundings:
         return np.diff(self.windows.firsts)
 
     def of_at_least(self, min_points: int) -> Bool:
-        """Return an array (N,), True for clusters with at least `min_points` points in the mask and any ring."""
+        """Return an array (N,), True for clusters with at least `min_points` points in the mask and in the ring.
+
+        A ring of width 0 is not required to have points.
+        """
         return np.asarray(
             (self.mask_counts >= min_points) & ((self.ring_counts >= min_points) | (self.ring_widths == 0))
         )
@@ -100,14 +103,14 @@ class Surroundings:
         return self._gathered(-(-counts // nth), -(-self.mask_counts // nth), nth)
 
     def own(self) -> Neighborhoods:
-        """Return the M points of the clusters, without the rings."""
+        """Return the neighborhoods with all M points of the clusters, and with empty rings."""
         return self._gathered(self.mask_counts, self.mask_counts, np.ones_like(self.ring_counts))
 
     def kept(self, good: Bool, judged: Bool) -> Bool:
-        """Return an array (P,), True for the points of the PointClusters to keep.
+        """Return an array (P,), True for the points of `clusters` to keep.
 
-        Clusters in `judged` (N,) keep the points of `own` that are `good` (M,). Points of other clusters and of no
-        cluster are kept.
+        A cluster for which `judged` (N,) is True keeps those of its points for which `good` (M,), in the order of
+        `own()`, is True. Points of other clusters and of no cluster are kept.
         """
         kept = np.ones(len(self.clusters.cluster), np.bool_)
         kept[self.order] = good | np.repeat(~judged, self.mask_counts)
@@ -130,8 +133,9 @@ class Ring:
     ring_fraction: float = 0.25  # ratio of the ring's width to the square root of the mask's area, >= 0; 0 = no ring
     min_ring: int = 4  # minimum width of the ring, px, >= 1
     max_ring: int = 12  # maximum width of the ring, px, >= min_ring
-    max_points: int = 1000  # maximum number of points of a mask and its ring in the fit, >= 100
-    min_points: int = 30  # minimum number of points of a mask and of its ring, >= 10; smaller clusters stay unchanged
+    # maximum number of points of a mask and its ring for the fit, >= 100; all points are classified
+    max_points: int = 1000
+    min_points: int = 30  # minimum number of points of a mask and of its ring, >= 10; clusters below it stay unchanged
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -167,7 +171,7 @@ def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundi
 
 
 def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
-    """Return the indices of the points of all clusters, cluster by cluster, and the cluster starts (N + 1,).
+    """Return the indices (M,) of the points of all clusters, cluster by cluster, and the cluster starts (N + 1,).
 
     Points of a cluster keep their order. Points of no cluster (-1) are omitted. For points already in this order, such
     as the result of `lift`, the indices are a slice to avoid a copy.
@@ -182,7 +186,8 @@ def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
 def thread_schedule(costs: Int64) -> ThreadSchedule:
     """Return the clusters of each thread, assigned by decreasing cost to the least busy thread (Graham 1969).
 
-    Numba divides a parallel loop into parts of equal length, but a few large clusters contain most of the points.
+    `costs`: the number of points (N,) of each cluster. Numba divides a parallel loop into parts of equal length, but a
+    few large clusters contain most of the points.
     """
     longest_first = np.argsort(-costs, kind="stable")
     return ThreadSchedule(*share_among_threads(costs, longest_first, numba.get_num_threads()))

@@ -36,9 +36,9 @@ class ThreadSchedule(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
-    """Return the points' indices (members,), stably sorted by cluster, and the cluster starts (n + 1,).
+    """Return the indices (M,) of the points sorted stably by `cluster` (P,), and the start (n + 1,) of each cluster.
 
-    Points of no cluster (-1) are omitted.
+    Points of no cluster (-1) are omitted, so M <= P.
     """
     firsts = np.zeros(n + 1, np.int64)
     for k in cluster:
@@ -57,7 +57,10 @@ def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
 
 @njit(cache=True, nogil=True)
 def share_among_threads(costs: Int64, longest_first: Int64, threads: int) -> tuple[Int64, Int64]:
-    """Return the clusters (N,) in the order of their threads, and the start (threads + 1,) of each thread."""
+    """Return the clusters (N,) in the order of their threads, and the start (threads + 1,) of each thread.
+
+    Each cluster of `longest_first` (N,), sorted by decreasing `costs` (N,), is assigned to the least busy thread.
+    """
     loads, owners, starts = np.zeros(threads, np.int64), np.empty(len(costs), np.int64), np.zeros(threads + 1, np.int64)
     for k in longest_first:
         least = 0
@@ -78,7 +81,11 @@ def share_among_threads(costs: Int64, longest_first: Int64, threads: int) -> tup
 
 @njit(cache=True, nogil=True)
 def bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, bounds: Int64) -> None:
-    """Set bounds (N, 4), v0, u0, v1, u1, to the bounding box of each cluster and its ring; v1 and u1 are exclusive."""
+    """Set `bounds` (N, 4) v0 u0 v1 u1, px, to the box around each cluster and its ring; v1 and u1 are exclusive.
+
+    `pixels`: (M, 2) u, v, cluster by cluster. `firsts`: the start (N + 1,) of each cluster. `widths`: ring widths (N,),
+    px. The boxes are clipped to the image of `height` x `width` px.
+    """
     for k in range(len(widths)):
         if firsts[k] < firsts[k + 1]:
             u0, v0, u1, v1 = bounding_box(pixels[firsts[k] : firsts[k + 1]])
@@ -105,11 +112,12 @@ def signed_distances(
     windows: Windows, widths: Int64, depth: Float32, schedule: ThreadSchedule, steps: Int16, ring_counts: Int64,
     radii: Float32,
 ) -> None:  # fmt: skip
-    """Set each pixel's signed distance `steps` (cells,), the number of readings in each ring, and the masks' radii, px.
+    """Set the signed distance of each pixel, `steps`, and for each cluster `ring_counts` (N,) and `radii` (N,).
 
-    Distances are in thirds of a pixel. They are above 0 in the mask (to the nearest reading outside), below 0 in the
-    ring (to the mask), and 0 elsewhere. Pixels without a reading are not a border of the mask, because the depth of
-    objects often has holes.
+    `steps` (cells,) is in thirds of a pixel: above 0 in the mask (to the nearest reading outside), below 0 in the ring
+    (to the mask), and 0 elsewhere. `ring_counts` is the number of readings in the ring, and `radii` is the largest
+    distance in the mask, px. `widths`: ring widths (N,), px. Pixels without a reading are not a border of the mask,
+    because the depth of objects often has holes.
     """
     firsts, cells = windows.firsts, windows.cells
     for thread in prange(len(schedule.starts) - 1):
@@ -125,11 +133,12 @@ def signed_distances(
 def _signed_distances_of(
     pixels: Int32, ring: np.int16, bounds: Int64, depth: Float32, steps: Int16
 ) -> tuple[int, np.float32]:
-    """Return the number of readings in the ring and the mask's radius, px.
+    """Set `steps` for the window of one cluster; return the number of readings in the ring and the mask's radius, px.
 
-    One grid holds the distances to the mask and to the readings outside it side by side, each surrounded by FAR cells.
-    A shortest path may take its horizontal steps first, in the row of its source. Therefore, each row is first filled
-    with the distances along the row. Two vectorized sweeps, down and up, then add the vertical and diagonal steps.
+    `ring`: the width of the ring in thirds of a pixel. One grid holds the distances to the mask and to the readings
+    outside it side by side, each surrounded by FAR cells. A shortest path may take its horizontal steps first, in the
+    row of its source. Therefore, each row is first filled with the distances along the row. Two vectorized sweeps, down
+    and up, then add the vertical and diagonal steps.
     """
     v0, u0 = bounds[0], bounds[1]
     rows, columns = bounds[2] - v0, bounds[3] - u0
@@ -168,7 +177,10 @@ def _mark_rest(in_mask: Bool, depth: Float32, in_rest: Bool) -> None:
 
 @njit(cache=True, nogil=True)
 def _sign(in_mask: Bool, to_mask: Int16, to_rest: Int16, depth: Float32, ring: np.int16, steps: Int16) -> int:
-    """Combine one row of the two distances; return the number of readings in the ring."""
+    """Set the signed distances `steps` of one row from the distances to the mask and to the readings outside it.
+
+    Returns the number of readings in the ring.
+    """
     count = np.int32(0)
     for c in range(len(steps)):
         in_ring = (not in_mask[c]) & (to_mask[c] <= ring) & (depth[c] > 0)
@@ -188,7 +200,7 @@ def _highest(steps: Int16) -> np.int16:
 
 @njit(cache=True, nogil=True)
 def _distances_along(sources: Bool, row: Int16) -> None:
-    """Set the distance of every cell to the nearest source in its row; FAR if the row has no source."""
+    """Set each cell of `row` to its distance to the nearest source in the row; FAR if the row has no source."""
     columns = len(row)
     row[:] = 0
     begin = 0
@@ -222,7 +234,11 @@ def _spread_across(neighbors: Int16, row: Int16, middle: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _lower(row: Int16, before: Int16, across: Int16, behind: Int16) -> None:
-    """Set `row` to the minimum of itself and of `before`, `across` and `behind` plus a step, in vectorizable code."""
+    """Update `row` of the chamfer distance transform from the cells of an adjacent row, in vectorizable code.
+
+    `across` are the vertical neighbors, at a distance of CHAMFER_STEP. `before` and `behind` are the diagonal
+    neighbors, at CHAMFER_DIAGONAL.
+    """
     for i in range(len(row)):
         diagonal = np.int16((before[i] if before[i] < behind[i] else behind[i]) + CHAMFER_DIAGONAL)
         straight = np.int16(across[i] + CHAMFER_STEP)
@@ -235,7 +251,11 @@ def gather(
     windows: Windows, steps: Int16, depth: Float32, pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64,
     schedule: ThreadSchedule, points: Float32, depth_in_mask: Float32,
 ) -> None:  # fmt: skip
-    """Set the camera-frame points (S, 3), m, as in geometry.back_project, and their `depth_in_mask` (S,), px."""
+    """Set the camera-frame `points` (S, 3), m, as in geometry.back_project, and their `depth_in_mask` (S,), px.
+
+    They are every nth[k]-th point of neighborhood k: first `mask_counts[k]` points of the mask, then those of the ring,
+    from index `starts[k]` on.
+    """
     firsts, cells = windows.firsts, windows.cells
     for thread in prange(len(schedule.starts) - 1):
         for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:
@@ -293,7 +313,11 @@ def _back_project(u: int, v: int, z: np.float32, pinhole: Float32, points: Float
 def ramps(
     depth_in_mask: Float32, starts: Int64, widths: Float32, expected_bleed: float, largest: float, log_odds: Float32
 ) -> None:
-    """Set log_odds (S,) to a ramp from -largest to largest over `widths` (N,) px for each neighborhood."""
+    """Set `log_odds` (S,) of each neighborhood k to a ramp over the distance from the mask's border, `depth_in_mask`.
+
+    The slope of the ramp is `largest` per `widths[k]` px. It is 0 at widths[k] * expected_bleed / (1 - expected_bleed)
+    px inside the mask, and is limited to [-`largest`, `largest`].
+    """
     zero = np.float32(expected_bleed / (1 - expected_bleed))
     for k in range(len(widths)):
         own = slice(starts[k], starts[k + 1])

@@ -12,7 +12,10 @@ PART = 8192  # number of rows that a thread processes at once
 
 @njit(cache=True, nogil=True)
 def part_starts(kept: Bool) -> Int64:
-    """Return the start (parts + 1,) of each part of PART rows among the kept rows."""
+    """Return, for each part of PART rows, the number of kept rows before it; the last entry (parts + 1,) is the total.
+
+    `kept`: (P,), True for rows to keep.
+    """
     parts = (len(kept) + PART - 1) // PART
     starts = np.zeros(parts + 1, np.int64)
     for part in range(parts):
@@ -28,7 +31,10 @@ def compress(
     points: Float32, pixels: Int32, cluster: Int32, kept: Bool, starts: Int64, kept_points: Float32,
     kept_pixels: Int32, kept_cluster: Int32,
 ) -> None:  # fmt: skip
-    """Copy the kept rows of three arrays. This is faster than Boolean indexing."""
+    """Copy the kept rows of three arrays to `kept_points`, `kept_pixels` and `kept_cluster`.
+
+    `starts`: from `part_starts`. This is faster than Boolean indexing.
+    """
     for part in prange(len(starts) - 1):
         k = starts[part]
         for i in range(part * PART, min((part + 1) * PART, len(kept))):

@@ -10,8 +10,8 @@ from framework.data import Float32
 RAYS = 8  # number of rays per pixel
 STEPS = 4  # number of samples along a ray
 TILE = 4  # side of a tile, px; rays differ between the pixels of a tile, and the result is averaged over a tile
-SLACK_M = np.float32(2e-3)  # minimum depth of an occluded sample behind the surface
-THICKNESS_M = np.float32(0.15)  # assumed thickness of surfaces; samples farther behind the surface are not occluded
+SLACK_M = np.float32(2e-3)  # minimum distance of an occluded sample behind the surface, along z
+THICKNESS_M = np.float32(0.15)  # assumed thickness of surfaces along z; samples farther behind are not occluded
 HALF = np.float32(0.5)  # px, distance from the border of a pixel to its center
 
 

@@ -12,15 +12,15 @@ from framework.geometry import inverse, project, transform
 from framework.rendering.palette import PAPER
 from framework.rendering.surface import Hits
 
-PATH_START, PATH_END = (40, 110, 220), (235, 90, 40)  # RGB
+PATH_START, PATH_END = (40, 110, 220), (235, 90, 40)  # RGB at the ends of the path
 
 
 @dataclass(frozen=True)
 class ProjectedPath:
-    """Camera positions, projected into the image of another camera; P of them are in front of it."""
+    """The P camera positions in front of another camera, projected into its image."""
 
     pixels: Float64  # (P, 2) u v, px
-    hidden: Bool  # (P,) occluded by the surface
+    hidden: Bool  # (P,) True = occluded by the surface
 
     @classmethod
     def of(cls, poses: Float64, camera: Camera, T_world_camera: Float64, hits: Hits) -> ProjectedPath:
@@ -49,7 +49,7 @@ class ProjectedPath:
         return np.asarray(np.rint(mixed), np.uint8)
 
     def draw(self, image: Image.Image) -> None:
-        """Draw the path as a line with a dot at each end; occluded segments are thin."""
+        """Draw the path into `image`, as a line with a dot at each end; occluded segments are thin."""
         canvas = ImageDraw.Draw(image)
         points = [tuple(pixel) for pixel in self.pixels.tolist()]
         shades = [tuple(shade) for shade in self.shades().tolist()]

@@ -13,9 +13,9 @@ from PIL import Image, ImageDraw, ImageFont
 from framework.data import Bool, Int32
 from framework.rendering.palette import INK, PAPER
 
-MIN_PIXELS = 60  # minimum area of an object with a name, pixels
+MIN_PIXELS = 60  # px, minimum area of an object with a name
 ROOM = 0.75  # minimum distance from the center of a name to the border of its object, relative to the name's height
-NEAREST, FARTHEST, STEP = 24, 160, 8  # px, minimum, maximum and step of the distance from an object to its name
+NEAREST, FARTHEST, STEP = 24, 160, 8  # px, start, end (exclusive) and step of the distances from an object to its name
 DIRECTIONS = 32  # number of directions from an object to its name
 ABOUT = 0.9  # minimum distance of a candidate point from the object's border, relative to the largest distance
 ON_OTHERS = 0.1  # maximum fraction of a name's area over other objects, for a name on its object
@@ -74,7 +74,7 @@ def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tup
 
 
 def draw_labels(image: Image.Image, labels: Sequence[Label], font: ImageFont.FreeTypeFont) -> None:
-    """Draw the names and their leader lines."""
+    """Draw the names and their leader lines into `image`."""
     canvas = ImageDraw.Draw(image)
     for label in labels:
         if label.target is not None:
@@ -109,10 +109,11 @@ def _widest_part(mask: Bool) -> tuple[float, float, float]:
 def _place_next_to(
     u: float, v: float, size: tuple[float, float], boxes: Sequence[Box], objects: Bool, others: Bool
 ) -> tuple[float, float] | None:
-    """Return the center (u, v), px, of the best free position for the name of an object; None if there is none.
+    """Return the center (u, v), px, of the position with the lowest cost for an object's name; None if none is free.
 
-    The cost of a position is the sum of three terms, px: the distance from the object, COVERING times the fraction of
-    the name over objects, and CROSSING times the fraction of the leader line over other objects.
+    A free position is inside the image and overlaps no other name. The cost of a position is the sum of three terms,
+    px: the distance from the object, COVERING times the fraction of the name over objects, and CROSSING times the
+    fraction of the leader line over other objects.
 
     Args:
         u: Column of the point on the object, px.

@@ -17,7 +17,10 @@ NOTHING = (229, 232, 236)  # RGB of empty pixels; not white, because surfaces ma
 
 
 class LitView:
-    """View of a surface from `camera` at `T_world_camera`, with lighting but without colors."""
+    """View of a surface from `camera` at `T_world_camera` (4, 4), with precomputed lighting.
+
+    The methods return images of this view in different colors.
+    """
 
     def __init__(self, surface: Surface, camera: Camera, T_world_camera: Float64) -> None:
         R_world_camera = T_world_camera[:3, :3]

@@ -14,9 +14,13 @@ AMBIENT, DIFFUSE = 0.70, 0.34  # relative brightness of ambient light, and of th
 
 @njit(cache=True, nogil=True)
 def light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Float32) -> None:
-    """Write the relative brightness of each pixel to `light` (H, W).
+    """Write the relative brightness of each pixel to `light` (H, W), and normalize the normals.
 
-    `normals` (H, W, 3), world frame, are replaced by unit vectors in the camera frame that face the camera.
+    Args:
+        normals: (H, W, 3) normals, world frame; replaced by unit vectors in the camera frame that face the camera.
+        R_world_camera: (3, 3) rotation of the camera.
+        K: (3, 3) camera matrix, px.
+        light: (H, W) output.
     """
     R = R_world_camera
     for v in range(normals.shape[0]):
@@ -34,12 +38,12 @@ def light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Float
 
 @njit(cache=True, nogil=True)
 def paint(ids: Int32, gray: Float32, palette: Float32, painted: Float32) -> None:
-    """Write the unlit color of each pixel's instance, RGB, to `painted` (H, W, 3).
+    """Write the unlit color of each pixel's instance, RGB, to `painted` (H, W, 3); borders of instances are darker.
 
     Args:
         ids: (H, W) instance ids, 0 = none.
-        gray: (H, W) brightness of the surface, 0 to 255, for some texture.
-        palette: (N, 3) RGB color by instance id.
+        gray: (H, W) brightness of the surface, 0 to 255, which adds some texture to the colors.
+        palette: (N, 3) RGB color of the instance with id n in row n.
         painted: (H, W, 3) output.
     """
     height, width = ids.shape

@@ -18,9 +18,9 @@ from framework.rendering.palette import FAINT_INK, INK, PAPER, instance_colors
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import best_view
 
-PANEL_WIDTH, PANEL_HEIGHT = 960, 760  # px
-TITLE_HEIGHT = 56  # px
-LEGEND_ROW = 30  # px
+PANEL_WIDTH, PANEL_HEIGHT = 960, 760  # px, size of each of the two images
+TITLE_HEIGHT = 56  # px, height of the title bar
+LEGEND_ROW = 30  # px, height of a row of the legend
 LEGEND_COLUMNS, LEGEND_ROWS = 9, 4
 PNG_LEVEL = 3  # zlib level; the default of 6 is much slower for a 3% smaller file
 LABEL_PX, LEGEND_PX, TITLE_PX = 17, 17, 22  # font sizes

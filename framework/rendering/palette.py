@@ -26,9 +26,9 @@ def candidates(shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
 
 
 def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
-    """Return RGB colors (N, 3) for objects at the centroids (N, 3), m.
+    """Return RGB colors (N, 3) for objects at the centroids (N, 3), m. Nearby objects get dissimilar colors.
 
-    The colors are chosen greedily, one object after another. Nearby objects get dissimilar colors.
+    Each object, in the given order, gets the candidate color that is least similar to the colors of nearby objects.
     """
     rgb = candidates(shades)
     lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0]
@@ -46,7 +46,7 @@ def object_colors(centroids: Mapping[int, Float64], likely: Set[int]) -> dict[in
 
     Args:
         centroids: Centroid (3,), m, by object id.
-        likely: Ids of the likely objects, which get the same colors as in overview.png.
+        likely: Ids of the likely objects. They are colored first, so that they have the same colors as in overview.png.
     """
     ordered = sorted(centroids, key=lambda key: (key not in likely, key))
     positions = np.array([centroids[key] for key in ordered], np.float64).reshape(-1, 3)
@@ -65,5 +65,5 @@ def class_colors(objects: Sequence[tuple[str, float]]) -> dict[str, UInt8]:
     for name, confidence in objects:
         most[name] = max(confidence, most.get(name, 0.0))
     names = sorted(most, key=lambda name: (-most[name], name))
-    # equal positions make all colors dissimilar
+    # with equal positions, all classes count as nearby and get dissimilar colors
     return dict(zip(names, instance_colors(np.zeros((len(names), 3))), strict=True))

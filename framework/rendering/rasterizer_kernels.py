@@ -10,7 +10,7 @@ from framework.data import Float32, Float64, Int32
 
 NO_TRIANGLE = -1  # index for pixels without a triangle
 CHUNK = 32  # number of triangles culled together
-SLACK = 0.01  # px, margin of bounds against rounding
+SLACK = 0.01  # px, margin of the bounds for rounding errors
 CELLS = 1023  # largest cell index along each axis of the bounding cube
 NEAR = 1e-9  # m, near plane for the bounds of triangles partly behind the camera
 
@@ -20,7 +20,7 @@ def morton_codes(vertices: Float32, triangles: Int32) -> npt.NDArray[np.uint32]:
     """Return the Morton code (F,) of each triangle's centroid in the bounding cube of all centroids, 10 bits per axis.
 
     Args:
-        vertices: (V, 3) coordinates.
+        vertices: (V, 3) m.
         triangles: (F, 3) vertex indices.
     """
     middle = np.empty((len(triangles), 3), np.float32)
@@ -92,7 +92,7 @@ def draw_triangles(
     Args:
         vertices: (V, 3) m, world frame.
         triangles: (F, 3) vertex indices.
-        order: (F,) triangle indices to write to `triangle`.
+        order: (F,) index that is written to `triangle` for each row of `triangles`.
         spheres: Bounding spheres of the triangles, from `bounding_spheres`.
         T_world_camera: (4, 4) camera pose.
         intrinsics: fx, fy, cx, cy, px.
@@ -103,7 +103,7 @@ def draw_triangles(
         uv: (H, W, 2) output, barycentric weights of the second and third vertex.
     """
     height, width = triangle.shape
-    closeness = np.zeros((height, width))  # 1/m
+    closeness = np.zeros((height, width))  # 1/m, inverse depth; 0 = no surface
     triangle[:] = NO_TRIANGLE  # the first pass writes indices into `triangles`, the second pass values of `order`
     for chunk in range(len(spheres)):
         center = _in_camera(T_world_camera, spheres[chunk, 0], spheres[chunk, 1], spheres[chunk, 2])

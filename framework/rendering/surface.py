@@ -106,7 +106,7 @@ class Surface:
 
 
 class FrontSides:
-    """The triangles of a surface that face a viewpoint. Back-facing walls and ceilings do not hide them."""
+    """The triangles of a surface that face a viewpoint, without walls and ceilings that are seen from behind."""
 
     def __init__(self, surface: Surface, eye_world: Float64) -> None:
         self._eye_world = eye_world  # (3,) m, position of the viewpoint

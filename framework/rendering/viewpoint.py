@@ -8,13 +8,13 @@ from framework.data import Camera, Float32, Float64, Int32
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint_kernels import draw_fronts, sum_level_normals
 
-FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical; narrow, for a weak perspective
-ELEVATIONS_RAD = np.deg2rad([38.0, 52.0])
+FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical field of view; narrow, for a weak perspective
+ELEVATIONS_RAD = np.deg2rad([38.0, 52.0])  # candidate angles of the camera above the horizontal
 AZIMUTHS = 16  # number of candidate directions around the up direction
 MARGIN = 1.04  # size of the view relative to its content
 TRIAL_WIDTH, TRIAL_HEIGHT = 96, 72  # px, size of candidate images
 TRIAL_POINTS = 60000  # approximate maximum number of vertices in candidate images
-LEVEL_CONE_RAD = np.deg2rad(30)  # maximum angle between floor normals and the mean up direction of the cameras
+LEVEL_CONE_RAD = np.deg2rad(30)  # largest angle between floor normals and the mean up direction of the cameras
 
 
 def upward(poses: Float64, surface: Surface) -> Float64:
@@ -39,10 +39,13 @@ def upward(poses: Float64, surface: Surface) -> Float64:
 
 
 def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the camera and the pose T_world_camera (4, 4) with the best view of a surface.
+    """Return a camera and the pose T_world_camera (4, 4) with the best view of a surface.
+
+    Candidate views look down from AZIMUTHS directions at the angles ELEVATIONS_RAD. The best view has the highest
+    `_score`, which favors many visible objects; directions similar to those of the mapping cameras are preferred.
 
     Args:
-        surface: Surface in view.
+        surface: Surface to show.
         instance_ids: (V,) instance ids of the surface's vertices, 0 = none.
         poses: (F, 4, 4) T_world_camera of the mapped frames.
         width: Width of the image in px.
@@ -88,7 +91,7 @@ def looking(forward: Float64, up: Float64) -> Float64:
 
 
 def fitted(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return a camera and its nearest pose T_world_camera (4, 4) with all points, except outliers, in view.
+    """Return a camera, and the pose T_world_camera (4, 4) nearest to the points that shows all points but outliers.
 
     Args:
         R_world_camera: (3, 3) rotation of the camera.
@@ -110,7 +113,7 @@ def _without_strays(points: Float32) -> Float32:
 
 
 def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the camera and pose of `fitted`, but with all points, including outliers, in view."""
+    """Return a camera and pose like `fitted`, but with all points in view, including outliers."""
     focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     x, y, z = R_world_camera.T @ points_world.T
@@ -146,6 +149,7 @@ def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: 
 def _score(instance_ids: Int32) -> float:
     """Return the score of a view from the instance ids (N,) of its visible points, 0 = none.
 
-    The square roots favor many small objects over one large object.
+    The score is the sum of the square roots of each instance's number of points and of N. The square roots favor many
+    small objects over one large object.
     """
     return float(np.sqrt(np.bincount(instance_ids, minlength=1)[1:]).sum() + np.sqrt(len(instance_ids)))

@@ -24,10 +24,10 @@ from framework.runtime.run_log import FUSION, STAGES
 
 WIDTH, HEIGHT, FLAT_HEIGHT, TIMES_HEIGHT, GROWTH_HEIGHT = 560.0, 380.0, 180.0, 240.0, 390.0  # px
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 40.0  # px, margins around the axes
-TEXT_PX, DOT_PX = 12.0, 10.0  # font size; diameter of the dots at the ends of a path
+TEXT_PX, DOT_PX = 12.0, 10.0  # font size, and diameter of the dots at the ends of a path
 FOOT = 36.0  # px, height below a top view for the scale bar
 MARGIN = 0.08  # margin on each side of a top view, relative to its content
-MIN_EXTENT_M = 0.04  # minimum vertical extent of a top view
+MIN_EXTENT_M = 0.04  # minimum height of the area that a top view shows, m
 LABEL_WIDTH_PX = 46.0  # minimum width of a footprint with a label
 MAX_POINTS = 240  # maximum number of frames in the chart of stage times
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])  # of the unit cube
@@ -79,12 +79,12 @@ class PlottedPath:
 
 @dataclass(frozen=True)
 class StageRow:
-    """The times of one stage, ms."""
+    """Percentiles of the time of one stage per frame, ms."""
 
     stage: str
-    lowest: float  # the 5th percentile
+    lowest: float  # 5th percentile
     median: float
-    p95: float
+    p95: float  # 95th percentile
 
 
 def box_corners(box: Box) -> Float64:
@@ -93,7 +93,7 @@ def box_corners(box: Box) -> Float64:
 
 
 def stage_rows(times: StageTimes) -> list[StageRow]:
-    """Return the times of the stages that ran, in the order of the pipeline."""
+    """Return the percentiles of each stage that ran, in the order of the pipeline."""
     rows = []
     for stage in (*STAGES, FUSION):
         values = times.milliseconds.get(stage, np.zeros(0))
@@ -109,12 +109,12 @@ def top_view(
     up: Float64,
     height: float = HEIGHT,
 ) -> tuple[str, float]:
-    """Return the SVG of a top view, and the extent of the paths relative to the view's width.
+    """Return the SVG of a top view, and the larger side of the paths' bounding rectangle relative to the view's width.
 
     Args:
         paths: Estimated paths, at least one.
         true_paths: Positions (n, 3), m, of each ground-truth path; drawn as a dashed line.
-        objects: Objects, drawn as outlines.
+        objects: Objects to draw as filled outlines.
         up: (3,) unit vector opposite to gravity, world frame.
         height: Height of the chart, px.
     """
@@ -127,7 +127,7 @@ def top_view(
         corners = np.concatenate([one.corners_world for one in objects]) @ plane.T
         low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
     size = (high - low) * (1 + 2 * MARGIN)
-    px = max(size[0] / WIDTH, max(size[1], MIN_EXTENT_M) / plot_height)  # m
+    px = max(size[0] / WIDTH, max(size[1], MIN_EXTENT_M) / plot_height)  # m per px
     left, bottom = (low + high) / 2 - px * np.array([WIDTH, plot_height]) / 2
 
     figure = Figure((WIDTH / 72, height / 72), dpi=72, facecolor="none")
@@ -157,7 +157,7 @@ def top_view(
 
 
 def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT_HEIGHT) -> str:
-    """Return the SVG of a chart of the position errors (n,), m, by frame number (n,)."""
+    """Return the SVG of a line chart of the position `errors` (n,), m, of the frames with the numbers `frames` (n,)."""
     figure, axes = _chart(height, frames[0], frames[-1], "Position error, mm")
     axes.plot(frames, 1e3 * errors, color=COLORS["accent"], linewidth=2, gid="chart-errors")
     axes.set_ylim(0, max(1.08e3 * float(errors.max(initial=0.0)), 1e-3))
@@ -165,7 +165,7 @@ def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT
 
 
 def stage_areas(times: StageTimes) -> str:
-    """Return the SVG of a stacked area chart with the running median of each stage's time."""
+    """Return the SVG of a stacked area chart of the stage times by frame: running medians over WINDOW frames, ms."""
     chosen = np.unique(np.linspace(0, len(times.frames) - 1, MAX_POINTS).astype(int))
     stages = [row.stage for row in stage_rows(times)]
     layers = [np.nan_to_num(running_median(times.milliseconds[stage], WINDOW))[chosen] for stage in stages]
@@ -179,12 +179,12 @@ def stage_areas(times: StageTimes) -> str:
 
 
 def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int], last_frame: int) -> str:
-    """Return the SVG of a chart of the surface and the objects of the final map that were visible up to each frame.
+    """Return the SVG of a chart of the mapping progress: visible surface and number of detected objects by frame.
 
     Args:
-        frames: Frame numbers of `fraction`.
+        frames: (n,) frame numbers of `fraction`.
         fraction: (n,) fraction of the final surface that was visible up to each frame, in [0, 1].
-        first_frames: Number of the first frame of each object.
+        first_frames: Number of the frame in which each object was first detected.
         last_frame: Number of the last frame of the sequence.
     """
     first, last = min([0, *frames]), max(last_frame, 1)
@@ -211,7 +211,7 @@ def round_length(longest: float) -> float:
 
 
 def _chart(height: float, first: float, last: float, title: str, right: float = RIGHT) -> tuple[Figure, Axes]:
-    """Return a figure and its empty axes, with frame numbers on the x axis."""
+    """Return a figure and its empty axes, with the frame numbers `first` to `last` on the x axis; lengths in px."""
     figure = Figure((WIDTH / 72, height / 72), dpi=72, facecolor="none")
     inner = 1 - (LEFT + right) / WIDTH, 1 - (TOP + BOTTOM) / height
     axes = figure.add_axes((LEFT / WIDTH, BOTTOM / height, *inner), facecolor="none")
@@ -230,7 +230,7 @@ def _chart(height: float, first: float, last: float, title: str, right: float = 
 def _horizontal(positions: Float64, up: Float64) -> Float64:
     """Return the right and up axes (2, 3) of the top view, unit vectors in the world frame.
 
-    The right axis is the horizontal direction of the largest variance of the positions.
+    The right axis is the horizontal direction in which the positions have the largest variance.
 
     Args:
         positions: (P, 3) m, world frame.
@@ -250,7 +250,7 @@ def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, px: float, gid
         axes: Axes of the top view.
         one: Object to draw.
         corners: (8, 2) m, corners of the object in the axes of the top view.
-        px: Size of a pixel, m.
+        px: Side of a pixel in the world, m.
         gid: Id of the outline in the SVG.
     """
     try:
@@ -289,7 +289,10 @@ def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) ->
 
 
 def _attributes(style: re.Match[str]) -> str:
-    """Convert inline CSS properties to SVG attributes, and colors to the color variables of the page."""
+    """Return the CSS properties of a matched `style`, except for fonts, as SVG attributes.
+
+    The colors in COLORS are replaced by the CSS variables of the page.
+    """
     pairs = [item.split(":", 1) for item in style[1].split(";") if ":" in item]
     kept = [(key.strip(), value.strip()) for key, value in pairs if not key.strip().startswith("font")]
     return "".join(f' {key}="{VARIABLES.get(value, value)}"' for key, value in kept)

@@ -22,14 +22,14 @@ from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
-MAX_MAPS = 6  # maximum number of maps in the page; their total size is that of the map in the page of one run
+MAX_MAPS = 6  # maximum number of maps in the page; their total size is limited to that of one map in a run's page
 
 
 @dataclass(frozen=True)
 class Row:
     """A metric in the comparison table."""
 
-    key: str  # of metrics.json
+    key: str  # key in metrics.json
     name: str
     unit: str  # "" = none
     digits: int  # number of decimal places
@@ -81,7 +81,7 @@ class Table:
 
     id: str
     title: str
-    first: str  # heading of the first column
+    first: str  # heading of the first column, which contains the row names
     rows: list[TableRow]
     lead: str = ""  # text below the title, "" = none
     empty: str = ""  # text for a table without rows; "" = omit the section

@@ -25,7 +25,7 @@ from framework.reporting.visibility import Sightings, sightings, spread_out
 from framework.runs.instances_file import StoredInstance
 from framework.runs.run_directory import LIKELY
 
-VIEW_WIDTH, VIEW_HEIGHT = 960, 640  # px, aspect ratio of the initial view
+VIEW_WIDTH, VIEW_HEIGHT = 960, 640  # px, size of the initial view; the viewer uses only its aspect ratio
 PATH_POINTS = 400  # maximum number of points of the camera path
 PROGRESS_PICTURES = 4  # number of mapping progress images, at equal intervals; the last image shows the whole map
 PROGRESS_SCALE = 0.5  # size of mapping progress images, relative to the initial view
@@ -47,9 +47,9 @@ class MapScene:
 
     contents: RunContents
     mesh: InstanceMesh  # decimated; the front sides of its triangles face the cameras
-    surface: Surface  # of the mesh
+    surface: Surface  # surface of `mesh`
     sightings: Sightings
-    up: Float64  # (3,) unit vector in the world frame
+    up: Float64  # (3,) unit vector opposite to gravity, world frame
 
     @classmethod
     def of(cls, contents: RunContents, footage: Footage, fraction: float = 1.0) -> MapScene | None:
@@ -82,7 +82,7 @@ class MapScene:
 
     @property
     def likely_labels(self) -> Int32:
-        """Label (V,) of each vertex: the position of its object in `likely_ids`, counted from 1; 0 = none."""
+        """Label (V,) of each vertex: position of its object in `likely_ids`, counted from 1; 0 = no likely object."""
         likely = np.array([0, *likely_ids(self.contents)])
         indices = np.minimum(np.searchsorted(likely, self.mesh.instance_ids), len(likely) - 1)
         return np.where(likely[indices] == self.mesh.instance_ids, indices, 0).astype(np.int32)
@@ -146,7 +146,7 @@ class MapScene:
 
 
 def likely_ids(contents: RunContents) -> list[int]:
-    """Return the ids of the objects with a confidence of at least LIKELY, as in overview.png."""
+    """Return the ids of the objects with a confidence of at least LIKELY, in ascending order."""
     return [one.id for one in contents.objects if one.confidence >= LIKELY]
 
 

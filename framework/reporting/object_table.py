@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from framework.data import Float64
-from framework.evaluation.instances import Judgment, Outcome
+from framework.evaluation.instances import MatchResult, Outcome
 from framework.reporting.map_scene import colors_by_id, hex_color
 from framework.reporting.pictures import Picture
 from framework.reporting.run_contents import RunContents
@@ -35,13 +35,19 @@ class ObjectRow:
 
 
 def object_rows(
-    contents: RunContents, pictures: Mapping[int, Picture], judgments: Mapping[int, Judgment]
+    contents: RunContents, pictures: Mapping[int, Picture], match_results: Mapping[int, MatchResult]
 ) -> list[ObjectRow]:
-    """Return the rows of the table, most confident object first; `pictures` and `judgments` are by object id."""
+    """Return the rows of the table, most confident object first.
+
+    Args:
+        contents: Outputs of the run.
+        pictures: Image of each visible object, by object id.
+        match_results: Comparison of each object with the ground truth, by object id; empty = not compared.
+    """
     colors = colors_by_id(contents.objects)
     rows = []
     for one in sorted(contents.objects, key=lambda one: (-one.confidence, one.id)):
-        judgment = judgments.get(one.id)
+        match_result = match_results.get(one.id)
         rows.append(
             ObjectRow(
                 one,
@@ -50,16 +56,16 @@ def object_rows(
                 _size(one, contents.up),
                 100 * float(one.obb.extent.max()),
                 _position(one),
-                _truth(judgment),
-                css_class(judgment.outcome) if judgment else "faint",
-                f"{judgment.iou:.2f}" if judgment and judgment.iou else "",
+                _truth(match_result),
+                css_class(match_result.outcome) if match_result else "faint",
+                f"{match_result.iou:.2f}" if match_result and match_result.iou else "",
             )
         )
     return rows
 
 
 def object_data(
-    one: StoredInstance, contents: RunContents, picture: Picture | None, judgment: Judgment | None
+    one: StoredInstance, contents: RunContents, picture: Picture | None, match_result: MatchResult | None
 ) -> dict[str, Any]:
     """Return the data of an object for the panel next to the map, as JSON values."""
     likeliest = sorted(one.class_probabilities.items(), key=lambda entry: (-entry[1], entry[0]))[:SHOWN_CLASSES]
@@ -76,14 +82,15 @@ def object_data(
         "frames": f"{one.first_frame} to {one.last_frame}",
         "vertices": one.vertices,
         "source": picture.source if picture else "",
-        "truth": _truth(judgment) + (f", IoU {judgment.iou:.2f}" if judgment and judgment.iou else ""),
+        "truth": _truth(match_result) + (f", IoU {match_result.iou:.2f}" if match_result and match_result.iou else ""),
     }
 
 
 def _size(one: StoredInstance, up: Float64 | None) -> str:
-    """Return the length, width and height of an object's oriented box as text, cm.
+    """Return the side lengths of an object's oriented box as text, cm.
 
-    If `up` is None, the sides are in descending order of length.
+    The order is length, width and height, where the length is the longer level side. If `up` (3,) is None, the order is
+    descending.
     """
     sides = np.sort(one.obb.extent)[::-1]
     if up is not None:
@@ -102,12 +109,12 @@ def _height_above_floor(one: StoredInstance, contents: RunContents) -> float | N
     return float(one.obb.center @ up) - half - floor
 
 
-def _truth(judgment: Judgment | None) -> str:
-    if judgment is None:
+def _truth(match_result: MatchResult | None) -> str:
+    if match_result is None:
         return ""
-    if judgment.outcome is Outcome.WRONG_CLASS:
-        return f"truth: {judgment.truth_class}"
-    return str(judgment.outcome.value)
+    if match_result.outcome is Outcome.WRONG_CLASS:
+        return f"truth: {match_result.truth_class}"
+    return str(match_result.outcome.value)
 
 
 def _position(one: StoredInstance) -> str:

@@ -63,7 +63,10 @@ class Photographer:
         return taken
 
     def _seen_from(self, k: int) -> tuple[UInt8, str]:
-        """Return the image (H, W, 3), RGB, at pose k and its source: the frame, or else a rendering of the map."""
+        """Return the image (H, W, 3), RGB, at pose `k`, and its source ("frame N" or "map").
+
+        The image is the frame at this pose if it is readable, otherwise a rendering of the map.
+        """
         if k in self._footage.images:
             return self._footage.images[k], f"frame {self._footage.frames[k]}"
         return LitView(self._surface, self._camera, self._poses[k]).in_colors(self._mesh.colors), "map"

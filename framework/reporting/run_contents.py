@@ -1,4 +1,4 @@
-"""The outputs of a run that its report shows."""
+"""The outputs of a run that a report shows."""
 
 from __future__ import annotations
 

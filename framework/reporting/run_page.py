@@ -40,7 +40,7 @@ from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
 OVERVIEW_WIDTH = 1400  # px, of the image for browsers without WebGL
-SMALL_PATH = 0.3  # extent, relative to the width of the top view, up to which a path is also shown enlarged
+SMALL_PATH = 0.3  # largest extent of a path, relative to the width of the top view, at which it is also shown enlarged
 TOP_VIEW_KEY = (
     ("mine", "estimated"),
     ("truth", "ground truth"),
@@ -82,12 +82,13 @@ class RunReport:
     def html(self) -> str:
         """Return the HTML page. The result is deterministic."""
         contents, metrics = self.contents, self.contents.record.metrics
-        judgments = self.check.judgments if self.check else {}
+        match_results = self.check.match_results if self.check else {}
         data: dict[str, Any] = {
             "likely": LIKELY,
             "maps": [] if self.scene is None else [{"name": contents.name, **self.scene.data()}],
             "objects": [
-                object_data(one, contents, self.pictures.get(one.id), judgments.get(one.id)) for one in contents.objects
+                object_data(one, contents, self.pictures.get(one.id), match_results.get(one.id))
+                for one in contents.objects
             ],
         }
         context = {
@@ -99,7 +100,7 @@ class RunReport:
             "mapped": self.scene is not None,
             "still": overview_url(contents.record.directory / "overview.png") if self.scene is not None else "",
             "checked": self.check is not None,
-            "objects": object_rows(contents, self.pictures, judgments),
+            "objects": object_rows(contents, self.pictures, match_results),
             "truth": truth_section(self.check, self.why_unchecked, contents, self.pictures),
             "trajectory": self._trajectory(),
             "progress": self._progress(),
@@ -166,11 +167,11 @@ class RunReport:
     def _error_text(self) -> str:
         metrics = self.contents.record.metrics
         parts = []
-        for key, name in (("trajectory.ate_rmse_m", "ATE"), ("trajectory.rpe_rmse_m", "RPE")):
+        for key, name in (("trajectory.ate_rmse_m", "ATE RMSE"), ("trajectory.rpe_rmse_m", "RPE RMSE")):
             if is_number(value := metrics.get(key)):
                 parts.append(f"{name} {1e3 * value:.1f} mm")
         if is_number(value := metrics.get("trajectory.rpe_rotation_rmse_rad")):
-            parts.append(f"RPE {np.rad2deg(value):.2f}° per frame")
+            parts.append(f"{np.rad2deg(value):.2f}° per frame")
         assert self.true_path is not None
         chart = f"The chart shows {len(self.true_path.chosen)} frames, after alignment."
         return f"{', '.join(parts)} over all frames. {chart}" if parts else chart
@@ -208,7 +209,7 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
     if metrics.get("pose_source") == "ground_truth":
         found.append(("Poses", "ground truth", "", "not estimated"))
     elif (ate := known("trajectory.ate_rmse_m")) is not None:
-        found.append(("ATE", f"{1e3 * ate:.1f}", "mm", "after alignment"))
+        found.append(("ATE RMSE", f"{1e3 * ate:.1f}", "mm", "after alignment"))
     if (voxels := known("map.voxels")) is not None:
         taken = known("map.bytes")
         found.append(("Voxels", f"{voxels / 1e6:.1f}", "M", "" if taken is None else f"{taken / 2**20:.0f} MiB"))

@@ -20,7 +20,7 @@ from framework.runs.metrics import TRUTH, truth_sha256
 from framework.runs.provenance import leaves
 
 MAX_WIDTH = 640  # px, of stored images
-MIN_CLARITY = 0.3  # lower limit of the clarity: a blurred close view of an object is better than a sharp distant view
+MIN_CLARITY = 0.3  # minimum clarity, so that a blurred close view of an object is preferred to a sharp distant view
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class RunSource:
         return None if self.video is None else self.video.camera
 
     def frame(self, k: int) -> Frame | None:
-        """Return the frame of the k-th pose of the trajectory; None if the frame cannot be read."""
+        """Return the frame of pose `k` of the trajectory, counted from 0; None if the frame cannot be read."""
         numbers = self.contents.tracked_frames
         if self.video is None or not numbers or self.contents.times is None:
             return None
         first = int(np.searchsorted(self.contents.times.frames, numbers[k]))
-        # frames that are missing in timings.csv may precede the frame
+        # the position is larger than `first` if timings.csv omits frames before this one
         skipped = len(self.video) - len(self.contents.times.frames)
         for position in range(first, min(first + max(skipped, 0) + 1, len(self.video))):
             try:
@@ -72,9 +72,10 @@ class RunSource:
         return None
 
     def scene_truth(self) -> tuple[SceneTruth | None, str]:
-        """Return the ground-truth instances of the run's evaluation, in the world frame of its map, and "".
+        """Return the ground-truth instances in the world frame of the run's map, and "".
 
-        If they are unavailable, return None and the reason; the reason is "" for a run without ground truth.
+        If the instances are unavailable or have changed since the run, return None and the reason. The reason is "" for
+        a run without ground truth.
         """
         expected = self.contents.record.metrics.get(TRUTH)
         if self.video is None:

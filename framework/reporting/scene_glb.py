@@ -13,10 +13,11 @@ from framework.exporting.object_meshes import REST
 from framework.exporting.upright_room import plain_name, upright
 
 MAX_BYTES = 9_500_000  # maximum size of the file, bytes, for mobile browsers
-BYTES_OF_VERTEX, BYTES_OF_TRIANGLE = 24, 12  # position, color, first view; three indices
-MAX_TRIANGLES = 300_000  # maximum number of triangles; together with their vertices, they have about 7 MB
+BYTES_OF_VERTEX = 24  # bytes of position, color and first view
+BYTES_OF_TRIANGLE = 12  # bytes of three indices
+MAX_TRIANGLES = 300_000  # maximum number of triangles; with their vertices, about 7 MB
 NOT_GEOMETRY = 200_000  # bytes reserved for names and nodes
-FIRST_SEEN = "_FIRST_SEEN"  # name of the vertex attribute
+FIRST_SEEN = "_FIRST_SEEN"  # name of the vertex attribute with the values of `first_seen`
 
 
 def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str], up: Float64) -> bytes:
@@ -27,7 +28,7 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
 
     Args:
         mesh: Mesh of the map.
-        first_seen: (V,) in [0, 1], fraction of the sequence before the first view of each vertex.
+        first_seen: (V,) in [0, 1], fraction of the sequence before the first view of each vertex; 1 = never visible.
         names: Class name by id, for the objects with a node.
         up: (3,) unit vector opposite to gravity, world frame.
     """

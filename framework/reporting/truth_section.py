@@ -11,7 +11,7 @@ import numpy as np
 from framework.data import SceneTruth, UInt8
 from framework.evaluation.instances import (
     MAX_DISTANCE,
-    Judgment,
+    MatchResult,
     Outcome,
     PredictedInstances,
     judge,
@@ -70,7 +70,7 @@ class Gallery:
 class TruthCheck:
     """The outcome of each object, and the missed ground-truth objects."""
 
-    judgments: Mapping[int, Judgment]  # by object id
+    match_results: Mapping[int, MatchResult]  # by object id
     missed: list[Card]
 
     @classmethod
@@ -112,8 +112,8 @@ class TruthCheck:
     def galleries(self, contents: RunContents, pictures: Mapping[int, Picture]) -> list[Gallery]:
         cards = {outcome: list[Card]() for outcome in GROUPS}
         for one in contents.objects:
-            if judgment := self.judgments.get(one.id):
-                cards[judgment.outcome].append(_card(one, judgment, pictures.get(one.id)))
+            if match_result := self.match_results.get(one.id):
+                cards[match_result.outcome].append(_card(one, match_result, pictures.get(one.id)))
         note = "ground-truth objects without a match of their class"
         galleries = [Gallery("missed", "Missed", note, self.missed, bool(self.missed))]
         for outcome, (name, note) in GROUPS.items():
@@ -125,7 +125,14 @@ class TruthCheck:
 def truth_section(
     check: TruthCheck | None, why_unchecked: str, contents: RunContents, pictures: Mapping[int, Picture]
 ) -> dict[str, Any] | None:
-    """Return the context for the section's template, None for a run without ground truth."""
+    """Return the variables of the ground-truth section in run.html; None for a run without ground truth.
+
+    Args:
+        check: Comparison of the objects with the ground truth; None = not available.
+        why_unchecked: Reason for a missing comparison, "" = the run has no mesh.
+        contents: Outputs of the run.
+        pictures: Image of each visible object, by object id.
+    """
     metrics = contents.record.metrics
     main = [(name, f"{metrics[key]:.2f}") for key, name in METRICS.items() if is_number(metrics.get(key))]
     if not main and check is None:
@@ -148,12 +155,12 @@ def css_class(outcome: Outcome) -> str:
     return outcome.name.lower().replace("_", "-")
 
 
-def _card(one: StoredInstance, judgment: Judgment, picture: Picture | None) -> Card:
-    near = judgment.truth_class or "an unlabeled object"
+def _card(one: StoredInstance, match_result: MatchResult, picture: Picture | None) -> Card:
+    near = match_result.truth_class or "an unlabeled object"
     notes = {
-        Outcome.RIGHT: f"IoU {judgment.iou:.2f}",
-        Outcome.WRONG_CLASS: f"truth: {near}, IoU {judgment.iou:.2f}",
-        Outcome.FALSE: f"best overlap: {near}, IoU {judgment.iou:.2f}" if judgment.iou else "no overlap",
+        Outcome.RIGHT: f"IoU {match_result.iou:.2f}",
+        Outcome.WRONG_CLASS: f"truth: {near}, IoU {match_result.iou:.2f}",
+        Outcome.FALSE: f"best overlap: {near}, IoU {match_result.iou:.2f}" if match_result.iou else "no overlap",
         Outcome.IGNORED: f"on {near}",
     }
-    return Card(one.class_name, f"{one.confidence:.2f}", notes[judgment.outcome], picture, one.id)
+    return Card(one.class_name, f"{one.confidence:.2f}", notes[match_result.outcome], picture, one.id)

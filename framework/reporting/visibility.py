@@ -17,7 +17,7 @@ LOOK_WIDTH = 200  # px, width of the rendered images
 TOLERANCE, TOLERANCE_PER_DEPTH = (
     0.05,
     0.03,
-)  # m, and relative to the depth: vertices farther behind the rendered depth are hidden
+)  # m, and m per m of depth; a vertex that is farther behind the rendered surface is hidden
 NOT_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # nominal Kinect, used if the camera is unknown
 
 
@@ -25,13 +25,13 @@ NOT_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # nominal Kinect, use
 class Sightings:
     """Visibility of a mesh with V vertices from n poses of the trajectory."""
 
-    chosen: list[int]  # indices of the poses
+    chosen: list[int]  # indices of the n poses in the trajectory
     first_seen: Int32  # (V,) index into `chosen` of the first pose with a view of each vertex; n = never visible
     best: Mapping[int, int]  # index of the pose with the best view, by label; labels without a view are missing
 
     @property
     def growth(self) -> Float64:
-        """Fraction (n,), in [0, 1], of the visible vertices that are visible from this or an earlier pose."""
+        """Fraction (n,), in [0, 1], of the vertices with a view whose first view is at or before each chosen pose."""
         counts = np.bincount(self.first_seen, minlength=len(self.chosen) + 1)[: len(self.chosen)]
         return np.asarray(np.cumsum(counts) / max(1, counts.sum()))
 
@@ -44,7 +44,7 @@ def spread_out(count: int, most: int = LOOKS) -> list[int]:
 def sightings(
     mesh: InstanceMesh, labels: Int32, poses: Float64, camera: Camera, clarity: Mapping[int, float]
 ) -> Sightings:
-    """Return the visibility of a mesh, which is rendered at evenly spaced poses.
+    """Return the visibility of a mesh from at most LOOKS evenly spaced poses of the trajectory.
 
     Args:
         mesh: Mesh of the map.
@@ -91,7 +91,7 @@ def _seen(vertices: Float32, T_world_camera: Float64, camera: Camera, depth: Flo
     u, v = np.rint(camera.fx * x / ahead + camera.cx), np.rint(camera.fy * y / ahead + camera.cy)
     inside = (z > 1e-3) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     visible = np.zeros(len(vertices), np.bool_)
-    # rounding may move a vertex at the border of the surface to a pixel outside
+    # because of rounding, a vertex at the border of the surface may be projected to a pixel without a surface
     bordered = np.where(depth > 0, depth, cv2.dilate(depth, np.ones((3, 3), np.uint8)))
     seen = bordered[v[inside].astype(int), u[inside].astype(int)]
     visible[inside] = z[inside] < seen + TOLERANCE + TOLERANCE_PER_DEPTH * seen

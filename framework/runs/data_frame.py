@@ -35,7 +35,7 @@ def load_runs(folder: Path | str) -> DataFrame:
         - `dataset`, `detector`, `tracker`, `refiner`, `fuser`, `preset`: the chosen options
         - `fuser.voxel_size`, ...: the parameters; lists as JSON
         - `instances.ap50`, `fps`, ...: the metrics, in the units of metrics.json
-        - `git_commit`, `config_hash`, `inputs_sha256`, `environment.cpus`, ...: the origin of the run
+        - `git_commit`, `code.refiner`, `config_hash`, `inputs_sha256`, `environment.cpus`, ...: the origin of the run
 
         The types are Int64, float64, boolean and string. Values that a run does not have are NA.
 

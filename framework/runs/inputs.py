@@ -1,4 +1,4 @@
-"""Hash of the input files of a run: weights, recording and others."""
+"""Hash of the input files of a run, such as weights and the recording."""
 
 from __future__ import annotations
 
@@ -16,28 +16,41 @@ from framework.errors import ConfigError, DataError
 from framework.files.search_paths import folder_of
 from framework.runs.provenance import leaves, relevant
 
-INPUTS = "inputs_sha256"  # the key of metrics.json
-MAX_FILES = 200_000  # maximum number of hashed files of a recording (3 s); known datasets have up to 20,000
+INPUTS = "inputs_sha256"  # key in metrics.json
+ROOT = "dataset.root"  # key of the recording
+MAX_FILES = 200_000  # maximum number of hashed files of a recording (takes 3 s); known datasets have up to 20,000
 OUTPUTS = {"outputs", "multirun"}  # Hydra's output folders
 
 
-def inputs_sha256(config: Mapping[str, Any]) -> str:
-    """Return the SHA-256 (hex) of the input files that a resolved config names.
+def input_hashes(config: Mapping[str, Any]) -> dict[str, str]:
+    """Return the SHA-256 (hex) of the input files that a resolved config names, by config key.
 
     Files and folders are hashed by content. A recording is hashed by the names, sizes and modification times of the
     files in dataset.root and below dataset.scene, which is faster.
     """
-    digest = hashlib.sha256()
+    found = {}
     for key, value in leaves(relevant(config)):
         if isinstance(value, str) and key == KEY:
-            digest.update("".join(map(_content, _truth_files(value))).encode())
-        elif isinstance(value, str) and key not in ("dataset.root", "dataset.scene"):
-            digest.update(f"{key} {_content(value)};".encode())
+            found[key] = "".join(map(_content, _truth_files(value)))
+        elif isinstance(value, str) and key not in (ROOT, "dataset.scene"):
+            found[key] = _content(value)
     dataset = config.get("dataset") or {}
     if root := dataset.get("root"):
+        digest = hashlib.sha256()
         for entry in islice(_listed(folder_of(Path(root)), str(dataset.get("scene") or "")), MAX_FILES):
             digest.update(f"{entry};".encode())
-    return digest.hexdigest()
+        found[ROOT] = digest.hexdigest()
+    return {key: sha256 for key, sha256 in found.items() if sha256}
+
+
+def inputs_sha256(config: Mapping[str, Any]) -> str:
+    """Return the SHA-256 (hex) of the input files that a resolved config names."""
+    return hash_of(input_hashes(config))
+
+
+def hash_of(inputs: Mapping[str, str]) -> str:
+    """Return the SHA-256 (hex) of the keys and hashes of `input_hashes`."""
+    return hashlib.sha256(repr(sorted(inputs.items())).encode()).hexdigest()
 
 
 def _truth_files(value: str) -> list[str]:

@@ -28,7 +28,7 @@ class StoredInstance:
     confidence: float  # in [0, 1]
     class_probabilities: Mapping[str, float]  # each in [0, 1]
     observations: int  # number of frames with a detection
-    first_frame: int  # Frame.index
+    first_frame: int  # Frame.index of the first detection
     last_frame: int
     vertices: int  # number of mesh vertices
     centroid: Float64 | None  # (3,) of its vertices; None = no vertices
@@ -72,10 +72,10 @@ def write_instances(
 
 
 def read_instances(path: Path) -> list[StoredInstance]:
-    """Read the objects that `write_instances` wrote. Raises DataError."""
+    """Read the objects that `write_instances` wrote. Raises DataError if the file is missing or invalid."""
     entries = read_json(path)
     if not isinstance(entries, list):
-        raise DataError(f"{path}: expected a list of instances, got {type(entries).__name__}")
+        raise DataError(f"{path}: expected a JSON array of instances, got {entries!r:.40}")
     found = [_stored(f"{path}, entry {number}", entry) for number, entry in enumerate(entries, start=1)]
     ids = {instance.id for instance in found}
     if len(ids) < len(found):
@@ -85,11 +85,11 @@ def read_instances(path: Path) -> list[StoredInstance]:
 
 def _stored(where: str, entry: Any) -> StoredInstance:
     if not isinstance(entry, dict):
-        raise DataError(f"{where}: expected an object with id, class, confidence and other keys, got {entry!r:.40}")
+        raise DataError(f"{where}: expected a JSON object with the keys of instances.schema.json, got {entry!r:.40}")
     box, probabilities = entry.get("obb"), entry.get("class_probabilities")
     if not isinstance(box, dict) or not isinstance(probabilities, dict):
         raise DataError(
-            f"{where}: expected mappings in obb and class_probabilities, got {box!r:.40} and {probabilities!r:.40}"
+            f"{where}: expected JSON objects in obb and class_probabilities, got {box!r:.40} and {probabilities!r:.40}"
         )
     return StoredInstance(
         id=_integer(where, entry, "id", 1),

@@ -35,18 +35,19 @@ def write_mesh(path: Path, mesh: InstanceMesh) -> None:
 
 
 def read_mesh(path: Path) -> InstanceMesh:
-    """Read the mesh that `write_mesh` wrote. Raises DataError."""
+    """Read the mesh that `write_mesh` wrote. Raises DataError if the file is missing, damaged or not such a mesh."""
     ply = read_ply(path)
     for name, kind in TYPES.items():
         if name not in ply.properties or ply.properties[name].dtype != kind:
-            got = ply.properties[name].dtype if name in ply.properties else "no such property"
+            got = ply.properties[name].dtype if name in ply.properties else "none"
             raise DataError(
-                f"{path}: expected {np.dtype(kind)} for the vertex property {name!r}, got {got}; use mesh.ply of a run"
+                f"{path}: expected {np.dtype(kind)} for the vertex property {name!r}, got {got}; "
+                "use the mesh.ply of a run"
             )
     class_lines = [comment for comment in ply.comments if f"{comment} ".startswith(CLASSES)]
     if len(class_lines) != 1:
         raise DataError(
-            f"{path}: expected one line 'comment {CLASSES}...', got {len(class_lines)} lines; use mesh.ply of a run"
+            f"{path}: expected one line 'comment {CLASSES}...', got {len(class_lines)} lines; use the mesh.ply of a run"
         )
     names = class_lines[0][len(CLASSES) :]
     return InstanceMesh(

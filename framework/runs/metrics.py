@@ -29,8 +29,8 @@ MAIN_FIGURES = (
     "ap",
     "ap50_agnostic",
     "mean_iou",
-)  # keys below `instances.` that are stored for both label transfers
-TRUTH = "truth_sha256"  # key of the hash of the ground truth
+)  # keys below `instances.` that are stored for both directions of the label transfer
+TRUTH = "truth_sha256"  # key of the ground-truth hash in metrics.json
 
 
 def run_metrics(result: RunResult) -> Metrics:
@@ -63,8 +63,8 @@ def run_metrics(result: RunResult) -> Metrics:
 
 
 def trajectory_metrics(result: RunResult) -> Metrics:
-    """Return the trajectory errors over the poses that are not lost; empty without ground-truth poses."""
-    reference: list[Float64 | None] = [None] * result.frames  # includes skipped frames, which interrupt relative poses
+    """Return the trajectory errors (ATE, RPE) of the frames that are not lost; empty without ground-truth poses."""
+    reference: list[Float64 | None] = [None] * result.frames  # includes skipped frames; no relative pose spans them
     estimated = [Pose(np.eye(4), lost=True)] * result.frames
     for frame in result.tracked:
         reference[frame.position], estimated[frame.position] = frame.T_world_camera_truth, frame.pose
@@ -108,10 +108,16 @@ def instance_metrics(
 def evaluation_metrics(
     predictions: PredictedInstances, truth: SceneTruth, aligned: SceneTruth, annotation: str
 ) -> Metrics:
-    """Return `InstanceEvaluation.metrics`, and the main metrics of the other label transfer as `instances.to_map.*`.
+    """Return the instance metrics, the release of the ground truth and its hash.
 
-    `aligned` is the ground truth in the world frame of the map. The metric `annotation_release` is the release of the
-    ground truth; None = the dataset has a single release. The metric `truth_sha256` is the hash of the ground truth.
+    The keys `instances.to_map.*` contain the main metrics with labels transferred from the ground truth to the map,
+    instead of from the map to the ground truth.
+
+    Args:
+        predictions: Instances of the map.
+        truth: Ground truth in the world frame of the dataset, for the hash.
+        aligned: Ground truth in the world frame of the map.
+        annotation: Release of the ground truth, "" = the dataset has a single release (None in the metrics).
     """
     figures = instances.evaluate(predictions, aligned).metrics()
     to_map = instances.evaluate(predictions, aligned, transfer=Transfer.TO_MAP).metrics()

@@ -7,7 +7,7 @@ import json
 import platform
 import subprocess
 from collections.abc import Iterator, Mapping
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, distributions, version
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,16 @@ def environment() -> dict[str, str | int]:
         "environment.instancemap": framework.__version__,
         **{f"environment.{package}": _version(package) for package in PACKAGES},
     }
+
+
+def frozen_environment() -> str:
+    """Return the Python version and the versions of all installed packages, as constraints for pip."""
+    packages = {
+        f"{name}=={package.version}"
+        for package in distributions()
+        if (name := package.metadata["Name"]) and package.version and not name.lower().startswith("instancemap")
+    }
+    return "\n".join([f"# Python {platform.python_version()}", *sorted(packages, key=str.lower)]) + "\n"
 
 
 def _git(directory: Path, *arguments: str) -> str | None:

@@ -18,10 +18,11 @@ from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum
 from framework.interfaces import RGBDVideo
 from framework.registry import build
+from framework.runs.manifest import MANIFEST, Manifest
 from framework.runs.metrics import TRUTH, evaluation_metrics, is_evaluation
 from framework.runs.provenance import code_version, leaves
 from framework.runs.stored_map import read_objects
-from framework.runs.stored_runs import EVALUATION, GROUND_TRUTH, METRICS, TRAJECTORY, Record
+from framework.runs.stored_runs import CONFIG, EVALUATION, GROUND_TRUTH, METRICS, TRAJECTORY, Record
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Truth:
     """The ground truth of a run's dataset."""
 
     scene: SceneTruth | None  # None = not labeled
-    annotation: str  # RGBDVideo.annotation
+    annotation: str  # release of the ground truth, as in RGBDVideo.annotation
     named: str | None = None  # dataset.ground_truth; None = the ground truth of the dataset
 
     @classmethod
@@ -37,13 +38,17 @@ class Truth:
         """Read the ground truth of a dataset's resolved config. Raises InstanceMapError."""
         for key, value in leaves({"dataset": dataset}):
             if "${" in str(value):
-                raise DataError(f"config of the run: expected resolved values, got {key}={value}")
+                raise DataError(f"{key}: expected a resolved value in the run's {CONFIG}, got {value}; repeat the run")
         video = build(RGBDVideo, OmegaConf.create(dict(dataset)))
         named = dataset.get("ground_truth")
         return cls(video.scene_truth(), video.annotation, None if named is None else str(named))
 
     def in_world_of(self, record: Record) -> SceneTruth | None:
-        """Return the ground truth in the world frame of a run. Raises DataError."""
+        """Return the ground truth in the world frame of a run; None = no ground truth.
+
+        Raises DataError if the trajectory of the run is missing or invalid, or has no time in common with the
+        ground-truth trajectory.
+        """
         return self.scene and in_map_world(self.scene, *read_tum(record.directory / TRAJECTORY))
 
 
@@ -64,8 +69,8 @@ class Reevaluation:
         if truth.scene is None:
             if any(map(is_evaluation, record.metrics)):
                 raise DataError(
-                    f"{record.directory}: expected a dataset with instances (as in its metrics), got a dataset without "
-                    "instances; set --ground-truth"
+                    f"{record.directory}: expected ground-truth instances of the dataset (as in {METRICS}), got none; "
+                    "set --ground-truth"
                 )
             return cls(record, record.metrics)
         aligned = truth.in_world_of(record)
@@ -113,14 +118,21 @@ class Reevaluation:
                 before = None
             if before is None or before.st_mtime != self.record.written:
                 raise DataError(
-                    f"{path}: expected an unchanged file, got a file of a restarted run; evaluate it when it ends"
+                    f"{path}: expected an unchanged file, got a file of a restarted run; evaluate it after the run ends"
                 )
             write_json(path, self.metrics)
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+            if (self.record.directory / MANIFEST).exists():
+                stored = Manifest.read(self.record.directory)
+                names = list(stored.files)
+                Manifest.of(self.record.directory, names, stored.status, stored.inputs).write(self.record.directory)
 
 
 def read_predictions(record: Record) -> PredictedInstances:
-    """Return the predictions that a run evaluated at its end. Raises DataError."""
+    """Return the predictions that a run evaluated at its end.
+
+    Raises DataError if mesh.ply or instances.json is missing, invalid or inconsistent with the other files of the run.
+    """
     mesh, instances = read_objects(record)
     return PredictedInstances.on_mesh(
         mesh,
@@ -131,5 +143,8 @@ def read_predictions(record: Record) -> PredictedInstances:
 
 
 def dataset_of(record: Record, ground_truth: str | None = None) -> dict[str, Any]:
-    """Return the dataset config of a run with another `ground_truth`; "" = that of the dataset, None = unchanged."""
+    """Return the dataset config of a run, with its key `ground_truth` replaced.
+
+    The value "" selects the ground truth of the dataset; None leaves the key unchanged.
+    """
     return record.dataset | ({} if ground_truth is None else {"ground_truth": ground_truth or None})

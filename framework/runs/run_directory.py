@@ -23,14 +23,18 @@ from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import RGBDVideo
 from framework.rendering.overview import write_overview
-from framework.runs.inputs import INPUTS, inputs_sha256
+from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import write_instances
+from framework.runs.manifest import MANIFEST, Manifest, RunStatus
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
-from framework.runs.provenance import code_version, config_hash, environment
+from framework.runs.plugin_code import plugin_code
+from framework.runs.provenance import code_version, config_hash, environment, frozen_environment
 from framework.runs.stored_runs import (
     CHOICE,
     CONFIG,
+    DIGESTS,
+    ENVIRONMENT,
     GROUPS,
     INSTANCES,
     KEYFRAMES,
@@ -40,6 +44,7 @@ from framework.runs.stored_runs import (
     METRICS,
     PARTIAL_METRICS,
     REPORT,
+    RESULT_FILES,
     TRAJECTORY,
 )
 from framework.runtime.run_log import RunResult
@@ -47,7 +52,7 @@ from framework.tracking.keyframes import write_keyframes
 
 log = logging.getLogger(__name__)
 
-LIKELY = 0.3  # minimum confidence of instances in figures and log messages; files contain all
+LIKELY = 0.3  # minimum confidence of instances in figures and log messages; files contain all instances
 
 Arguments = ParamSpec("Arguments")
 Made = TypeVar("Made")
@@ -60,7 +65,7 @@ class RunRecord:
     directory: Path
     config: Mapping[str, Any]  # resolved
     choices: Mapping[str, str | None]  # chosen option of each config group
-    inputs: str  # inputs_sha256
+    inputs: Mapping[str, str]  # input_hashes
     provenance: Metrics  # code and machine at the start of the run
 
     @classmethod
@@ -69,11 +74,11 @@ class RunRecord:
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
         plain = {str(key): value for key, value in resolved.items()}
-        inputs = inputs_sha256(plain)
-        provenance: Metrics = {**code_version(), **environment()}
+        inputs = input_hashes(plain)
+        provenance: Metrics = {**code_version(), **plugin_code(plain), **environment()}
         directory.mkdir(parents=True, exist_ok=True)
         remove_left_over(directory)
-        for name in (METRICS, PARTIAL_METRICS, REPORT):
+        for name in (MANIFEST, METRICS, PARTIAL_METRICS, REPORT):
             (directory / name).unlink(missing_ok=True)
         _write_config(directory / CONFIG, plain)
         _reset_peak_memory()
@@ -98,7 +103,7 @@ class RunRecord:
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         scene, attempt = result.scene, _Attempts(result.stopped_by)
-        for name in (*MAPPED, KEYFRAMES):  # from an earlier run
+        for name in (MANIFEST, *MAPPED, KEYFRAMES, DIGESTS, ENVIRONMENT):  # from an earlier run
             attempt((self.directory / name).unlink, missing_ok=True)
         if not (self.directory / CONFIG).exists():  # the directory was removed
             attempt(_write_config, self.directory / CONFIG, self.config)
@@ -106,6 +111,8 @@ class RunRecord:
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
         attempt(write_tum, self.directory / TRAJECTORY, np.array([frame.timestamp for frame in trusted]), poses)
         attempt(write_timings, self.directory / "timings.csv", result)
+        attempt(write_digests, self.directory / DIGESTS, result)
+        attempt(_write_text, self.directory / ENVIRONMENT, frozen_environment())
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **(counts or {})}
         found = attempt(lambda: (scene.mesh(), scene.instances()))
         if found is not None:
@@ -134,6 +141,7 @@ class RunRecord:
             (self.directory / PARTIAL_METRICS).unlink(missing_ok=True)
         else:
             attempt(self._write_partial, video, figures, attempt.error)
+        attempt(self._write_manifest, RunStatus.COMPLETE if attempt.error is None else RunStatus.PARTIAL)
         self._announce(title, labels if found is not None else {}, figures, attempt.error)
         return attempt.error
 
@@ -146,7 +154,7 @@ class RunRecord:
             "seed": self.config.get("seed"),
             "detection_interval": self.config.get("detection_interval", 1),
             "config_hash": config_hash(self.config),
-            INPUTS: self.inputs,
+            INPUTS: hash_of(self.inputs),
             **self.provenance,
         }
 
@@ -154,6 +162,10 @@ class RunRecord:
         """Write the metrics of a partial run with the reason; `error` None = the outputs are still being written."""
         why = "the outputs were not completed" if error is None else reason(error)
         write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
+
+    def _write_manifest(self, status: RunStatus) -> None:
+        names = [*RESULT_FILES, METRICS, PARTIAL_METRICS]
+        Manifest.of(self.directory, names, status, self.inputs).write(self.directory)
 
     def _announce(
         self, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics, error: BaseException | None
@@ -174,9 +186,9 @@ class RunRecord:
 
 @dataclass
 class _Attempts:
-    """Caller of functions that logs their errors, so that a failing call does not prevent later calls."""
+    """Callable that runs functions and logs their errors, so that a failing call does not prevent later calls."""
 
-    error: BaseException | None  # the first error
+    error: BaseException | None  # first error; None = no error
 
     def __call__(
         self, function: Callable[Arguments, Made], *arguments: Arguments.args, **named: Arguments.kwargs
@@ -196,7 +208,7 @@ def _write_config(path: Path, config: Mapping[str, Any]) -> None:
 
 
 def _from_here(path: Path) -> Path:
-    """Return the path relative to the working folder if it is inside this folder."""
+    """Return the path relative to the working directory if it is inside it, otherwise the absolute path."""
     here, place = Path.cwd(), path.absolute()
     return place.relative_to(here) if place.is_relative_to(here) else place
 
@@ -233,7 +245,7 @@ def headline(metrics: Mapping[str, Any]) -> str:
 
 
 def reason(error: BaseException) -> str:
-    """Return the reason for a partial run as text."""
+    """Return the error that ended a partial run as one line of text."""
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted by Ctrl-C"
     return one_line(error) if isinstance(error, InstanceMapError) else f"{type(error).__name__}: {one_line(error)}"
@@ -247,10 +259,21 @@ def write_timings(path: Path, result: RunResult) -> None:
         writer.writerows((time.frame, time.stage, f"{time.milliseconds:.3f}") for time in result.timings)
 
 
-def peak_memory() -> int | None:
-    """Return the peak resident memory of this process in bytes; on Linux since the start of the run.
+def write_digests(path: Path, result: RunResult) -> None:
+    """Write the digest of each stage for each frame, in chronological order."""
+    lines = [f"{one.frame},{one.stage},{one.digest:08x}" for one in result.digests]
+    _write_text(path, "\n".join(["frame,stage,digest", *lines]) + "\n")
 
-    None on Windows, which has no module `resource`.
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, "utf-8")
+
+
+def peak_memory() -> int | None:
+    """Return the peak resident memory of this process in bytes; None on Windows, which has no module `resource`.
+
+    On Linux, the peak is measured from the start of the run; on macOS, from the start of the process.
     """
     try:
         import resource
@@ -261,6 +284,6 @@ def peak_memory() -> int | None:
 
 
 def _reset_peak_memory() -> None:
-    """Reset the peak memory of earlier sweep jobs."""
+    """Reset the peak memory of the process on Linux, because it includes earlier jobs of a sweep."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")

@@ -13,14 +13,14 @@ from framework.registry import STAGES
 from framework.runs.metrics import TRUTH
 from framework.runs.stored_runs import CHOICE, Record, is_number
 
-DATA = "dataset.root"  # config key of the recording's folder
+DATA = "dataset.root"  # config key of the dataset folder
 ANNOTATION = "annotation"  # key of the release of the ground truth in the differences between rows
 CONFIDENCE = 0.95
 PRESET_STAGES = ("tracker", "refiner", "fuser")  # stages set by preset=NAME
 
 ABSENT = "–"  # value of a key that a run does not have
 
-Run = tuple[str, ...]  # values of the averaged keys: ("3",) is seed 3
+Run = tuple[str, ...]  # values of the keys that are averaged over, e.g. ("3",) for seed 3
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Mean:
     """A mean over runs. NaN = undefined, such as the mean of no run or the deviation of a single run."""
 
     value: float
-    deviation: float  # sample standard deviation, with n - 1; 0 = equal values
+    deviation: float  # sample standard deviation, with the divisor n - 1; 0 = equal values
     count: int
 
     @classmethod
@@ -47,9 +47,9 @@ class Mean:
 
     @property
     def is_not_zero(self) -> bool:
-        """Return True if 0 is outside of the confidence interval of the mean, by Student's t.
+        """Return True if 0 is outside of the confidence interval of the mean (level CONFIDENCE, Student's t).
 
-        Equal values, such as counts, have no confidence interval.
+        Return False for fewer than two values and for equal values, whose deviation of 0 is no estimate of the spread.
         """
         if self.count < 2 or self.deviation <= 1e-9 * abs(self.value):
             return False
@@ -64,8 +64,8 @@ class RunRow:
 
     name: str
     records: Mapping[Run, Record]
-    system: str = ""  # name in an experiment; "" = no experiment
-    variant: tuple[str, ...] = ()  # other differences between rows: ("tracker=icp_only",)
+    system: str = ""  # name of the row in an experiment; "" = no experiment
+    variant: tuple[str, ...] = ()  # other overrides that differ between rows, e.g. ("tracker=icp_only",)
 
     @property
     def pose_source(self) -> str:
@@ -93,7 +93,7 @@ class RunRow:
         return (self.pose_source, *(part for part in self.variant if is_of_data(part)))
 
     def values(self, column: str) -> dict[Run, float]:
-        """Return the metric of each run, without undefined values."""
+        """Return the metric `column` of each run; runs with an undefined value are omitted."""
         found = {run: record.metrics.get(column) for run, record in self.records.items()}
         return {run: float(value) for run, value in found.items() if is_number(value)}
 
@@ -101,7 +101,7 @@ class RunRow:
         return Mean.of(self.values(column).values())
 
     def differences(self, base: RunRow, column: str) -> dict[Run, float]:
-        """Return the difference of the metric from the base row, for the runs in both rows.
+        """Return the difference of the metric `column` from the row `base`, for each run in both rows.
 
         Runs with the same seed have the same scene and detections, so most of the variation cancels.
         """
@@ -290,5 +290,5 @@ def _differing(groups: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[str]:
 
 
 def natural(run: Run) -> tuple[tuple[float, str], ...]:
-    """Return a sort key that orders seeds as numbers, and other words after them."""
+    """Return a sort key that orders numbers by value, and other texts alphabetically after them."""
     return tuple((float(word) if word.isdecimal() else math.inf, word) for word in run)

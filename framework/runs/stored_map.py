@@ -22,8 +22,8 @@ class StoredMap:
     """A map of F frames with V vertices."""
 
     mesh: InstanceMesh
-    ids: Int32  # (V,) 0 = no stored instance
-    class_names: Mapping[int, str]  # by instance
+    ids: Int32  # (V,) instance id of each vertex, 0 = no stored instance
+    class_names: Mapping[int, str]  # by instance id
     poses: Float64  # (F, 4, 4) T_world_camera of the mapped frames
     record: Record
 
@@ -39,7 +39,7 @@ class StoredMap:
         return cls(mesh, ids, names, poses, record)
 
     def true_ids(self, truth: SceneTruth) -> Int32:
-        """Return the nearest ground-truth instance (V,) of each vertex; 0 = none within MAX_DISTANCE."""
+        """Return the id (V,) of the ground-truth instance nearest to each vertex; 0 = none within MAX_DISTANCE."""
         return transfer_labels(truth.points_world, truth.instance_ids, self.mesh.vertices, MAX_DISTANCE)
 
 

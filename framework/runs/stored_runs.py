@@ -21,6 +21,7 @@ from framework.files.json_file import read_json
 from framework.files.yaml_file import load_yaml
 from framework.registry import STAGES
 from framework.runs.inputs import INPUTS, inputs_sha256
+from framework.runs.plugin_code import changed_code, plugin_code
 from framework.runs.provenance import (
     OF_SPEED,
     code_version,
@@ -46,8 +47,13 @@ KEYFRAMES = "keyframes.npz"  # of the tracker, to resume the map; optional
 MAPPED = (TRAJECTORY, "timings.csv", INSTANCES, MESH, MAP, "overview.png")
 """Files of a map in the order of writing, small files first in case the disk is full."""
 
-EVALUATION = "evaluation."  # prefix of the code version of a re-evaluation
-GROUND_TRUTH = EVALUATION + "ground_truth"  # key of dataset.ground_truth in the last re-evaluation, if it was set
+DIGESTS = "digests.csv"  # digest of each stage and frame, to locate differences between runs
+ENVIRONMENT = "environment.txt"  # versions of all installed packages, as constraints for pip
+RESULT_FILES = (CONFIG, *MAPPED, KEYFRAMES, DIGESTS, ENVIRONMENT)
+"""Files listed in manifest.json, in addition to the metrics."""
+
+EVALUATION = "evaluation."  # prefix of the keys with the code version of the last re-evaluation
+GROUND_TRUTH = EVALUATION + "ground_truth"  # key of the `dataset.ground_truth` of the last re-evaluation, if it was set
 
 CHOICE = "choice."  # prefix of the chosen options in metrics.json
 GROUPS = (*STAGES, "preset", "sequences")  # config groups whose chosen option is stored
@@ -65,7 +71,7 @@ class Record:
     directory: Path
     metrics: Mapping[str, Any]  # flat; None = undefined
     config: Mapping[str, Any]  # resolved
-    written: float  # modification time, s
+    written: float  # modification time of the metrics file, s since the epoch
 
     @property
     def commit(self) -> str:
@@ -137,21 +143,27 @@ def commit_of(metrics: Mapping[str, Any]) -> str:
     return f"{str(metrics.get('git_commit'))[:7]}{changes}"
 
 
-def read_record(directory: Path) -> Record:
-    """Read the completed run in `directory`. Raises DataError for invalid or inconsistent files."""
-    return _read(directory, METRICS)
+def read_record(directory: Path, check_config: bool = True) -> Record:
+    """Read the completed run in `directory`. Raises DataError for invalid or inconsistent files.
+
+    Without `check_config`, the config may differ from that of the run.
+    """
+    return _read(directory, METRICS, check_config)
 
 
 def read_partial(directory: Path) -> tuple[Record, str]:
-    """Read the partial run in `directory`, and the reason for its early end. Raises DataError."""
+    """Read the partial run in `directory`, and the reason for its early end.
+
+    Raises DataError if its metrics or config are missing, invalid or from different runs.
+    """
     record = _read(directory, PARTIAL_METRICS)
     return record, str(record.metrics.get("partial"))
 
 
-def _read(directory: Path, name: str) -> Record:
+def _read(directory: Path, name: str, check_config: bool = True) -> Record:
     path = directory / name
     metrics, config = _read_flat(path), read_yaml(directory / CONFIG)
-    if metrics.get("config_hash") != config_hash(config):
+    if check_config and metrics.get("config_hash") != config_hash(config):
         raise DataError(
             f"{path}: expected the config_hash of {CONFIG}, {config_hash(config)[:8]}, got "
             f"{metrics.get('config_hash')!s:.8}; repeat the run"
@@ -159,7 +171,7 @@ def _read(directory: Path, name: str) -> Record:
     try:
         written = path.stat().st_mtime
     except OSError as error:  # the run has been restarted
-        raise DataError(f"{path}: expected a readable file, got {error.strerror}") from error
+        raise DataError(f"{path}: expected a readable file, got an error ({error.strerror})") from error
     return Record(directory, metrics, config, written)
 
 
@@ -193,10 +205,10 @@ def completed_runs(root: Path) -> tuple[list[Record], list[Incomplete]]:
 
 
 def is_recorded(directory: Path, config: DictConfig) -> bool:
-    """Return True if `directory` contains a completed run of this config and inputs, and log the reason.
+    """Return True if `directory` contains a completed run with this config and these inputs. Log the decision.
 
-    If the experiment's table shows the speed, settings that change times must also match. The commit may differ: most
-    commits do not change results, and tables list the commits of their runs.
+    The code of its plugins must match. If the experiment's table shows the speed, settings that change times must also
+    match. The commit may differ: most commits do not change results, and tables list the commits of their runs.
     """
     if not (directory / METRICS).exists():
         return False
@@ -211,7 +223,10 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
     if record.metrics["config_hash"] != config_hash(plain):
         log.info("repeating the run: the config in %s differs", directory)
         return False
-    if record.metrics.get(INPUTS) not in (None, inputs_sha256(plain)):  # None: an older run
+    if changed := changed_code(record.metrics, plugin_code(plain)):
+        log.info("repeating the run: the code changed since the run in %s: %s", directory, "; ".join(changed))
+        return False
+    if record.metrics.get(INPUTS) not in (None, inputs_sha256(plain)):  # None = written before the key existed
         log.info("repeating the run: weights or data changed since the run in %s", directory)
         return False
     settings = speed_settings(record.config, record.metrics)
@@ -238,13 +253,16 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML mapping without resolving interpolations. Raises DataError."""
+    """Read a YAML mapping without resolving interpolations.
+
+    Raises DataError if the file is missing or does not contain a mapping.
+    """
     if not path.exists():
         raise DataError(f"{path}: expected a file, got none")
     try:
         content = OmegaConf.to_container(load_yaml(path), resolve=False)
     except OmegaConfBaseException as error:
-        raise DataError(f"{path}: expected a readable file, got {first_line(error)}") from error
+        raise DataError(f"{path}: expected valid YAML, got an error ({first_line(error)})") from error
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected keys and values, got a list")
     return {str(key): _with_text_keys(value) for key, value in content.items()}
@@ -258,7 +276,10 @@ def _with_text_keys(node: Any) -> Any:
 
 
 def read_metrics(directory: Path) -> dict[str, Any]:
-    """Read metrics.json, or metrics.partial.json of a partial run. Raises DataError."""
+    """Read metrics.json, or metrics.partial.json of a partial run.
+
+    Raises DataError if neither file exists, or if the file is invalid.
+    """
     for name in (METRICS, PARTIAL_METRICS):
         if path_exists(directory / name):
             return _read_flat(directory / name)
@@ -268,7 +289,7 @@ def read_metrics(directory: Path) -> dict[str, Any]:
 def _read_flat(path: Path) -> dict[str, Any]:
     content = read_json(path)
     if not isinstance(content, dict):
-        raise DataError(f"{path}: expected an object, got {type(content).__name__}")
+        raise DataError(f"{path}: expected a JSON object, got {content!r:.40}")
     if nested := [key for key, value in content.items() if isinstance(value, dict | list)]:
         raise DataError(f"{path}: expected flat values, got nested values below {nested[0]!r}")
     for key, value in content.items():

@@ -87,7 +87,7 @@ def _params(sweep: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _without_hydra(sweep: Mapping[str, Any]) -> DictConfig:
-    """Return the sweep's config without Hydra's part; references ${...} to keys outside it are replaced by "???"."""
+    """Return the sweep's config without the key `hydra`; references ${...} to values outside it become "???"."""
     return OmegaConf.create({key: _of_itself(value) for key, value in sweep.items() if key != "hydra"})
 
 
@@ -101,7 +101,7 @@ def _of_itself(node: Any) -> Any:
 
 
 def _below(sweep: Mapping[str, Any], part: str, name: str, kind: type) -> Any:
-    """Return `hydra.PART.NAME`; empty if it is missing or of another type."""
+    """Return the value of `hydra.<part>.<name>`, or an empty `kind` if it is missing or of another type."""
     node: Any = sweep
     for key in ("hydra", part, name):
         node = node.get(key) if isinstance(node, Mapping) else None

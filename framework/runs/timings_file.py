@@ -31,7 +31,7 @@ class StageTimes:
     """The stage times of a run."""
 
     frames: Int64  # (F,) frame numbers, ascending
-    milliseconds: Mapping[str, Float64]  # by stage: (F,), NaN = stage not run, as after a lost pose
+    milliseconds: Mapping[str, Float64]  # (F,) by stage, NaN = not run, such as integration of a lost frame
 
 
 def current_key(key: str) -> str:
@@ -41,7 +41,7 @@ def current_key(key: str) -> str:
 
 
 def read_timings(path: Path) -> StageTimes:
-    """Read the stage times of a run. Raises DataError."""
+    """Read the stage times of a run. Raises DataError if the file cannot be read, is invalid or has no times."""
     try:
         lines = list(csv.reader(read_text(path).splitlines(keepends=True)))
     except csv.Error as error:

@@ -81,7 +81,8 @@ class CpuBudget:
     def prefetching(self, workers: int = 1) -> Iterator[None]:
         """Run the body on the cores for prefetching. The body prefetches one frame, in one of `workers` threads.
 
-        If all cores map, the priority of the thread is low from then on, so that parallel loops do not wait for it.
+        If no core is left for prefetching, the priority of the thread is lowered permanently, so that parallel loops of
+        mapping do not wait for it.
         """
         cores = self.cores if self._alone else self.prefetch_cores()
         if cores == 0:
@@ -101,7 +102,10 @@ class CpuBudget:
             self._record(self._mapping, threads * (time.thread_time() - began))
 
     def prefetch_cores(self) -> int:
-        """Return the number of cores for prefetching, rounded; 0 or all cores if one side has almost no work."""
+        """Return the number of cores for prefetching: half of the cores before both sides have measured a frame.
+
+        The number may be 0 or all cores if one side has almost no work.
+        """
         with self._lock:
             if not (self._prefetching and self._mapping):
                 return self.cores // 2

@@ -1,7 +1,7 @@
 """Retention of freed memory in the process.
 
-The C library returns large freed blocks to the system. The next image of that size then needs new pages. A huge page
-(2 MiB) takes 0.1 ms, and up to 5 ms in a virtual machine.
+The C library returns large freed blocks to the system. The next large array then needs new pages. Allocating a huge
+page (2 MiB) takes 0.1 ms, or up to 5 ms in a virtual machine.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ MAX_SHARED = 2**25  # maximum size of an array that reuses freed memory, bytes; 
 
 @cache
 def keep_freed_memory() -> None:
-    """Keep about MAX_KEPT freed bytes in the process, if its C library is glibc.
+    """Keep up to MAX_KEPT bytes of freed memory in the process, if its C library is glibc.
 
-    Environment variables of malloc take precedence.
+    Nothing is changed if environment variables configure malloc.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     configured = {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES"} & os.environ.keys()

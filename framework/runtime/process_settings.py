@@ -139,7 +139,7 @@ class Settings:
         return cls(seed=config.seed, device=config.device, threads=config.threads, **run_settings)
 
     def apply(self) -> None:
-        """Limit the threads of the libraries and seed their global generators, in a process of the command line.
+        """Limit the threads of the libraries and seed the global generators. For processes of the command line only.
 
         The project's own code uses separate generators seeded with `seed`. Third-party plugins may use the global
         generators. Call this method again after the stages are built: torch is configured only if it is loaded already.

@@ -23,7 +23,10 @@ class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
         self._begun = self._spoken = time.monotonic()
 
     def line_is_due(self) -> bool:
-        """Return True if no bar is shown and a log line is due: every few seconds, later at longer intervals."""
+        """Return True if no bar is shown and a log line is due.
+
+        The interval is 10 % of the elapsed time, limited to [MIN_INTERVAL, MAX_INTERVAL].
+        """
         now = time.monotonic()
         interval = min(max(MIN_INTERVAL, 0.1 * (now - self._begun)), MAX_INTERVAL)
         if not self.disable or self.quiet or now - self._spoken < interval:

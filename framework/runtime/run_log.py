@@ -17,6 +17,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from framework.data import Array, DelayEstimate, Float64, Frame, Pose
 from framework.errors import FrameError, NoPoseError
 from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
+from framework.runtime.digests import StageDigest, digest_of
 from framework.runtime.progress import Progress
 from framework.sensors.noise_models import SensorKind
 
@@ -46,7 +47,7 @@ class TrackedFrame:
     position: int  # position in the sequence, counting skipped frames
     timestamp: float  # s
     pose: Pose
-    T_world_camera_truth: Float64 | None  # (4, 4)
+    T_world_camera_truth: Float64 | None  # (4, 4); None = unknown
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ class RunResult:
     live: LiveFigures | None = None  # None = a recording
     keyframes: Mapping[str, Array] = field(default_factory=dict)  # of the tracker
     color_delay: DelayEstimate | None = None  # None = given, not estimated
+    digests: tuple[StageDigest, ...] = ()  # of each stage and frame
 
     @property
     def frames_lost(self) -> int:
@@ -103,6 +105,7 @@ class Journal:
     first_without_pose: str = ""  # message of the first frame without a pose
     tracked: list[TrackedFrame] = field(default_factory=list)
     timings: list[StageTime] = field(default_factory=list)
+    digests: list[StageDigest] = field(default_factory=list)
     frames_in_map: int = 0  # number of frames that are at least partly fused
     stopped_by: BaseException | None = None
     frames_began: list[float] = field(default_factory=list)  # start of each frame, s
@@ -132,14 +135,17 @@ class Journal:
 
     @contextmanager
     def timed(self, frame: int, stage: str) -> Iterator[None]:
-        """Record the time of the body for a frame index and a stage, if the body succeeds."""
+        """Record the run time of the body as a stage time of the frame with index `frame`, unless the body raises."""
         started = time.perf_counter()
         yield
         self.timings.append(StageTime(frame, stage, 1e3 * (time.perf_counter() - started)))
 
     @contextmanager
     def fusing(self, frame: int) -> Iterator[StageTimer]:
-        """Record the times of the fuser's stages, if the body succeeds."""
+        """Record the stage times that the fuser measures with the yielded timer, unless the body raises.
+
+        If the fuser measures none, the run time of the body is recorded as FUSION.
+        """
         seconds: defaultdict[str, float] = defaultdict(float)
 
         @contextmanager
@@ -152,6 +158,10 @@ class Journal:
         yield timer
         of_stages = seconds or {FUSION: time.perf_counter() - started}
         self.timings += [StageTime(frame, stage, 1e3 * spent) for stage, spent in of_stages.items()]
+
+    def digest(self, frame: int, **results: object) -> None:
+        """Record the digests of the results of stages for a frame index."""
+        self.digests += [StageDigest(frame, stage, digest_of(result)) for stage, result in results.items()]
 
     def stage_ms(self, frame: int) -> dict[str, float]:
         """Return the stage times of the last frame, ms; `frame` is its index."""
@@ -196,6 +206,7 @@ class Journal:
         if frame.sensor is not self.sensor:
             self.sensor = frame.sensor
             log.info("depth sensor: %s", frame.sensor)
+        self.digest(frame.index, tracking=pose)
         self.tracked.append(TrackedFrame(frame.index, self.frames - 1, frame.timestamp, pose, frame.T_world_camera))
         if pose.lost:
             if not self.lost_for:
@@ -218,6 +229,7 @@ class Journal:
             frames_skipped=self.frames_skipped,
             tracked=tuple(self.tracked),
             timings=tuple(self.timings),
+            digests=tuple(self.digests),
             seconds=self.seconds,
             stopped_by=self.stopped_by,
             intervals=tuple(np.diff(self.frames_began).tolist()),

@@ -38,7 +38,7 @@ OURS_TO_HANDLE = (signal.SIG_DFL, signal.default_int_handler, _raise_interrupted
 
 
 def raise_on_signals() -> None:
-    """Make every signal of ENDING raise Interrupted in this process."""
+    """Let the signals of ENDING raise Interrupted in this process. Handlers of other programs are kept."""
     for number in ENDING:
         if signal.getsignal(number) in OURS_TO_HANDLE:
             signal.signal(number, _raise_interrupted)
@@ -60,9 +60,10 @@ class Interruption:
 
     @contextmanager
     def second_ends_at_once(self, when: str) -> Iterator[None]:
-        """Let the second signal raise Interrupted in the body. The message of the first signal contains `when`.
+        """Let the second signal raise Interrupted in the body.
 
-        Outside such bodies, signals do not raise, so that no result is lost between two bodies.
+        The message about the first signal contains `when`, the end of the step, such as "after this frame". Outside
+        such bodies, signals do not raise, so that no result is lost between two bodies.
         """
         self._when, self._at_once = when, True
         try:
@@ -92,7 +93,9 @@ _in_worker = ExitStack()  # never closed
 
 @contextmanager
 def signals_deferred(*numbers: int) -> Iterator[Interruption]:
-    """Record the first of these signals in the yielded Interruption instead of raising in the body.
+    """Defer the signals `numbers`.
+
+    Record the first signal in the yielded Interruption instead of raising an exception in the `with` body.
 
     An exception within a frame would leave it partly integrated. A nested call yields the outer Interruption. Other
     threads, ignored signals and signals with other handlers are not affected.
@@ -121,7 +124,7 @@ def signals_deferred(*numbers: int) -> Iterator[Interruption]:
 
 
 def received_from_sweep() -> Interruption:
-    """Return the Interruption of a worker process, which records a SIGTERM from the sweep since the first job.
+    """Return the Interruption of this worker process. It records a SIGTERM sent by the sweep since the first job.
 
     A terminal sends the other signals to the sweep and to all workers. The workers ignore these signals.
     """
@@ -135,10 +138,10 @@ def received_from_sweep() -> Interruption:
 
 @contextmanager
 def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterator[None]:
-    """Forward the first signal in the body to the worker processes `at_work`, and raise after they have finished.
+    """Forward the first signal in the body to the busy workers, and raise Interrupted after they have finished.
 
-    Idle workers get no signal: they may have no handler yet, and joblib kills all workers when one ends. The second
-    signal raises immediately.
+    `at_work` returns the worker processes that are busy. Idle workers get no signal: they may have no handler yet, and
+    joblib kills all workers when one ends. The second signal raises immediately.
     """
 
     def end_workers(number: int, _frame: FrameType | None) -> None:

@@ -1,6 +1,6 @@
 """Noise models of depth sensors: the standard deviation, m, of a depth reading at depth z, m.
 
-For a surface at the angle theta to the image plane:
+For a surface at the angle theta, rad, to the image plane:
 
     sigma(z, theta) = max(FLOOR, least + growth (z - near)^2)
                       + (slant / sqrt(z) + far_slant z^1.5) theta^2 / (pi / 2 - theta)^2
@@ -50,7 +50,7 @@ class DepthNoise(NamedTuple):
 class SensorKind(Enum):
     """Kind of a depth sensor: EXACT, KINECT_V1, REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR.
 
-    The value is its noise model.
+    The value of a member is the noise model of the sensor.
     """
 
     EXACT = DepthNoise(0.0, 0.0, 0.0, full_weight_depth=math.inf)
@@ -66,12 +66,12 @@ class SensorKind(Enum):
         return self.value
 
     def sigma(self, z: float | NDArray[np.float32]) -> NDArray[np.floating]:
-        """Return the standard deviation, m, with the shape of `z`, m, for surfaces that face the camera."""
+        """Return the standard deviation, m, of readings at each depth in `z`, m, for surfaces that face the camera."""
         least, near, growth = self.noise[:3]
         return np.maximum(FLOOR, least + growth * (z - near) ** 2)
 
     def __str__(self) -> str:
-        """Return the name and two standard deviations, for messages."""
+        """Return the name and the standard deviations at depths of 1 m and 3 m, for messages."""
         near, far = (f"{1000 * self.sigma(z):.1f} mm at {z} m" for z in (1, 3))
         return f"{self.name}, standard deviation of depth {near}, {far}"
 
@@ -79,7 +79,7 @@ class SensorKind(Enum):
 class SensorChoice(Enum):
     """Values of `dataset.sensor`."""
 
-    AUTO = "of the recording or the device"
+    AUTO = "from the recording or the device"
     EXACT = "rendered depth"
     KINECT_V1 = "structured light: Kinect v1, Xtion, Astra"
     REALSENSE_D435 = "active stereo: RealSense D400, Gemini"

@@ -21,20 +21,23 @@ device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fas
 
 @device
 def axial_sigma(z: float, noise: DepthNoise) -> float:
-    """Return sigma(z, 0), m, in double precision."""
+    """Return the standard deviation sigma(z, 0), m, at depth `z`, m, in double precision; see noise_models.py."""
     return max(FLOOR, noise.least + noise.growth * (z - noise.near) ** 2)
 
 
 @device
 def axial_sigma_single(z: np.float32, noise: DepthNoise) -> np.float32:
-    """Return sigma(z, 0), m, in single precision."""
+    """Return the standard deviation sigma(z, 0), m, at depth `z`, m, in single precision; see noise_models.py."""
     beyond = z - np.float32(noise.near)
     return max(np.float32(FLOOR), np.float32(noise.least) + np.float32(noise.growth) * beyond * beyond)
 
 
 @device
 def axial_sigma_at_angle(z: np.float32, theta: np.float32, noise: DepthNoise) -> np.float32:
-    """Return sigma(z, theta), m, in single precision; theta in rad."""
+    """Return the standard deviation sigma(z, theta), m, at depth `z`, m, in single precision; see noise_models.py.
+
+    `theta`: angle between the surface and the image plane, rad.
+    """
     theta = min(theta, LARGEST_THETA)
     beyond = z - np.float32(noise.near)
     upright = np.float32(np.pi / 2) - theta

@@ -37,7 +37,7 @@ from framework.synthetic.walk import CameraPath, plan_path
 MIN_ROOM_SIZE = (4.8, 4.2)  # m, width and depth of the smallest candidate room
 STREWN = 9  # maximum number of objects on the floor next to furniture
 ATTEMPTS = 6  # number of candidate scenes; the scene with the best visibility is kept
-JUDGED_VIEWS = 30  # number of views for the visibility score of a scene
+JUDGED_VIEWS = 30  # maximum number of views for the visibility score of a scene
 # minimum number of pixels of a visible object in a view, and minimum fraction of views in which it is visible
 WELL_SEEN, LONG_SEEN = 10, 1 / 6
 SMALL_VIEW = Camera(80, 60, 68.0, 68.0, 39.5, 29.5)  # camera of the scored views, with the field of view of a Kinect
@@ -47,11 +47,11 @@ MakeGroup = Callable[[Rng], Group]
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """Role and contents of a scene, excluding the contents that all scenes have."""
+    """Description and contents of a scene, except for the contents that all scenes have (door, window and others)."""
 
-    role: str  # description of the scene, for messages
+    role: str  # description of the scene in messages
     groups: tuple[MakeGroup, ...]  # furniture groups, placed largest first
-    holds: Mapping[str, int]  # COCO class -> minimum number of objects
+    holds: Mapping[str, int]  # minimum number of objects by COCO class
 
 
 def bag(rng: Rng) -> Group:
@@ -142,10 +142,15 @@ class Scene:
 
 
 def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: float) -> Scene:
-    """Return the candidate scene with the best visibility of its objects in `frames` frames.
+    """Return the candidate scene with the best visibility of its objects along the camera path.
 
-    `stream` is the seed of the random numbers. `stride` is the camera speed relative to the recommended speed, as in
-    walk.plan_path. Raises DataError if no candidate has space for the furniture and the camera path.
+    Raises DataError if no candidate has space for the furniture and the camera path.
+
+    Args:
+        spec: Scene specification.
+        stream: Seed of the random numbers.
+        frames: Number of frames of the camera path.
+        stride: Camera motion per frame, relative to the recommended speed at FRAME_RATE, as in walk.plan_path.
     """
     best: Scene | None = None
     most_shown = (-1.0, -1.0)
@@ -165,7 +170,7 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: floa
 
 
 def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[Scene, tuple[float, float]]:
-    """Return a random scene, and the fractions of its classes and of its objects that are visible.
+    """Return a random scene, and two fractions: of its classes and of its objects with a class that are visible.
 
     An object counts as visible if it is visible in at least a fraction LONG_SEEN of the scored views.
     """

@@ -24,10 +24,10 @@ LAYOUTS = 16  # number of candidate layouts for each room size
 TRIES = 50  # number of candidate positions of each group
 GROWTH = (1.0, 1.06, 1.12, 1.2, 1.3, 1.4, 1.5)  # scale factors of the side lengths of candidate rooms
 WALK_RADIUS = 1.3  # m, minimum radius of the free circle for a camera path
-HEAD_ROOM = 1.9  # m, minimum height of the base of objects that do not block the camera path
+HEAD_ROOM = 1.9  # m, height of the base above which an object does not block the camera path
 CONTACT = 0.003  # m, gap between an object on the floor and the furniture that it touches
-PLACES = 60  # number of candidate positions of each object on the floor
-ON_FLOOR = 0.05  # m, maximum height of the base of objects on the floor
+PLACES = 60  # maximum number of candidate positions of each object on the floor
+ON_FLOOR = 0.05  # m, maximum height of the base of an object that stands on the floor
 NO_HOSTS = ("door", "window", "rug")  # kinds of furniture without objects next to them
 CELL = 0.05  # m, cell size of the grid of free floor
 
@@ -39,13 +39,14 @@ class Layout:
     width: float  # m, along x
     depth: float  # m, along y
     pieces: list[Furniture]  # objects in the room frame: x, y along the walls, z up, origin at the center of the floor
-    free: Float64  # (rows along y, columns along x) m, distance from each floor cell to the nearest furniture or wall
+    free: Float64  # (rows along y, columns along x) m, distance from each floor cell to the nearest object or wall
 
 
 def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout:
-    """Return a layout of the groups in the smallest possible room with space for a camera path.
+    """Return a layout of the groups in the smallest candidate room with space for a camera path.
 
-    The room has at least `width` x `depth` m. Raises DataError if a room with 1.5 times these sides is too small.
+    The sides of the candidate rooms are `width` and `depth` (m) times the factors in GROWTH. Raises DataError if the
+    largest candidate is too small.
     """
     boxes = [group.boxes for group in groups]
     for factor in GROWTH:
@@ -68,7 +69,7 @@ def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout
 @dataclass
 class _Plan:
     places: list[Place] = field(default_factory=list)
-    solid: list[Float64] = field(default_factory=list)  # (N, 2, 3) solid boxes of each group
+    solid: list[Float64] = field(default_factory=list)  # (N, 2, 3) m, boxes of the solid objects of each group
 
 
 def _try_layout(
@@ -112,9 +113,9 @@ def _try_layout(
 
 
 def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
-    """Return the pose of a group at a wall of a room of `width` x `depth` m.
+    """Return the pose of a group at a wall of a room with sides of `width` and `depth` m.
 
-    The group is `along` m from the middle of the wall. `wall` is 0 for the wall at -y, 1 at +x, 2 at +y, and 3 at -x.
+    The group is `along` m from the middle of the wall. The wall at -y has the number `wall` = 0, +x 1, +y 2, and -x 3.
     """
     if wall == 0:
         return along, -depth / 2, 0.0
@@ -146,8 +147,12 @@ def _inside(boxes: Float64, width: float, depth: float) -> bool:
 def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
     """Return a lower bound of the distance, m, from each floor cell to the nearest box or wall.
 
-    The grid has one row per CELL along y and one column per CELL along x. The room has `width` x `depth` m, and `boxes`
-    are (N, 2, 3), m.
+    The result is a grid with one row per CELL along y and one column per CELL along x.
+
+    Args:
+        boxes: (N, 2, 3) m, lower and upper corners of the boxes in the room frame.
+        width: Width of the room along x, m.
+        depth: Depth of the room along y, m.
     """
     rows, columns = int(depth / CELL), int(width / CELL)
     free = np.zeros((rows + 2, columns + 2), np.uint8)
@@ -196,7 +201,7 @@ def _with_thing(layout: Layout, thing: Furniture, rng: Rng) -> Layout:
 def _against(host: Float64, thing: Furniture, rng: Rng) -> Furniture:
     """Return `thing`, placed on the floor at a random side of the box `host` (2, 3), m.
 
-    The center of `thing` is not past the ends of the side.
+    The center of `thing` is between the ends of this side.
     """
     turned = thing.placed(0, 0, 0, np.pi / 2 * int(rng.integers(4)))
     low, high = turned.bounds()

@@ -20,7 +20,7 @@ GATHER_DIRECTIONS = 48  # number of rays per vertex for light from other surface
 BOUNCES = 3  # number of diffuse bounces
 LIFT = 4e-3  # m, height of the ray origins above the surface
 CHUNK = 8192  # number of vertices per chunk, to limit memory
-WALL_BRIGHTNESS = 0.60  # mean irradiance of floor, walls and ceiling after exposure, with headroom for bright areas
+WALL_BRIGHTNESS = 0.60  # mean irradiance of floor, walls and ceiling after scaling; leaves headroom for bright areas
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Lamp:
 
     points: Float64  # (S, 3) m
     normals: Float64  # (S, 3) unit vectors in the direction of emission; zero vector = emission in all directions
-    power: Color  # linear RGB, total power of the lamp
+    power: Color  # linear RGB, total power of the lamp in arbitrary units
 
 
 def globe(center: Float64, radius: float, power: Color, samples: int = 16) -> Lamp:

@@ -27,7 +27,7 @@ WALLS: tuple[Color, ...] = (
     (0.87, 0.84, 0.77), (0.78, 0.84, 0.85), (0.83, 0.86, 0.78), (0.90, 0.80, 0.72), (0.82, 0.80, 0.86),
 )  # fmt: skip
 
-DARKEST = 0.35  # mean sRGB value below which a surface absorbs the infrared light of a projector
+DARKEST = 0.35  # mean sRGB value, in [0, 1], below which a surface absorbs infrared light of the projector
 ABSORBED = 0.8  # fraction of the depth readings lost on a black surface
 MATTE_SCREEN = 0.75  # `dark` of a matte screen
 POLISHED, GLAZED = 0.7, 0.5  # `shiny` of metal and of ceramics
@@ -66,7 +66,7 @@ class Material:
     scale: float = 0.1  # m, size of the pattern
     extent: tuple[float, float] = (1.0, 1.0)  # m, size of a painting or screen
     seed: int = 0
-    emission: float = 0.0  # emitted light, 1 = a white wall in the mean light of the room
+    emission: float = 0.0  # emitted light, 1 = radiance of a white wall in the mean light of the room
     dark: float = 0.0  # in [0, 1], fraction of a structured-light camera's depth readings lost at all angles
     shiny: float = 0.0  # in [0, 1], fraction of the other readings lost at oblique angles (shading_kernels.GLANCED_OFF)
 
@@ -90,7 +90,7 @@ def _to_linear(srgb: Float64) -> Float64:
 
 
 def absorbed(color: Color) -> float:
-    """Return the fraction of depth readings lost on a surface with this color."""
+    """Return the fraction of depth readings, in [0, ABSORBED], that are lost on a surface with this sRGB color."""
     return ABSORBED * max(0.0, 1 - sum(color) / 3 / DARKEST)
 
 
@@ -156,7 +156,7 @@ def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Materi
 
 
 def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
-    """Return the material of a picture of `width` x `height` m, such as a painting or a screen.
+    """Return the material of a picture, such as a painting or a screen, with sides of `width` and `height` m.
 
     Half of the screens are glossy and give no depth readings. `emission` is the emitted light, as in Material.
     """

@@ -21,7 +21,7 @@ Numbers = npt.NDArray[np.floating] | npt.NDArray[np.integer]
 class RayHits:
     """Intersections of rays with the surface; the leading dimensions match the rays."""
 
-    distance: Float32  # in multiples of the ray's direction vector, inf = no intersection
+    distance: Float32  # in units of the length of the ray's direction vector, inf = no intersection
     triangle: Int32  # NO_TRIANGLE = no intersection
     uv: Float32  # (..., 2) barycentric weights of the second and third vertex of the triangle
 
@@ -47,7 +47,7 @@ class RayCaster:
     def occluded(self, origins: Float32, ends: Float32) -> Bool:
         """Return the mask (...) of the pairs of points with a surface between them.
 
-        `origins` and `ends` are (..., 3), m. Surfaces at these points do not count.
+        `origins` and `ends` are (..., 3), m. Surfaces at these points are ignored.
         """
         rays = np.concatenate([origins, ends - origins], axis=-1).astype(np.float32)
         return np.asarray(self._scene.test_occlusions(_tensor(rays), 1e-3, 0.999, get_num_threads()).numpy())

@@ -23,7 +23,8 @@ from framework.synthetic.shading_kernels import (
 )
 from framework.synthetic.surfaces import Surfaces
 
-EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))  # px, offsets on a rotated grid
+# offsets (u, v) of the samples of an edge pixel from its center
+EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))  # px, on a rotated grid
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Rendering:
 
 
 class Renderer:
-    """Thread-safe renderer of `surfaces` under `lamps`; light is baked once."""
+    """Thread-safe renderer of `surfaces` under `lamps`. The light is computed once, for all vertices."""
 
     def __init__(self, surfaces: Surfaces, lamps: list[Lamp]) -> None:
         self.surfaces = surfaces
@@ -58,7 +59,10 @@ class Renderer:
         self._rasterizer = Rasterizer(surfaces.vertices, surfaces.triangles)
 
     def render(self, camera: Camera, T_world_camera: Float64, material_table: Float32 | None = None) -> Rendering:
-        """Return images of the room, optionally with another paints.material_table under the same light."""
+        """Return images of the room from a camera at T_world_camera (4, 4).
+
+        `material_table` (M, 14) replaces the materials but not the light; None = materials of the room.
+        """
         surfaces = self._lit if material_table is None else self._lit._replace(table=material_table)
         buffer = self._rasterizer.draw(camera, T_world_camera)
         triangle, depth = buffer.triangle, buffer.depth

@@ -6,7 +6,7 @@
   disparity of a RealSense D400 is quantized to 1/32 px. The depth of other sensors has steps of 1 mm.
 - Lateral noise moves readings across edges by about a pixel (Nguyen et al.). It is applied as in Handa et al., "A
   Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
-- Readings are missing in the shadow of the projector or second camera, at many pixels along depth edges, and at
+- Readings are missing where the projector or second camera is occluded, at many pixels along depth edges, and at
   grazing angles.
 - Dark and shiny surfaces lose readings in patches, because the correlation window is wider than a pixel.
 - Color has noise and motion blur.
@@ -35,15 +35,15 @@ from framework.synthetic.rgbd_camera_kernels import (
 )
 
 LATERAL_SIGMA = 0.8  # px at 640 px width, standard deviation: the constant term of Nguyen et al.
-PATCH = 14.0  # px at 640 px width, spacing of the random numbers for patches without readings
+PATCH = 14.0  # px at 640 px width, spacing of the random field that determines the patches without readings
 COLOR_SIGMA = 1.5  # standard deviation of color noise, in gray levels from 0 to 255
 
 
 class Triangulation(NamedTuple):
     """Geometry of a sensor that measures disparity."""
 
-    baseline: float  # m, to the projector or the second camera; 0 = no triangulation
-    steps_depth: float  # m, product of depth and disparity in quantization steps; 0 = constant steps of depth
+    baseline: float  # m, distance to the projector or the second camera; 0 = no triangulation
+    steps_depth: float  # m, depth times disparity, in quantization steps of disparity; 0 = constant steps of depth
 
 
 TRIANGULATION = {  # focal lengths: 580 px (Kinect v1, at 640 px width) and 424 px (D435, at 848 px width)
@@ -57,7 +57,7 @@ class DepthSensor:
     """Model of a depth sensor that adds the measurement errors to exact depth."""
 
     noise: float  # 0 = exact, 1 = as measured; scales standard deviations and probabilities
-    max_range: float  # m
+    max_range: float  # m, maximum depth of a reading
     kind: SensorKind = SensorKind.KINECT_V1
 
     def measure(
@@ -72,7 +72,7 @@ class DepthSensor:
 
         Args:
             depth: (H, W) m along z, exact depth, 0 = no surface.
-            incidence: (H, W) cosine of the angle of incidence.
+            incidence: (H, W) in [0, 1], cosine of the angle of incidence.
             camera: Camera of the depth image.
             rng: Random generator of the noise.
             unread: (H, W) fraction of the readings lost in patches on dark and shiny materials; None = no loss.

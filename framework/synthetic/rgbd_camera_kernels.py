@@ -24,14 +24,14 @@ SHARP = np.float32(0.5)  # px, minimum path length for blur
 def depth_step(z: np.float32, steps_depth: np.float32) -> np.float32:
     """Return the quantization step of depth, m, at depth z (m).
 
-    `steps_depth`: m, product of depth and disparity in quantization steps; 0 = constant steps of depth.
+    `steps_depth` (m) is depth times disparity, in quantization steps of disparity; 0 = constant steps of depth.
     """
     return np.float32(z * z / steps_depth) if steps_depth > 0 else np.float32(FLOOR)
 
 
 @njit(cache=True, nogil=True)
 def quantized(z: np.float32, steps_depth: np.float32) -> np.float32:
-    """Return depth z (m) rounded to a step of disparity, or to a step of depth if `steps_depth` is 0."""
+    """Return depth z (m), rounded to a quantization step of disparity, or of depth if `steps_depth` is 0; in m."""
     if steps_depth > 0:
         steps = np.rint(steps_depth / max(z, np.float32(0.1)))
         return np.float32(steps_depth / max(steps, np.float32(1)))
@@ -62,7 +62,7 @@ def read_depth(
         noise: Scale of the noise model, 1 = as measured.
         lateral_sigma: Standard deviation of the lateral error, px.
         disparity_scale: Product of disparity and depth, px m.
-        steps_depth: Product of depth and disparity in quantization steps, m; see `depth_step`.
+        steps_depth: Depth times disparity, in quantization steps of disparity, m; see `depth_step`.
         model: Model of the axial noise.
         max_range: Maximum depth of a reading, m.
         reading: (H, W) output.
@@ -108,8 +108,8 @@ def drop_patches(
 
     A reading is lost if a smooth random field is below the quantile of the fraction. The field interpolates the
     normally distributed numbers `field` (R, C), which are `cell` px apart. The interpolated value is divided by the
-    norm of the weights, so it is also normally distributed in each pixel. `normal` (N,) contains the quantiles from
-    `normal_quantiles`.
+    norm of the interpolation weights, so it is also normally distributed in each pixel. `normal` (N,) contains the
+    quantiles from `normal_quantiles`.
     """
     one, count = np.float32(1), np.float32(len(normal))
     for v in range(reading.shape[0]):
@@ -132,10 +132,10 @@ def drop_patches(
 
 @njit(cache=True, nogil=True)
 def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> np.float32:
-    """Return the depth, m, at the offset (dv, du) px if a depth edge lies in between, otherwise the pixel's own depth.
+    """Return the depth, m, at the offset (dv, du) px if a depth edge lies in between, otherwise the depth at (v, u).
 
-    The offset is rounded. Smooth surfaces have no lateral error, because the axial noise includes the entire measured
-    deviation.
+    The offset is rounded. Smooth surfaces have no lateral error, because the axial noise model already includes its
+    effect.
     """
     y = min(max(v + int(np.rint(dv)), 0), depth.shape[0] - 1)
     x = min(max(u + int(np.rint(du)), 0), depth.shape[1] - 1)
@@ -166,7 +166,7 @@ def add_noise(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, 
 
     Args:
         color: (N,) values of all channels.
-        random: (N,) random bits.
+        random: (N,) 16 random bits per value.
         normal: Quantiles from `normal_quantiles`.
         sigma: Standard deviation, gray levels from 0 to 255.
         noisy: (N,) output.

@@ -23,7 +23,7 @@ from framework.synthetic.paints import Material, Texture
 from framework.synthetic.surfaces import Surfaces, assemble
 
 HEIGHT = 2.55  # m, height of the ceiling
-WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear RGB of lamps and daylight
+WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear RGB colors of lamps and of daylight
 
 
 class RoomKind(StrEnum):
@@ -50,7 +50,7 @@ class Room:
     """A furnished room with lamps."""
 
     layout: Layout
-    objects: tuple[tuple[int, Furniture], ...]  # (instance id, object); 0 = shell
+    objects: tuple[tuple[int, Furniture], ...]  # pairs of instance id and object; id 0 = shell
     lamps: tuple[Lamp, ...]
     surfaces: Surfaces  # exact triangles of all objects
 
@@ -61,7 +61,7 @@ def furnish(kind: RoomKind, rng: Rng) -> Room:
 
 
 def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, strewn: Sequence[Furniture] = ()) -> Room:
-    """Return a room of at least `width` x `depth` m with `contents`, placed largest first.
+    """Return a room with sides of at least `width` and `depth` m and with `contents`, placed largest first.
 
     `strewn` objects are placed on the floor next to furniture if they fit.
     """

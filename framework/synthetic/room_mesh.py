@@ -11,7 +11,7 @@ from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.surfaces import Surfaces
 
-ON_SURFACE = 1.001  # maximum distance of a hit, relative to the vertex; above 1 to include the vertex's own surface
+ON_SURFACE = 1.001  # maximum distance of a hit, relative to the vertex; above 1 to include the surface at the vertex
 LONGEST_EDGE = 0.02  # m, maximum edge length of the mesh
 
 
@@ -20,7 +20,7 @@ class RoomMesh:
     """Triangle mesh with an instance id per vertex."""
 
     vertices: Float32  # (V, 3) m, world frame
-    triangles: Int32  # (F, 3), counter-clockwise as seen from outside
+    triangles: Int32  # (F, 3) vertex indices, counterclockwise as seen from outside
     instance_ids: Int32  # (V,), 0 = floor, wall or ceiling
 
     def only(self, kept: Bool) -> RoomMesh:
@@ -38,10 +38,17 @@ def visible_mesh(
     reach: tuple[float, float],
     longest_edge: float = LONGEST_EDGE,
 ) -> RoomMesh:
-    """Return the mesh of the surfaces visible from `poses` (T_world_camera), at depths within `reach` (near, far), m.
+    """Return the mesh of the surfaces that are visible from at least one pose. Its edges are at most `longest_edge` m.
 
-    `caster` contains the triangles of `surfaces`. Surfaces without depth readings, and surfaces behind them, are
-    invisible.
+    Surfaces without depth readings, and surfaces behind them, are invisible.
+
+    Args:
+        surfaces: Surfaces of the room.
+        caster: Ray caster of `surfaces`.
+        camera: Camera of all poses.
+        poses: (4, 4) T_world_camera of each view.
+        reach: Minimum and maximum depth of a visible surface, m.
+        longest_edge: Maximum edge length, m.
     """
     mesh = tessellate(surfaces, longest_edge)
     return mesh.only(seen_from(mesh.vertices, caster, camera, poses, reach, surfaces.unreadable))
@@ -106,7 +113,7 @@ def seen_from(
         caster: Ray caster of the surfaces.
         camera: Camera of all poses.
         poses: (4, 4) T_world_camera of each view.
-        reach: Minimum and maximum depth in m.
+        reach: Minimum and maximum depth of a visible vertex, m.
         unreadable: (F,) mask of the caster's triangles without depth readings. Vertices on or closely behind these
             triangles count as occluded.
     """
@@ -125,9 +132,9 @@ def seen_from(
 def _in_view(
     vertices: Float32, skip: Bool, camera: Camera, T_world_camera: Float64, reach: tuple[float, float]
 ) -> Int64:
-    """Return the indices (N,) of the vertices in view, occluded or not, except the vertices in the mask `skip` (V,).
+    """Return the indices (N,) of the vertices in view, occluded or not, without the vertices in the mask `skip` (V,).
 
-    `reach` contains the minimum and maximum depth, m.
+    `vertices` (V, 3) are in m in the world frame. `reach` contains the minimum and maximum depth, m.
     """
     index = np.flatnonzero(~skip)
     dx, dy, dz = vertices[index].T - T_world_camera[:3, 3:]

@@ -1,7 +1,7 @@
 """Parallel writing of the scenes in a benchmark folder; existing files are kept.
 
-A process works on a scene until the scene is complete, because furnishing and lighting a room takes seconds. If all
-scenes are started, a free process works on the scene of another process.
+A process writes one scene until the scene is complete, because furnishing and lighting a room takes seconds. When all
+scenes have been started, a free process helps to write a scene of another process.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Benchmar
     bar = tqdm(total=total, initial=total - missing, desc="rendering", unit=" frames", disable=None)
     with ExitStack() as stack:
         stack.enter_context(bar)
-        # Processes are spawned, because threads of numba and OpenCV do not survive a fork. Each process has its own
-        # pool, so that it can keep its scene in memory.
+        # Processes are spawned, because a forked process lacks the threads of numba and OpenCV. Each process has its
+        # own pool, so that its tasks share the scene in its memory.
         spawn = multiprocessing.get_context("spawn")
         pools = [stack.enter_context(ProcessPoolExecutor(1, spawn, _begin_process)) for _ in range(jobs)]
         running: dict[Future[int], ProcessPoolExecutor] = {}
@@ -84,7 +84,7 @@ def _begin(root: Path, recording: BenchmarkSettings) -> None:
             found = read_json(made_by)
         except DataError as error:
             raise DataError(
-                f"{made_by}: expected valid JSON, got a damaged file; delete the folder or set another folder"
+                f"{made_by}: expected valid JSON, got a damaged file; delete {root} or set another folder"
             ) from error
         if isinstance(found, dict) and "haste" in found:  # earlier name of camera_speed
             found["camera_speed"] = found.pop("haste")
@@ -104,7 +104,7 @@ def _begin(root: Path, recording: BenchmarkSettings) -> None:
 
 
 class _Scene:
-    """The missing files of one scene. The trajectory is written last: a scene with a trajectory is complete."""
+    """Tasks for the missing files of one scene. The trajectory, which marks a complete scene, is the last file."""
 
     def __init__(self, folder: Path, spec: SceneSpec, recording: BenchmarkSettings) -> None:
         self.folder, self.spec = folder, spec

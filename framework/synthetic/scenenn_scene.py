@@ -1,6 +1,6 @@
 """Scene of the synthetic benchmark as a recording in SceneNN's format.
 
-The world frame of SceneNN has y up and the room has z up, so all output is rotated by a quarter turn about x.
+In SceneNN's world frame, y is up. In the room frame, z is up. All output is therefore rotated by 90 degrees about x.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from framework.synthetic.room_mesh import visible_mesh
 from framework.synthetic.walk import FRAME_RATE
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
-GENERATION = 3  # version of the generated rooms; increment it after a change, so that no folder mixes versions
+GENERATION = 3  # version of the generated rooms; increment it with every change, so that no folder mixes versions
 ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrinsic/asus.ini
 NOISE, MAX_RANGE = 1.0, 6.0  # scale of the sensor noise, 1 = Kinect v1; maximum depth of the sensor, m
-EXPOSURE = 1 / 60  # s, exposure of color images, centered at the pose; typical for indoor light
+EXPOSURE = 1 / 60  # s, exposure time of color images, centered at the time of the pose; typical of indoor light
 TRUTH_VIEWS = 60  # maximum number of frames for the labeled mesh; views of neighboring frames are nearly equal
 MAX_CAMERA_SPEED = 5.0  # maximum camera speed relative to the recommended speed; about 2.2 m/s
-LARGEST_ID = 934338  # largest label in SceneNN; labels are unordered
+LARGEST_ID = 934338  # largest label in SceneNN; labels are not consecutive
 PNG = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB),
 )
-"""PNG options for noisy images: no search for repetitions, and a single filter. Encoding takes 10 ms, and files are at
-most 5% larger than with slow options."""
+"""PNG options for noisy images: no search for repetitions, and one filter for all rows. Encoding takes 10 ms. Files are
+at most 5% larger than with slow options."""
 
 T_YUP_ZUP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""Rotation from the axes of the room to the axes of SceneNN. It only swaps and negates, which avoids rounding."""
+"""Rotation from the room frame to SceneNN's world frame. It only swaps and negates coordinates, without rounding."""
 
 _COCO_TO_SCENENN = {coco: name for name, coco in SCENENN_TO_COCO.items()}
 _NYU_CLASSES = {
@@ -64,7 +64,7 @@ _NYU_CLASSES = {
     "table lamp": "lamp",
     "window": "window",
 }
-"""NYU class by kind of clutter. Other clutter has a text, but no nyu_class, as in SceneNN."""
+"""NYU class by kind of clutter. Other clutter has a `text`, but no `nyu_class`, as in SceneNN."""
 
 
 @dataclass(frozen=True)
@@ -122,13 +122,13 @@ class SceneNNScene:
         self.colors = scene.rng.integers(64, 256, (len(ids), 3))  # RGB by instance id
 
     def write_frames(self, frames: Sequence[int]) -> int:
-        """Write color and depth of `frames`; return the number of frames."""
+        """Write the color and depth images of `frames` (0 = first); return the number of frames."""
         for index in frames:
             self.write_frame(index)
         return len(frames)
 
     def write_frame(self, index: int) -> None:
-        """Write color and depth of the frame `index` (0 = first)."""
+        """Write the color and depth images of the frame `index` (0 = first)."""
         T_world_camera = self.path.pose(index)
         picture = self.renderer.render(self.camera, T_world_camera)
         rng = np.random.default_rng([*self._stream, index])

@@ -30,7 +30,7 @@ TRUTH_VIEWS = 60  # maximum number of frames for the ground-truth surface; views
 
 @dataclass
 class Synthetic(RGBDSequence):
-    """RGB-D sequence of a hand-held camera in a furnished room; `room.surfaces` is the exact geometry of the room.
+    """RGB-D sequence of a hand-held camera in a random furnished room. `room.surfaces` is the exact geometry.
 
     Frames are bit-identical for equal parameters, in any order and from any thread.
     """
@@ -38,19 +38,22 @@ class Synthetic(RGBDSequence):
     seed: int = 0  # seed of the scene and the camera path, >= 0; combined with the scene name
     scene: str = "room0"  # name of the scene; every name gives a different scene
     kind: RoomKind = RoomKind.STUDIO  # type of room; a studio contains all nine classes
-    frames: int = 240  # number of frames at 30 Hz
-    width: int = 640  # width of the images, px
-    height: int = 480  # height of the images, px
+    frames: int = 240  # number of frames, at 30 Hz, >= 1
+    width: int = 640  # width of the images, px, >= 16
+    height: int = 480  # height of the images, px, >= 16
     sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = KINECT_V1, or EXACT without noise
-    noise: float = 1.0  # scale of the sensor noise; 0 = none, 1 = as in the noise model
-    max_depth: float = 6.0  # maximum depth of the sensor, m
-    simulated_color_delay: float = 0.0  # simulated time from depth to color with equal timestamps, s, in [-0.2, 0.2]
-    color_delay: str = AUTO  # time from depth to color assumed by the pipeline, s, in [-0.2, 0.2]; AUTO = estimated
+    noise: float = 1.0  # scale of the sensor noise, >= 0; 0 = none, 1 = noise model of the sensor
+    max_depth: float = 6.0  # maximum depth of the sensor, m, > 0
+    # simulated delay of color relative to depth at equal timestamps, s, in [-0.2, 0.2]; positive = color captured later
+    simulated_color_delay: float = 0.0
+    # delay of color relative to depth assumed by the pipeline, s, in [-0.2, 0.2]; positive = color captured later; AUTO
+    # = estimated during the run, 0 until then
+    color_delay: str = AUTO
     start: int = 0  # index of the first frame
-    stop: int = TO_THE_END  # index after the last frame; -1 = end of the sequence
-    stride: int = 1  # step between frames; 1 = every frame
+    stop: int = TO_THE_END  # index of the first frame after the selection, >= 0; -1 = end of the sequence
+    stride: int = 1  # step between selected frames, in frames, >= 1; 1 = every frame
     frame_fraction: float = 1.0  # randomly selected fraction of the frames, in (0, 1]; 1 = all frames
-    ground_truth_spacing: float = 0.02  # spacing of the ground-truth surface points, m
+    ground_truth_spacing: float = 0.02  # spacing of the ground-truth surface points, m, in [0.001, 1]
     domain = RENDERED_ROOMS
 
     def __post_init__(self) -> None:
@@ -125,7 +128,8 @@ class Synthetic(RGBDSequence):
     def scene_truth(self) -> SceneTruth:
         """Return the labeled surface points within the range of the sensor.
 
-        They are fused from the exact depth of at most about TRUTH_VIEWS of the selected frames.
+        The points are fused from the exact depth of about TRUTH_VIEWS of the selected frames, or of all if there are
+        fewer.
         """
         every = max(1, -(-len(self._chosen) // TRUTH_VIEWS))
         chosen = sorted({*self._chosen[::every], self._chosen[-1]})

@@ -12,8 +12,8 @@ from framework.rendering.rasterizer_kernels import NO_TRIANGLE
 from framework.synthetic.paints import DARK, EMISSION, SHINY
 from framework.synthetic.texture_kernels import surface_color
 
-EDGE_STEP = 0.04  # minimum relative depth step at an edge
-WHITE = 2.2  # linear light of full white; lamps and windows may saturate
+EDGE_STEP = 0.04  # minimum depth step at an edge, relative to the depth
+WHITE = 2.2  # linear light that is mapped to sRGB white; lamps and windows may saturate
 GLANCED_OFF = np.float32(np.deg2rad(60.0))  # rad, angle of incidence from which a mirror loses all readings
 GRAZING = np.float32(0.05)  # lower limit of the cosine of the angle of incidence for the footprint of a pixel
 
@@ -24,7 +24,7 @@ class LitSurfaces(NamedTuple):
     texture: Float32  # (V, 3) m, texture coordinates
     irradiance: Float32  # (V, 3) linear RGB
     triangles: Int32  # (F, 3) vertex indices
-    normals: Float32  # (F, 3) unit vectors, toward either side
+    normals: Float32  # (F, 3) unit vectors that point to either side of a triangle
     materials: Int32  # (F,) rows of the table
     parts: Int32  # (F,) index of each triangle's part
     table: Float32  # (M, 14), see paints.material_table
@@ -44,9 +44,9 @@ class Viewpoint(NamedTuple):
 def gather_light(
     triangle: Int32, uv: Float32, triangles: Int32, materials: Int32, reflectance: Float32, irradiance: Float32
 ) -> Float32:
-    """Return the mean reflected light (V, 3), linear RGB, of the points visible from each vertex.
+    """Return the mean light (V, 3), linear RGB, that the points visible from each vertex reflect.
 
-    For cosine-distributed rays, this is the irradiance of the vertex.
+    For cosine-distributed directions, this is the irradiance of the vertex.
 
     Args:
         triangle: (V, D) triangle visible from each vertex in D directions, -1 = none.

@@ -1,10 +1,10 @@
 """Procedural textures, evaluated per pixel.
 
-They need no image files, have no seams, and have sufficient gradients for photometric alignment. Solid textures (wood,
-fabric, paint, metal) use all three texture coordinates. Planar textures (planks, tiles, rug, painting) use the first
-two. Detail below the size of a pixel is faded out to prevent flicker between frames.
+Procedural textures need no image files, have no seams, and have sufficient gradients for photometric alignment. Solid
+textures (wood, fabric, paint, metal) use all three texture coordinates. Planar textures (planks, tiles, rug, painting)
+use the first two. Detail below the size of a pixel is faded out to prevent flicker between frames.
 
-Lengths are in m unless stated otherwise. `footprint` is the size of a pixel on the surface. A *color mix* of 0 is the
+Lengths are in m unless stated otherwise. `footprint` is the width of a pixel on the surface. A *color mix* of 0 is the
 first color of the material, and a color mix of 1 is the second color. A *brightness factor* scales the mixed color.
 """
 

@@ -17,7 +17,7 @@ MAX_TURN = np.deg2rad(28.0)  # rad/s, maximum angular speed
 DISTANCE = 0.5  # m, minimum distance to furniture and walls
 RADII = np.arange(0.30, 1.06, 0.15)  # m, radii of candidate ellipses
 EYE_HEIGHT = (1.38, 1.58)  # m, range of the mean camera height
-PITCH = np.deg2rad(14.0)  # rad, mean downward pitch of the camera
+PITCH = np.deg2rad(14.0)  # rad, mean angle of the camera below the horizontal
 PHASES = 48  # number of positions on the ellipse for the visibility score
 
 
@@ -29,12 +29,12 @@ class CameraPath:
     radii: Float64  # (2,) m, along x and y
     height: float  # m, mean height
     start: float  # rad, phase of the first frame
-    turn: int  # 1 = counter-clockwise as seen from above, -1 = clockwise
+    turn: int  # 1 = counterclockwise as seen from above, -1 = clockwise
     sway: Float64  # (4,) rad, phases of the hand motion
     phase_speed: float = 1.0  # rad/s
 
     def pose(self, frame: float) -> Float64:
-        """Return T_world_camera (4, 4) of a frame at FRAME_RATE; fractional values are times between frames."""
+        """Return T_world_camera (4, 4) at the time `frame` / FRAME_RATE; fractional values are between two frames."""
         return self.pose_at(self.start + self.turn * self.phase_speed * frame / FRAME_RATE)
 
     def pose_at(self, phase: float) -> Float64:
@@ -76,9 +76,9 @@ def plan_path(
         layout: Layout of the room.
         frames: Number of frames of the path.
         labels: Function that renders the instance ids at a pose.
-        wanted: Ids of the wanted instances.
+        wanted: Ids of the instances that should be visible.
         rng: Random generator.
-        stride: Camera speed, relative to the recommended speed. MAX_SPEED and MAX_TURN limit the recommended speed.
+        stride: Camera speed, relative to the recommended speed, which is the highest within MAX_SPEED and MAX_TURN.
     """
     center, radii = _widest_ellipse(layout)
     turn = 1 if rng.uniform() < 0.5 else -1
@@ -117,7 +117,7 @@ def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
 
 
 def _allowed_phase_speed(path: CameraPath) -> float:
-    """Return the maximum phase speed (rad/s) within MAX_SPEED and MAX_TURN along the whole path."""
+    """Return the highest phase speed, rad/s, at which the whole path is within MAX_SPEED and MAX_TURN."""
     phase = np.linspace(0, 2 * np.pi, 721)
     step = phase[1]
     position, yaw, pitch, roll = path._state(phase)
@@ -128,9 +128,9 @@ def _allowed_phase_speed(path: CameraPath) -> float:
 
 
 def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[int]) -> float:
-    """Return the start phase, rad, from which the largest number of wanted instances is visible along `sweep` rad.
+    """Return the start phase, rad, from which most wanted instances are visible along `sweep` rad of the path.
 
-    If several start phases have the same number of instances, the number of visible pixels decides.
+    If several start phases have the same number of instances, the one with the most visible pixels is returned.
     """
     phases = 2 * np.pi * np.arange(PHASES) / PHASES
     ids = sorted(wanted)

@@ -160,7 +160,7 @@ class ComparisonTable:
 
     @cached_property
     def compared(self) -> list[tuple[RunRow, RunRow]]:
-        """Pairs of a row and its base."""
+        """Pairs of a row and its base, for every row with a base."""
         pairs = ((row, self.base_of(row)) for row in self.rows)
         return [(row, base) for row, base in pairs if base is not None]
 
@@ -211,12 +211,12 @@ class ComparisonTable:
     @property
     def published_rows(self) -> list[PublishedRow]:
         """Published rows with a number in the table."""
-        return [row for row in self.published.rows if row.knows(self._keys)]
+        return [row for row in self.published.rows if row.has_any(self._keys)]
 
     @property
     def published_unknown(self) -> list[PublishedRow]:
         """Published rows with numbers for this table that were not looked up."""
-        return [row for row in self.published.rows if not row.knows(self._keys) and row.leaves_open(self._keys)]
+        return [row for row in self.published.rows if not row.has_any(self._keys) and row.lacks_any(self._keys)]
 
     @property
     def _keys(self) -> list[Key]:
@@ -229,13 +229,13 @@ class ComparisonTable:
 
     @cached_property
     def sequences(self) -> list[str]:
-        """Values of the split key: those of the published table, then those of the runs."""
+        """Values of the split key: first the values in the published table, then the values in the runs."""
         found = {run[-1] for run in self._runs} if self.choice.split_key else set()
         order = sorted(found, key=lambda value: natural((value,)))
         return list(dict.fromkeys([*self.published.sequences, *order]))
 
     def called(self, row: RunRow, without: str = "") -> str:
-        """Return a row's name in the table; the value of the key `without` is omitted."""
+        """Return the name of a row in the table, without the part of its variant for the config key `without`."""
         named = self.choice.names.get(row.system, row.system)
         variant = [part for part in row.variant if not without or not part.startswith(f"{without}=")]
         return ", ".join([named, *variant] if named else variant) or row.name
@@ -287,7 +287,7 @@ class SequenceMean:
 
 
 def mean_by_sequence(values: Mapping[Run, float]) -> dict[str, Mean]:
-    """Return the mean of each sequence; the sequence is the last part of a run."""
+    """Return the mean of each sequence over the other keys. The sequence is the last entry of a Run."""
     return _grouped(values, lambda run: run[-1])
 
 

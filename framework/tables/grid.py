@@ -25,7 +25,7 @@ def decimals(values: Iterable[float]) -> int:
 
 
 def figure(value: float, spread: float, digits: int, signed: bool = False) -> str:
-    """Return the text `value ± spread`; a NaN spread is omitted."""
+    """Return the text `value ± spread` with `digits` decimals; a NaN spread is omitted."""
     text = f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # + 0.0 avoids -0.000
     return text if math.isnan(spread) else f"{text} ± {spread:.{digits}f}"
 
@@ -72,5 +72,5 @@ def _escaped(cell: str) -> str:
 
 def _latex_line(cells: Iterable[str]) -> str:
     line = " & ".join(cells) + " \\\\"
-    # Without {}, the command of the previous line would interpret the mark as its argument.
+    # Without {}, LaTeX would interpret the star or bracket as an argument of the row end or rule before it.
     return f"{{}}{line}" if line.startswith(("*", "[")) else line

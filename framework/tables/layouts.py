@@ -1,7 +1,7 @@
-"""Layouts of a comparison: a line per row, a column per sequence, or a group of lines per sequence.
+"""Layouts of a comparison: one line per row, one column per sequence, or one group of lines per sequence.
 
-In the layouts with sequences, rows with the same pose source are adjacent, and their best mean is bold unless several
-rows have it. Means over fewer runs than the others are not compared.
+In the layouts with sequences, rows with the same pose source are adjacent, and the best mean among them is bold unless
+several rows have it. Means over fewer runs than the others are not compared.
 """
 
 from __future__ import annotations
@@ -56,6 +56,8 @@ _Cell = tuple[str, float]  # text and compared value; NaN = not compared
 
 @dataclass(frozen=True)
 class _Line:
+    """A line of a table with sequences."""
+
     labels: list[str]
     cells: list[_Cell]
     peers: tuple[str, ...] = ()  # RunRow.peers; lines with the same value are compared
@@ -78,7 +80,10 @@ class _SequenceFigures:
         return {sequence for of_row in self.means.values() for sequence in of_row}
 
     def cell(self, row: RunRow, sequence: str) -> _Cell:
-        """Return the mean ± standard deviation over seeds, with the number of seeds if values are missing."""
+        """Return the mean ± standard deviation over the seeds of one sequence.
+
+        The number of seeds is appended if values are missing.
+        """
         if not any(run[-1] == sequence for run in row.records):
             return MISSING, math.nan
         mean = self.means[row.name].get(sequence, Mean.of(()))
@@ -88,7 +93,10 @@ class _SequenceFigures:
         return text, mean.value if mean.count == most else math.nan
 
     def mean_cell(self, row: RunRow, sequences: int) -> _Cell:
-        """Return the mean ± standard deviation over seeds, with the number of sequences or runs if some are missing."""
+        """Return the mean over sequences ± standard deviation over seeds.
+
+        The number of sequences or runs is appended if some of the expected `sequences` or of their runs are missing.
+        """
         mean = self._overall[row.name]
         others = [self._overall[other.name] for other in self._rows if other.peers == row.peers]
         competes = (mean.count, mean.runs) == max((other.count, other.runs) for other in others)
@@ -102,7 +110,7 @@ class _SequenceFigures:
 
 
 def across_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a table of each row's means over seeds: one column per sequence, and a column with their mean."""
+    """Return a table of the means of each row over seeds, with one column per sequence and a column with their mean."""
     [key] = comparison.choice.columns
     figures, sequences = _SequenceFigures(comparison, key), comparison.sequences
     sections = []
@@ -120,7 +128,7 @@ def across_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def by_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a table with a group of lines per sequence, and one line per row. The last group contains the means."""
+    """Return a table with one group of lines per sequence, and one line per row. The last group contains the means."""
     keys = comparison.choice.columns
     rows = [row for rows in _by_peers(comparison.rows) for row in rows]
     figures = [_SequenceFigures(comparison, key) for key in keys]
@@ -128,7 +136,7 @@ def by_grid(comparison: ComparisonTable) -> TextTable:
 
     sections: dict[str, list[_Line]] = {}
     for sequence in comparison.sequences:
-        known = [one for one in comparison.published_rows if one.knows((sequence, key) for key in keys)]
+        known = [one for one in comparison.published_rows if one.has_any((sequence, key) for key in keys)]
         sections[sequence] = [
             _row_line(comparison, row, [of_key.cell(row, sequence) for of_key in figures])
             for row in rows
@@ -243,7 +251,7 @@ def _difference(mean: Mean, digits: int) -> str:
 
 
 def _of(text: str, count: int, expected: int) -> str:
-    """Return the text, with the count appended if it differs from the expected count."""
+    """Return the text, with the count appended if it differs from the expected count; NOTHING if the count is 0."""
     if not count:
         return NOTHING
     return text if count == expected else f"{text} ({count} of {expected})"

@@ -29,14 +29,14 @@ class PublishedRow:
     remark: str  # conditions of the measurement
     poses: str  # source of the poses
     annotation: str  # release of the annotation
-    decimals: int  # number of known decimals of the values
+    decimals: int  # number of known decimals of the values, in the unit of metrics.json
     values: Mapping[Key, float | None] | None  # in the unit of metrics.json; None = not looked up
 
-    def knows(self, keys: Iterable[Key]) -> bool:
+    def has_any(self, keys: Iterable[Key]) -> bool:
         """Return True if the number for at least one of the keys is known."""
         return any((self.values or {}).get(key) is not None for key in keys)
 
-    def leaves_open(self, keys: Iterable[Key]) -> bool:
+    def lacks_any(self, keys: Iterable[Key]) -> bool:
         """Return True if the number for at least one of the keys was not looked up."""
         return self.values is None or any(key in self.values and self.values[key] is None for key in keys)
 

@@ -56,11 +56,13 @@ class TableChoice:
                 f"table.columns_by, table.group_by: expected at most one key, got {self.columns_by} and {self.group_by}"
             )
         if self.split_key in self.average_over:
-            raise ConfigError(f"table.average_over: expected keys other than table.{self.layout}, got {self.split_key}")
+            raise ConfigError(
+                f"table.average_over: expected keys other than the key of table.{self.layout}, got {self.split_key}"
+            )
         if self.columns_by and len(self.columns) > 1:
             raise ConfigError(
                 f"table.columns: expected one metric with table.columns_by, got {len(self.columns)}; set "
-                f"table.group_by={self.columns_by} for several metrics"
+                f"table.columns_by=null and table.group_by={self.columns_by} for several metrics"
             )
         for key in self.pair_by:
             if key not in self.averaged:
@@ -73,7 +75,7 @@ class TableChoice:
 
     @property
     def layout(self) -> str:
-        """`columns_by`, `group_by` or `rows`."""
+        """Layout of the table: `columns_by`, `group_by` or `rows`."""
         return "columns_by" if self.columns_by else "group_by" if self.group_by else "rows"
 
     @property
@@ -99,7 +101,7 @@ class TableChoice:
 
     @classmethod
     def of(cls, node: Any) -> TableChoice:
-        """Return the choice of a config's `table`. Raises ConfigError for unknown keys and wrong types."""
+        """Return the choice of a config block. Raises ConfigError for unknown keys and wrong types."""
         choice = cls(**checked_block(cls, "table", node))
         # a stored sweep may have keys of an older version
         return replace(choice, columns=[current_key(key) for key in choice.columns])

@@ -10,6 +10,7 @@ from typing import Any
 from framework.evaluation.instances import MAX_DISTANCE
 from framework.registry import STAGES
 from framework.runs.metrics import is_evaluation
+from framework.runs.plugin_code import CODE
 from framework.runs.run_rows import CONFIDENCE, DATA, Run, RunRow, dependent_keys
 from framework.runs.stored_runs import Record, is_number
 from framework.tables.comparison import ComparisonTable, as_text, mean_by_sequence
@@ -43,6 +44,7 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
     yield from _published(comparison)
     yield f"Data: {data(comparison.records)}."
     yield f"Code: {counted(record.code for record in comparison.records)}."
+    yield from _mixed_code(comparison)
     yield f"Machine: {counted(machine(record) for record in comparison.records)}."
     yield f"Config: config.yaml of each run; SHA-256 of all config hashes: {digest(comparison.records)}."
     yield from _missing(comparison)
@@ -60,8 +62,8 @@ def _averaging(comparison: ComparisonTable) -> Iterator[str]:
         yield f"Cells: {spread}. runs: number of complete runs."
         return
     yield (
-        f"Cells: {spread}. mean: average over {choice.split_key} with equal weights; its deviation is over the runs "
-        f"with all values of {choice.split_key}. {_bold(choice.columns)} missing: no complete run."
+        f"Cells: {spread}. mean: average over {choice.split_key} with equal weights; its standard deviation is over "
+        f"the runs with all values of {choice.split_key}. {_bold(choice.columns)} missing: no complete run."
     )
 
 
@@ -92,11 +94,11 @@ def _comparing(comparison: ComparisonTable) -> Iterator[str]:
             error += f" over {units}, after averaging the runs of each"
         yield (
             f"Differences are paired by {keys}: {error}. pairs: number of values of {units} in both rows. "
-            f"*: the {CONFIDENCE:.0%} interval of Student's t excludes 0."
+            f"*: the {CONFIDENCE:.0%} confidence interval (Student's t) excludes 0."
         )
         paired = {one.name for pair in comparison.compared for one in pair}
         if alone := [row.name for row in comparison.rows if row.name not in paired]:
-            yield f"Rows without a matching row of {comparison.base_called}: {'; '.join(alone)}."
+            yield f"Rows without a matching base row ({comparison.base_called}): {'; '.join(alone)}."
 
 
 def _identical(comparison: ComparisonTable) -> Iterator[str]:
@@ -192,6 +194,15 @@ def _missing(comparison: ComparisonTable) -> Iterator[str]:
         yield f"Incomplete: {one.directory.relative_to(comparison.root)}: {one.reason.rstrip('.')}."
 
 
+def _mixed_code(comparison: ComparisonTable) -> Iterator[str]:
+    """Yield a note for each row whose runs have different plugin code."""
+    for row in comparison.rows:
+        keys = sorted({key for record in row.records.values() for key in record.metrics if key.startswith(CODE)})
+        codes = {key: counted(str(record.metrics.get(key)) for record in row.records.values()) for key in keys}
+        if mixed := [f"{key.removeprefix(CODE)} {code}" for key, code in codes.items() if "(" in code]:
+            yield f"Mixed plugin code in {row.name}: {'; '.join(mixed)}; repeat its runs with skip_completed=true."
+
+
 def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
     """Return the runs as overrides: seed=0 dataset.scene=011,030; seed=1 dataset.scene=011."""
     last: dict[Run, list[str]] = {}
@@ -202,7 +213,7 @@ def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
 
 
 def _same(records: Sequence[Record]) -> str:
-    """Return the options that all runs have in common, by stage."""
+    """Return the config options that all runs have in common, as stage=option."""
     chosen = {stage: {record.choices.get(stage) for record in records} for stage in STAGES}
     agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}
     return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
@@ -234,7 +245,7 @@ def machine(record: Record) -> str:
 
 
 def counted(words: Iterable[str]) -> str:
-    """Return the distinct words, each with its number of runs if there are several words."""
+    """Return the distinct texts, each with its number of runs if there are several."""
     counts = Counter(words).most_common()
     if len(counts) == 1:
         return counts[0][0]
@@ -242,6 +253,6 @@ def counted(words: Iterable[str]) -> str:
 
 
 def digest(records: Sequence[Record]) -> str:
-    """Return one short hash of the configs of several runs, independent of their order."""
+    """Return 12 hexadecimal digits of the hash of the configs of several runs, independent of their order."""
     hashes = sorted(str(record.metrics["config_hash"]) for record in records)
     return hashlib.sha256("".join(hashes).encode()).hexdigest()[:12]

@@ -35,10 +35,13 @@ from framework.testing.corner_room import (
 
 
 class OptionContract:
-    """Tests of an option. They build the plugin as in a run. Use this class as the first base class of a test class."""
+    """Tests of a config option, which build the plugin as in a run.
 
-    stage: str  # set by the contract of the stage
-    option: str
+    Use this class as the first base class of a test class, followed by the contract of the stage.
+    """
+
+    stage: str  # config group; set by the contract of the stage
+    option: str  # name of the tested option in the config group of the stage
     overrides: tuple[str, ...] = ()  # values that the user must set: ("detector.weights=FILE",)
 
     def plugin(self) -> Any:
@@ -56,7 +59,7 @@ class OptionContract:
         named = {parameter.name for parameter in listed.parameters}
         assert named == set(map(str, self.node())) - {"_target_"}, "the YAML file must list every parameter"
         bare = [parameter.name for parameter in listed.parameters if not parameter.comment]
-        assert not bare, f"the YAML file must have comments for {bare}"
+        assert not bare, f"the YAML file must have a comment for each of {bare}"
 
     def test_option_values_are_class_defaults(self) -> None:
         node = self.node()
@@ -141,7 +144,7 @@ class DetectorContract:
 
 
 def assert_valid(found: Detections, detector: Detector, frame: Frame) -> None:
-    """Check that detections fulfill the detector contract."""
+    """Raise AssertionError unless the detections of a frame fulfill the detector contract."""
     assert found.classes == detector.classes
     assert found.masks.shape == (len(found), *frame.camera.shape)
     assert found.class_probabilities.shape == (len(found), len(detector.classes))
@@ -160,7 +163,7 @@ def assert_valid(found: Detections, detector: Detector, frame: Frame) -> None:
 
 
 class TrackerContract:
-    """Tests of a tracker. The map is immutable, so that changes of the map raise an error."""
+    """Tests of a tracker with an immutable map, so that changes of the map raise an error."""
 
     stage = "tracker"
 
@@ -259,7 +262,7 @@ class RefinerContract:
 
 
 def readings(frame: Frame) -> Float64:
-    """Return the points (H, W, 3), m, of the pixels in the world frame; NaN where depth is missing."""
+    """Return the point (H, W, 3), m, world frame, of each pixel of a frame; NaN where depth is missing."""
     whole = replace(spheres_in(frame), masks=np.ones((2, *CAMERA.shape), np.bool_))
     lifted = lift(whole, frame, Pose(pose_at(frame.index)))
     points = np.full((*CAMERA.shape, 3), np.nan)
@@ -305,7 +308,7 @@ class FuserContract:
         mesh, instances = scene.mesh(), scene.instances()
         assert scene.instance_ids() == set(instances)
         assert mesh.triangles.max(initial=-1) < len(mesh.vertices)
-        assert instances, "expected instances of two spheres, fully visible in five frames"
+        assert instances, "expected instances of two spheres, which are fully visible in five frames, got none"
         for key, instance in instances.items():
             assert key == instance.id > 0
             assert (mesh.instance_ids[instance.vertices] == key).all()
@@ -396,7 +399,7 @@ class FuserContract:
 
 
 def fused(fuser: MapFuser, frames: int = 5) -> MapFuser:
-    """Fuse `frames` frames of the room, and return the fuser."""
+    """Fuse the first `frames` frames of the corner room with exact clusters and poses, and return the fuser."""
     for k in range(frames):
         frame = frame_at(k)
         fuser.fuse(frame, Pose(pose_at(k)), exact_clusters(frame))
@@ -404,7 +407,7 @@ def fused(fuser: MapFuser, frames: int = 5) -> MapFuser:
 
 
 def nothing_in(frame: Frame, pose: Pose) -> PointClusters:
-    """Return empty point clusters of a frame."""
+    """Return the point clusters of a frame without detections."""
     return lift(Detections.none(CAMERA.shape, CLASSES), frame, pose)
 
 
@@ -415,7 +418,7 @@ def same(a: Any, b: Any) -> bool:
 
 
 def assert_data_error(call: Callable[[], object], words: str) -> None:
-    """Check that the call raises a one-line DataError that contains `words`."""
+    """Raise AssertionError unless `call` raises a one-line DataError that contains `words`."""
     try:
         call()
     except DataError as error:

@@ -42,7 +42,10 @@ SPHERES = (((-0.5, 0.7, 2.2), 0.35), ((0.5, 0.6, 2.5), 0.45))  # centers and rad
 
 
 def look(camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float64, UInt8, Int32]:
-    """Return exact depth (H, W), m, world-frame normals (H, W, 3), color (H, W, 3) and instance ids (H, W)."""
+    """Return exact depth (H, W), m, world-frame normals (H, W, 3), color (H, W, 3) and instance ids (H, W).
+
+    Depth is 0 and color is black where no surface is visible; instance 0 = no instance.
+    """
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
     d = rays @ T_world_camera[:3, :3].T
@@ -70,12 +73,12 @@ def look(camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float64, UIn
 
 
 def pose_at(k: int) -> Float64:
-    """Return T_world_camera of frame k, about 1 cm and 0.3 degrees from the previous frame."""
+    """Return T_world_camera (4, 4) of frame k, about 1 cm and 0.3 degrees from the pose of the previous frame."""
     return exp_se3(np.array([0.010, -0.003, 0.006, 0.002, -0.005, 0.001]) * k)
 
 
 def frame_at(k: int, truth: bool = True) -> Frame:
-    """Return frame k of a moving camera, with or without its ground-truth pose and instances."""
+    """Return frame k of a moving camera; `truth`: with the ground-truth pose and instances."""
     depth, _, color, ids = look(CAMERA, pose_at(k))
     if not truth:
         return Frame(k, k / RATE, color, depth, CAMERA)
@@ -100,7 +103,7 @@ def exact_clusters(frame: Frame) -> PointClusters:
 
 
 def bleeding_clusters(frame: Frame) -> PointClusters:
-    """Return the clusters of both spheres, lifted with masks that extend onto the wall."""
+    """Return the clusters of both spheres, lifted with masks that extend 3 px onto the wall and with the exact pose."""
     exact = spheres_in(frame)
     masks = exact.masks | np.roll(exact.masks, 3, axis=2)
     return lift(replace(exact, masks=masks), frame, Pose(pose_at(frame.index)))
@@ -108,7 +111,7 @@ def bleeding_clusters(frame: Frame) -> PointClusters:
 
 @dataclass(frozen=True)
 class RoomMap(SceneMap):
-    """Read-only map of the room with exact views."""
+    """Read-only map of the room with exact views, and without a mesh and instances."""
 
     classes: tuple[str, ...] = CLASSES
 

@@ -33,7 +33,7 @@ STAGE_MS = {  # stage times of a frame, ms
 
 @dataclass(frozen=True)
 class WatchedMap(RoomMap):
-    """A map of one chair (a triangle). It records reads outside of viewer calls."""
+    """A map of one chair (a triangle) that records reads outside of viewer calls."""
 
     within_a_call: threading.Event = field(default_factory=threading.Event)
     reads_outside: list[str] = field(default_factory=list)
@@ -118,7 +118,10 @@ class ViewerContract:
 
 
 def frame_with_found(k: int) -> tuple[Frame, Detections]:
-    """Return frame k and its detections. One frame has no detections; one frame is black and has no depth."""
+    """Return frame k and its detections.
+
+    Frame NOTHING_FOUND has no detections. Frame BLIND is black and has no depth.
+    """
     frame = frame_at(k)
     found = spheres_in(frame)
     if k == NOTHING_FOUND:
@@ -130,7 +133,7 @@ def frame_with_found(k: int) -> tuple[Frame, Detections]:
 
 
 def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detections]], directory: Path) -> None:
-    """Show the frames as a run does. One frame is lost, and one frame is skipped."""
+    """Show the frames, with their detections, as a run does. Frame LOST is lost, and frame SKIPPED is skipped."""
     with scene.call():
         viewer.begin(scene, "a room", directory)
     for k, (frame, found) in enumerate(frames):
@@ -149,5 +152,5 @@ def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detect
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """Return the logged warnings, including failures in the thread of a viewer."""
+    """Return the messages of all log records of at least WARNING level, including those from threads of viewers."""
     return [record.message for record in caplog.records if record.levelno >= logging.WARNING]

@@ -50,9 +50,9 @@ class AbsolutePoseEstimator:
     ) -> AbsolutePose | None:
         """Return the pose of `camera` from M matches of `points_world` (M, 3), m, with `pixels` (M, 2).
 
-        `depth` (M,), m, contains the readings at these pixels, 0 = no reading. Returns None if there are too few
-        inliers. An inlier has finite coordinates, is in front of the camera, reprojects within `max_error` and agrees
-        with its depth reading.
+        `pixels` are u, v in px, with pixel centers at integers. `depth` (M,), m, contains the readings at these pixels,
+        0 = no reading. Returns None if there are too few inliers. An inlier has finite coordinates, is in front of the
+        camera, reprojects within `max_error` and agrees with its depth reading.
         """
         import pycolmap
 
@@ -96,7 +96,10 @@ class AbsolutePoseEstimator:
         T_camera_world: Float64,
         max_error: float,
     ) -> Bool:
-        """Return a mask (M,), True for matches that agree with the pose and have finite coordinates."""
+        """Return an array (M,), True for matches that reproject within `max_error`, px, and agree with their depth.
+
+        Non-finite matches are False.
+        """
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             x, y, z = transform(T_camera_world, points_world.astype(np.float64)).T
             u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy

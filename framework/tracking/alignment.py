@@ -2,12 +2,14 @@
 
     E(xi) = sum_i w_i (n_i . (T p_i - q_i))^2 + lambda sum_i v_i (I(pi(T p_i)) - I_frame,i)^2
 
-T = T_view_camera moves the frame's points p_i into the view. The view gives each point its model point q_i with normal
-n_i, and its model intensity. w_i and v_i are Tukey's biweights. Residuals are divided by their expected noise, so that
-both terms are in standard deviations. Beyond `FAR` the standard deviation of a depth is its noise times depth / FAR.
-Errors of structured-light cameras at this range cover whole image regions and do not average out. `RANGE` is the
-maximum depth of these cameras. Beyond it, standard deviations and gates are proportional to depth, so that the
-balance of the two terms does not depend on depth. Gauss-Newton steps are twists in the view's frame: T <- exp(xi) T.
+T = T_view_camera moves the frame's points p_i into the view. p_i is compared with the model point q_i, its normal n_i
+and the model intensity at the pixel pi(T p_i) of the view, where pi is the projection. w_i and v_i are Tukey's
+biweights, lambda is `color_weight`, and I and I_frame are intensities in [0, 1]. Residuals are divided by their
+expected noise, so that both terms are in standard deviations. Beyond `FAR` the standard deviation of a depth is its
+noise times depth / FAR. Errors of structured-light cameras at this range cover whole image regions and do not average
+out. `RANGE` is the maximum depth of these cameras. Beyond it, standard deviations and gates are proportional to depth,
+so that the balance of the two terms does not depend on depth. A Gauss-Newton step is a twist xi in the view's frame,
+which changes T to exp(xi) T.
 
 `LinearWeights` replaces Tukey's weights by the weights in VoxelHashing's published code, for residuals in m and in
 [0, 1]. With the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:
@@ -60,8 +62,8 @@ class ModelView(NamedTuple):
     """A view of the map, to which frames are aligned."""
 
     depth: Float32  # (H, W) m, 0 = nothing mapped
-    normals: Float32  # (3, H, W) in the view's camera frame
-    fx: np.float32
+    normals: Float32  # (3, H, W) unit normals in the view's camera frame; 0 = nothing mapped
+    fx: np.float32  # px, as cx, cy and fy
     fy: np.float32
     cx: np.float32
     cy: np.float32
@@ -72,8 +74,8 @@ class FrameView(NamedTuple):
 
     depth: Float32  # (H, W) m, 0 = no reading
     intensity: Float32  # (H, W) in [0, 1]
-    normals: Float32  # (3, H, W) in the camera frame
-    fx: np.float32
+    normals: Float32  # (3, H, W) unit normals in the camera frame; 0 = unknown
+    fx: np.float32  # px, as cx, cy and fy
     fy: np.float32
     cx: np.float32
     cy: np.float32
@@ -115,21 +117,22 @@ class LinearWeights(NamedTuple):
     """Limits of VoxelHashing's weights, which replace Tukey's weights."""
 
     max_depth: np.float32  # maximum depth z_max, m
-    max_intensity_difference: np.float32  # intensity difference with weight 0; intensities are in [0, 1]
+    # intensity difference at which the weight reaches 0; intensities are in [0, 1]
+    max_intensity_difference: np.float32
 
 
 class NormalEquations(NamedTuple):
-    """The linearized problem and its point counts."""
+    """The normal equations A xi = -b for the twist xi (m, rad) of a Gauss-Newton step, and counts of points."""
 
-    A: Float64  # (6, 6)
-    b: Float64  # (6,)
+    A: Float64  # (6, 6) J^T W J of the weighted residuals
+    b: Float64  # (6,) J^T W r
     visible: int  # number of points on a mapped part of the view
     matched: int  # number of visible points with a nonzero weight
     close: int  # number of visible points at a depth that agrees with the model
     behind: int  # number of visible points clearly behind the model, which should occlude them
     A_color: Float64  # (6, 6) part of A from the photometric term; 0 for LinearWeights
-    energy: float  # sum of w r^2 of the geometric term
-    color_energy: float  # sum of v r^2 of the photometric term
+    energy: float  # sum of w r^2 over the residuals r of the geometric term
+    color_energy: float  # sum of v r^2 over the residuals r of the photometric term
     matched_colors: int  # number of visible points with a nonzero photometric weight
     brightness: float  # mean of frame minus model intensity; nonzero after a change of exposure
 
@@ -140,8 +143,9 @@ def linearize(
 ) -> NormalEquations:  # fmt: skip
     """Return the normal equations of E at T_view_camera for one pyramid level of the frame.
 
-    `model_intensity` (h, w) is the view's intensity at that level's resolution, negative where nothing is mapped.
-    `brightness` is the difference of frame and model intensity to compensate. `linear` = None selects Tukey's weights.
+    `model_intensity` (h, w) in [0, 1] is the view's intensity at the resolution of this level, negative where nothing
+    is mapped. `brightness` is the mean of frame minus model intensity, which is compensated. `linear`: the limits of
+    linear weights; None = Tukey's weights.
     """
     sums = np.empty((CHUNKS, TERMS))
     scale = 1 << round(math.log2(model.depth.shape[1] / model_intensity.shape[1]))  # halving drops odd columns

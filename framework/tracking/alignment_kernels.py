@@ -14,7 +14,7 @@ LANES = 16  # number of lanes of a sum; point n of a batch is added to lane n % 
 ROW = 5  # number of sums per derivative of the error: products with itself, the next three and the error
 ENERGY = 6 * ROW  # index of the weighted squared error among the sums of one term of the energy
 COLOR = ENERGY + 1  # index of the first sum of the photometric term, after those of the geometric term
-BRIGHTNESS = 2 * COLOR  # index of the change of brightness
+BRIGHTNESS = 2 * COLOR  # index of the sum of frame minus model intensity
 SUMS = BRIGHTNESS + 1  # number of sums over points, each of LANES lanes
 TERMS = SUMS + 6  # number of values of a chunk: its sums, then its six counts
 # offsets of a batch's point fields: in the frame, in the view, and in the model ...
@@ -24,10 +24,7 @@ DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00,
 POINT_FIELDS = 21
 # ... and of its residual terms
 J0, J1, J2, J3, J4, J5, W, ERROR, DARKER, ADDED = (field * BATCH for field in range(10))
-ADDED_COLOR = ADDED + COLOR * LANES  # after the fields, the sums of the latest batches by lane, of both terms ...
-ADDED_BRIGHTNESS = ADDED_COLOR + COLOR * LANES  # ... and of the brightness
-TERM_SIZE = ADDED_BRIGHTNESS + LANES
-PRECISE = 8  # number of batches with sums in single precision
+TERM_SIZE = ADDED + COLOR * LANES  # after the fields, the batch's sums of one term by lane
 FAR = 2.0  # depth above which depth errors are correlated, m
 RANGE = 5.0  # largest depth of structured-light cameras, m; errors and gates are proportional to depth beyond it
 NEAREST = 0.05  # minimum depth of projected points in the view, m
@@ -36,9 +33,9 @@ NEAREST = 0.05  # minimum depth of projected points in the view, m
 # Not cv2.blur: other threads that use OpenCV change the split of its running sums, and thus the rounding.
 @njit(cache=True, nogil=True, parallel=True)
 def smooth_normals(normals, reach, row_sums, smooth):
-    """Set smooth (3, H, W) to the normalized means of normals (3, H, W) over squares of side 2 reach + 1 px.
+    """Set `smooth` (3, H, W) to the normalized means of `normals` (3, H, W) over squares of side 2 `reach` + 1 px.
 
-    The result is 0 where all normals of a square are 0.
+    The result is 0 where all normals of a square are 0. `row_sums` (3, H, W) is a buffer.
     """
     _, height, width = normals.shape
     for v in prange(height):
@@ -62,7 +59,7 @@ def smooth_normals(normals, reach, row_sums, smooth):
 
 @njit(cache=True, nogil=True, parallel=True)
 def turn_normals(normals_world, R, normals):
-    """Set normals (3, H, W) to the normals_world (H, W, 3) rotated by R (3, 3)."""
+    """Set `normals` (3, H, W) to `normals_world` (H, W, 3) rotated by `R` (3, 3)."""
     for v in prange(normals.shape[1]):
         for u in range(normals.shape[2]):
             x, y, z = normals_world[v, u, 0], normals_world[v, u, 1], normals_world[v, u, 2]
@@ -72,7 +69,7 @@ def turn_normals(normals_world, R, normals):
 
 @device
 def _tukey(r, scale):
-    """Return Tukey's biweight of a residual in standard deviations."""
+    """Return Tukey's biweight of the residual `r`, which is 0 beyond `scale`; both in standard deviations."""
     s = r / scale
     s = max(np.float32(1.0) - s * s, np.float32(0.0))
     return s * s
@@ -80,7 +77,10 @@ def _tukey(r, scale):
 
 @device
 def _load(frame, v, u0, points):
-    """Copy the batch of pixels that starts at (u0, v) to `points`; depth is 0 past the end of the row."""
+    """Copy depth, intensity and normals of BATCH pixels of row `v`, starting at column `u0`, to `points`.
+
+    Past the end of the row, depth is 0.
+    """
     depth, intensity, normals = frame.depth, frame.intensity, frame.normals
     for n in range(BATCH):
         u = u0 + n
@@ -93,7 +93,11 @@ def _load(frame, v, u0, points):
 
 @device
 def _project(frame, v, u0, model, shape, R, t, points, pixel):
-    """Set a batch's points in the view (m and px) and their flat pixel indices (BATCH,), -1 = outside."""
+    """Project the points of a batch into the view, whose image has the `shape` (height, width).
+
+    Set the points PX, PY, PZ, m, and their image positions U, V, px from the image corner. Set `pixel` (BATCH,) to
+    their flat pixel indices, -1 = outside. `R` and `t`: T_view_camera.
+    """
     fx, fy, cx, cy = frame.fx, frame.fy, frame.cx, frame.cy
     one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
     width = np.int32(shape[1])
@@ -119,7 +123,10 @@ def _project(frame, v, u0, model, shape, R, t, points, pixel):
 
 @device
 def _gather_model(depth, normals, size, pixel, points):
-    """Fetch the model's depth and normal at each point's pixel; depth 0 = no surface."""
+    """Set QZ and MX, MY, MZ to the model's depth, m, and normal at the pixel of each point; depth 0 = no surface.
+
+    `size`: number of pixels of the view.
+    """
     for n in range(BATCH):
         i = pixel[n]
         if i >= 0:
@@ -133,10 +140,10 @@ def _gather_model(depth, normals, size, pixel, points):
 
 @device
 def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
-    """Set the term of point n in J: weight, error, and derivative with respect to a twist of the view's frame.
+    """Set the term of point `n` in `J`: weight, error, and derivative with respect to a twist of the view's frame.
 
-    (gx, gy, gz) is the derivative of the error with respect to the point (px, py, pz). Values of points with
-    weight 0 may be NaN.
+    (gx, gy, gz) is the derivative of the error with respect to the point (px, py, pz). Values of points with weight 0
+    may be NaN.
     """
     zero = np.float32(0.0)
     weighted = weight > zero
@@ -152,10 +159,10 @@ def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
 
 @device
 def _add_geometry(model, R, weights, linear, noise_model, points, J):
-    """Set the point-to-plane terms of a batch in J; return the counts (visible, matched, close, behind).
+    """Set the point-to-plane terms of a batch in `J`; return the counts (visible, matched, close, behind).
 
-    points[NEAR] is set to 1 if a point is within max_distance of its model point, otherwise to 0. With linear weights,
-    the normals must also match.
+    The counts are those of `NormalEquations`. points[NEAR] is set to 1 if a point is within max_distance of its model
+    point, otherwise to 0. With linear weights, the normals must also match.
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     inv_fx, inv_fy = one / model.fx, one / model.fy
@@ -213,7 +220,11 @@ def _add_geometry(model, R, weights, linear, noise_model, points, J):
 
 @device
 def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
-    """Fetch the model's four intensities around each point and the bilinear weights; -1 = nothing mapped."""
+    """Set I00, I10, I01, I11 to the model intensities around each point, and A, B to its bilinear weights.
+
+    I00 is -1 for points outside of the image or with NEAR = 0. `inverse_scale`: width of the intensity image divided by
+    the width of the view.
+    """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     width = np.int32(shape[1])
     right, bottom = np.float32(shape[1] - 2), np.float32(shape[0] - 2)
@@ -235,7 +246,11 @@ def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
 
 @device
 def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J):
-    """Set the photometric terms (model minus frame intensity) of a batch in J; return counts (matched, compared)."""
+    """Set the photometric terms of a batch in `J`; return the counts (matched, compared).
+
+    The error is model minus frame intensity plus `brightness`. `compared` is the number of points with a model
+    intensity, and `matched` is the number of these with a nonzero weight.
+    """
     one, zero = np.float32(1.0), np.float32(0.0)
     noise, scale = weights.intensity_noise, weights.photometric_scale
     strength = weights.color_weight / (noise * noise)
@@ -267,12 +282,15 @@ def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J
 
 
 @device
-def _multiply(J, a, b, c, d, added):
-    """Add a batch's weighted products of the derivative at offset `a` with a, b, c, d and the error from `added` on."""
+def _multiply(J, a, b, c, d, row):
+    """Set the five sums of `row` in `J`, each of LANES lanes, to weighted products summed over a batch.
+
+    They are the products of the field at offset `a` with the fields at `a`, `b`, `c` and `d` and with the error.
+    """
+    zero = np.float32(0.0)
+    added = ADDED + row * ROW * LANES
     for lane in range(LANES):
-        product0, product1 = J[added + lane], J[added + LANES + lane]
-        product2, product3 = J[added + 2 * LANES + lane], J[added + 3 * LANES + lane]
-        product_error = J[added + 4 * LANES + lane]
+        product0 = product1 = product2 = product3 = product_error = zero
         for step in range(BATCH // LANES):  # the compiler unrolls this loop and vectorizes the loop over lanes
             n = step * LANES + lane
             weighted = J[W + n] * J[a + n]
@@ -289,60 +307,46 @@ def _multiply(J, a, b, c, d, added):
 
 
 @device
-def _add_products(J, added):
-    """Add a batch's sums of one term to J from `added` on.
+def _add_products(J, lanes, first):
+    """Add the sums of one term over a batch to `lanes` from index `first` on, in double precision.
 
     The sums are w J^T J (upper triangle and three more elements), w J^T r and w r^2.
     """
-    _multiply(J, J0, J1, J2, J3, added)
-    _multiply(J, J1, J2, J3, J4, added + ROW * LANES)
-    _multiply(J, J2, J3, J4, J5, added + 2 * ROW * LANES)
-    _multiply(J, J3, J4, J5, J0, added + 3 * ROW * LANES)
-    _multiply(J, J4, J5, J0, J1, added + 4 * ROW * LANES)
-    _multiply(J, J5, J0, J1, J2, added + 5 * ROW * LANES)
+    _multiply(J, J0, J1, J2, J3, 0)
+    _multiply(J, J1, J2, J3, J4, 1)
+    _multiply(J, J2, J3, J4, J5, 2)
+    _multiply(J, J3, J4, J5, J0, 3)
+    _multiply(J, J4, J5, J0, J1, 4)
+    _multiply(J, J5, J0, J1, J2, 5)
     for lane in range(LANES):
-        energy = J[added + ENERGY * LANES + lane]
+        energy = np.float32(0.0)
         for step in range(BATCH // LANES):
             n = step * LANES + lane
             energy += J[W + n] * J[ERROR + n] * J[ERROR + n]
-        J[added + ENERGY * LANES + lane] = energy
+        J[ADDED + ENERGY * LANES + lane] = energy
+    for n in range(COLOR * LANES):
+        lanes[first + n] += np.float64(J[ADDED + n])
 
 
 @device
-def _add_brightness(J):
-    """Add a batch's sum of brightness changes to J."""
+def _add_brightness(J, lanes):
+    """Add the sum of frame minus model intensity over a batch to `lanes`, in double precision."""
     for lane in range(LANES):
-        change = J[ADDED_BRIGHTNESS + lane]
+        change = np.float32(0.0)
         for step in range(BATCH // LANES):
             n = step * LANES + lane
             change += J[DARKER + n]
-        J[ADDED_BRIGHTNESS + lane] = change
-
-
-@device
-def _add_batches(J, lanes, color):
-    """Add the sums of the latest batches to the lanes in double precision, and set them to 0.
-
-    `color` is the first lane of the photometric term.
-    """
-    for n in range(COLOR * LANES):
-        lanes[n] += np.float64(J[ADDED + n])
-        J[ADDED + n] = np.float32(0.0)
-    for n in range(COLOR * LANES):
-        lanes[color + n] += np.float64(J[ADDED_COLOR + n])
-        J[ADDED_COLOR + n] = np.float32(0.0)
-    for lane in range(LANES):
-        lanes[BRIGHTNESS * LANES + lane] += np.float64(J[ADDED_BRIGHTNESS + lane])
-        J[ADDED_BRIGHTNESS + lane] = np.float32(0.0)
+        lanes[BRIGHTNESS * LANES + lane] += np.float64(change)
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, linear, noise_model, brightness, sums):
-    """Sum the normal equations over a FrameView by chunks of rows into sums (CHUNKS, TERMS).
+    """Set `sums` (CHUNKS, TERMS) to the sums of the normal equations over each chunk of rows of a FrameView.
 
-    `R` (3, 3) and `t` (3,), m, are the rotation and the translation of T_view_camera. `inverse_scale` is the width of
-    model_intensity divided by the width of the view. `linear` is a LinearWeights, or None for Tukey's weights.
-    `noise_model` is the DepthNoise of the frame's sensor.
+    `model` is a ModelView, and `model_intensity` (h, w) is its intensity at the resolution of the frame. `R` (3, 3) and
+    `t` (3,), m, are the rotation and the translation of T_view_camera. `inverse_scale` is the width of model_intensity
+    divided by the width of the view. `linear` is a LinearWeights, or None for Tukey's weights. `noise_model` is the
+    DepthNoise of the frame's sensor.
     """
     height, width = frame.depth.shape
     shape, level_shape = model.depth.shape, model_intensity.shape
@@ -354,16 +358,15 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, line
         total = np.zeros(TERMS, np.float64)
         lanes = np.zeros(SUMS * LANES, np.float64)
         points = np.zeros(POINT_FIELDS * BATCH, np.float32)
-        J = np.zeros(TERM_SIZE, np.float32)
+        J = np.empty(TERM_SIZE, np.float32)
         pixel = np.empty(BATCH, np.int32)
-        batches = 0
         for v in range(chunk * height // CHUNKS, (chunk + 1) * height // CHUNKS):
             for u0 in range(0, width, BATCH):
                 _load(frame, v, u0, points)
                 _project(frame, v, u0, model, shape, R, t, points, pixel)
                 _gather_model(flat_depth, flat_normals, size, pixel, points)
                 visible, matched, close, behind = _add_geometry(model, R, weights, linear, noise_model, points, J)
-                _add_products(J, ADDED)
+                _add_products(J, lanes, 0)
                 total[SUMS] += visible
                 total[SUMS + 1] += matched
                 total[SUMS + 2] += close
@@ -371,14 +374,10 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, line
                 if weights.color_weight > np.float32(0.0):
                     _gather_intensities(flat_intensity, level_shape, inverse_scale, points, pixel)
                     matched, compared = _add_photometry(model, inverse_scale, weights, linear, brightness, points, J)
-                    _add_products(J, ADDED_COLOR)
-                    _add_brightness(J)
+                    _add_products(J, lanes, color)
+                    _add_brightness(J, lanes)
                     total[SUMS + 4] += matched
                     total[SUMS + 5] += compared
-                batches += 1
-                if batches % PRECISE == 0:
-                    _add_batches(J, lanes, color)
-        _add_batches(J, lanes, color)
         for i in range(SUMS):
             for lane in range(LANES):
                 total[i] += lanes[i * LANES + lane]

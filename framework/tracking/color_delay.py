@@ -50,7 +50,7 @@ UNKNOWN = DelayEstimate(0.0, np.inf, 0)
 
 
 def is_usable(estimate: DelayEstimate) -> bool:
-    """Return True if the estimate is accurate enough to register color with it."""
+    """Return True if the estimated delay is accurate enough to register color with it."""
     return estimate.deviation <= max(MAX_DEVIATION, MAX_RELATIVE_DEVIATION * abs(estimate.seconds))
 
 
@@ -60,7 +60,7 @@ class _Tracked(NamedTuple):
 
 
 class DelayEstimator:
-    """Online estimator of the delay of color relative to depth."""
+    """Online estimator of the delay of color behind depth with equal timestamps, s; positive = color captured later."""
 
     def __init__(self) -> None:
         self.estimate = UNKNOWN
@@ -89,7 +89,7 @@ class DelayEstimator:
         self._recent.clear()
 
     def _compare(self) -> bool:
-        """Compare color and depth of the middle frame of the recent frames. Return False without a result.
+        """Compare color and depth of the middle one of the recent frames and store the delay; return True on success.
 
         There is no result if the frame is slow, has too few edges, or has a delay outside of the tested range.
         """
@@ -127,7 +127,7 @@ class DelayEstimator:
 
 
 def edge_points(frame: Frame) -> Float32:
-    """Return points (P, 3), m, on depth edges in the camera frame, P <= MAX_EDGES."""
+    """Return P points (P, 3), m, camera frame, on the nearer side of depth edges, with P <= MAX_EDGES."""
     edges = np.empty((frame.depth.size // 8, 3), np.float32)
     edges = edges[: find_edges(frame.depth, edges)]
     edges = edges[:: len(edges) // MAX_EDGES + 1]
@@ -135,9 +135,9 @@ def edge_points(frame: Frame) -> Float32:
 
 
 def normalized_gradient(frame: Frame) -> tuple[Float32, float]:
-    """Return the smoothed color gradient (h, w), w <= WIDTH, and its scale relative to the image.
+    """Return the magnitude (h, w) of the smoothed intensity gradient, and the ratio of w to the image width.
 
-    The gradient has mean 0 and standard deviation 1.
+    The image is reduced to w <= WIDTH px. The values have mean 0 and standard deviation 1.
     """
     scale = min(WIDTH / frame.camera.width, 1.0)
     small = cv2.resize(frame.color, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -149,7 +149,7 @@ def normalized_gradient(frame: Frame) -> tuple[Float32, float]:
 
 
 def poses_at(times: Float64, poses: Float64, at: Float64) -> Float64:
-    """Return the poses (A, 4, 4) at the times (A,), s, from poses (P, 4, 4) at increasing times (P,), s.
+    """Return the poses (A, 4, 4) at the times `at` (A,), s, from `poses` (P, 4, 4) at increasing `times` (P,), s.
 
     Translations are interpolated linearly and rotations spherically between neighboring poses, and extrapolated beyond
     the first and the last pose.
@@ -165,9 +165,9 @@ def poses_at(times: Float64, poses: Float64, at: Float64) -> Float64:
 
 
 def regress(comparisons: Float64, start: float) -> DelayEstimate:
-    """Return the estimate of the delay from comparisons (K, 3): delay, s, and image motion (x, y), image widths / s.
+    """Return the estimate of the delay from K comparisons (K, 3): delay, s, and image motion (x, y), image widths / s.
 
-    The regression starts at a delay of `start` s without an offset.
+    The regression starts at the delay `start`, s, and an offset of 0.
     """
     delays, speeds = comparisons[:, 0], np.hypot(comparisons[:, 1], comparisons[:, 2])
     shifts = speeds * delays  # image widths

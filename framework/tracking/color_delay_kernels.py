@@ -13,7 +13,10 @@ SEARCHED_ROWS = 120  # number of searched rows of an image
 
 @njit(cache=True, nogil=True)
 def find_edges(depth, edges):
-    """Write (u, v, z), px and m, of pixels on the nearer side of depth steps to edges (N, 3). Return their number."""
+    """Write u, v, px, and z, m, of pixels on the nearer side of depth steps to `edges` (N, 3). Return their number.
+
+    `depth`: (H, W), m, 0 = no reading. At most N pixels are written.
+    """
     height, width = depth.shape
     count = 0
     for v in range(REACH, height - REACH, max(height // SEARCHED_ROWS, 1)):
@@ -37,10 +40,10 @@ def find_edges(depth, edges):
 
 @njit(cache=True, nogil=True, parallel=True)
 def mean_gradients(points, transforms, intrinsics, scale, gradient, means):
-    """Set means (D,) to the mean gradient at the points (P, 3), m, moved by each of the transforms (D, 3, 4).
+    """Set `means` (D,) to the mean of `gradient` at `points` (P, 3), m, moved by each of the `transforms` (D, 3, 4).
 
-    `gradient` (h, w) is at `scale` times the resolution of the intrinsics (fx, fy, cx, cy). Points outside of the image
-    are ignored.
+    `gradient` (h, w) is at `scale` times the resolution of the `intrinsics` (fx, fy, cx, cy), px. Points outside of the
+    image are ignored. The mean is 0 if there are no others.
     """
     fx, fy, cx, cy = intrinsics
     half, one = np.float32(0.5), np.float32(1.0)

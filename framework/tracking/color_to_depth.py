@@ -39,8 +39,8 @@ log = logging.getLogger(__name__)
 class RegisteredFrame(NamedTuple):
     """A frame with color registered to depth."""
 
-    frame: Frame  # with the color of each depth pixel
-    T_world_color: Float64  # (4, 4) pose of the color camera
+    frame: Frame  # color is registered to the depth pixels
+    T_world_color: Float64  # (4, 4) pose of the color camera at the time of the color image
     color_pixels: Int32 | None = None  # (H, W) flat index of each reading's color pixel, -1 = none; None = same pixel
 
 
@@ -51,7 +51,7 @@ class ColorToDepth:
     """
 
     def __init__(self, delay: float | None) -> None:
-        """Set the delay of color, s. None = estimated."""
+        """Set the delay of color behind depth with equal timestamps, s; None = estimated from the tracked frames."""
         self._estimator = DelayEstimator() if delay is None else None
         self._usable = False  # True once the estimate was accurate enough
         self._given = 0.0 if delay is None else delay
@@ -125,15 +125,16 @@ class ColorToDepth:
 
 
 def _shift(frame: Frame, T_a_b: Float64) -> float:
-    """Return the image motion, px, of points at the depth NEAR for a small motion of the camera."""
+    """Return the approximate image motion, px, of points at the depth NEAR for the small camera motion T_a_b."""
     return frame.camera.fx * (rotation_angle(T_a_b[:3, :3]) + math.hypot(*T_a_b[:3, 3]) / NEAR)
 
 
 def register(frame: Frame, T_color_depth: Float64) -> tuple[UInt8, Int32]:
     """Return the nearest color (H, W, 3) of each depth pixel, and its flat index (H, W) in the color image.
 
-    The index is -1 outside of the color image and without a reading. A pixel outside of the color image gets the color
-    of the nearest pixel. A pixel without a reading gets the color at the median depth.
+    `T_color_depth`: (4, 4), motion from the depth camera to the color camera. The index is -1 outside of the color
+    image and without a reading. A pixel outside of the color image gets the color of the nearest pixel. A pixel without
+    a reading gets the color at the median depth.
     """
     color, pixels = np.empty_like(frame.color), np.empty(frame.camera.shape, np.int32)
     readings = frame.depth[::STRIDE, ::STRIDE]

@@ -13,8 +13,9 @@ MIN_DEPTH = 0.05  # minimum depth of projected points in the color image, m
 def register_colors(depth, otherwise, intrinsics, T_color_depth, color, registered, pixels):
     """Set `registered` (H, W, 3) to the nearest color of each pixel of `depth` (H, W), m, and `pixels` to its index.
 
-    `pixels` (H, W) has the flat index in `color` (H, W, 3), -1 outside of the color image and without a reading.
-    Positions outside are moved to the border. Without a reading, the depth is `otherwise` m.
+    `pixels` (H, W) is the flat index in `color` (H, W, 3), -1 outside of the color image and without a reading.
+    `T_color_depth`: (3, 4). Positions outside of the color image are moved to its border. Pixels without a reading are
+    projected at the depth `otherwise`, m.
     """
     fx, fy, cx, cy = intrinsics
     R, t = T_color_depth[:, :3], T_color_depth[:, 3]

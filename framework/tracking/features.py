@@ -53,7 +53,7 @@ class FeatureExtractor:
         check_bounds(self, max_features=(1, 100_000), contrast=(1e-6, 1.0))
 
     def extract(self, frame: Frame) -> Features:
-        """Return the features of `frame`, none for an image without texture. This method is thread-safe."""
+        """Return the features of the color image, none for an image without texture. This method is thread-safe."""
         gray, scale = _reduced(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY))
         # without precise upscaling, OpenCV's keypoints are off by a quarter of a pixel
         sift = cv2.SIFT.create(self.max_features, contrastThreshold=self.contrast, enable_precise_upscale=True)
@@ -86,10 +86,10 @@ class FrameFeatures:
 
 
 def match(query: UInt8, reference: UInt8, max_ratio: float) -> Int32:
-    """Return index pairs (M, 2) of mutual nearest neighbors in `query` (Q, 128) and `reference` (R, 128).
+    """Return the M index pairs (M, 2) of mutual nearest neighbors in `query` (Q, 128) and `reference` (R, 128).
 
-    A pair is dropped if its distance is above `max_ratio` times the distance to the second-nearest
-    neighbor (Lowe 2004).
+    A pair is dropped if its distance is above `max_ratio` times the distance from the query descriptor to the
+    second-nearest reference descriptor (Lowe 2004).
     """
     if len(query) == 0 or len(reference) < 2:
         return np.zeros((0, 2), np.int32)
@@ -103,12 +103,15 @@ def match(query: UInt8, reference: UInt8, max_ratio: float) -> Int32:
     mutual = squared.argmin(axis=0)[nearest] == rows
     smallest = squared[rows, nearest]
     squared[rows, nearest] = np.inf
-    trusted = mutual & (smallest <= np.float32(max_ratio) ** 2 * squared.min(axis=1))
-    return np.stack([rows[trusted], nearest[trusted]], axis=1).astype(np.int32)
+    distinct = mutual & (smallest <= np.float32(max_ratio) ** 2 * squared.min(axis=1))
+    return np.stack([rows[distinct], nearest[distinct]], axis=1).astype(np.int32)
 
 
 def surface_depth(depth: Float32, pixels: Float32) -> Float32:
-    """Return the median depth (F,), m, of the patches around `pixels` (F, 2), 0 at surface edges and in holes."""
+    """Return the median depth (F,), m, of the patches around `pixels` (F, 2), u and v; 0 at surface edges and in holes.
+
+    `depth`: (H, W), m, 0 = no reading.
+    """
     height, width = depth.shape
     offsets = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
     u, v = np.rint(pixels).astype(np.intp).T

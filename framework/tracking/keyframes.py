@@ -20,7 +20,7 @@ from framework.data import Array, Float32, Float64, Frame, UInt8, check_array, c
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import path_exists
 from framework.geometry import back_project, transform
-from framework.mapping.storage.map_file import map_file_errors, read_arrays, write_map
+from framework.mapping.storage.map_file import read_arrays, write_map
 from framework.runtime.cpu_budget import lower_priority
 from framework.tracking.absolute_pose import AbsolutePose, AbsolutePoseEstimator
 from framework.tracking.features import DESCRIPTOR_LENGTH, FeatureExtractor, Features, match
@@ -40,11 +40,11 @@ WORD_BITS = 12  # 4096 visual words; fewer do not distinguish views, and more ra
 
 @dataclass(frozen=True)
 class Keyframe:
-    """The features with depth of one trusted frame."""
+    """The F features with depth of one frame with a reliable pose."""
 
     T_world_camera: Float64  # (4, 4)
     points_world: Float32  # (F, 3) m
-    descriptors: UInt8  # (F, 128)
+    descriptors: UInt8  # (F, 128) RootSIFT
     bag: Float32  # (2^WORD_BITS,) bag of visual words
 
 
@@ -52,10 +52,10 @@ class Keyframe:
 class Keyframes:
     """A bounded database of keyframes.
 
-    Call `add` with every trusted frame. It extracts the features of new views in a background thread. A view is new if
-    distance / min_distance + angle / min_angle >= 1 for all keyframes. All other methods wait for the thread first, so
-    that results do not depend on timing. The cost of `relocalize` does not depend on the number of keyframes, except
-    for the comparison of bags of words.
+    Call `add` for every frame that has a reliable pose. It extracts the features of new views in a background thread. A
+    view is new if distance / min_distance + angle / min_angle >= 1 for all keyframes. All other methods wait for the
+    thread first, so that results do not depend on timing. The cost of `relocalize` does not depend on the number of
+    keyframes, except for the comparison of bag-of-words vectors.
     """
 
     max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is removed
@@ -63,11 +63,12 @@ class Keyframes:
     min_angle: float = 0.3  # minimum angle of a new view without translation, rad, > 0
     max_features: int = 800  # maximum number of features of a frame, >= 1
     min_features: int = 30  # minimum number of features with depth of a keyframe, >= 4
-    candidates: int = 6  # number of keyframes matched with a lost frame, >= 1
+    candidates: int = 6  # maximum number of keyframes matched with a frame, >= 1
     max_ratio: float = 0.8  # maximum ratio of best to second-best descriptor distance (Lowe's ratio test), in (0, 1]
     max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0
     min_inliers: int = 20  # minimum number of inliers, >= 4
-    min_inlier_ratio: float = 0.15  # minimum fraction of inliers, in (0, 1]; low: candidates may not overlap
+    # minimum fraction of inliers among the matches, in (0, 1]; low, because not all candidates overlap with the frame
+    min_inlier_ratio: float = 0.15
     seed: int = 0  # seed of RANSAC and of the visual words, >= 0
 
     def __post_init__(self) -> None:
@@ -173,7 +174,7 @@ class Keyframes:
         return self.keyframe(frame, features, T_world_camera) if len(features) >= self.min_features else None
 
     def _append(self, keyframe: Keyframe) -> None:
-        """Add a keyframe; above the limit, remove the older keyframe of the nearest pair."""
+        """Add a keyframe. If there are more than `max_keyframes`, remove the older one of the nearest two keyframes."""
         self._keyframes.append(keyframe)
         self._poses = np.concatenate([self._poses, keyframe.T_world_camera[None]])
         if len(self._keyframes) > self.max_keyframes:
@@ -192,7 +193,7 @@ class Keyframes:
         return Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag)
 
     def is_new(self, T_world_camera: Float64) -> bool:
-        """Return True if no keyframe is too close to this pose."""
+        """Return True if the pose T_world_camera (4, 4) is far enough from all keyframes for a new keyframe."""
         self._settle()
         return bool((self._separation(self._poses, T_world_camera) >= 1).all())
 
@@ -208,7 +209,7 @@ class Keyframes:
         return self.locate(frame, features, self.alike(features))
 
     def alike(self, features: Features) -> list[Keyframe]:
-        """Return the candidate keyframes with the most similar visual words, best first."""
+        """Return the `candidates` keyframes with visual words most similar to those of `features`, best first."""
         self._settle()
         if not self._keyframes:
             return []
@@ -217,7 +218,7 @@ class Keyframes:
         return [self._keyframes[k] for k in order[: self.candidates]]
 
     def nearest(self, T_world_camera: Float64) -> list[Keyframe]:
-        """Return the candidate keyframes nearest to a pose, nearest first."""
+        """Return the `candidates` keyframes nearest to the pose T_world_camera (4, 4), nearest first."""
         self._settle()
         order = np.argsort(self._separation(self._poses, T_world_camera), kind="stable")
         return [self._keyframes[k] for k in order[: self.candidates]]
@@ -234,7 +235,10 @@ class Keyframes:
         return self._estimator.estimate(frame.camera, features.pixels[query], points_world, features.depth[query])
 
     def _separation(self, poses: Float64, T_world_camera: Float64) -> Float64:
-        """Return the separations (K,) of a pose from other poses (K, 4, 4); 1 = far enough for a new keyframe."""
+        """Return the separations (K,) of a pose (4, 4) from K other poses (K, 4, 4).
+
+        The separation is distance / min_distance + angle / min_angle; 1 = far enough for a new keyframe.
+        """
         distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
         cosine = (np.einsum("kij,ij->k", poses[:, :3, :3], T_world_camera[:3, :3]) - 1) / 2
         return np.asarray(distance / self.min_distance + np.arccos(np.clip(cosine, -1, 1)) / self.min_angle)
@@ -254,7 +258,7 @@ class VisualWords:
         self._directions = np.ascontiguousarray(rng.permuted(np.tile(half, (WORD_BITS, 1)), axis=1).T)
 
     def bag(self, descriptors: UInt8) -> Float32:
-        """Return the bag of words: the square root (2^WORD_BITS,) of each word's count."""
+        """Return the bag of words of descriptors (F, 128): the square root (2^WORD_BITS,) of the count of each word."""
         if len(descriptors) == 0:
             return np.zeros(1 << WORD_BITS, np.float32)
         signs = cv2.gemm(descriptors.astype(np.float32), self._directions, 1, None, 0) > 0
@@ -263,7 +267,7 @@ class VisualWords:
 
 
 def similarity(bag: Float32, bags: Float32) -> Float32:
-    """Return the similarity (K,) in [0, 1] of one bag of words to other bags (K, 2^WORD_BITS)."""
+    """Return the tf-idf cosine similarity (K,) in [0, 1] of a bag (2^WORD_BITS,) to K other bags (K, 2^WORD_BITS)."""
     document_counts = np.count_nonzero(bags, axis=0)
     idf = np.log((1 + len(bags)) / (1 + document_counts)).astype(np.float32)
     if not idf.any():
@@ -282,5 +286,4 @@ def read_keyframes(path: Path) -> dict[str, Array]:
     """Return the arrays written by `write_keyframes`; empty if there is no file. Raises DataError if it is invalid."""
     if not path_exists(path):
         return {}
-    with map_file_errors(path):
-        return read_arrays(path, FILE_FORMAT)
+    return read_arrays(path, FILE_FORMAT)

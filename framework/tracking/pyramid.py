@@ -37,9 +37,10 @@ def build_pyramid(
     camera: Camera, depth: Float32, color: UInt8, finest: float, levels: int,
     sensor: SensorKind = SensorKind.KINECT_V1,
 ) -> list[PyramidLevel]:  # fmt: skip
-    """Return the image at `finest` times its size and at levels - 1 further halvings, finest first.
+    """Return the image at `finest` times its size and at `levels` - 1 further halvings, finest first.
 
-    `finest` is 1 or a power of 1/2. Intensities are averaged over all pixels, and depths over pixels of one surface.
+    `depth`: (H, W), m, 0 = no reading. `color`: (H, W, 3) RGB. `finest` is 1 or a power of 1/2. Intensities are
+    averaged over all pixels, and depths over pixels of one surface.
     """
     intensity = _intensity(color)
     pyramid: list[PyramidLevel] = []
@@ -79,7 +80,7 @@ def is_scattered(depth: Float32) -> bool:
 
 
 def _distinct(depth: Float32) -> Float32:
-    """Return the distinct readings (N,), m, in ascending order.
+    """Return the distinct positive values (N,), m, of `depth` in ascending order.
 
     For few distinct values, a hash table is faster than np.unique.
     """
@@ -105,7 +106,7 @@ def _intensity(color: UInt8) -> Float32:
 
 
 def model_intensities(view: SurfaceView, levels: int) -> list[Float32]:
-    """Return the view's intensity in [0, 1] at its own resolution and at `levels` - 1 halvings, -1 = unmapped."""
+    """Return the intensity of the view in [0, 1], at its own resolution and at `levels` - 1 halvings; -1 = unmapped."""
     intensity = _intensity(view.color)
     intensity[view.depth == 0] = -1
     pyramid = [intensity]

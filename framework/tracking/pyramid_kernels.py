@@ -11,7 +11,7 @@ MIN_MAPPED = np.float32(2.0)  # minimum number of mapped pixels among four for a
 
 @njit(cache=True, nogil=True)
 def find_distinct(bits, table, found):
-    """Write the distinct positive values of `bits` to `found` and return their count.
+    """Write the distinct positive values of `bits` (N,) to `found` (N,) and return their number.
 
     `table` (2^k,) is a hash table filled with zeros, more than twice as large as `bits`.
     """
@@ -32,7 +32,10 @@ def find_distinct(bits, table, found):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve(depth, intensity, half_depth, half_intensity):
-    """Average intensity over 2x2 pixels, and depth over those of the 2x2 pixels on the nearest surface."""
+    """Set `half_intensity` and `half_depth` (h, w) to means of `intensity` and `depth` (H, W), m, over 2x2 px.
+
+    Depth is averaged only over those of the four pixels that are on the nearest surface; 0 = no reading.
+    """
     for v in prange(half_depth.shape[0]):
         for u in range(half_depth.shape[1]):
             total = np.float32(0.0)
@@ -58,9 +61,10 @@ def halve(depth, intensity, half_depth, half_intensity):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def compute_normals(depth, intrinsics, normals):
-    """Set normals (3, H, W) from each pixel's four neighbors; 0 unless all of them are on the same surface.
+    """Set `normals` (3, H, W), unit length in the camera frame, from the depth, m, of the four neighbors of each pixel.
 
-    The loop over a row has no branches, so that the compiler vectorizes it.
+    A normal is 0 unless all neighbors have a reading on the surface of the pixel. `intrinsics`: fx, fy, cx, cy, px. The
+    loop over a row has no branches, so that the compiler vectorizes it.
     """
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
@@ -91,7 +95,10 @@ def compute_normals(depth, intrinsics, normals):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve_mapped(intensity, half):
-    """Average the mapped intensities of 2x2 pixels, -1 = too few. A new map has many holes of one pixel."""
+    """Set `half` to means of the mapped intensities of 2x2 px; -1 = fewer than MIN_MAPPED mapped pixels.
+
+    A new map has many holes of one pixel.
+    """
     zero, one = np.float32(0.0), np.float32(1.0)
     for v in prange(half.shape[0]):
         for u in range(half.shape[1]):

@@ -41,9 +41,9 @@ class RawKeyframe:
 
     @classmethod
     def of(cls, levels: Sequence[PyramidLevel], T_world_camera: Float64, scattered: bool = False) -> RawKeyframe:
-        """Return the keyframe of an image pyramid, finest level first.
+        """Return the raw keyframe of a frame with the image pyramid `levels`, finest level first.
 
-        With `scattered` depth, normals are averaged over 3x3 px.
+        `scattered`: True = normals are averaged over 3x3 px, because many isolated pixels have no depth.
         """
         level = levels[COMPARED]
         model = smoothed(ModelView(level.depth, level.normals, *intrinsics(level.camera)), int(scattered))
@@ -51,7 +51,7 @@ class RawKeyframe:
 
 
 class KeyframeTerm(NamedTuple):
-    """The keyframe's part of one alignment."""
+    """The term of a raw keyframe in the normal equations of one alignment."""
 
     keyframe: RawKeyframe
     T_key_view: Float64  # (4, 4)
@@ -60,7 +60,10 @@ class KeyframeTerm(NamedTuple):
 
     @classmethod
     def at(cls, keyframe: RawKeyframe | None, T_world_view: Float64, scale: DepthScale) -> KeyframeTerm | None:
-        """Return the term of an alignment to the view at T_world_view; None if the keyframe is too far away."""
+        """Return the keyframe's term for aligning a frame to the model view at T_world_view.
+
+        Returns None without a keyframe, or if its `scale.distance` to the view is at least USED_DISTANCE.
+        """
         if keyframe is None:
             return None
         distance = scale.distance(keyframe.T_world_camera, T_world_view)
@@ -74,9 +77,10 @@ class KeyframeTerm(NamedTuple):
         self, levels: Sequence[PyramidLevel], level: int, T_view_camera: Float64, weights: Weights, brightness: float,
         linear: LinearWeights | None,
     ) -> NormalEquations:  # fmt: skip
-        """Return the weighted equations of the keyframe for twists of the view's frame.
+        """Return the keyframe's weighted normal equations for a twist in the view's coordinate frame.
 
-        `level` is the level of the alignment, at most COMPARED.
+        `levels`: the image pyramid of the aligned image, finest first. `level`: the level of the alignment, at most
+        COMPARED. See `linearize` for the other arguments.
         """
         own = linearize(
             levels[COMPARED], self.keyframe.model, self.keyframe.intensity, self.T_key_view @ T_view_camera, weights,

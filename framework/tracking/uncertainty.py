@@ -24,9 +24,10 @@ MIN_VARIANCE = 1e-18  # minimum variance of a motion, m^2 and rad^2, for data wi
 
 
 def pose_covariance(terms: Sequence[NormalEquations], T_view_camera: Float64) -> Float64:
-    """Return the covariance (6, 6) of a pose, as defined by `Pose.covariance`.
+    """Return the covariance (6, 6) of a pose: translation in m and rotation in rad, as defined by `Pose.covariance`.
 
-    The terms are the normal equations at T_view_camera for twists of the view's frame.
+    `terms`: the normal equations of the map and of the keyframe, if any, at T_view_camera for twists of the view's
+    frame.
     """
     A, spread = np.zeros((6, 6)), np.zeros((6, 6))
     for term in terms:

@@ -8,17 +8,20 @@ import numpy as np
 from framework.data import UInt8
 from framework.training.room_pictures import Example
 
-ZOOM = (0.55, 1.0)  # side length of a crop divided by the side length of the image
+ZOOM = (0.55, 1.0)  # range of the ratio of a crop's side to the image's side
 ZOOMED = 0.5  # fraction of zoomed images
 MIN_REMAINING = 0.25  # minimum fraction of an object's area inside the crop
 MIN_PIXELS = 40  # px, minimum area of an object
-GAIN, CHANNEL_GAIN = 0.35, 0.12  # logarithms of the maximum factors of the image and of each channel
+GAIN, CHANNEL_GAIN = 0.35, 0.12  # logarithms of the maximum brightness factors of the image and of each channel
 GAMMA = 0.35  # logarithm of the maximum gamma exponent
 BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # fractions of blurred, noisy and gray images
 
 
 def augmented(example: Example, rng: np.random.Generator) -> Example:
-    """Return a randomly mirrored, zoomed, recolored, blurred and noisy example, without objects outside of the crop."""
+    """Return a copy of an example that is mirrored, zoomed, recolored, blurred and made noisy at random.
+
+    Objects with fewer than MIN_PIXELS pixels, or a fraction below MIN_REMAINING, in the crop are removed.
+    """
     color, masks = example.color, example.masks
     if rng.uniform() < 0.5:
         color, masks = color[:, ::-1], masks[:, :, ::-1]

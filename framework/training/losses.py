@@ -1,7 +1,7 @@
 """The loss of Mask R-CNN (He et al. 2017) on Faster R-CNN's anchors (Ren et al. 2015).
 
-Boxes are x1 y1 x2 y2, px, with extent 0 (width = x2 - x1). `own` (N,) contains the object index of each box,
-BACKGROUND or IGNORED.
+Boxes are x1 y1 x2 y2, px, with extent 0 (width = x2 - x1). `own` (N,) contains the index of the object assigned to each
+box, BACKGROUND or IGNORED.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def losses(
 ) -> dict[str, Tensor]:
     """Return the five terms of the loss by name, each the mean over the `images` (N, 3, H, W), RGB 0..255.
 
-    The loss is the sum of the terms.
+    The loss is the sum of the terms: objectness and deltas of anchors; classes, box deltas and masks of proposals.
     """
     shape = (images.shape[2], images.shape[3])
     pyramid = network.extract(network.normalize(images))
@@ -111,7 +111,7 @@ def _proposal_losses(
 
 
 def box_iou(a: Tensor, b: Tensor) -> Tensor:
-    """Return the intersection over union (N, M) of boxes (N, 4) and (M, 4)."""
+    """Return the intersection over union (N, M) of each of N boxes `a` (N, 4) with each of M boxes `b` (M, 4)."""
     low = torch.maximum(a[:, None, :2], b[None, :, :2])
     high = torch.minimum(a[:, None, 2:], b[None, :, 2:])
     shared = (high - low).clamp(min=0).prod(dim=2)
@@ -120,7 +120,7 @@ def box_iou(a: Tensor, b: Tensor) -> Tensor:
 
 
 def match(iou: Tensor, foreground: float, background: float, each_object: bool) -> Tensor:
-    """Return `own` (N,), the object assigned to each box by `iou` (N, M).
+    """Return `own` (N,), the object assigned to each of N boxes by their `iou` (N, M) with M objects.
 
     A box gets its best object at an IoU of at least `foreground`, BACKGROUND below `background`, otherwise IGNORED.
     With `each_object`, the boxes with the highest IoU with an object also get their best object, if this IoU is > 0.
@@ -139,9 +139,9 @@ def match(iou: Tensor, foreground: float, background: float, each_object: bool) 
 
 
 def sample(own: Tensor, count: int, positive_fraction: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return the indices of at most `count` random boxes: boxes with an object, and background boxes.
+    """Return the indices of random boxes with an object, and of random background boxes, at most `count` in total.
 
-    `positive_fraction`: maximum fraction of boxes with an object.
+    `own`: (N,). `positive_fraction`: maximum fraction of `count` for boxes with an object.
     """
     positive = _draw(torch.nonzero(own >= 0)[:, 0], int(count * positive_fraction), generator)
     negative = _draw(torch.nonzero(own == BACKGROUND)[:, 0], count - len(positive), generator)
@@ -163,7 +163,8 @@ def encode(boxes: Tensor, objects: Tensor) -> Tensor:
 def mask_targets(masks: Tensor, boxes: Tensor, own: Tensor, bins: int) -> Tensor:
     """Return the target masks (N, bins, bins) of boxes (N, 4): 1 in bins at least half covered by the object, else 0.
 
-    `masks`: (M, H, W) bool. Pixel centers are half a pixel inside the borders, as in boxes with extent 0.
+    `masks`: (M, H, W) bool, of the M objects. `own`: (N,), the object of each box. Pixel centers are at half-integer
+    coordinates, as in boxes with extent 0.
     """
     targets = torch.empty((len(boxes), bins, bins), device=boxes.device)
     for k in torch.unique(own).tolist():

@@ -41,7 +41,7 @@ EYE_HEIGHT = (0.9, 1.75)  # m, range of the camera height
 CLEAR = 0.35  # m, minimum distance of the camera to furniture and walls
 TINT = 0.5  # logarithm of the maximum factor for the colors of a surface
 TINTED = 0.7  # fraction of the images with changed colors
-STUDIOS = 0.5  # fraction of studios among the rooms; some classes occur only in studios
+STUDIOS = 0.5  # probability of a studio (RoomKind.STUDIO); some classes occur only in studios
 QUALITY = 93  # JPEG quality of the images
 MIN_PIXELS = 100  # px, minimum area of objects in an image
 TRIES = 20  # maximum number of candidate views for each image
@@ -57,7 +57,10 @@ class Example:
 
 
 def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: int) -> None:
-    """Render `rooms` rooms, starting at number `first`, into `folder`; existing rooms are kept."""
+    """Render `views` images of each of `rooms` rooms, from number `first` on, into `folder`; existing rooms are kept.
+
+    `processes`: number of rendering processes.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     missing = [number for number in range(first, first + rooms) if not room_folder(folder, number).is_dir()]
     if not missing:
@@ -70,12 +73,12 @@ def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: in
 
 
 def room_folder(folder: Path, number: int) -> Path:
-    """Return the folder of a training room."""
+    """Return the folder of training room `number` in `folder`."""
     return folder / f"room_{number:06d}"
 
 
 def render_room(folder: Path, views: int, number: int) -> None:
-    """Render and write `views` images of room `number`."""
+    """Render `views` images of room `number`, and write them atomically to its folder in `folder`."""
     with tempfile.TemporaryDirectory(dir=folder, prefix=".room_") as unfinished:
         target = Path(unfinished) / "room"
         target.mkdir()
@@ -102,7 +105,7 @@ def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[
 def _random_views(
     room: Room, renderer: Renderer, names: Mapping[int, str], views: int, rng: np.random.Generator
 ) -> Iterator[tuple[Camera, Float64]]:
-    """Yield the camera and T_world_camera (4, 4) of random views of objects with a class."""
+    """Yield the camera and T_world_camera (4, 4) of `views` random views of objects with a class (`names` by id)."""
     centers = [_centers(room, [i for i in names if names[i] == name]) for name in sorted(set(names.values()))]
     for _ in range(views):
         for _ in range(TRIES):
@@ -116,14 +119,17 @@ def _random_views(
 
 
 def _centers(room: Room, ids: Sequence[int]) -> Float64:
-    """Return the centers (N, 3), m, of the objects' boxes."""
+    """Return the centers (N, 3), m, of the axis-aligned bounding boxes of N objects, world frame."""
     surfaces = room.surfaces
     corners = [surfaces.vertices[surfaces.triangles[surfaces.instance_ids == i]].reshape(-1, 3) for i in ids]
     return np.array([(c.min(axis=0) + c.max(axis=0)) / 2 for c in corners], np.float64)
 
 
 def _view(room: Room, centers: Sequence[Float64], rng: np.random.Generator) -> Float64:
-    """Return a random T_world_camera (4, 4) above free floor, roughly towards an object of a random class."""
+    """Return a random T_world_camera (4, 4) above free floor, roughly towards an object of a random class.
+
+    `centers`: for each class, the centers (N, 3), m, of its objects.
+    """
     layout = room.layout
     rows, columns = np.nonzero(layout.free >= CLEAR)
     at = int(rng.integers(len(rows)))

@@ -46,7 +46,10 @@ NETWORK, PRECISION = "network.safetensors", "average_precision.json"
 
 
 def train(config: DictConfig, folder: Path) -> MaskAp:
-    """Render missing rooms, train the remaining steps and evaluate."""
+    """Render missing rooms, run the remaining training steps, and return the mask AP on the held-out rooms.
+
+    `folder`: output folder; training resumes from its checkpoint, if any.
+    """
     Settings.of(config).apply()
     torch.manual_seed(config.seed)
     network = _started(config.network)
@@ -88,7 +91,10 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
 
 
 def _started(config: DictConfig) -> MaskRCNN:
-    """Return the initial network. Raises ConfigError if `start_from` has another architecture."""
+    """Return the initial network of the section `network`: random weights, or those of `start_from`.
+
+    Raises ConfigError if `start_from` has another architecture.
+    """
     network = MaskRCNN(architecture(config))
     if config.start_from:
         start = load_network(Path(config.start_from))
@@ -104,7 +110,7 @@ def _started(config: DictConfig) -> MaskRCNN:
 
 
 def architecture(network: DictConfig) -> Architecture:
-    """Return the configured architecture for the classes of synthetic scenes."""
+    """Return the architecture configured in the section `network`, for the classes of synthetic scenes."""
     require(network.backbone in DEPTHS, "network.backbone", network.backbone, f"one of {', '.join(DEPTHS)}")
     return Architecture(
         classes=tuple(name for name in COCO if name in SCENENN_TO_COCO.values()),

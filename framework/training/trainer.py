@@ -103,7 +103,7 @@ class Trainer:
         return network.eval()
 
     def _learn(self) -> dict[str, float]:
-        """Run one step and return the terms of the loss."""
+        """Run one training step and return the terms of the loss by name."""
         rng = np.random.default_rng([self.schedule.seed, self.step])
         chosen = rng.integers(len(self.pictures), size=self.schedule.batch)
         examples = [augmented(self.pictures[int(k)], rng) for k in chosen]
@@ -130,7 +130,10 @@ class Trainer:
         index = {name: k for k, name in enumerate(self.network.architecture.classes, start=1)}
         unknown = sorted(set(example.class_names) - set(index))
         if unknown:
-            raise DataError(f"images: expected classes of the network, got {', '.join(unknown)}")
+            raise DataError(
+                f"pictures.folder: expected only classes of the network in the rendered rooms, got "
+                f"{', '.join(unknown)}; set pictures.folder to an empty folder"
+            )
         boxes = tight_boxes(example.masks) + np.array([0, 0, 1, 1], np.float32)  # from pixel centers to borders
         return Objects(
             boxes=torch.from_numpy(boxes),
@@ -174,8 +177,8 @@ class Trainer:
             self.step, self.history = state["step"], state["history"]
         except Exception as error:  # torch raises many exception types for a damaged file
             raise DataError(
-                f"{path}: expected an intact checkpoint of this network, got {in_one_line(error)}; remove it, or train "
-                "in another folder"
+                f"{path}: expected an intact checkpoint of this network, got an error ({in_one_line(error)}); remove "
+                "it, or train in another folder"
             ) from error
 
 

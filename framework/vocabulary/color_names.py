@@ -22,7 +22,7 @@ _SAMPLES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "pink": ((235, 130, 170), (160, 107, 128), (232, 182, 190)),
     "brown": ((110, 70, 40), (142, 94, 58), (158, 84, 48), (94, 66, 51), (60, 38, 24), (183, 140, 96)),
     "beige": ((216, 196, 160), (204, 189, 163), (220, 186, 138)),
-}  # sRGB, 0..255: samples of each name, saturated, muted and dark
+}  # samples of each name in sRGB, 0..255: saturated, muted and dark colors
 
 COLOR_NAMES = tuple(_SAMPLES)
 CONFUSED = 12.0  # CIELAB distance at which two names are interchangeable under changing light
@@ -43,8 +43,8 @@ def nearest_names(srgb: Float32) -> Int32:
 def fits(srgb: Float32, name: str) -> Float32:
     """Return the fit (N,) in [0, 1] of a name of COLOR_NAMES to sRGB colors (N, 3) in [0, 1].
 
-    The fit is a Gaussian of the distance to this name minus the distance to the nearest name. It is 1 for the nearest
-    name.
+    The fit is exp(-d^2 / (2 CONFUSED^2)), where d is the distance to this name minus the distance to the nearest name,
+    both in CIELAB. So it is 1 for the nearest name.
     """
     distances = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
     additional = distances[:, COLOR_NAMES.index(name) == _NAME_OF_SAMPLE].min(axis=1) - distances.min(axis=1)
@@ -53,7 +53,7 @@ def fits(srgb: Float32, name: str) -> Float32:
 
 @cache
 def _samples_lab() -> Float32:
-    """Return the CIELAB colors (S, 3) of all samples.
+    """Return the CIELAB colors (S, 3) of all S samples, in the order of COLOR_NAMES.
 
     They are computed on demand, because the first conversion in OpenCV is slow.
     """

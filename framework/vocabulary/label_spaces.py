@@ -47,11 +47,11 @@ class LabelMapping:
     meaning: Int32  # (C,) index of each label in `classes`; -1 = no object class of COCO
 
     def apply(self, probabilities: Float32) -> tuple[Float32, Bool]:
-        """Return the float32 distributions (N, C') over `classes` from `probabilities` (N, C) of the labels.
+        """Return the float32 distributions (N, C') over `classes`, and an array (N,), True where they are meaningful.
 
-        The probabilities of labels with the same meaning are summed, labels without a meaning are removed, and the
-        result is normalized. Also return a mask (N,) of the rows whose best label has a meaning. A row without any
-        class becomes uniform, and its mask is False. `probabilities` must not be negative.
+        `probabilities` (N, C) are nonnegative weights of the labels. Labels with the same COCO name are summed, labels
+        without a COCO name are removed, and the result is normalized. The array is True for rows whose best label has a
+        COCO name. A row whose sum is 0 becomes uniform, and its entry is False.
         """
         has_meaning = self.meaning >= 0
         sums = np.zeros((len(probabilities), len(self.classes)))
@@ -74,33 +74,37 @@ def read_labels(name_or_path: str) -> tuple[str, ...]:
         lines = read_text(path, LARGEST_FILE).rstrip().splitlines()
     except DataError as error:
         raise ConfigError(
-            f"labels: expected one of {', '.join(SPACES)}, or a text file with one name per line, got {name_or_path}"
+            f"detector.label_space: expected one of {', '.join(SPACES)}, or a text file with one name per line, got "
+            f"{name_or_path}"
         ) from error
     names = tuple(line.strip() for line in lines)
     if "" in names:  # skipping an empty line would shift the following names
-        raise ConfigError(f"labels: {path}, line {names.index('') + 1}: expected a name, got an empty line")
+        raise ConfigError(
+            f"detector.label_space: {path}, line {names.index('') + 1}: expected a name, got an empty line; write "
+            f"{NO_CLASS} for an unused index"
+        )
     if not names:
-        raise ConfigError(f"labels: {path}: expected one name per line, got an empty file")
+        raise ConfigError(f"detector.label_space: {path}: expected one name per line, got an empty file")
     return names
 
 
-def to_coco(labels: Sequence[str]) -> LabelMapping:
-    """Map `labels` to COCO names with `label_spaces.yaml`.
+def to_coco(labels: Sequence[str], key: str = "detector.label_space") -> LabelMapping:
+    """Map `labels` from the config key `key` to COCO names with `label_spaces.yaml`.
 
-    Case, outer spaces and text after a comma are ignored: "Sofa, couch, lounge" is "sofa". Raises ConfigError with all
-    unknown labels, or if no label is an object class of COCO.
+    Case, leading and trailing spaces, and text after a comma are ignored: "Sofa, couch, lounge" is "sofa". Raises
+    ConfigError with all unknown labels, or if no label is an object class of COCO.
     """
     keys = [label.partition(",")[0].strip().lower() for label in labels]
     unknown = [label for label, key in zip(labels, keys, strict=True) if key not in MEANINGS]
     if unknown:
         raise ConfigError(
-            f"labels: expected names of a label space, got {len(unknown)} unknown names in {len(labels)} labels: "
+            f"{key}: expected names of a label space, got {len(unknown)} unknown names in {len(labels)} labels: "
             f"{', '.join(map(repr, unknown))}; add them to framework/vocabulary/{Path(__file__).stem}.yaml"
         )
     meanings = [MEANINGS[key] for key in keys]
     classes = tuple(name for name in COCO if name in meanings)
     if not classes:
-        raise ConfigError(f"labels: expected an object class of COCO, got none in {len(labels)} labels")
+        raise ConfigError(f"{key}: expected at least one object class of COCO, got none in {len(labels)} labels")
     index = {name: k for k, name in enumerate(classes)}
     meaning = [-1 if name is None else index[name] for name in meanings]
     return LabelMapping(classes, np.array(meaning, np.int32))

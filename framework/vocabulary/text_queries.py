@@ -26,7 +26,7 @@ MAX_WORDS = 4  # maximum number of words in a class name
 
 @dataclass(frozen=True)
 class ObjectWords:
-    """Classes, colors and unknown words of a query."""
+    """The classes, colors and unknown words of a text query."""
 
     classes: tuple[str, ...]  # in the order of the query
     colors: tuple[str, ...]  # names in COLOR_NAMES, in the order of the query
@@ -34,10 +34,10 @@ class ObjectWords:
 
 
 def object_words(query: str, classes: Collection[str]) -> ObjectWords:
-    """Return the class names from `classes`, the colors and the unknown words of a query.
+    """Return the names of `classes`, the colors and the unknown words in a text query.
 
-    Case, articles, plurals and shades of colors are ignored. Words of other label spaces are mapped (sofa = couch). An
-    ambiguous word (orange) is a color if a class follows, otherwise a class.
+    Case, articles, plurals and shades of colors are ignored. Names of other label spaces are mapped to COCO names (sofa
+    = couch). An ambiguous word (orange) is a color if a class follows, otherwise a class.
     """
     words = re.findall(r"[^\W_]+(?:[-'][^\W_]+)*", query.lower())
     known = {name.lower(): name for name in classes}
@@ -62,12 +62,15 @@ def object_words(query: str, classes: Collection[str]) -> ObjectWords:
 
 
 def _color(word: list[str]) -> str:
-    """Return the first word, with the spelling of COLOR_NAMES for colors; "" for an empty list."""
+    """Return the first word of a list, in the spelling of COLOR_NAMES if it is a color; "" for an empty list."""
     return OTHER_SPELLINGS.get(word[0], word[0]) if word else ""
 
 
 def _class_at(words: list[str], at: int, known: dict[str, str]) -> tuple[int, str]:
-    """Return the word count and the name of the longest class name that starts at word `at`; 0 and "" = none."""
+    """Return the number of words and the name of the longest class name that starts at word `at`; 0 and "" = none.
+
+    `known`: the names of the classes by lower-case name.
+    """
     for length in range(min(MAX_WORDS, len(words) - at), 0, -1):
         phrase = words[at : at + length]
         for last in _singulars(phrase[-1]):

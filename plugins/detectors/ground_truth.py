@@ -16,12 +16,13 @@ from framework.vocabulary.label_spaces import COCO
 
 @dataclass
 class GroundTruthDetector(Detector):
-    """Visible instances of known class with exact masks, score 1 and a certain class.
+    """Visible ground-truth instances of known class, with exact masks, score 1 and class probability 1.
 
     Raises DataError for a sequence without instance ground truth.
     """
 
-    min_pixels: int = 64  # minimum number of pixels of a detected instance, >= 1; about the limit of real detectors
+    # minimum number of pixels of a detected instance, >= 1; 64 is about the limit of real detectors
+    min_pixels: int = 64
 
     def __post_init__(self) -> None:
         require(self.min_pixels >= 1, "detector.min_pixels", self.min_pixels, "at least 1 px")

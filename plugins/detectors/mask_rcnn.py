@@ -41,15 +41,18 @@ class MaskRCNNDetector(Detector):
     """
 
     weights: Path = Path("resnet50_fpn_coco")  # published name, or file relative to the working or project folder
-    score_threshold: float = 0.1  # minimum score, in [0, 1); low, because weak detections can update instances
+    # minimum score of a detection, in [0, 1); low, because low-score detections can update existing instances
+    score_threshold: float = 0.1
     nms_iou: float = 0.5  # box IoU threshold of non-maximum suppression within a class, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
-    proposals_before_nms: int = 1000  # maximum number of anchors per pyramid level before non-maximum suppression, >= 1
-    proposals: int = 300  # maximum number of region proposals for the box head, >= 1; 1000 in published networks
+    # maximum number of region proposals per pyramid level before non-maximum suppression, >= 1
+    proposals_before_nms: int = 1000
+    proposals: int = 300  # maximum number of region proposals for the box head, >= 1; published networks use 1000
     max_detections: int = 100  # maximum number of detections per image, >= 1
-    short_side: int = 0  # short side of the resized image, px, >= 32; 0 = as in training
-    long_side: int = 0  # maximum long side of the resized image, px, >= short_side; 0 = same ratio as in training
-    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
+    short_side: int = 0  # short side of the resized image, px, 0 or >= 32; 0 = as in training
+    # maximum long side of the resized image, px, 0 or >= short_side; 0 = same ratio to the short side as in training
+    long_side: int = 0
+    mask_threshold: float = 0.5  # minimum mask probability of a pixel in the mask, in (0, 1)
     half_precision: bool = True  # True = half precision on CUDA; the CPU always uses single precision
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
 
@@ -109,7 +112,7 @@ class MaskRCNNDetector(Detector):
         return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms_iou)
 
     def _resize(self, frame: Frame) -> Tensor:
-        """Return the network's input before normalization (1, 3, H, W), RGB, 0..255."""
+        """Return the resized image (1, 3, H, W), RGB, 0..255, the input of the network before normalization."""
         height, width = frame.camera.shape
         scale = min(self._short_side / min(height, width), self._long_side / max(height, width))
         size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -119,7 +122,10 @@ class MaskRCNNDetector(Detector):
         return image.contiguous(memory_format=torch.channels_last)
 
     def _mask_grids(self, pyramid: list[Tensor], boxes: Float32, label: Int32) -> Float32:
-        """Return the probabilities (N, 28, 28) that points of the box are inside the object."""
+        """Return grids (N, 28, 28) over boxes (N, 4), px, of the probability that a point is inside the object.
+
+        `label`: the class (N,) of the object in each box, from 1.
+        """
         logits = self._network.segment(pyramid, self._on_device(boxes))
         own = logits[torch.arange(len(label), device=self._device), self._on_device(label).long()]
         return self._finite(torch.sigmoid(own.float()))

@@ -68,16 +68,20 @@ class MaskRCNN2Go(Detector):
     ambiguous object does not create two instances.
     """
 
-    weights: Path = Path("plugins/detectors/maskrcnn2go_int8")  # folder, relative to the working or project folder
-    score_threshold: float = 0.1  # minimum score, in [0, 1); low, because weak detections can update instances
+    # folder of the network, absolute or relative to the working directory or the project folder
+    weights: Path = Path("plugins/detectors/maskrcnn2go_int8")
+    # minimum score of a detection, in [0, 1); low, because low-score detections can update existing instances
+    score_threshold: float = 0.1
     nms_iou: float = 0.3  # box IoU threshold of non-maximum suppression within a class, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
-    proposals: int = 120  # maximum number of region proposals for the box head, >= 1; 100 to 120 in training
+    # maximum number of region proposals for the box head, >= 1; the network was trained with 100 to 120
+    proposals: int = 120
     max_detections: int = 100  # maximum number of detections per image, >= 1
-    short_side: int = 320  # short side of the resized image, px, >= 32; 320 in training
+    short_side: int = 320  # short side of the resized image, px, >= 32; the network was trained with 320
     long_side: int = 640  # maximum long side of the resized image, px, >= short_side
-    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
-    int8: bool = True  # True = 8-bit arithmetic on CPUs with VNNI, three times as fast per core; False = float
+    mask_threshold: float = 0.5  # minimum mask probability of a pixel in the mask, in (0, 1)
+    # True = 8-bit integer arithmetic on CPUs with VNNI, three times as fast per core; False = floating-point arithmetic
+    int8: bool = True
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
 
     reads = ("color",)
@@ -149,7 +153,7 @@ class MaskRCNN2Go(Detector):
         return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms_iou)
 
     def _resize(self, frame: Frame) -> Tensor:
-        """Return the network's input (1, 3, H, W), RGB, 0..255."""
+        """Return the resized image (1, 3, H, W), RGB, 0..255, the input of the network."""
         height, width = frame.camera.shape
         scale = min(self.short_side / min(height, width), self.long_side / max(height, width))
         size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -160,7 +164,10 @@ class MaskRCNN2Go(Detector):
         return roi_align(features, torch.from_numpy(boxes).to(self._device), BINS, 1 / STRIDE)
 
     def _mask_grids(self, pooled: Tensor, label: Int32) -> Float32:
-        """Return the probabilities (N, 24, 24) that points of the box are inside the object of its class."""
+        """Return grids (N, 24, 24) over N boxes of the probability that a point is inside the object.
+
+        `pooled`: the features of the boxes. `label`: the class (N,) of the object in each box, from 1.
+        """
         (features,) = self._mask_head(pooled)
         own = torch.from_numpy(label).long().to(self._device)
         weight, bias = self._mask_logits
@@ -172,7 +179,10 @@ class MaskRCNN2Go(Detector):
 
 
 def _find_weights(folder: Path) -> Path:
-    """Return the network's folder. A relative path is searched in the working folder, then in the project folder."""
+    """Return the existing folder of the network. Raises DataError if there is none.
+
+    A relative path is searched in the working directory, then in the project folder.
+    """
     for candidate in candidates(folder):
         if candidate.is_dir():
             return candidate
@@ -181,7 +191,7 @@ def _find_weights(folder: Path) -> Path:
 
 
 def _read_network(folder: Path) -> tuple[list[Operator], dict[str, Tensor], dict[str, float]]:
-    """Return the operators in order, the float tensors, and the quantization steps of the quantized tensors."""
+    """Return the operators in order, the float32 tensors by name, and the quantization steps of quantized tensors."""
     content = {name: _read_checked(folder / name, sha256) for name, sha256 in SHA256.items()}
     description = json.loads(content["graph.json"])
     quantization: Mapping[str, tuple[float, int]] = description["quant"]

@@ -25,29 +25,34 @@ SOURCE = "yolox_nano.onnx (3.7 MB, COCO, Apache-2.0) is at https://github.com/Me
 class OnnxBoxes(Detector):
     """YOLO or SSD from an ONNX file, run by onnxruntime, with masks from depth.
 
-    The class distribution of a detection is its class scores times the objectness, normalized. Its score is the largest
-    of these products before normalization. A mask is the connected foreground of its box, see
+    The class distribution of a detection consists of the normalized products of its class scores and objectness. Its
+    score is the largest of these products before normalization. A mask is the connected foreground of its box; see
     `framework.detection.masks.masks_from_boxes`. A box with too few depth readings is dropped and counted in
     `boxes_without_depth`. The defaults match Megvii's YOLOX.
     """
 
     weights: Path = field(metadata={"source": SOURCE})  # ONNX file, relative to the working or project folder
     sha256: str = ""  # expected SHA-256 of the file; "" = not checked
-    label_space: str = "coco"  # class names: a label space, or a text file with one name per line
+    # class names: a label space such as coco, or a text file with one name per line (n/a = unused index)
+    label_space: str = "coco"
     layout: OutputLayout = OutputLayout.yolox  # layout of the outputs
-    score_threshold: float = 0.1  # minimum score, in (0, 1); low, because weak detections can update instances
+    # minimum score of a detection, in (0, 1); low, because low-score detections can update existing instances
+    score_threshold: float = 0.1
     nms_iou: float = 0.45  # box IoU threshold of non-maximum suppression within a class, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
-    input_size: int = 0  # side of the input of a network with variable input size, px; 0 = size in the file
+    input_size: int = 0  # side of the square input, px, for networks with variable input size; 0 = size in the file
     placement: Placement = Placement.top_left  # position of the image in the input
     padding: int = 114  # gray value of the padding, in [0, 255]
     bgr: bool = True  # channel order: True = BGR, False = RGB
-    black_level: float = 0.0  # input of the network for a channel value of 0
-    white_level: float = 255.0  # input of the network for a channel value of 255; 1 for networks with inputs in 0..1
-    min_foreground_fraction: float = 0.4  # minimum center-weighted fraction of readings in the foreground, in [0, 1]
-    max_slant: float = 85.0  # maximum angle between surface and image plane, degrees, in (0, 90); steeper = boundary
-    min_readings: float = 0.1  # minimum fraction of the box's pixels with depth, in [0, 1]; other boxes are dropped
+    black_level: float = 0.0  # network input for a channel value of 0
+    white_level: float = 255.0  # network input for a channel value of 255; 1 for networks with inputs in [0, 1]
+    # minimum fraction of a box's depth readings in the foreground, weighted toward the box center, in [0, 1]
+    min_foreground_fraction: float = 0.4
+    # maximum angle between surface and image plane, degrees, in (0, 90); a steeper depth step is an object boundary
+    max_slant: float = 85.0
+    # minimum fraction of a box's pixels with depth, in [0, 1]; boxes below it are dropped and counted
+    min_readings: float = 0.1
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if onnxruntime supports it
     reads = ("color", "depth", "camera", "sensor")
 

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class OnnxSegmentation(Detector):
-    """YOLO-style instance segmentation: boxes, class scores, mask coefficients, prototypes; needs the extra `onnx`.
+    """YOLO-style instance segmentation with mask coefficients and prototypes; needs the extra `onnx`.
 
     The network has K candidates, each with a box, C class scores and M coefficients of the prototypes. The outputs are
     (1, 4 + C + M, K) or its transpose, and (1, M, h, w) or (1, h, w, M). If suppression is part of the network (exports
@@ -30,28 +30,32 @@ class OnnxSegmentation(Detector):
     see `framework.detection.segmentation_output`. An ambiguous layout raises DataError.
 
     The class distribution of a detection is its normalized class scores. Its score is the largest class score before
-    normalization. Suppression in the network discards the other scores. Then the other classes get equal parts of
-    `class_spread` * (1 - score), so that ambiguous objects contribute less to the map. The other defaults match
+    normalization. Suppression in the network discards the scores of the other classes. Then the other classes get equal
+    parts of `class_spread` * (1 - score), so that ambiguous objects contribute less to the map. The defaults match
     Ultralytics' exports. Ultralytics' code and weights (AGPL) are not part of this project.
     """
 
     weights: Path  # ONNX file, relative to the working or project folder
     sha256: str = ""  # expected SHA-256 of the file; "" = not checked
-    label_space: str = "coco"  # class names: a label space, or a text file with one name per line
+    # class names: a label space such as coco, or a text file with one name per line (n/a = unused index)
+    label_space: str = "coco"
     objectness: bool = False  # True = an objectness score precedes the class scores in the outputs, as in YOLOv5
     box_format: BoxKind = BoxKind.AUTO  # box format: CENTER, CORNER or AUTO (detected)
-    class_spread: float = 1.0  # fraction of (1 - score) for other classes, if the network reports one class, in [0, 1]
-    score_threshold: float = 0.1  # minimum score, in (0, 1); low, because weak detections can update instances
+    # fraction of (1 - score) distributed over the other classes, for networks that report one class, in [0, 1]; 0 =
+    # certain label
+    class_spread: float = 1.0
+    # minimum score of a detection, in (0, 1); low, because low-score detections can update existing instances
+    score_threshold: float = 0.1
     nms_iou: float = 0.45  # box IoU threshold of non-maximum suppression within a class, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
-    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
-    input_size: int = 0  # side of the input of a network with variable input size, px; 0 = size in the file
+    mask_threshold: float = 0.5  # minimum mask probability of a pixel in the mask, in (0, 1)
+    input_size: int = 0  # side of the square input, px, for networks with variable input size; 0 = size in the file
     placement: Placement = Placement.center  # position of the image in the input
     padding: int = 114  # gray value of the padding, in [0, 255]
     bgr: bool = False  # channel order: True = BGR, False = RGB
-    black_level: float = 0.0  # input of the network for a channel value of 0
-    white_level: float = 1.0  # input of the network for a channel value of 255; 255 for networks with inputs in 0..255
+    black_level: float = 0.0  # network input for a channel value of 0
+    white_level: float = 1.0  # network input for a channel value of 255; 255 for networks with inputs in [0, 255]
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if onnxruntime supports it
     reads = ("color",)
 
@@ -95,7 +99,7 @@ class OnnxSegmentation(Detector):
         return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms_iou)
 
     def _log_classes(self) -> None:
-        """Log single-class outputs, and class names in the file that differ from `label_space`."""
+        """Log that the network reports one class per detection, and class names that differ from `label_space`."""
         if self._layout.suppressed:
             log.info(
                 "detector.class_spread: %s reports one class per detection; the other classes get %g of 1 - score",

@@ -26,18 +26,20 @@ SIGNIFICANCE, MAX_SLANT, MIN_READINGS = 0.4, 85.0, 0.1  # parameters of masks fr
 class OpenVocabulary(Detector):
     """Boxes from OWLv2 for text queries, and masks from SAM, SAM 2 or EdgeTAM; needs the extra `transformers`.
 
-    The classes are the text queries as written, and `something else`. OWLv2 estimates an independent probability p for
-    each query. The distribution is proportional to the odds p / (1 - p), with the odds of the threshold for `something
-    else`. The score is the largest p. Queries that are COCO names are evaluated as these classes. Other queries are not
-    evaluated.
+    The classes are the text queries as written, and `something else`. OWLv2 estimates an independent probability p of
+    each query for each box. The distribution of a detection is proportional to the odds p / (1 - p). For `something
+    else`, p is `score_threshold`. The score is the largest p of a query. Queries that are COCO names are evaluated as
+    these classes. Other queries are not evaluated.
     """
 
     text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # distinct text queries
     model: str = "google/owlv2-base-patch16-ensemble"  # OWLv2 model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model repository
-    mask_model: str = "facebook/sam2.1-hiera-tiny"  # SAM, SAM 2 or EdgeTAM: id or folder; "" = masks from depth
-    mask_model_revision: str = "main"  # branch, tag or commit of the mask model id
-    score_threshold: float = 0.1  # minimum probability of the best query for a box, in (0, 1)
+    # promptable segmentation model for the masks, SAM, SAM 2 or EdgeTAM (requires timm): huggingface.co id or folder;
+    # "" = masks from depth
+    mask_model: str = "facebook/sam2.1-hiera-tiny"
+    mask_model_revision: str = "main"  # branch, tag or commit of the mask model repository
+    score_threshold: float = 0.1  # minimum probability of the most likely query for a box, in (0, 1)
     nms_iou: float = 0.5  # box IoU threshold of non-maximum suppression across queries, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across queries, in (0, 1]; 1 = off
     max_detections: int = 50  # maximum number of detections per image, >= 1
@@ -79,7 +81,10 @@ class OpenVocabulary(Detector):
 
 
 def word_distributions(probabilities: Float32, threshold: float) -> Float32:
-    """Return the distributions (N, W + 1) over W queries and `something else` from independent probabilities (N, W)."""
+    """Return the distributions (N, W + 1) over W queries and `something else` from independent `probabilities` (N, W).
+
+    They are proportional to the odds p / (1 - p); p of `something else` is `threshold`.
+    """
     p = np.clip(probabilities.astype(np.float64), 1e-6, 1 - 1e-6)
     odds = np.hstack([p / (1 - p), np.full((len(p), 1), threshold / (1 - threshold))])
     return np.asarray(odds / odds.sum(axis=1, keepdims=True), np.float32)

@@ -25,28 +25,33 @@ from framework.vocabulary.label_spaces import read_labels, to_coco
 
 log = logging.getLogger(__name__)
 
-FRAMES_IN_DOUBT = 30  # number of initial frames without an entry before a warning
+FRAMES_IN_DOUBT = 30  # number of initial frames without an entry after which a warning is logged
 
 
 @dataclass
 class Precomputed(Detector):
-    """Detections in a COCO result file or a folder of masks, by frame number.
+    """Detections from a COCO results file or a mask folder, by frame number.
 
-    `instancemap detect` and programs for COCO's evaluation write such files. A folder has NNNNNN.png with 16-bit
-    instance ids and NNNNNN.json with [{"id", "class", "score"}] for frame NNNNNN. Both formats may contain
-    `class_probabilities` over their own labels. `label_spaces.yaml` maps labels to COCO names. A detection is dropped
-    if its best label has no COCO name. A label with only a score s gets the probability 1 - class_spread * (1 - s), at
-    least 1 / classes. The other classes get equal parts of the rest.
+    `instancemap detect` and programs for COCO's evaluation write COCO results files. A mask folder contains for each
+    frame NNNNNN an image NNNNNN.png of 16-bit instance ids, and NNNNNN.json with a list of {"id", "class", "score"}.
+    Both formats may contain `class_probabilities` over the names in `label_space`. `label_spaces.yaml` maps these names
+    to COCO names. A detection is dropped if its best label has no COCO name. Without `class_probabilities`, the label
+    of a detection with the score s gets the probability 1 - class_spread * (1 - s), but at least 1 / (number of
+    classes). The other classes share the remainder equally.
 
-    A frame without an entry has no detections. Raises DataError if no frame up to the last frame in the file had an
-    entry, because the file then belongs to another sequence.
+    A frame without an entry has no detections. Raises DataError if no requested frame up to the last frame in the file
+    had an entry, because the file then belongs to another sequence.
     """
 
-    path: Path  # COCO result file, or folder of masks
-    label_space: str = "coco"  # label space of the file, or a text file with one name per line
+    # COCO results file (e.g. from `instancemap detect`), or folder with NNNNNN.png and NNNNNN.json
+    path: Path
+    # class names: a label space (coco, nyu40, scenenn, ...), or a text file with one name per line
+    label_space: str = "coco"
     category_ids: CategoryIds = CategoryIds.COCO_91  # numbering of category_id
     score_threshold: float = 0.0  # minimum score of a detection, in [0, 1]
-    class_spread: float = 1.0  # fraction of (1 - score) for other classes of detections with one class, in [0, 1]
+    # fraction of (1 - score) distributed over the other classes, for detections with one class, in [0, 1]; 0 = certain
+    # label
+    class_spread: float = 1.0
 
     reads = ("index", "camera")
 
@@ -55,7 +60,8 @@ class Precomputed(Detector):
         self.path = Path(self.path).expanduser()
         self._labels = read_labels(self.label_space)
         if len(set(self._labels)) < len(self._labels):
-            raise ConfigError(f"detector.label_space: expected unique names, got duplicates in {self.label_space}")
+            repeated = next(name for k, name in enumerate(self._labels) if name in self._labels[:k])
+            raise ConfigError(f"detector.label_space: expected unique names, got {repeated!r} twice")
         if self.path.is_dir():
             stored = read_mask_folder(self.path, self._labels)
         else:
@@ -64,7 +70,10 @@ class Precomputed(Detector):
             raise DataError(f"{self.path}: expected at least one detection, got none")
         probabilities, known = self._distributions(stored)
         if not known.any():
-            raise DataError(f"{self.path}: expected detections of COCO's classes, got none of {len(stored)}")
+            raise DataError(
+                f"{self.path}: expected detections of COCO classes, got none in {len(stored)} detections; check "
+                "detector.label_space"
+            )
         if not known.all():
             lost = sorted({one.label for one, is_known in zip(stored, known, strict=True) if not is_known})
             log.info("%s: dropped %d of %d detections of classes without a COCO name: %s",
@@ -100,9 +109,9 @@ class Precomputed(Detector):
         )
 
     def _distributions(self, stored: Sequence[StoredDetection]) -> tuple[Float32, Bool]:
-        """Return distributions (N, C) over COCO names, and an array (N,), True if the best label has a COCO name.
+        """Return distributions (N, C) over COCO names for N detections, and set `classes` to these names.
 
-        Sets `classes`.
+        Also return an array (N,), True for detections whose best label has a COCO name.
         """
         index = {name: k for k, name in enumerate(self._labels)}
         one_hot = np.eye(len(index), dtype=np.float32)

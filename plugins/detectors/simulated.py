@@ -30,18 +30,20 @@ LOOKALIKES = (
 """COCO classes that detectors confuse indoors."""
 
 CLUTTER_CLASSES = tuple(dict.fromkeys(name for group in LOOKALIKES for name in group))
-"""Classes assigned to detections of things without a COCO class."""
+"""Classes assigned to detections of objects of unknown class."""
 
 LOOKALIKE_FRACTION = 0.8  # fraction of the probability of wrong classes for similar classes; other classes get the rest
 EVEN_FRACTION = 0.01  # weight of the mean distribution in each distribution; avoids zeros, as a softmax does
 FALSE_SIZES = (24.0, 160.0)  # range of the sides of false detections, px, log-uniform
 RECURRING_SIZES = (0.2, 1.2)  # range of the sides of recurring false detections, m, log-uniform
-LARGEST_CLUTTER = 0.25  # maximum size of things detected as objects, fraction of the image; walls are larger
-LARGEST_ATTACHED = 2.0  # maximum size of things detected as part of an object, times the object's size
+# maximum area of an object of unknown class that is detected, as a fraction of the image; walls are larger
+LARGEST_CLUTTER = 0.25
+# maximum ratio of the area of an object of unknown class to the area of the object whose mask includes it
+LARGEST_ATTACHED = 2.0
 INTERVALS = {
     **dict.fromkeys(("clutter_rate", "attach_rate", "merge_rate", "miss_rate", "truncated_miss_rate"), "[0, 1]"),
     **dict.fromkeys(("split_rate", "confusion_consistency", "recurring_fraction"), "[0, 1]"),
-    **dict.fromkeys(("small_side", "miss_spread", "shift", "boundary_noise", "score_concentration"), "[0, inf)"),
+    **dict.fromkeys(("miss_size_scale", "miss_spread", "shift", "boundary_noise", "score_concentration"), "[0, inf)"),
     **dict.fromkeys(("confusion", "score_threshold"), "[0, 1)"),
     "seed": "[0, inf)",
     "min_pixels": "[1, inf)",
@@ -56,7 +58,7 @@ INTERVALS = {
 
 
 class Draw(IntEnum):
-    """The purpose of a random number. Each has its own random stream, so that errors are independent of each other."""
+    """The purpose of a random number. Each purpose has its own random stream, so that errors are independent."""
 
     MERGE = 0
     MISS = 1
@@ -78,7 +80,7 @@ class Candidate:
 
     instance: int  # id in the ground truth; negative for a false detection
     part: int  # 0; 1 for the second half of a split object
-    class_id: int
+    class_id: int  # index into COCO
     mask: Bool  # (H, W)
     true_mask: Bool  # (H, W) ground-truth mask of the instance; empty for a false detection
 
@@ -89,15 +91,15 @@ class SimulatedDetector(Detector):
 
     The errors are applied in this order:
 
-    - Things of unknown class are detected as objects (`clutter_rate`).
-    - An object includes a touching thing, such as the cupboard of a sink (`attach_rate`).
+    - Objects of unknown class are detected as an arbitrary class (`clutter_rate`).
+    - The mask of an object includes a touching object of unknown class, such as the cupboard of a sink (`attach_rate`).
     - Touching objects share one mask (`merge_rate`).
-    - Objects are missed, more often if small (`small_side`) or cut by the image border. Some objects are missed nearly
-      always and others never (`miss_spread`).
+    - Objects are missed, more often if small (`miss_size_scale`) or cut by the image border. Some objects are missed
+      nearly always and others never (`miss_spread`).
     - Objects are split in two (`split_rate`).
     - Masks are shifted, extend beyond the object, have a noisy border and are resampled on a coarse grid.
-    - The class becomes a distribution around a confusion kernel of similar classes, often with the same draw for an
-      object (`confusion_consistency`).
+    - The class becomes a random distribution with a mean from a confusion matrix of similar classes (`confusion`). For
+      a fraction of the frames, an object always has the same distribution (`confusion_consistency`).
     - The score depends on mask quality and class certainty.
     - False detections appear, some repeatedly at the same locations (`recurring_fraction`, if poses are known).
 
@@ -107,22 +109,24 @@ class SimulatedDetector(Detector):
 
     seed: int = 0  # seed of the simulated errors, >= 0
     min_pixels: int = 64  # minimum number of pixels of a detected instance, >= 1
-    clutter_rate: float = 0.0  # fraction of objects of unknown class that are detected, in [0, 1]
-    # probability of a common mask of an object and a touching object of unknown class, in [0, 1]
+    clutter_rate: float = 0.0  # fraction of the objects of unknown class that are detected, in [0, 1]
+    # probability that an object and a touching object of unknown class share one mask, in [0, 1]
     attach_rate: float = 0.0
-    merge_rate: float = 0.1  # probability of a common mask of two touching objects, in [0, 1]
+    merge_rate: float = 0.1  # probability that two touching objects share one mask, in [0, 1]
     miss_rate: float = 0.1  # probability of missing a large object inside the image, in [0, 1]
-    small_side: float = 24.0  # object side with a size-related miss probability of 1/e, px, >= 0; 0 = no effect
+    # object side length at which the size-related miss probability is 1/e, px, >= 0; 0 = no effect of the size
+    miss_size_scale: float = 24.0
     truncated_miss_rate: float = 0.15  # additional probability of missing an object at the image border, in [0, 1]
     miss_spread: float = 0.0  # standard deviation of the logit of the detection rate over objects, >= 0
     split_rate: float = 0.05  # probability of splitting an object into two detections, in [0, 1]
     shift: float = 1.5  # standard deviation of the mask shift along x and y, px, >= 0
     bleed: float = 2.0  # offset of the mask border from the object border, px; positive = outside, negative = inside
-    boundary_noise: float = 2.5  # standard deviation of the mask border's displacement, px, >= 0
-    boundary_scale: float = 12.0  # correlation length of the mask border's displacement, px, >= 2
+    boundary_noise: float = 2.5  # standard deviation of the displacement of the mask border, px, >= 0
+    boundary_scale: float = 12.0  # correlation length of the displacement along the mask border, px, >= 2
     mask_grid: int = 28  # number of cells per side of a mask, >= 4; 0 = full resolution
-    confusion: float = 0.25  # mean probability of wrong classes, in [0, 1)
-    confusion_concentration: float = 3.0  # concentration of the Dirichlet distribution of classes, > 0
+    confusion: float = 0.25  # mean total probability of the wrong classes, in [0, 1)
+    # concentration of the Dirichlet distribution of classes, > 0; small values give confident but often wrong classes
+    confusion_concentration: float = 3.0
     confusion_consistency: float = 0.5  # fraction of an object's frames with the same class distribution, in [0, 1]
     score_scale: float = 1.0  # scale of the mean score (mask IoU times class probability), in (0, 1]
     score_concentration: float = 20.0  # concentration of the Beta distribution of scores, >= 0; 0 = no noise
@@ -170,7 +174,7 @@ class SimulatedDetector(Detector):
         return np.random.default_rng([self.seed, int(draw), *(k & 0xFFFFFFFF for k in key)])
 
     def _clutter(self, things: Mapping[int, Bool]) -> list[Candidate]:
-        """Return the things of unknown class that are detected as objects, the same in all frames."""
+        """Return the objects of unknown class that are detected; they are the same in all frames."""
         candidates = []
         for instance, mask in things.items():
             random = self._random(Draw.CLUTTER, instance)
@@ -180,7 +184,7 @@ class SimulatedDetector(Detector):
         return candidates
 
     def _things(self, frame: Frame) -> dict[int, Bool]:
-        """Return the masks of things of unknown class with at least `min_pixels`, by id."""
+        """Return the masks (H, W) of the objects of unknown class with at least `min_pixels` pixels, by id."""
         assert frame.truth is not None
         names = frame.truth.class_names
         found, areas = np.unique(frame.truth.instance_ids, return_counts=True)
@@ -188,7 +192,10 @@ class SimulatedDetector(Detector):
         return {i: frame.truth.instance_ids == i for i in chosen}
 
     def _attached(self, truth: TrueInstances, things: Mapping[int, Bool], pairs: list[list[int]]) -> list[Candidate]:
-        """Return the instances, largest first, some with attached touching things."""
+        """Return the instances of known class, largest first; some masks include touching objects of unknown class.
+
+        `things`: the masks of objects of unknown class by id. `pairs`: the ids of touching instances.
+        """
         candidates = {
             i: Candidate(i, 0, c, mask, mask)
             for i, c, mask in zip(truth.ids.tolist(), truth.class_ids.tolist(), truth.masks, strict=True)
@@ -225,7 +232,7 @@ class SimulatedDetector(Detector):
         side = float(np.sqrt(np.count_nonzero(mask)))
         truncated = bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
         p = 1 - self.miss_rate
-        p *= 1 - np.exp(-side / self.small_side) if self.small_side > 0 else 1.0
+        p *= 1 - np.exp(-side / self.miss_size_scale) if self.miss_size_scale > 0 else 1.0
         p *= 1 - self.truncated_miss_rate if truncated else 1.0
         if self.miss_spread > 0 and 0 < p < 1:
             own = self.miss_spread * self._random(Draw.DETECTABILITY, candidate.instance).standard_normal()
@@ -233,7 +240,7 @@ class SimulatedDetector(Detector):
         return bool(self._random(Draw.MISS, frame.index, candidate.instance).random() < p)
 
     def _split(self, candidate: Candidate, frame: Frame) -> list[Candidate]:
-        """Return the object, or its two parts along a random line through its centroid."""
+        """Return the object, or its two parts on both sides of a random line through its centroid."""
         random = self._random(Draw.SPLIT, frame.index, candidate.instance)
         if random.random() >= self.split_rate:
             return [candidate]
@@ -270,7 +277,7 @@ class SimulatedDetector(Detector):
         return replace(candidate, mask=self._coarsen(_placed(shape, x1 - margin, y1 - margin, (height, width))))
 
     def _coarsen(self, mask: Bool) -> Bool:
-        """Return the mask resampled on a grid of `mask_grid` cells per side over its box, like a network's mask."""
+        """Return the mask (H, W) resampled on a grid of `mask_grid` cells per side over its box, as in Mask R-CNN."""
         if self.mask_grid == 0 or not mask.any():
             return mask
         x1, y1, x2, y2 = tight_boxes(mask[None])[0].astype(int)
@@ -280,9 +287,10 @@ class SimulatedDetector(Detector):
         return np.asarray(paste_masks(grid[None], borders, (mask.shape[0], mask.shape[1]))[0], np.bool_)
 
     def _false_positives(self, frame: Frame) -> list[Candidate]:
-        """Return ellipses with a noisy border, of any class at any pixel or of one class at a fixed location.
+        """Return false positives: ellipses with a noisy border.
 
-        Visible locations have the same order in all frames.
+        A false positive has any class at any pixel, or is recurring: it has one class at a fixed location of the world
+        frame. Visible locations are used in the same order in all frames.
         """
         random = self._random(Draw.FALSE_POSITIVES, frame.index)
         height, width = frame.camera.shape
@@ -307,7 +315,7 @@ class SimulatedDetector(Detector):
         return candidates
 
     def _classify(self, candidate: Candidate, frame: Frame) -> Float64:
-        """Return a random distribution (C,), with the confusion kernel's row of the ground-truth class as mean."""
+        """Return a random class distribution (C,) whose mean is the confusion kernel's row of the candidate's class."""
         mean = self._kernel[candidate.class_id]
         random = self._random(Draw.CLASS, frame.index, candidate.instance, candidate.part)
         if random.random() < self.confusion_consistency:
@@ -316,7 +324,11 @@ class SimulatedDetector(Detector):
         return np.asarray((1 - EVEN_FRACTION) * drawn + EVEN_FRACTION * mean, np.float64)
 
     def _score(self, candidate: Candidate, probabilities: Float64, frame: Frame) -> float:
-        """Return a Beta sample with the mean `score_scale` times mask IoU times largest class probability."""
+        """Return a sample of a Beta distribution: the score in [0, 1].
+
+        The mean is `score_scale` times mask IoU times largest class probability, or `false_positive_score` for a
+        candidate without a ground-truth mask.
+        """
         mean = self.false_positive_score
         if candidate.true_mask.any():
             union = np.count_nonzero(candidate.mask | candidate.true_mask)
@@ -329,7 +341,11 @@ class SimulatedDetector(Detector):
 
 
 def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
-    """Return the kernel (C, C). Row t is the mean distribution of class t, with 1 - `confusion` on t itself."""
+    """Return the confusion kernel (C, C) of C classes.
+
+    Row t is the mean class distribution of objects of class t: 1 - `confusion` for t itself, and more for similar
+    classes (LOOKALIKES) than for other classes.
+    """
     index = {name: k for k, name in enumerate(classes)}
     alike = np.zeros((len(classes), len(classes)), np.bool_)
     for group in LOOKALIKES:
@@ -344,7 +360,10 @@ def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
 
 
 def touching_pairs(frame: Frame) -> Int32:
-    """Return the pairs (M, 2) of instance ids with a common border without a depth step, smaller id first."""
+    """Return the M pairs (M, 2) of ids of instances that touch: neighboring pixels without a depth step.
+
+    The smaller id of a pair comes first.
+    """
     assert frame.truth is not None
     return np.asarray(np.unique(contacts(frame.truth.instance_ids, frame.depth), axis=0), np.int32)
 
@@ -369,13 +388,19 @@ def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: flo
 
 
 def _dirichlet(random: np.random.Generator, alpha: Float64) -> Float64:
-    """Return a sample (C,) of a Dirichlet distribution; with a single positive alpha, its class is certain."""
+    """Return a sample (C,) of a Dirichlet distribution with the parameters `alpha` (C,).
+
+    If the sampled weights are all 0, the mean of the distribution is returned.
+    """
     weights = random.gamma(alpha)
     return np.asarray(weights / weights.sum(), np.float64) if weights.sum() > 0 else alpha / alpha.sum()
 
 
 def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
-    """Return the mask (H, W) of an ellipse at (x, y) with half axes a, b (px), shrunk by `wobble` (H, W) radii."""
+    """Return the mask (H, W) of an axis-aligned ellipse at (x, y) with half axes a and b, all in px.
+
+    At each pixel, the radius of the ellipse is reduced by `wobble` (H, W), relative to the radius.
+    """
     mask = np.zeros(wobble.shape, np.bool_)
     reach = max(0.0, 1.0 - float(wobble.min()))  # maximum radius, in radii
     window = tuple(
@@ -389,7 +414,10 @@ def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
 
 
 def _placed(crop: Bool, x: int, y: int, shape: tuple[int, int]) -> Bool:
-    """Return a mask (H, W), empty except for `crop` at (x, y), which may be partly outside."""
+    """Return a mask of `shape` (H, W), empty except for `crop`, whose first pixel is at (x, y), px.
+
+    Parts of the crop outside of the image are ignored.
+    """
     image = np.zeros(shape, np.bool_)
     height, width = shape
     top, left = max(0, -y), max(0, -x)

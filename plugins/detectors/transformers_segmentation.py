@@ -31,7 +31,7 @@ PLACEHOLDER = re.compile(r"LABEL_\d+|N/A", re.IGNORECASE)  # name of an unnamed 
 
 @dataclass(frozen=True)
 class Family:
-    """The conventions of a family of architectures."""
+    """The conventions of a family of architectures with Q queries and C labels."""
 
     auto_class: str  # auto class of transformers
     logits: str  # output with the class logits, (1, Q, C or C + 1)
@@ -71,12 +71,13 @@ class TransformersSegmentation(Detector):
 
     model: str = "facebook/mask2former-swin-tiny-coco-instance"  # model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model repository
-    score_threshold: float = 0.1  # minimum score, in [0, 1); low, because weak detections can update instances
+    # minimum score of a detection, in [0, 1); low, because low-score detections can update existing instances
+    score_threshold: float = 0.1
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
-    short_side: int = 0  # short side of the resized image, px, >= 32; 0 = as in the published model
-    long_side: int = 0  # maximum long side of the resized image, px, >= short_side; must be 0 if short_side is 0
-    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
+    short_side: int = 0  # short side of the resized image, px, 0 or >= 32; 0 = as in the published model
+    long_side: int = 0  # maximum long side of the resized image, px, 0 or >= short_side; must be 0 if short_side is 0
+    mask_threshold: float = 0.5  # minimum mask probability of a pixel in the mask, in (0, 1)
     half_precision: bool = True  # True = half precision on CUDA; the CPU always uses single precision
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
     reads = ("color",)
@@ -98,7 +99,7 @@ class TransformersSegmentation(Detector):
             require(self._family.any_size, "detector.short_side", short, "0, because this model has a fixed input size")
             size = {"shortest_edge": short, "longest_edge": long}
             self._preprocessing = replace(self._preprocessing, size=size)
-        self._mapping = to_coco(checkpoint.labels)
+        self._mapping = to_coco(checkpoint.labels, "detector.model")
         self.classes = self._mapping.classes
         self._network = checkpoint.read_network().to(self._device)
         self._commit = commit_of(checkpoint.folder)
@@ -139,10 +140,10 @@ class TransformersSegmentation(Detector):
 
 
 def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]:
-    """Return the distributions (Q, C) over the labels, and the probability (Q,) of the best label.
+    """Return the distributions (Q, C) over C labels for Q queries, and the probability (Q,) of the best label.
 
     The logits are (Q, K). K = C + 1 means a softmax with no-object as the last label. K = C means independent sigmoids.
-    See TransformersSegmentation.
+    See TransformersSegmentation for the formulas.
     """
     if logits.shape[1] not in (labels, labels + 1):
         raise DataError(f"detector.model: expected {labels} class logits (as in config.json), got {logits.shape[1]}")
@@ -158,10 +159,10 @@ def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]
 
 
 def resample_masks(grids: Tensor, covered: tuple[float, float], shape: tuple[int, int]) -> Tensor:
-    """Return the mask logits (N, H, W) at the pixels of an image of `shape`, interpolated from (N, h, w).
+    """Return the mask logits (N, H, W) at the pixels of an image of `shape`, interpolated from `grids` (N, h, w).
 
-    `covered` contains the fractions of the input's height and width covered by the image, from the upper left. The rest
-    is padding.
+    The grids cover the input of the network. `covered` contains the fractions of its height and width that the image
+    covers, from the upper left. The rest is padding.
     """
     axes = [
         (torch.arange(size, device=grids.device, dtype=torch.float32) + 0.5) * (2 * fraction / size) - 1
@@ -173,7 +174,10 @@ def resample_masks(grids: Tensor, covered: tuple[float, float], shape: tuple[int
 
 
 def mean_probability(mask_logits: Tensor, inside: Tensor) -> Float32:
-    """Return the mean probability (N,) of the pixels inside each mask (N, H, W); 0 for an empty mask."""
+    """Return the mean mask probability (N,) over the pixels inside each of N masks; 0 for an empty mask.
+
+    `mask_logits`: (N, H, W). `inside`: (N, H, W), True for pixels inside the mask.
+    """
     total = (torch.sigmoid(mask_logits) * inside).sum(dim=(1, 2))
     return np.asarray((total / inside.sum(dim=(1, 2)).clamp(min=1)).cpu().numpy(), np.float32)
 
@@ -185,13 +189,13 @@ class Preprocessing:
     It replaces transformers' image processors, because they require torchvision.
     """
 
-    size: Mapping[str, int] | None  # as in the file; None = original size
+    size: Mapping[str, int] | None  # target size, px, with the keys in the file; None = original size
     divisor: int  # px; sides are rounded up to multiples of it
-    pad_to: tuple[int, int] | None  # padded (height, width), black at the right and bottom
-    mode: str  # interpolation mode
+    pad_to: tuple[int, int] | None  # padded (height, width) px, black at the right and bottom; None = no padding
+    mode: str  # interpolation mode: bilinear or bicubic
     factor: float  # factor of the values 0..255
-    mean: tuple[float, ...]  # mean, RGB, after the factor
-    std: tuple[float, ...]
+    mean: tuple[float, ...]  # RGB, subtracted after the factor is applied
+    std: tuple[float, ...]  # RGB, divides the difference
 
     @classmethod
     def parse(cls, content: Mapping[str, Any], where: str) -> Preprocessing:
@@ -202,7 +206,7 @@ class Preprocessing:
                 "(do_split_image); choose another model"
             )
         if content.get("pad_size"):
-            raise DataError(f"{where}: pad_size: expected no value, got {content['pad_size']}")
+            raise DataError(f"{where}: pad_size: expected no value, got {content['pad_size']}; choose another model")
         if content.get("resample", 2) not in RESAMPLING:
             raise DataError(f"{where}: resample: expected one of {[*RESAMPLING]}, got {content['resample']}")
         size = content.get("size") if content.get("do_resize", True) else None
@@ -211,7 +215,10 @@ class Preprocessing:
         keys = {key for key, value in (size or {}).items() if value}
         known = ({"shortest_edge", "longest_edge"}, {"max_height", "max_width"}, {"height", "width"})
         if content.get("do_resize", True) and keys not in known:
-            raise DataError(f"{where}: size: expected height and width, or shortest_edge and longest_edge, got {size}")
+            raise DataError(
+                f"{where}: size: expected height and width, max_height and max_width, or shortest_edge and "
+                f"longest_edge, got {size}"
+            )
         normalizes = content.get("do_normalize", True)
         pads = content.get("do_pad") and str(content.get("image_processor_type", "")).startswith("Eomt")
         return cls(
@@ -226,7 +233,7 @@ class Preprocessing:
         )
 
     def resized(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """Return the shape (height, width) of an image of `shape` after resizing."""
+        """Return the (height, width) px to which an image of `shape` (height, width) px is resized."""
         if self.size is None:
             return shape
         height, width = shape
@@ -256,7 +263,11 @@ class Preprocessing:
 
 
 def _with_short_side(shape: tuple[int, int], short: int, long: int) -> tuple[int, int]:
-    """Return the resized (height, width) with the aspect ratio of `shape`, rounded as in DETR's transforms."""
+    """Return the resized (height, width), px, with the aspect ratio of `shape` (height, width).
+
+    The shorter side is `short`, or less if the longer side would exceed `long`. Sides are rounded as in DETR's
+    transforms.
+    """
     smaller, larger = min(shape), max(shape)
     exact: float = short
     if larger / smaller * short > long:

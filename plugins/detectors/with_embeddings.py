@@ -16,15 +16,19 @@ from framework.interfaces import Detector
 
 @dataclass
 class WithEmbeddings(Detector):
-    """Detections of another detector with image embeddings of CLIP or SigLIP; needs the extra `transformers`."""
+    """Detections from another detector with image embeddings from CLIP or SigLIP; needs the extra `transformers`.
+
+    An embedding is computed from a square crop around the object. Detections without an embedding have zeros.
+    """
 
     detector: Detector  # wrapped detector; replace it with detector@detector.detector=NAME
     model: str = "google/siglip2-base-patch16-224"  # CLIP or SigLIP model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model repository
     frame_interval: int = 1  # interval between frames with embeddings, in frames, >= 1; 1 = every frame
-    min_score: float = 0.3  # minimum score of a detection with an embedding, in [0, 1]; weaker ones are often wrong
+    # minimum score of a detection with an embedding, in [0, 1]; detections with lower scores are often wrong
+    min_score: float = 0.3
     min_pixels: int = 200  # minimum number of mask pixels of a detection with an embedding, >= 1
-    context: float = 1.2  # ratio of the square crop's side to the longer side of the object's box, >= 1
+    context: float = 1.2  # ratio of the side of the square crop to the longer side of the object's box, in [1, 4]
     background_contrast: float = 0.4  # contrast of the background in the crop, in [0, 1]; 0 = gray, 1 = unchanged
     batch_size: int = 16  # number of crops per batch, >= 1
     half_precision: bool = True  # True = half precision on CUDA; the CPU always uses single precision

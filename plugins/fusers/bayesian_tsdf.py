@@ -1,4 +1,4 @@
-"""Voxels with class and instance distributions, updated by Bayes' rule: section 3.2.3 of the paper."""
+"""Voxels with class and instance distributions, updated by Bayes' rule (section 3.2.3 of the paper)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.label_rule import DetectionEvidence, LabeledVoxels, LabelRule, floored_log
 
 RULE = LabelRule(Combine.SUM, logarithmic=True)
-MIN_LIKELIHOOD = 1e-3  # minimum likelihood of an instance, so that no single score determines the result
+MIN_LIKELIHOOD = 1e-3  # minimum of score and 1 - score, so that no single detection determines the result
 
 
 @dataclass
 class BayesianTsdf(MapFuser):
-    """Two independent Bayesian recursions per voxel, eqs. (7) and (8), as sums of log-likelihoods.
+    """Two independent Bayesian recursions per voxel, eqs. (7) and (8) of docs/method.md, as sums of log-likelihoods.
 
     The likelihood of the matched instance in eq. (8) is the score of the detection (our interpretation). The paper does
     not state the likelihood of other instances. Here, it is `instance_floor`. With `instance_floor=0`, 1 - score is
@@ -30,8 +30,8 @@ class BayesianTsdf(MapFuser):
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
     association: Association = field(default_factory=Association)
     class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
-    # likelihood of each other instance, in [0, 1); 0 = (1 - score) divided equally among the other instances and
-    # "no instance"
+    # likelihood of each unmatched instance, in [0, 1); 0 = (1 - score) divided equally among the unmatched instances
+    # and "no instance"
     instance_floor: float = 0.05
     absence_likelihood: float = 0.7  # P(outside the mask | matched instance), in (0, 1]; 1 = no evidence of absence
 
@@ -60,7 +60,11 @@ class BayesianTsdf(MapFuser):
             self.association.merge(self.scene, matches)
 
     def evidence(self, clusters: PointClusters, instances: int) -> DetectionEvidence:
-        """Return log P(O_u | I_t) of eqs. (7) and (8); for the matched instance, relative to any other instance."""
+        """Return the evidence of the clusters, log P(O_u | I_t) of eqs. (7) and (8).
+
+        The evidence for an instance is relative to any other instance. `instances` is the number of instances in the
+        map.
+        """
         if self.instance_floor > 0:  # a score counts as at least twice the floor, so that no match lowers the log-odds
             log_odds = np.log(np.maximum(clusters.scores, 2 * self.instance_floor) / self.instance_floor)
         else:

@@ -22,18 +22,19 @@ class ClassOnlyFusion(MapFuser):
     The baseline follows SemanticFusion (McCormac et al. 2017) and Pham et al. (WACV 2019). These systems label every
     pixel. Here, the distributions come from masks. A pixel gets the distribution of the mask with the highest score at
     this pixel. In this distribution, the background has the probability that the detector assigns to no class. A pixel
-    under no mask is background, unless the detector missed an object. Two touching objects of one class become one
-    instance. Both systems regularize with a CRF. Here, `smoothness` is the weight of a Potts model over the mesh. It is
-    off by default, because it did not improve AP50.
+    outside all masks is evidence for the background. This evidence is limited by `missed`, because the detector may
+    have missed an object. Two touching objects of one class become one instance. Both systems regularize with a CRF.
+    Here, `smoothness` is the weight of a Potts model over the mesh. It is off by default, because it did not improve
+    AP50.
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     min_area: float = 0.01  # minimum surface area of an instance in the mesh, m^2, >= 0; smaller instances are omitted
     class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
-    # likelihood ratio of a pixel without a mask, P(no mask | any class) / P(no mask | background), in (0, 1]; 1 = no
+    # likelihood ratio for a pixel without a mask, P(no mask | any class) / P(no mask | background), in (0, 1]; 1 = no
     # evidence of absence
     missed: float = 0.7
-    smoothness: float = 0.0  # log-odds per neighboring vertex of the same class, >= 0; 0 = no regularization
+    smoothness: float = 0.0  # log-odds added per neighboring vertex of the same class, >= 0; 0 = no regularization
 
     def __post_init__(self) -> None:
         check_bounds(self, class_floor=(1e-6, 0.999), missed=MISSED, min_area=AREA, smoothness=SMOOTHNESS)
@@ -56,10 +57,11 @@ class ClassOnlyFusion(MapFuser):
             self.scene.labels.update(seen, masks)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
-        """Return log P(O_u = c) / P(O_u = background) (N, C) of a pixel under each mask, for eq. (7), with a floor.
+        """Return the log ratios (N, C), log P(O_u = c) / P(O_u = background), of eq. (7) for a pixel inside each mask.
 
         A score is the probability of the best class, but the distribution excludes the background. Therefore, the score
-        divided by the best class's entry is the probability of all classes together.
+        divided by the entry of the best class is the probability of all classes together. The result is mixed with a
+        fraction `class_floor` of the uniform distribution.
         """
         p = clusters.class_probabilities.astype(np.float64)
         objects = np.minimum(clusters.scores[:, None] / p.max(axis=1, keepdims=True, initial=1e-6), 1.0)

@@ -1,4 +1,4 @@
-"""Label rules without distributions: each detection votes for its instance and its best class."""
+"""Label rules without distributions: each detection votes for its instance and its most likely class."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from framework.mapping.labels.label_rule import LabeledVoxels, LabelRule, vote_f
 
 
 class Vote(Enum):
-    """Rule for combining the votes for a voxel's labels."""
+    """Rule for selecting the label of a voxel from the votes."""
 
     COUNT = "count"  # number of detections (Voxblox++, Grinvald et al. 2019)
     LAST = "last"  # last detection only; among overlapping masks, the last mask
@@ -32,7 +32,7 @@ RULES = {
 
 @dataclass
 class LabelVote(MapFuser):
-    """Majority vote over labels, without evidence against a label."""
+    """Votes of the detections for the labels of voxels, without evidence against a label."""
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
     association: Association = field(default_factory=Association)
@@ -56,7 +56,7 @@ class LabelVote(MapFuser):
         with timer("update"):
             weights = np.ones(len(clusters), np.float32)
             if self.vote is Vote.MAX_SCORE:
-                weights = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # a score of 0 would not be evidence
+                weights = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # a score of 0 would be no evidence
             evidence = vote_for_best(clusters, weights)
             measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULES[self.vote])
             self.scene.labels.update(seen, measurement)

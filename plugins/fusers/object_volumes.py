@@ -19,13 +19,16 @@ from framework.mapping.voxels.tsdf_volume import VoxelHashing
 
 
 def existence(record: InstanceRecord) -> float:
-    """Return Fusion++'s existence probability: the mean of Beta(1 + detections, 1 + in-view frames without one)."""
+    """Return the existence probability of an object in Fusion++: the mean of Beta(1 + n, 1 + m).
+
+    n is the number of frames with a detection, and m is the number of frames in view without a detection.
+    """
     return (1 + record.observations) / (2 + max(record.visible, record.observations))
 
 
 @dataclass
 class ObjectVolumes(MapFuser):
-    """A TSDF with foreground probabilities for each object, and a TSDF of the whole scene.
+    """One TSDF with foreground probabilities per object, and one TSDF of the whole scene.
 
     A detection belongs to the object with the largest overlap. If several detections belong to one object, the union of
     their masks is used. The defaults are the rule of Fusion++. Set `overlap_rule=CLUSTER min_overlap=0.05
@@ -37,7 +40,7 @@ class ObjectVolumes(MapFuser):
     min_overlap: float = 0.2  # minimum overlap of a detection and an object to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.IOU  # denominator of the overlap
     require_same_class: bool = False  # True = match only objects with the same most likely class, as in MaskFusion
-    create_score: float = 0.3  # minimum score of a detection to create an object, in [0, 1]; updates have no minimum
+    create_score: float = 0.3  # minimum score of a detection to create an object, in [0, 1]; no minimum for updates
     # minimum number of pixels of a detection to create an object, >= 1; also the minimum denominator of the overlap
     create_points: int = 50
     min_existence: float = 0.1  # minimum existence probability of an object, in [0, 1]; objects below it are removed
@@ -93,14 +96,17 @@ class ObjectVolumes(MapFuser):
         return Matches(frame.index, clusters, overlaps, instance_ids)
 
     def _agree(self, clusters: PointClusters, instance_ids: Int32) -> Bool:
-        """Return an array (N, M), True if the classes of a cluster and an object allow a match."""
+        """Return a Boolean array (N, M), True where the classes of cluster n and object m allow a match."""
         if not self.require_same_class or not len(instance_ids):
             return np.ones((len(clusters), len(instance_ids)), np.bool_)
         known = np.array([self.scene.table.records[k].class_evidence.argmax() for k in instance_ids.tolist()])
         return np.asarray(clusters.class_probabilities.argmax(axis=1)[:, None] == known[None, :])
 
     def _remove_empty(self, instance_ids: Int32) -> None:
-        """Remove new objects without readings in range, because objects without voxels can never be matched."""
+        """Remove new objects without depth readings in range, because objects without voxels can never be matched.
+
+        Sets their entries in instance_ids (N,) to 0.
+        """
         for instance_id in set(instance_ids[instance_ids > 0].tolist()):
             if not self.scene.volumes[instance_id].block_count:
                 self.scene.remove(instance_id)
@@ -114,7 +120,10 @@ class ObjectVolumes(MapFuser):
 
 
 def _masks(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> dict[int, Bool]:
-    """Return the union (H, W) of the cluster masks of each object, by id."""
+    """Return the union (H, W) of the cluster masks of each object, by id.
+
+    `instance_ids` (N,) holds the object of each cluster, 0 = none.
+    """
     masks: dict[int, Bool] = {}
     for k in np.flatnonzero(instance_ids):
         u, v = clusters.pixels[clusters.cluster == k].T

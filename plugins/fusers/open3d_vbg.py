@@ -29,8 +29,10 @@ class Open3DVoxelBlockGrid(MapFuser):
     tsdf: Tsdf = field(default_factory=Tsdf)
     association: Association = field(default_factory=Association)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    block_resolution: int = 8  # number of voxels per side of a block, in [2, 64]; 16 doubles the voxel count
-    max_blocks: int = 200_000  # maximum number of blocks, > 0; 14 KiB each, up to 5.7 GB when Open3D copies the map
+    # number of voxels per block side, in [2, 64]; with 16, the default of Open3D, the map has twice as many voxels
+    block_resolution: int = 8
+    # maximum number of blocks, > 0; each needs 14 KiB; at the maximum, copying the map needs up to 5.7 GB
+    max_blocks: int = 200_000
     min_weight: float = 1.0  # minimum number of observations of a surface voxel, >= 1; Open3D's default is 3
     class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
 
@@ -66,7 +68,7 @@ class Open3DVoxelBlockGrid(MapFuser):
 
 
 def _paint(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> Int32:
-    """Return the instance (H, W) at each pixel, 0 = none; overlaps go to the cluster with the highest score."""
+    """Return the instance ids (H, W), 0 = none; pixels of several clusters go to the one with the highest score."""
     image = np.zeros(shape, np.int32)
     for k in np.argsort(clusters.scores, kind="stable"):
         if instance_ids[k]:

@@ -1,4 +1,4 @@
-"""Chain of refiners."""
+"""Chain of cluster refiners."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from framework.refinement.refine import refine
 
 @dataclass
 class Chain(ClusterRefiner):
-    """Refiners applied in order.
+    """Refiners applied in order: each refines the clusters from the previous one.
 
-    `refiner.links.gmm_em=null` removes a link. `refiner@refiner.links.gmm_em=kmeans` replaces it.
+    `refiner.links.gmm_em=null` removes the refiner `gmm_em`. `refiner@refiner.links.gmm_em=kmeans` replaces it.
     """
 
     links: Mapping[str, ClusterRefiner]  # refiners by name, in order, at least one

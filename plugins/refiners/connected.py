@@ -19,17 +19,19 @@ class Connected(ClusterRefiner):
     """Selection of the largest 3D-connected component of each cluster, and of components at a similar depth.
 
     Connected components are defined as in `largest_component`. A component is kept if most of its points agree in depth
-    with the nearest kept point. The allowed difference is the gap plus `max_depth_slope` times the lateral distance.
-    This removes background, such as the carpet between a chair's slats. It keeps object parts that are separated by
-    occlusion or missing readings. All points vote. If only the nearest quarter voted, the leaves of plants would be
-    removed.
+    with the nearest kept point. The allowed difference is the maximum depth step plus `max_depth_slope` times the
+    lateral distance. This removes background, such as the carpet between the slats of a chair. It keeps object parts
+    that are separated by occlusion or missing readings. All points of a component are compared. If only the nearest
+    quarter of them were compared, the leaves of plants would be removed.
     """
 
     max_gap: float = 0.1  # maximum depth step between connected pixels at depth 0, m, >= 0
     gap_per_depth: float = 0.02  # increase of the maximum depth step with depth, m per m, >= 0
     connection_radius: int = 2  # maximum distance between connected pixels, px, >= 1; 2 bridges single missing readings
-    min_piece_ratio: float = 0.05  # minimum size relative to the largest component, in [0, 1]; smaller ones are dropped
-    # maximum ratio of depth difference to lateral distance of two components, m per m, >= 0
+    # minimum ratio of a component's number of pixels to that of the largest component, in [0, 1]; smaller components
+    # are dropped
+    min_piece_ratio: float = 0.05
+    # maximum ratio of depth difference to lateral distance of a component from the nearest kept point, m per m, >= 0
     max_depth_slope: float = 2.0
 
     def __post_init__(self) -> None:

@@ -30,8 +30,9 @@ class Dbscan(ClusterRefiner):
     eps: float = 0.04  # neighborhood radius at depth 0, m, >= 0.001
     eps_per_depth: float = 0.01  # increase of the radius with depth, m per m, >= 0
     min_points: int = 10  # minimum number of neighbors of a core point, including itself, >= 1
-    stride: int = 2  # step between the pixels searched for core points, px, >= 1; 1 = all pixels
-    max_points: int = 20000  # maximum number of a cluster's points searched for core points, >= 100; limits memory
+    stride: int = 2  # step between the pixels that are searched for core points, px, >= 1; 1 = all pixels
+    # maximum number of points of a cluster that are searched for core points, >= 100; limits memory
+    max_points: int = 20000
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -53,9 +54,9 @@ class Dbscan(ClusterRefiner):
         return keep_points(clusters, kept)
 
     def _sampled(self, pixels: Int32) -> tuple[Bool, int]:
-        """Return a mask (P,) of the pixels in every step-th row and column, and the step.
+        """Return an array (P,), True for the `pixels` (P, 2) in every step-th row and column, and the step.
 
-        The step is the smallest one with at most `max_points` such pixels.
+        The step is the smallest one of at least `stride` with at most `max_points` such pixels.
         """
         for step in range(self.stride, 1 << 16):
             sampled = (pixels[:, 0] % step == 0) & (pixels[:, 1] % step == 0)
@@ -64,7 +65,11 @@ class Dbscan(ClusterRefiner):
         return sampled, step
 
     def _near_largest_piece(self, points: Float32, sampled: Float32, eps: float, weight: float) -> Bool:
-        """Return an array (P,), True for points near a core point of the largest component of `sampled` (S, 3)."""
+        """Return an array (P,), True for points (P, 3) within `eps`, m, of the largest component's core points.
+
+        `sampled`: the points (S, 3), m, that are searched for core points, each with the weight `weight`. If there are
+        no core points, all entries are True.
+        """
         from scipy.spatial import KDTree
         from sklearn.cluster import DBSCAN
 

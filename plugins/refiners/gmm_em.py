@@ -20,27 +20,30 @@ from framework.refinement.refine import keep_points
 class GmmEm(ClusterRefiner):
     """Removal of background and outliers by a Gaussian mixture of object, background and outliers.
 
-    The refiner applies eqs. (1) to (4) to each mask. Object components start from groups of the mask's points, and
-    background components from groups of the points in a ring around the mask. A uniform component can represent
-    outliers.
+    The refiner applies eqs. (1) to (4) of docs/method.md to each mask. Object components start from groups of the
+    mask's points, and background components from groups of the points in a ring around the mask. A uniform component
+    can represent outliers.
 
     The mask is also used as evidence. This is our choice: without it, object and background can swap. Log-odds for the
     object decrease linearly from `mask_log_odds` inside the mask to -`mask_log_odds` in the ring. Pixels of the
-    `structure` from an earlier refiner are not part of the ring and do not count as the mask's border. Clusters with
-    fewer than `min_points` points in the mask or the ring remain unchanged. Without background components, only
-    outliers compete with the object.
+    `structure` from an earlier refiner are treated as pixels without a reading, so they are not part of the ring.
+    Clusters with fewer than `min_points` points in the mask or the ring remain unchanged. Without background
+    components, only outliers compete with the object.
     """
 
     object_components: int = 3  # number of Gaussians of the object, >= 1; about one per visible face
-    background_components: int = 6  # number of Gaussians of the background, >= 0; 0 = no ring
-    start_iterations: int = 5  # number of initial k-means iterations, >= 1; 1 = groups of equal size by depth
+    background_components: int = 6  # number of Gaussians of the background, >= 0; 0 = no background model
+    # number of k-means iterations for the initialization, >= 1; 1 = groups of equal size, ordered by depth
+    start_iterations: int = 5
     max_iterations: int = 8  # maximum number of EM iterations, >= 1
-    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
-    std_floor: float = 0.01  # minimum standard deviation of a Gaussian along any axis, m
-    outlier_fraction: float = 0.0  # initial fraction of outliers, in [0, 1); 0 = no uniform component
+    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point, >= 0
+    std_floor: float = 0.01  # minimum standard deviation of a Gaussian along any axis, m, in [0.0001, 1]
+    outlier_fraction: float = 0.0  # initial fraction of outliers, in [0, 1); 0 = no uniform component for outliers
     min_posterior: float = 0.5  # minimum posterior probability of the object to keep a point, in (0, 1)
-    mask_log_odds: float = 4.0  # prior log-odds of the object far inside the mask, nats, >= 0; 0 = initialization only
-    expected_bleed: float = 0.4  # distance inside the mask border with prior log-odds 0, in ring widths, in [0, 1)
+    # prior log-odds of the object far inside the mask, nats, in [0, 20]; 0 = the mask only initializes the mixture
+    mask_log_odds: float = 4.0
+    # distance inside the mask border at which the prior log-odds are 0, in ring widths, in [0, 1)
+    expected_bleed: float = 0.4
     ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:

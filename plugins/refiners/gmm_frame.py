@@ -22,30 +22,35 @@ from framework.refinement.refine import keep_points
 class ForeignPoints(Enum):
     """The treatment of points whose most probable Gaussian belongs to another mask."""
 
-    MOVE = "they move to that mask's cluster"
-    DROP = "they are dropped"
-    STAY = "they stay"
+    MOVE = "moved to the cluster of that mask"
+    DROP = "removed"
+    STAY = "kept in their cluster"
 
 
 @dataclass
 class GmmFrame(ClusterRefiner):
     """Assignment of the points of a frame's masks to the most probable mask, by hierarchical EM.
 
-    The refiner applies eqs. (1) to (4) to the points of all masks (section 3.2.2). A pixel in several masks is one
-    point of the mask with the best score. There is no background, and the masks only initialize the mixture. Therefore,
-    a point leaves its cluster only if it fits another cluster better. The paper does not specify the hierarchy. Levels,
-    children and initialization are our choice (J = 8 after Eckart et al., CVPR 2016).
+    The refiner applies eqs. (1) to (4) of docs/method.md to the points of all masks (section 3.2.2). A pixel in several
+    masks is one point of the mask with the best score. There is no background, and the masks only initialize the
+    mixture. Therefore, a point leaves its cluster only if it fits another cluster better. The paper does not specify
+    the hierarchy. Levels, children and initialization are our choice (J = 8 after Eckart et al., CVPR 2016).
     """
 
-    levels: int = 2  # number of levels of hierarchical EM, >= 1; 1 = flat
-    children: int = 8  # number of children of a node: 2, 4 or 8
-    gaussians_per_mask: int = 1  # number of Gaussians of level 1 per mask, >= 1
+    levels: int = 2  # number of levels of hierarchical EM, >= 1; 1 = flat mixture; 2 is our choice
+    # number of children of a node: 2, 4 or 8; 8 is our interpretation of section 3.2.2
+    children: int = 8
+    # number of level-1 Gaussians per mask, >= 1; section 3.2.2 has one group for each of K classes; 1 per mask is our
+    # choice
+    gaussians_per_mask: int = 1
     initialization: Initialization = Initialization.MASKS  # initial groups of level 1
-    foreign_points: ForeignPoints = ForeignPoints.MOVE  # treatment of points of another mask's Gaussian
+    # treatment of points whose most probable Gaussian belongs to another mask: MOVE to that mask (our interpretation of
+    # section 3.2.2), DROP or STAY
+    foreign_points: ForeignPoints = ForeignPoints.MOVE
     max_iterations: int = 10  # maximum number of EM iterations in a node, >= 1
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
-    std_floor: float = 0.005  # minimum standard deviation of a Gaussian along any axis, m
-    # minimum fraction of the frame's points in a Gaussian, in [0, 1); smaller ones are dropped
+    std_floor: float = 0.005  # minimum standard deviation of a Gaussian along any axis, m, in [0.0001, 1]; our choice
+    # minimum fraction of the frame's points in a Gaussian, in [0, 1); smaller Gaussians are dropped; our choice
     min_support: float = 1e-4
     min_points: int = 30  # minimum number of points of a refined cluster, >= 1; smaller clusters are dropped
     max_points: int = 20_000  # maximum number of points of a frame for the fit, >= 100; all points are assigned
@@ -83,7 +88,10 @@ class GmmFrame(ClusterRefiner):
 
 
 def best_of_pixels(clusters: PointClusters, shape: tuple[int, int]) -> Bool:
-    """Return an array (P,), True for points of the highest-scored cluster at their pixel; ties go to the first."""
+    """Return an array (P,), True for points of the cluster with the highest score at their pixel.
+
+    `shape`: (height, width) of the frame, px. Ties go to the first cluster.
+    """
     rank = np.empty(len(clusters), np.int32)
     rank[np.argsort(-clusters.scores, kind="stable")] = np.arange(len(clusters), dtype=np.int32)
     kept = np.empty(len(clusters.cluster), np.bool_)

@@ -18,13 +18,15 @@ from framework.refinement.refine import keep_points
 class KMeans(ClusterRefiner):
     """Removal of the points nearer to a background center than to an object center.
 
-    Lloyd's algorithm runs on each mask and the ring around it, as in `gmm_em`. The object centers start at the means of
-    equal parts of the mask by depth, and the background centers at the means of equal parts of the ring. Clusters with
-    fewer than `min_points` points in the mask or the ring stay unchanged.
+    Lloyd's algorithm runs on the points of each mask and of the ring around it, as in `gmm_em`. The object centers
+    start at the means of groups of the mask's points, and the background centers at the means of groups of the ring's
+    points. The points are divided into these groups by depth, with equal numbers of points. Clusters with fewer than
+    `min_points` points in the mask or the ring stay unchanged.
     """
 
     object_centers: int = 5  # number of centers of the object, >= 1
-    background_centers: int = 5  # number of centers of the background, >= 0; 0 = no ring, all points are kept
+    # number of centers of the background, >= 0; 0 = no background model, all points are kept
+    background_centers: int = 5
     max_iterations: int = 20  # maximum number of iterations, >= 1; stops early if no assignment changes
     ring: Ring = field(default_factory=Ring)
 

@@ -24,13 +24,18 @@ class PlaneRemoval(ClusterRefiner):
     pass the planes to later refiners as `structure`.
     """
 
-    plane_distance: float = 0.01  # maximum distance to a plane, m, >= 0, in addition to 3 standard deviations of noise
+    # maximum distance of a point from its plane, m, >= 0, in addition to 3 standard deviations of depth noise
+    plane_distance: float = 0.01
     inverse_depth_noise: float = 0.003  # maximum RMS residual of a plane in inverse depth, 1/m, >= 0, for KINECT_V1
     min_area: float = 0.8  # minimum visible area of a plane, m^2, >= 0
     min_frame_fraction: float = 0.04  # minimum fraction of the frame's readings on a plane, in [0, 1]
-    max_behind_ratio: float = 0.1  # maximum ratio of readings behind a plane to readings on the plane, >= 0
-    max_tilt: float = 180.0  # maximum angle from the camera's up axis to the normal, degrees, in [0, 180]; 60 = floors
-    max_cluster_fraction: float = 0.5  # fraction of a plane's points above which a cluster keeps them, in [0, 1]
+    # maximum ratio of readings behind a plane to readings on the plane, >= 0; greater than 0 to allow for doorways
+    max_behind_ratio: float = 0.1
+    # maximum angle between the camera's up axis and the plane normal, degrees, in [0, 180]; 180 = any plane, 60 =
+    # floors
+    max_tilt: float = 180.0
+    # maximum fraction of a plane's points that is removed from one cluster, in [0, 1]; above it, the cluster keeps them
+    max_cluster_fraction: float = 0.5
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -50,7 +55,7 @@ class PlaneRemoval(ClusterRefiner):
         return replace(keep_points(clusters, kept), structure=structure)
 
     def structure(self, frame: Frame) -> Planes:
-        """Return the frame's planes at the border of the scene."""
+        """Return the planes of the frame that are structure: floors, walls and other planes at the scene's border."""
         planes = find_planes(frame, self.plane_distance, self.inverse_depth_noise, self.min_area)
         upright = -planes.normals[:, 1] >= np.cos(np.deg2rad(self.max_tilt)) - 1e-9  # the camera's y axis points down
         large = planes.fractions >= self.min_frame_fraction

@@ -33,9 +33,9 @@ class RankOrder(ClusterRefiner):
     points. Each other point joins the group of the nearest compared point.
     """
 
-    neighbors: int = 16  # number of nearest neighbors k, >= 2
+    neighbors: int = 16  # number k of nearest neighbors, in [2, 254]
     threshold: float = 1.0  # maximum rank-order distance of linked points, >= 0
-    max_points: int = 500  # maximum number of compared points of a cluster, >= 10
+    max_points: int = 500  # maximum number of points of a cluster that are compared, in [10, 5000]
 
     def __post_init__(self) -> None:
         # a square table stores ranks as bytes
@@ -58,7 +58,10 @@ class RankOrder(ClusterRefiner):
 
 
 def _firsts_of_blocks(pixels: Int32, max_points: int) -> Int64:
-    """Return the first of the pixels (P, 2) in each square block; blocks are as small as `max_points` allows."""
+    """Return the indices of the first of the `pixels` (P, 2) in each square block, in ascending order.
+
+    The blocks are the smallest ones with at most `max_points` results.
+    """
     u, v = (pixels - pixels.min(axis=0)).T
     side = int(np.ceil(np.sqrt(len(pixels) / max_points)))
     while True:
@@ -71,7 +74,10 @@ def _firsts_of_blocks(pixels: Int32, max_points: int) -> Int64:
 
 
 def rank_order_groups(points: Float32, neighbors: int, threshold: float) -> Int32:
-    """Return the group (P,) of each point (P, 3), m; groups are numbered in the order of their first points."""
+    """Return the rank-order group (P,) of each of P points (P, 3), m; see `RankOrder` for k = `neighbors`.
+
+    Groups are numbered in the order of their first points.
+    """
     n, k = len(points), neighbors
     if n <= k:  # all points have the same neighbors
         return np.zeros(n, np.int32)

@@ -26,7 +26,7 @@ class Method(Enum):
 
 
 class Reference(Enum):
-    """The target of the alignment of a frame."""
+    """The target to which a frame is aligned."""
 
     PREVIOUS_FRAME = "previous frame"
     MAP = "view of the map from the last pose"
@@ -34,7 +34,7 @@ class Reference(Enum):
 
 @dataclass(frozen=True)
 class _Seen:
-    """The Open3D image of a frame and its pose."""
+    """The Open3D image of a frame, and the pose of the frame."""
 
     image: o3d.t.geometry.RGBDImage
     T_world_camera: Float64  # (4, 4)
@@ -42,9 +42,9 @@ class _Seen:
 
 @dataclass
 class Open3dOdometry(PoseTracker):
-    """Open3D's multi-scale RGB-D odometry to a view of the map or to the previous frame.
+    """Open3D's multi-scale RGB-D odometry relative to a view of the map or to the previous frame.
 
-    Use POINT_TO_PLANE with the map. Use HYBRID and INTENSITY with the previous frame, because the map's colors are
+    Use POINT_TO_PLANE with the map. Use HYBRID and INTENSITY with the previous frame, because the colors of the map are
     blurred.
     """
 
@@ -55,9 +55,10 @@ class Open3dOdometry(PoseTracker):
     iterations_fine: int = 3  # number of iterations at full resolution, >= 1
     max_depth: float = 5.0  # maximum depth of used readings, m, > 0
     max_distance: float = 0.07  # maximum depth difference of corresponding pixels, m, > 0
-    max_translation: float = 0.3  # maximum translation between frames, m, > 0; lost above it
-    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; lost above it
-    min_matched: float = 0.3  # minimum fraction of the frame's readings with a correspondence, in [0, 1]
+    max_translation: float = 0.3  # maximum translation between frames, m, > 0; above it, the pose is lost
+    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; above it, the pose is lost
+    # minimum fraction of the frame's readings with a correspondence, in [0, 1]; below it, the pose is lost
+    min_matched: float = 0.3
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -71,7 +72,7 @@ class Open3dOdometry(PoseTracker):
         self._criteria = [odometry.OdometryConvergenceCriteria(count) for count in iterations]
         self._loss = odometry.OdometryLossParams(depth_outlier_trunc=self.max_distance)
         self._method = getattr(odometry.Method, self.method.value)
-        self._last: _Seen | None = None  # last trusted frame
+        self._last: _Seen | None = None  # last reliable frame
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         image = _rgbd_image(frame.color, frame.depth)
@@ -97,7 +98,7 @@ class Open3dOdometry(PoseTracker):
     def _aligned(
         self, image: o3d.t.geometry.RGBDImage, reference: o3d.t.geometry.RGBDImage, frame: Frame
     ) -> tuple[Float64, str]:
-        """Return T_last_camera and a one-line reason for rejection; "" = the pose is trusted."""
+        """Return T_last_camera (4, 4) and a one-line reason for rejection; "" = the pose is accepted."""
         from open3d.t.pipelines import odometry
 
         readings = np.count_nonzero((frame.depth > 0) & (frame.depth <= self.max_depth))

@@ -1,4 +1,4 @@
-"""Sparse tracking of image features with depth against a local map of keyframes, with poses from pycolmap."""
+"""Sparse tracking: image features with depth are matched with keyframes, and pycolmap estimates the pose."""
 
 from __future__ import annotations
 
@@ -22,20 +22,23 @@ class PycolmapPnp(PoseTracker):
     """
 
     max_features: int = 800  # maximum number of features of a frame, >= 1
-    min_features: int = 30  # minimum number of features with depth of a keyframe, >= 4
+    min_features: int = 30  # minimum number of features with depth in a keyframe, >= 4
     max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is removed
-    min_distance: float = 0.15  # minimum distance of a new view without rotation, m, > 0
-    min_angle: float = 0.2  # minimum angle of a new view without translation, rad, > 0
+    # minimum distance between keyframes of equal orientation, m, > 0; new keyframe if distance / min_distance + angle /
+    # min_angle >= 1
+    min_distance: float = 0.15
+    min_angle: float = 0.2  # minimum angle between keyframes at equal position, rad, > 0; see min_distance
     candidates: int = 4  # maximum number of keyframes to match with a frame, >= 1
     max_ratio: float = 0.8  # maximum ratio of best to second-best descriptor distance (Lowe's ratio test), in (0, 1]
     max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0
-    min_inliers: int = 20  # minimum number of inliers, >= 4; lost below it
-    min_inlier_ratio: float = 0.15  # minimum fraction of inliers among the matches, in (0, 1]; lost below it
+    min_inliers: int = 20  # minimum number of inliers, >= 4; below it, the pose is lost
+    # minimum fraction of inliers among the matches, in (0, 1]; below it, the pose is lost
+    min_inlier_ratio: float = 0.15
     seed: int = 0  # seed of RANSAC and of the visual words, >= 0
 
     def __post_init__(self) -> None:
         self._keyframes = Keyframes(**vars(self))
-        self._T_world_last: Float64 | None = None  # last trusted pose
+        self._T_world_last: Float64 | None = None  # last reliable pose
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         features = self._keyframes.extractor.extract(frame)
@@ -60,7 +63,7 @@ class PycolmapPnp(PoseTracker):
         self._keyframes.restore(keyframes)
 
     def _begin(self, frame: Frame, features: Features) -> Pose:
-        """Return the pose of the first frame with enough features, which defines the world frame."""
+        """Return the pose that defines the world frame, or a lost pose if the frame has too few features."""
         T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
         if not self._keyframes.add_with(frame, features, T_world_camera):
             reason = f"the frame has fewer than {self.min_features} features with depth"

@@ -26,17 +26,18 @@ class World(Enum):
 
 @dataclass
 class TrajectoryFile(PoseTracker):
-    """Poses from a TUM file, the nearest in time for each frame. Frames without a pose are skipped.
+    """Poses from a TUM file: each frame gets the pose nearest in time. Frames without such a pose are skipped.
 
     By default the trajectory is moved rigidly so that the first frame with a pose defines the world frame, as in
-    `PoseTracker`. `world_frame=FILE` keeps the file's world frame. The sequence's ground-truth poses are invalid in the
-    file's world frame. Raises DataError with the file and the line for poses that are not finite or not rigid, and for
+    `PoseTracker`. `world_frame=FILE` keeps the world frame of the file, in which the ground-truth poses of the sequence
+    are invalid. Raises DataError with the file and the line for poses that are not finite or not rigid, and for
     timestamps that do not increase.
     """
 
     path: Path  # trajectory in TUM format
-    max_time_difference: float = 0.02  # maximum time difference from a frame to its pose, s, >= 0; skipped above it
-    time_offset: float = 0.0  # offset added to the file's timestamps, s
+    # maximum time difference between a frame and its pose, s, >= 0; frames without a pose are skipped
+    max_time_difference: float = 0.02
+    time_offset: float = 0.0  # offset added to the timestamps of the file, s
     world_frame: World = World.FIRST_FRAME  # world frame of the poses
 
     def __post_init__(self) -> None:

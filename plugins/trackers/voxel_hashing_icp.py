@@ -26,10 +26,12 @@ from framework.tracking.uncertainty import is_significant, pose_covariance
 
 LEVELS = 3
 CONVERGED = 1e-4  # maximum last step of the finest level, m and rad; the limit is four times larger per coarser level
-STANDING = 1e-3  # maximum motion of a possibly stationary camera, m and rad; larger motions are used even if uncertain
-SAME_POSE = 0.05  # maximum difference between equal poses, m and rad
+# maximum motion of a possibly stationary camera, m and rad; larger motions are used even if they are not significant
+STANDING = 1e-3
+SAME_POSE = 0.05  # maximum difference between poses that count as equal, m and rad
 SMALLEST = 8  # minimum side of the coarsest level, px
-CHANGED_SCENE = 0.95  # minimum agreement of the points not behind the map's surface, if an object was removed
+# minimum agreement_in_front near the prediction, which replaces min_agreement, because an object may have been removed
+CHANGED_SCENE = 0.95
 EXPECTED_AGREEMENT = 0.8  # replaces min_agreement near the prediction of a steady motion
 EXPECTED_BEHIND = 0.1  # replaces max_occluded near the prediction of a steady motion
 STEADY = 5  # minimum number of consecutive frames with a correct prediction in a steady motion
@@ -39,7 +41,7 @@ RECOVERY_INFORMATION = 2.0  # factor of min_information for a lost camera
 
 
 class ResidualWeights(Enum):
-    """Weights of residuals (framework/tracking/alignment.py)."""
+    """Weights of residuals; see framework/tracking/alignment.py."""
 
     TUKEY = "weights by residual over expected noise, with larger noise at coarse levels and exposure compensation"
     LINEAR = "weights of VoxelHashing's code, equal at all levels, without noise model and exposure compensation"
@@ -48,7 +50,7 @@ class ResidualWeights(Enum):
 class Alignment(NamedTuple):
     """Result of the alignment of a frame. Fractions are relative to the visible points unless stated otherwise."""
 
-    T_world_camera: Float64
+    T_world_camera: Float64  # (4, 4)
     matched: float  # fraction of points with a nonzero weight
     agreement: float  # fraction of points that agree with the map
     behind: float  # fraction of points behind the map's surface
@@ -58,7 +60,8 @@ class Alignment(NamedTuple):
     covariance: Float64 | None = None  # (6, 6) Pose.covariance; None = unknown
 
     @property
-    def trusted(self) -> bool:
+    def reliable(self) -> bool:
+        """True if the pose is possible and needs no confirmation."""
         return not (self.reason or self.doubt)
 
 
@@ -67,12 +70,12 @@ class VoxelHashingIcp(PoseTracker):
     """Frame-to-model ICP plus RGB, coarse to fine, with lost detection (after VoxelHashing and ElasticFusion).
 
     A pose needs agreement with the map. Near the prediction of a steady motion, less agreement is sufficient. Agreement
-    alone does not separate correct from wrong poses (docs/guides/trackers.md). So any other pose needs confirmation by
-    features.
+    alone does not separate correct from wrong poses (docs/guides/trackers.md). Therefore, every other pose is also
+    compared with the pose from features, if there is one.
 
     A frame is always lost if too few points match, if the step is implausible, or if the points do not determine the
     step. All other checks are our additions. min_agreement=0 and max_occluded=1 disable the checks of agreement, also
-    after a loss. relocalize=false disables the checks by features.
+    for a lost camera. relocalize=false disables the comparison with features.
     """
 
     residual_weights: ResidualWeights = ResidualWeights.TUKEY  # weights of residuals
@@ -81,25 +84,31 @@ class VoxelHashingIcp(PoseTracker):
     iterations_coarse: int = 8  # number of iterations at 1/4 of the finest resolution, >= 0
     iterations_middle: int = 6  # number of iterations at 1/2 of the finest resolution, >= 0
     iterations_fine: int = 4  # number of iterations at the finest resolution, >= 1
-    max_distance: float = 0.1  # maximum distance of corresponding points, m, > 0; proportional to depth beyond 5 m
-    close_distance: float = 0.05  # maximum distance for agreement with the map, m, > 0; at least 3 sigma of depth noise
+    # maximum distance of corresponding points, m, > 0; increases with depth beyond 5 m (TUKEY)
+    max_distance: float = 0.1
+    # maximum distance of a point from the map's surface to agree with the map, m, > 0; at least 3 sigma of depth noise
+    close_distance: float = 0.05
     min_normal_dot: float = 0.7  # minimum cosine between corresponding normals, in [-1, 1]
-    geometric_scale: float = 4.0  # cut-off of distances, in standard deviations, > 0 (TUKEY)
+    geometric_scale: float = 4.0  # cut-off of point-to-plane distances, in standard deviations, > 0 (TUKEY)
     photometric_scale: float = 4.0  # cut-off of intensity differences, in standard deviations, > 0 (TUKEY)
     intensity_noise: float = 0.05  # standard deviation of intensity differences, for intensities in [0, 1], > 0 (TUKEY)
-    max_intensity_difference: float = 0.1  # intensity difference with weight 0, for intensities in [0, 1], > 0 (LINEAR)
+    # intensity difference at which the weight reaches 0, for intensities in [0, 1], > 0 (LINEAR)
+    max_intensity_difference: float = 0.1
     color_weight: float = 0.1  # weight lambda of the photometric term, >= 0; 0 = ICP only
     color_levels: int = 3  # number of levels with color, from the coarsest, in [1, 3]
     depth_weight: float = 1.0  # weight of the point-to-plane term, in [0, 1]; 0 = color only
-    max_translation: float = 0.3  # maximum translation between frames, m, > 0; proportional to depth beyond 5 m (TUKEY)
-    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; lost above it
+    # maximum translation between frames, m, > 0; above it, the pose is lost; increases with depth beyond 5 m (TUKEY)
+    max_translation: float = 0.3
+    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; above it, the pose is lost
     min_visible: float = 0.05  # minimum fraction of a frame's points that are visible in the map, in [0, 1]
     min_matched: float = 0.4  # minimum fraction of the visible points with a nonzero weight, in [0, 1]
     # minimum ratio of smallest to mean eigenvalue of the dimensionless normal matrix, in [0, 1]; doubled while lost
     min_information: float = 1e-3
-    min_agreement: float = 0.92  # minimum fraction of visible points that agree with the map, in [0, 1]; 0 = off
-    max_occluded: float = 0.015  # maximum fraction of visible points behind the map's surface, in [0, 1]; 1 = off
-    raw_keyframe: bool = True  # True = align to a raw keyframe in addition to the map; False = map only
+    # minimum fraction of the visible points that agree with the map, in [0, 1]; 0 = no check
+    min_agreement: float = 0.92
+    # maximum fraction of the visible points behind the map's surface, in [0, 1]; 1 = no check
+    max_occluded: float = 0.015
+    raw_keyframe: bool = True  # True = align to a keyframe with raw depth in addition to the map; False = map only
     relocalize: bool = True  # True = relocalize against keyframes and visited poses; False = no relocalization
     seed: int = 0  # seed of the relocalization, >= 0
 
@@ -120,14 +129,14 @@ class VoxelHashingIcp(PoseTracker):
             "tracker.color_levels", self.color_levels, f"{LEVELS} if depth_weight is 0",
         )  # fmt: skip
         self._weights = Weights(*(np.float32(getattr(self, name)) for name in Weights._fields))
-        self._T_world_last: Float64 | None = None  # last trusted pose
+        self._T_world_last: Float64 | None = None  # last reliable pose
         self._T_last_next = np.eye(4)  # motion to the next frame under constant velocity
         self._lost_frames = 0  # number of consecutive lost frames
         self._steady_frames = 0  # number of consecutive frames with a correct prediction
         self._keyframes = Keyframes(seed=self.seed)
         self._visited: deque[Float64] = deque(maxlen=VISITED)
         self._T_world_doubted: Float64 | None = None  # pose of the last frame if only its confirmation failed
-        self._last: FrameFeatures | None = None  # features of the last trusted frame
+        self._last: FrameFeatures | None = None  # features of the last reliable frame
         self._stored_scene: SceneMap | None = None  # map to relocalize in; None after success
         self._raw_keyframe: RawKeyframe | None = None
         self._scale = DepthScale()  # scale of the current frame
@@ -146,11 +155,11 @@ class VoxelHashingIcp(PoseTracker):
             alignment = self._align_lost(levels, scene)
         else:
             alignment = self._align_predicted(levels, scene, T_world_predicted)
-        if not (alignment.trusted and self._steady_frames >= STEADY) and levels[0].depth.any():
+        if not (alignment.reliable and self._steady_frames >= STEADY) and levels[0].depth.any():
             alignment = self._relocalized(alignment, seen, levels, scene)
             if not self._scale.near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
                 self._steady_frames = 0
-        if not alignment.trusted:
+        if not alignment.reliable:
             self._lost_frames += 1
             self._steady_frames = 0
             self._T_last_next = np.eye(4)
@@ -161,12 +170,12 @@ class VoxelHashingIcp(PoseTracker):
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
         if self.raw_keyframe:
             self._update_raw_keyframe(levels, alignment.T_world_camera)
-        return self._trust(seen, alignment.T_world_camera, alignment.covariance)
+        return self._accept(seen, alignment.T_world_camera, alignment.covariance)
 
     def _held(self, alignment: Alignment) -> Alignment:
-        """Return the alignment at the last pose if the motion from there is small and does not exceed its uncertainty.
+        """Return the alignment, with the last pose if the motion from it is small and does not exceed its uncertainty.
 
-        The last pose is that of the last significant motion, so that slow motions add up until they are significant.
+        The last pose changes only with a significant motion, so slow motions add up until they are significant.
         """
         assert self._T_world_last is not None
         if self._lost_frames or alignment.covariance is None:
@@ -197,9 +206,10 @@ class VoxelHashingIcp(PoseTracker):
         return levels
 
     def _finest_scale(self, camera: Camera) -> float:
-        """Return the scale of the finest level, whose longer side is at most `finest_side` px.
+        """Return the scale of the finest level relative to the image: `finest_scale`, halved for large images.
 
-        Coarse levels of larger images would be too fine for large motions.
+        The longer side of the level is at most `finest_side` px. Otherwise, the coarsest level would be too fine for
+        large motions.
         """
         scale = self.finest_scale
         while self.finest_side and max(camera.shape) * scale > self.finest_side:
@@ -207,25 +217,25 @@ class VoxelHashingIcp(PoseTracker):
         return scale
 
     def _loss(self, alignment: Alignment, frame: Frame) -> str:
-        """Return the reason for a loss, with the cause if many isolated pixels have no depth."""
+        """Return the reason for a loss; if many isolated pixels have no depth, it includes the fraction with depth."""
         reason = alignment.reason or alignment.doubt
         if not is_scattered(frame.depth):
             return reason
         return f"{reason}; only {np.mean(frame.depth > 0):.0%} of the pixels have depth, most without neighbors"
 
     def _relocalize_in_stored(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
-        """Find the camera in a stored map by features, confirmed by alignment."""
+        """Return the pose in a stored map from features, confirmed by alignment, or a lost pose if it is not found."""
         alignment = Alignment(np.eye(4), 0, 0, 0, 0, "not relocalized in the stored map yet", "")
         found = self._keyframes.relocalize(seen.frame)
         if found is not None:
             alignment = self._confirmed(alignment, found.T_world_camera, self._pyramid(seen.frame), scene)
-        if not alignment.trusted:
+        if not alignment.reliable:
             return Pose(np.eye(4), lost=True, reason=alignment.reason)
         self._stored_scene = None
-        return self._trust(seen, alignment.T_world_camera, alignment.covariance)
+        return self._accept(seen, alignment.T_world_camera, alignment.covariance)
 
     def _align_predicted(self, levels: list[PyramidLevel], scene: SceneMap, T_world_predicted: Float64) -> Alignment:
-        """Align from the predicted pose. A result near the prediction needs less agreement."""
+        """Return the alignment that starts at the predicted pose. A result near the prediction needs less agreement."""
         assert self._T_world_last is not None
         alignment = self._align(levels, scene, T_world_predicted, self._T_world_last)
         if not self._scale.near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
@@ -240,16 +250,19 @@ class VoxelHashingIcp(PoseTracker):
         return alignment
 
     def _align_lost(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
-        """Align from the last trusted pose, then from the unconfirmed pose of the last frame, if any."""
+        """Return the alignment that starts at the last reliable pose.
+
+        If it is not reliable, start at the unconfirmed pose of the last frame, if any.
+        """
         assert self._T_world_last is not None
         alignment = self._align_twice(levels, scene, self._T_world_last)
-        if alignment.trusted or self._T_world_doubted is None:
+        if alignment.reliable or self._T_world_doubted is None:
             return alignment
         again = self._align_twice(levels, scene, self._T_world_doubted)
         return alignment if again.reason else again
 
     def _initialize(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
-        """Define the world frame by the first frame with enough depth."""
+        """Return the pose that defines the world frame, or a lost pose if the frame has too little depth."""
         frame = seen.frame
         if min(frame.camera.shape) * self._finest_scale(frame.camera) < SMALLEST * 2 ** (LEVELS - 1):
             side = min(frame.camera.shape) * self._finest_scale(frame.camera) / 2 ** (LEVELS - 1)
@@ -266,10 +279,10 @@ class VoxelHashingIcp(PoseTracker):
             return Pose(T_world_camera, lost=True, reason=few if frame.depth.any() else "the frame has no depth")
         if self.raw_keyframe:
             self._update_raw_keyframe(self._pyramid(frame), T_world_camera)
-        return self._trust(seen, T_world_camera, np.zeros((6, 6)))
+        return self._accept(seen, T_world_camera, np.zeros((6, 6)))
 
     def _update_raw_keyframe(self, levels: list[PyramidLevel], T_world_camera: Float64) -> None:
-        """Replace the raw keyframe if it is missing or too far from a trusted pose."""
+        """Replace the raw keyframe by a frame with a reliable pose if it is missing or too far from this pose."""
         key = self._raw_keyframe
         if key is None or not self._scale.near(key.T_world_camera, T_world_camera, NEW_DISTANCE):
             self._raw_keyframe = RawKeyframe.of(levels, T_world_camera, self._scattered_depth)
@@ -278,7 +291,7 @@ class VoxelHashingIcp(PoseTracker):
         step, turn = np.linalg.norm(T_last_next[:3, 3]), rotation_angle(T_last_next[:3, :3])
         return bool(step > self.max_translation * self._scale.growth or turn > self.max_rotation)
 
-    def _trust(self, seen: FrameFeatures, T_world_camera: Float64, covariance: Float64 | None) -> Pose:
+    def _accept(self, seen: FrameFeatures, T_world_camera: Float64, covariance: Float64 | None) -> Pose:
         self._T_world_last = T_world_camera
         self._T_world_doubted = None
         self._lost_frames = 0
@@ -295,28 +308,34 @@ class VoxelHashingIcp(PoseTracker):
     def _relocalized(
         self, alignment: Alignment, seen: FrameFeatures, levels: list[PyramidLevel], scene: SceneMap
     ) -> Alignment:
-        """Return the alignment confirmed or replaced by features. For a lost camera, a visited pose is also tried."""
+        """Return the alignment, confirmed or replaced by the pose from features, if any.
+
+        For a lost camera without a reliable pose, an alignment from a visited pose is also tried.
+        """
         if not self.relocalize:
             return alignment
         found = self._pose_from_features(seen)
         if found is not None:
             alignment = self._confirmed(alignment, found.T_world_camera, levels, scene)
-        if self._lost_frames and self._visited and not alignment.trusted:
+        if self._lost_frames and self._visited and not alignment.reliable:
             T_world_visited = self._visited[-1 - self._lost_frames % len(self._visited)]
             again = self._align_twice(levels, scene, T_world_visited)
-            if again.trusted:
+            if again.reliable:
                 return again
         return alignment
 
     def _confirmed(
         self, alignment: Alignment, T_world_found: Float64, levels: list[PyramidLevel], scene: SceneMap
     ) -> Alignment:
-        """Return the alignment confirmed by a pose from features. A pose with two independent sources is trusted."""
-        if alignment.trusted and self._scale.near(alignment.T_world_camera, T_world_found, self.max_distance):
+        """Return the alignment, or an alignment that starts at the pose `T_world_found` from features.
+
+        A pose is reliable if alignment and features agree.
+        """
+        if alignment.reliable and self._scale.near(alignment.T_world_camera, T_world_found, self.max_distance):
             return alignment
         again = self._align(levels, scene, T_world_found, T_world_found)
         agrees = not again.reason and self._scale.near(again.T_world_camera, T_world_found, self.max_distance)
-        if agrees and (alignment.reason or again.trusted or again.agreement > alignment.agreement):
+        if agrees and (alignment.reason or again.reliable or again.agreement > alignment.agreement):
             return again._replace(doubt="")
         if alignment.reason:
             return alignment
@@ -325,7 +344,7 @@ class VoxelHashingIcp(PoseTracker):
         return alignment._replace(doubt=alignment.doubt or "features and alignment with the map disagree")
 
     def _pose_from_features(self, seen: FrameFeatures) -> AbsolutePose | None:
-        """Return the pose from the last trusted frame and nearby keyframes, otherwise from similar keyframes."""
+        """Return the pose from the last reliable frame and nearby keyframes, otherwise from similar keyframes."""
         assert self._T_world_last is not None
         near = self._keyframes.nearest(self._T_world_last)
         if self._last is not None:
@@ -336,9 +355,12 @@ class VoxelHashingIcp(PoseTracker):
         return found
 
     def _align_twice(self, levels: list[PyramidLevel], scene: SceneMap, T_world_from: Float64) -> Alignment:
-        """Align from a pose, then from the result. If both results agree, the pose is determined."""
+        """Align from the pose `T_world_from`, then from the result, and return the second alignment.
+
+        If the two results differ, it needs confirmation.
+        """
         alignment = self._align(levels, scene, T_world_from, T_world_from)
-        if not alignment.trusted or self.min_agreement == 0:
+        if not alignment.reliable or self.min_agreement == 0:
             return alignment
         again = self._align(levels, scene, alignment.T_world_camera, T_world_from)
         if not self._scale.near(alignment.T_world_camera, again.T_world_camera, SAME_POSE / 2):
@@ -348,9 +370,10 @@ class VoxelHashingIcp(PoseTracker):
     def _align(
         self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64
     ) -> Alignment:
-        """Align a frame to the view of the map at T_world_view, coarse to fine.
+        """Return the alignment of a frame to the view of the map at T_world_view, computed coarse to fine.
 
-        The step is limited relative to the last pose T_world_from.
+        `levels`: the image pyramid of the frame, finest first. `T_world_from`: the pose from which the motion of the
+        camera is limited.
         """
         view = scene.render_near(levels[0].camera, T_world_view, levels[0].depth, levels[0].sensor)
         model, intensities = model_view(view), model_intensities(view, LEVELS)
@@ -402,15 +425,15 @@ class VoxelHashingIcp(PoseTracker):
         return Alignment(T_world_camera, matched, agreement, behind, agreement_in_front, reason, doubt, covariance)
 
     def _linear_weights(self, scene: SceneMap) -> LinearWeights | None:
-        """Return the limits of linear weights, None for Tukey's weights."""
+        """Return the limits of linear weights; None = Tukey's weights."""
         if self.residual_weights is ResidualWeights.TUKEY:
             return None
         return LinearWeights(np.float32(scene.depth_range[1]), np.float32(self.max_intensity_difference))
 
     def _weights_at(self, level: int) -> Weights:
-        """Return the weights of a level.
+        """Return the weights of pyramid level `level`, 0 = finest.
 
-        Coarse levels start from less accurate poses, and Tukey's weights tolerate larger residuals there.
+        Coarse levels start from less accurate poses. Therefore, Tukey's weights tolerate larger residuals there.
         """
         normals_known = not (self._coarse_depth or self._scattered_depth)
         weights = self._weights._replace(
@@ -426,7 +449,11 @@ class VoxelHashingIcp(PoseTracker):
         )
 
     def _rejection(self, frame: PyramidLevel, equations: NormalEquations, T_from_camera: Float64) -> str:
-        """Return a one-line reason for rejection of the pose, empty if the pose is possible."""
+        """Return a one-line reason for rejection of the pose; "" = the pose is possible.
+
+        `frame`: the level of the frame whose points are counted in `equations`. `T_from_camera`: the motion from the
+        last pose.
+        """
         points = int(np.count_nonzero(frame.depth))
         if points == 0:
             return "the frame has no depth"
@@ -445,8 +472,8 @@ class VoxelHashingIcp(PoseTracker):
     def _is_determined(self, equations: NormalEquations) -> bool:
         """Return True if the points determine the motion in all six degrees of freedom.
 
-        The test uses the eigenvalues of A with translations in units of the typical depth. Color counts in full,
-        without lambda, because noise of normals adds false information to geometry only.
+        The test uses the eigenvalues of A with translations in units of the typical depth. The photometric term is not
+        multiplied by lambda, because only the geometric term contains false information from the noise of normals.
         """
         color = (1 / self.color_weight - 1) * equations.A_color if self.color_weight > 0 else 0.0
         information = np.linalg.eigvalsh(self._scale.without_units(equations.A + color))
@@ -455,6 +482,6 @@ class VoxelHashingIcp(PoseTracker):
 
 
 def _solved(A: Float64, b: Float64) -> Float64:
-    """Return the Gauss-Newton step; damping keeps undetermined directions at the prediction."""
+    """Return the Gauss-Newton step xi (6,), m and rad, with A xi = -b; damping keeps undetermined components near 0."""
     damping = 1e-6 * max(float(np.trace(A)), 1e-12) * np.eye(6)
     return np.asarray(np.linalg.solve(A + damping, -b))

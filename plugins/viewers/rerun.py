@@ -27,7 +27,7 @@ from framework.live_view.sealed_page import SealedPage
 log = logging.getLogger(__name__)
 
 RECORDING = "recording.rrd"
-FLUSH_S = 0.2  # maximum duration of data lost by a killed run, s
+FLUSH_S = 0.2  # maximum duration of the data that are lost if a run is killed, s
 
 
 class Mode(Enum):
@@ -42,20 +42,24 @@ class Mode(Enum):
 class RerunViewer(Viewer):
     """Viewer of the camera path, the newest frame with masks and depth, the mesh, object boxes, and stage times.
 
-    If drawing is slower than mapping, images are omitted. Poses, times and lost frames are always shown.
+    If drawing is slower than mapping, some images are omitted. Poses, stage times and lost frames are always shown.
     """
 
     mode: Mode = Mode.RECORD  # output: RECORD (file), WINDOW (rerun's viewer) or BROWSER (local web page)
-    file: str = ""  # .rrd file; "" = recording.rrd in the run directory for RECORD, none for other modes
-    frame_interval: int = 3  # interval between logged images, in frames, >= 1
+    # path of the .rrd file; "" = recording.rrd in the run directory for RECORD, no file for the other modes
+    file: str = ""
+    frame_interval: int = 3  # interval between logged images, in frames, >= 1; 1 = every frame
     mesh_interval: float = 2.0  # minimum interval between mesh snapshots, s, in [0.1, 3600]
-    stride: int = 2  # pixel step of the logged images, px, in [1, 16]
+    stride: int = 2  # step between the logged pixels of an image, px, in [1, 16]
     jpeg_quality: int = 75  # JPEG quality of the images, in [1, 100]
-    region_size: float = 1.0  # side of the cubic regions of the mesh, m, in [0.1, 1000]
-    min_confidence: float = 0.3  # minimum confidence of displayed objects and labeled detections, in [0, 1]
-    memory_limit: str = "2GB"  # maximum memory of WINDOW and BROWSER, e.g. 2GB or 25%; oldest data are dropped first
-    port: int = 9876  # port of the data stream, in [1024, 65535]; WINDOW reuses an open viewer on this port
-    web_port: int = 9090  # port of the web page of BROWSER, in [1024, 65535]
+    region_size: float = 1.0  # side of the cubic regions in which the mesh is updated, m, in [0.1, 1000]
+    # minimum confidence of displayed objects and minimum score of labeled detections, in [0, 1]
+    min_confidence: float = 0.3
+    # maximum viewer memory in the modes WINDOW and BROWSER, e.g. 2GB or 25% of system memory; the oldest data is
+    # dropped first
+    memory_limit: str = "2GB"
+    port: int = 9876  # port of the data stream, in [1024, 65535]; WINDOW reuses a viewer that is open on this port
+    web_port: int = 9090  # port of the web page in the mode BROWSER, in [1024, 65535]
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -100,7 +104,10 @@ class RerunViewer(Viewer):
             self._page.close()
 
     def _sinks(self, rr: Any, directory: Path) -> list[Any]:
-        """Return rerun's sinks for the chosen outputs."""
+        """Open the outputs chosen by `mode` and `file`, and return their rerun sinks.
+
+        `directory`: the run directory, to which `file` is relative.
+        """
         sinks = []
         file = self.file or (RECORDING if self.mode is Mode.RECORD else "")
         if file:
@@ -123,7 +130,7 @@ def _file_sink(rr: Any, path: Path) -> Any:
 
 
 def _server(rr: Any, port: int, memory_limit: str) -> Any:
-    """Serve the data on 127.0.0.1."""
+    """Start a server of the data on 127.0.0.1 and return its rerun sink."""
     with _named_errors(f"viewer.port: expected a free port, got {port}"):
         with socket.socket() as probe:  # rerun would report this only on stderr
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -79,7 +79,10 @@ def measure(chosen: Measurement) -> list[str]:
 
 
 def run(names: Sequence[str]) -> bool:
-    """Run the named measurements, or all that are missing or outdated. Return True if all meet their bounds."""
+    """Run the named measurements and return True if all meet their bounds.
+
+    Without names, run all measurements that are missing on the page or outdated.
+    """
     rows = read_rows()
     outdated = [k for k, known in MEASUREMENTS.items() if k not in rows or not is_current(rows[k], known.paths)]
     for name in names or outdated:

@@ -10,7 +10,7 @@ NOTHING = "-"  # a cell without a number: not measured, or not defined
 
 @dataclass
 class Table:
-    """Table of text with a title; the notes state how the values were measured."""
+    """Table with text cells. The notes below the table state how the values were measured."""
 
     title: str
     columns: Sequence[str]

@@ -22,13 +22,13 @@ class Recording:
 
 
 def red_kitchen(shared: Path, frames: int) -> Recording:
-    """Return a real Kinect video with the masks of a real detector."""
+    """Return the first `frames` frames of a real Kinect video, with the masks of a real detector."""
     sequence = RgbdFolder(shared / "data" / "redkitchen", stop=frames)
     return _recorded("redkitchen", sequence, MaskRCNN2Go())
 
 
 def furnished_room(frames: int) -> Recording:
-    """Return a synthetic room with dense, noisy Kinect depth and masks with simulated detector errors."""
+    """Return `frames` frames of a synthetic room, with noisy Kinect depth and masks with simulated detector errors."""
     return _recorded("synthetic room", Synthetic(frames=240, stop=frames), SimulatedDetector())
 
 

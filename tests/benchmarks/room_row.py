@@ -15,13 +15,13 @@ from framework.data import Camera, Float32, Float64, Frame, FrameTruth, Int32, U
 from framework.interfaces import RGBDSequence
 
 FRAMES_PER_ROOM = 260  # 1.5 cm per frame
-LENGTH, HALF_WIDTH, HEIGHT = 3.9, 2.0, 2.6  # m, of a room
+LENGTH, HALF_WIDTH, HEIGHT = 3.9, 2.0, 2.6  # m, size of a room
 WALL = 0.06  # m, half the thickness of the wall between two rooms
-DOOR = (0.6, 2.1)  # m, half the width and the height
+DOOR = (0.6, 2.1)  # m, half of the width, and the height
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 CAMERA_HEIGHT = 1.4  # m, above the floor
-PAN = np.deg2rad(35.0)  # rad, maximum angle to the left and to the right
-PITCH = np.deg2rad(12.0)  # rad, mean downward angle
+PAN = np.deg2rad(35.0)  # rad, maximum angle of the camera to the left and to the right
+PITCH = np.deg2rad(12.0)  # rad, mean angle of the camera below the horizontal
 
 # Boxes of a room: lower corner, upper corner (m, x from the start of the room), class; None = a part of the building.
 FURNITURE = (
@@ -71,7 +71,7 @@ class RoomRow(RGBDSequence):
 
 
 def pose_at(k: int) -> Float64:
-    """Return T_world_camera of frame k; the path leads through the doors, and the camera turns left and right."""
+    """Return T_world_camera (4, 4) of frame k; the path leads through the doors, and the camera pans left and right."""
     phase = 2 * np.pi * k / FRAMES_PER_ROOM
     yaw, pitch = PAN * np.sin(phase), -PITCH + np.deg2rad(2.0) * np.sin(3 * phase)
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])

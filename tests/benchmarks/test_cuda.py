@@ -33,8 +33,8 @@ from tests.benchmarks.test_detectors import RANDOM
 from tests.support import registered
 
 DEVICE = "cuda"
-IMAGES, WARM_UP = 40, 10  # per detector and device
-LONGEST = 6.0  # s per detector and device; the warm-up takes at most a quarter of it
+IMAGES, WARM_UP = 40, 10  # number of timed and of warm-up images per detector and device
+LONGEST = 6.0  # s, maximum time per detector and device; the warm-up takes at most a quarter of it
 MATCH = 0.5  # minimum mask IoU of two detections of one object
 VOXEL_SIZE = 0.01  # m
 TURN, FIRST, LAST = 10, 20, 80  # frames per turn; frames in [FIRST, LAST) are evaluated
@@ -48,10 +48,10 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="requires 
 class Agreement:
     """Matching detections of a detector on two devices, over all images."""
 
-    found: tuple[int, int]  # number of detections of the reference, and of the other device
+    found: tuple[int, int]  # numbers of detections on the reference device and on the other device
     overlaps: list[float]  # mask IoU of each match
     score_differences: list[float]  # absolute, of each match
-    same_class: float  # fraction of the matches
+    same_class: float  # fraction of the matches with equal classes
 
     @classmethod
     def of(cls, reference: Sequence[Detections], other: Sequence[Detections]) -> Agreement:

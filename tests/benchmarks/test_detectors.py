@@ -35,8 +35,8 @@ THREADS = 2
 FRAMES = 8
 ROUNDS = 3  # passes over the frames
 WARM_UP = 2  # images that are not timed
-LONGEST = 20.0  # s, after which a slow detector is stopped
-MASKS = 20  # detections that random networks return
+LONGEST = 20.0  # s, maximum time per detector; slower detectors are stopped early
+MASKS = 20  # number of detections that random networks return per image
 
 
 def random_mask_rcnn(backbone: str, folder: Path) -> list[str]:
@@ -53,7 +53,7 @@ def random_mask_rcnn(backbone: str, folder: Path) -> list[str]:
 def random_transformer(
     model: str, parameters: dict[str, Any], preprocessing: dict[str, Any], folder: Path
 ) -> list[str]:
-    """Return the overrides for a `transformers` model with COCO's classes."""
+    """Return the overrides for a `transformers` model with COCO classes."""
     transformers = pytest.importorskip("transformers")
     torch.manual_seed(0)
     model_class = getattr(transformers, model)
@@ -74,7 +74,7 @@ MASK2FORMER = partial(
 
 
 def rf_detr_seg(side: int, windows: int) -> Callable[[Path], list[str]]:
-    """Return a function that writes a network like Nano (312 px, one window) or Small (384 px, two windows)."""
+    """Return a function that writes an RF-DETR-Seg network: Nano has 312 px and one window, Small 384 px and two."""
     backbone = {
         "model_type": "rf_detr_dinov2", "hidden_size": 384, "num_attention_heads": 6, "image_size": side,
         "patch_size": 12, "num_windows": windows, "out_features": ["stage3", "stage6", "stage9", "stage12"],

@@ -87,7 +87,7 @@ def test_refine_ten_masks_speed(benchmark, refiner: ClusterRefiner):
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-def test_gmm_em_agrees_with_scikit_learn_and_is_faster(benchmark):
+def test_gmm_em_agrees_with_scikit_learn(benchmark):
     """With the same points, initial labels and iterations, the log-likelihoods agree; times are compared."""
     iterations, components = 8, 8
     clusters, frame = ten_masks()

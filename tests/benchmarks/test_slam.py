@@ -31,7 +31,7 @@ from tests.benchmarks.slam_loop import RENDERING, SlamLoop, seconds
 
 VOXEL_SIZES = (0.01, 0.02)  # m
 TURN = 10  # frames
-FIRST, LAST = 20, 80  # frames in [FIRST, LAST) are evaluated; caches are cold before
+FIRST, LAST = 20, 80  # frames in [FIRST, LAST) are evaluated; earlier frames fill the caches
 TARGETS = {  # speedup over Open3D
     "redkitchen": {"whole loop": ">= 6", "integrate": ">= 3.5", "render full image": ">= 3"},
     "synthetic room": {"whole loop": ">= 5", "integrate": ">= 4", "render full image": ">= 3"},
@@ -41,7 +41,7 @@ FRAMES = 2000  # number of frames of the long path
 WARM = 10  # number of warm-up frames
 EARLY, LATE = (WARM, 700), (WARM + 1300, FRAMES)  # compared frames: a third each, a whole number of rooms apart
 SECOND_START = LATE[0] - EARLY[0]
-assert SECOND_START % FRAMES_PER_ROOM == 0, "expected a distance of whole rooms"
+assert SECOND_START % FRAMES_PER_ROOM == 0, "expected a distance of a whole number of rooms"
 
 
 @pytest.fixture(scope="module")

@@ -163,8 +163,8 @@ def test_mapper_add_none_raises() -> None:
         ("detection_cache=bogus", "detection_cache: expected one of"),
         ("seed=-1", r"seed: expected an integer in \["),
         ("~refiner", "refiner: expected a plugin's config .*; choose refiner=NAME"),
-        ("dataset=desk", "got dataset=desk; use it only on the command line"),
-        ("hydra.run.dir=x", "got hydra.run.dir=x; use it only on the command line"),
+        ("dataset=desk", "got dataset=desk; use dataset, .* only on the command line"),
+        ("hydra.run.dir=x", "got hydra.run.dir=x; use dataset, .* only on the command line"),
         (None, "Mapper: expected overrides such as 'fuser.voxel_size=0.02', got None"),
     ],
 )

@@ -29,7 +29,7 @@ def test_error_message_is_shortened_and_escaped(given: str) -> None:
     assert message.encode()
 
 
-def test_printable_long_word_is_replaced_by_its_length() -> None:
+def test_printable_long_word_is_shortened() -> None:
     message = printable(f"there is no {'x' * 5000}; did you mean 'coco'?")
     assert "(5001 characters)" in message
     assert message.endswith("did you mean 'coco'?")

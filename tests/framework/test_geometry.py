@@ -86,7 +86,7 @@ def test_project_inverts_back_project_at_every_pixel() -> None:
     np.testing.assert_allclose(geometry.project(CAMERA, points), pixels, atol=1e-4)
 
 
-def test_principal_point_is_pixel_center() -> None:
+def test_back_project_principal_point_lies_on_optical_axis() -> None:
     camera = Camera(3, 3, 10.0, 10.0, 1.0, 1.0)
     center = geometry.back_project(camera, np.array([[1, 1]], np.int32), np.array([2.0], np.float32))
     np.testing.assert_array_equal(center, [[0, 0, 2]])

@@ -119,12 +119,12 @@ def test_pipeline_skips_unreadable_frame(prefetch: int, caplog: pytest.LogCaptur
 
 
 @PREFETCH
-def test_pipeline_skips_frame_after_detector_frame_error(room: CornerRoom, prefetch: int) -> None:
+def test_pipeline_skips_frame_on_detector_frame_error(room: CornerRoom, prefetch: int) -> None:
     result = pipeline(prefetch, detector=SphereDetector(broken_at=0)).run(room)
     assert (result.frames_skipped, len(result.tracked)) == (1, 5)
 
 
-def test_pipeline_skips_frame_after_refiner_frame_error(room: CornerRoom) -> None:
+def test_pipeline_skips_frame_on_refiner_frame_error(room: CornerRoom) -> None:
     @dataclass
     class Refuses(KeepAll):
         def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
@@ -136,22 +136,26 @@ def test_pipeline_skips_frame_after_refiner_frame_error(room: CornerRoom) -> Non
     assert (result.frames, result.frames_skipped, len(mapped(result).vertices)) == (6, 1, 5)
 
 
-def test_pipeline_refines_only_inexact_masks_and_checks_pixels(room: CornerRoom) -> None:
+@dataclass
+class _InvalidPixels(KeepAll):
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        return replace(clusters, pixels=clusters.pixels - 99)
+
+
+def test_pipeline_refined_pixels_outside_image_raise(room: CornerRoom) -> None:
+    with pytest.raises(
+        DataError, match=r"clusters: expected pixels in the image of .*x.*, got u in \[.*, .*\], v in \[.*, .*\]"
+    ):
+        pipeline(refiner=_InvalidPixels()).run(room)
+
+
+def test_pipeline_exact_masks_are_not_refined(room: CornerRoom) -> None:
     @dataclass
     class Exact(SphereDetector):
         def detect(self, frame: Frame) -> Detections:
             return replace(super().detect(frame), exact=True)
 
-    @dataclass
-    class InvalidPixels(KeepAll):
-        def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-            return replace(clusters, pixels=clusters.pixels - 99)
-
-    with pytest.raises(
-        DataError, match=r"clusters: expected pixels in the image of .*x.*, got u in \[.*, .*\], v in \[.*, .*\]"
-    ):
-        pipeline(refiner=InvalidPixels()).run(room)
-    assert pipeline(detector=Exact(), refiner=InvalidPixels()).run(room).frames_skipped == 0
+    assert pipeline(detector=Exact(), refiner=_InvalidPixels()).run(room).frames_skipped == 0
 
 
 @pytest.mark.parametrize(
@@ -232,7 +236,11 @@ class _Blind(SphereDetector):
         return Detections.none(frame.camera.shape, self.classes)
 
 
-def test_pipeline_accepts_no_detections_and_overlapping_masks(room: CornerRoom) -> None:
+def test_pipeline_without_detections_maps_no_instances(room: CornerRoom) -> None:
+    assert not mapped(pipeline(detector=_Blind()).run(room)).instances()
+
+
+def test_pipeline_overlapping_masks_are_separate_instances(room: CornerRoom) -> None:
     @dataclass
     class Doubled(SphereDetector):
         def detect(self, frame: Frame) -> Detections:
@@ -240,7 +248,6 @@ def test_pipeline_accepts_no_detections_and_overlapping_masks(room: CornerRoom) 
             parts = (once.masks, once.boxes, once.scores, once.class_probabilities)
             return Detections(*(np.concatenate([part, part]) for part in parts), classes=once.classes)
 
-    assert not mapped(pipeline(detector=_Blind()).run(room)).instances()
     assert set(mapped(pipeline(detector=Doubled()).run(room)).instances()) == {3, 4}
 
 

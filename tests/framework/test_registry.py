@@ -218,7 +218,8 @@ def test_find_class_import_failure_raises_one_line_error(tmp_path: Path, monkeyp
     with pytest.raises(ConfigError, match=r".* expected an installed package 'surely_not_installed', got none"):
         find_class(PoseTracker, "needs_more.Tracker")
     with pytest.raises(
-        ConfigError, match=r"raises: expected an importable module, got RuntimeError: operator .* does not exist$"
+        ConfigError,
+        match=r"raises: expected an importable module, got an error \(RuntimeError: operator .* does not exist\)$",
     ):
         find_class(PoseTracker, "raises.Tracker")
 

@@ -136,7 +136,10 @@ numba.core.dispatcher.Dispatcher.compile = lambda *_: None
 
 
 def changes(code: str, path: Path, before: str = "", **variables: str) -> list[str]:
-    """Return what `code` changes in a process that has run `before`."""
+    """Return the names of the process settings that `code` changes in a new process, which runs `before` first.
+
+    `variables` are environment variables of the process; `path` is a folder for a map.
+    """
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "NUMBA_THREADING"))
     }

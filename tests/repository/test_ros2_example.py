@@ -118,5 +118,5 @@ def test_ros2_node_warns_about_lost_frame(node_class: type[Any]) -> None:
     color, depth, info = messages(0, "rgb8", False)
     depth.data = bytes(len(depth.data))
     node.map(color, depth, info)
-    assert node.warned == ["lost: the frame has no depth"]
+    assert node.warned == ["pose lost: the frame has no depth"]
     assert node.published == []

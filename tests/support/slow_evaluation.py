@@ -70,7 +70,7 @@ def slow_metrics(
         return mostly or any(overlap[p, t] >= threshold for t in ignored)
 
     def match(threshold: Fraction, of: str | None, by_class: bool) -> Matched:
-        """Match the predictions `of` one class (None = all); with `by_class`, matches must have the same class."""
+        """Match the predictions of the class `of` (None = all); with `by_class`, matches must have the same class."""
         chosen = [t for t, name in counted.items() if of in (None, name)]
         found = Matched([], 0, Fraction(0), len(chosen))
         free = set(counted)

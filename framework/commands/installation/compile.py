@@ -15,10 +15,10 @@ from framework.errors import ConfigError
 def main() -> None:
     """Run the command `instancemap compile`."""
     parser = argparse.ArgumentParser(
-        description="Compile the kernels of a run with the default stages in advance. numba stores them for later runs "
-        "of this installation. Kernels that are already compiled are skipped."
+        description="Compile the kernels of the default stages in advance. numba caches them for later runs of this "
+        "installation. Kernels that are already compiled are skipped."
     )
-    part = "part of a kernel name, searched in all stages; default: the kernels of the default stages"
+    part = "part of the names of the kernels to compile, in all stages; default: the kernels of the default stages"
     parser.add_argument("names", metavar="NAME", nargs="*", help=part)
     parser.add_argument("--all", action="store_true", help="compile the kernels of all stages")
     parsed = arguments(parser)
@@ -28,9 +28,9 @@ def main() -> None:
 
 
 def compile_named(kernels: list[Kernel], parts: list[str]) -> str:
-    """Compile the missing kernels whose names contain one of the `parts` ([] = all), and return a summary.
+    """Compile the kernels that are not compiled yet and whose name contains one of the `parts`; return a summary.
 
-    Raises ConfigError if no kernel matches, DataError if a kernel cannot be compiled.
+    Empty `parts` match all kernels. Raises ConfigError if no kernel matches, DataError if a kernel cannot be compiled.
     """
     if parts:
         kernels = [kernel for kernel in kernels if any(part in f"{kernel.module}.{kernel.name}" for part in parts)]

@@ -1,6 +1,7 @@
 """`instancemap convert-weights IN OUT`: convert torchvision or detectron2 weights for `detector=mask_rcnn`.
 
-The metadata of OUT describe the network, so `detector.weights=OUT` is sufficient. Code in IN is never executed.
+The metadata of OUT describes the network, so `detector.weights=OUT` needs no other parameter. Code in IN is never
+executed.
 """
 
 from __future__ import annotations
@@ -31,9 +32,22 @@ def main() -> None:
 
 
 def convert(source: Path, target: Path, kind: str | None, classes: str | None, norm_eps: float, half: bool) -> None:
-    """Convert a checkpoint to safetensors."""
+    """Convert the checkpoint `source` to the safetensors file `target`, and print a summary.
+
+    Args:
+        source: A .pth or .pkl file, or the name of a published network.
+        target: The output file, .safetensors.
+        kind: The format of `source`: torchvision or detectron2; None = detected.
+        classes: Comma-separated class names in network order; None = COCO classes.
+        norm_eps: Epsilon of batch normalization, for torchvision only.
+        half: Store the weights as float16.
+
+    Raises:
+        ConfigError: `target` has another suffix.
+        DataError: The checkpoint is invalid.
+    """
     if target.suffix != ".safetensors":
-        raise ConfigError(f"{target}: expected the suffix .safetensors, got {target.suffix or 'none'}")
+        raise ConfigError(f"OUT: expected a file name with the suffix .safetensors, got {target.name}")
     from framework.detection.mask_rcnn.checkpoint import CheckpointKind, read_network
     from framework.detection.mask_rcnn.network_file import save_network
     from framework.detection.mask_rcnn.published_weights import find_network

@@ -37,7 +37,7 @@ def main() -> None:
 
 
 def examine() -> dict[str, list[Check]]:
-    """Return the checks by section, without downloading, compiling or writing anything."""
+    """Run all checks and return them by section. Nothing is downloaded, compiled or written."""
     imports = [packages.import_statement(line.name) for line in packages.declared()[1]]
     outcomes = run_all([ACCELERATION, KERNELS, *imports])
     libraries, acceleration, kernels = (
@@ -80,10 +80,10 @@ def _acceleration(outcomes: Outcomes) -> Iterator[Check]:
     answer, error = outcomes[ACCELERATION]
     found: dict[str, Any] = json.loads(answer) if answer else {"gpus": [], "int8": False}
     has_driver = Path("/proc/driver/nvidia/version").exists()
-    detail = "torch does not use the NVIDIA driver" if has_driver else "none; networks run on the CPU"
+    detail = "NVIDIA driver found, but torch cannot use it" if has_driver else "none; networks run on the CPU"
     fix = "install a torch build for your driver: https://pytorch.org/get-started/locally" if has_driver else ""
     yield Check.of("GPU", bool(found["gpus"]), ", ".join(found["gpus"]) or error or detail, fix)
-    detail = "VNNI" if found["int8"] else error or "no VNNI; maskrcnn2go runs in float32, three times slower"
+    detail = "VNNI" if found["int8"] else error or "no VNNI; maskrcnn2go computes in float32, three times slower"
     yield Check.of("8-bit integers", found["int8"], detail)
 
 
@@ -97,8 +97,8 @@ def _kernels(outcomes: Outcomes) -> Iterator[Check]:
     for (name, command), (compiled, count) in zip(commands.items(), found["counts"], strict=True):
         yield Check.of(name, compiled == count, f"{compiled} of {count} kernels compiled", command)
     _, writable = machine.writable_parent(Path(found["folder"]))
-    detail = anonymous(found["folder"]) + ("" if writable else " is not writable; each process compiles the kernels")
-    yield Check.of("kernel cache", writable, detail, "set the environment variable NUMBA_CACHE_DIR")
+    detail = anonymous(found["folder"]) + ("" if writable else " is not writable; each process compiles again")
+    yield Check.of("kernel cache", writable, detail, "set the variable NUMBA_CACHE_DIR to a writable folder")
 
 
 def _as_text(sections: Mapping[str, list[Check]], errors: int) -> str:
@@ -116,7 +116,7 @@ def _as_text(sections: Mapping[str, list[Check]], errors: int) -> str:
 
 
 def _as_json(sections: Mapping[str, list[Check]]) -> str:
-    """Return [{"title", "checks": [{"name", "status", "detail", "fix"}]}]."""
+    """Return JSON: a list of sections {title, checks}, each check with name, status, detail and fix."""
     listed = [
         {"title": title, "checks": [asdict(check) | {"status": check.status.name.lower()} for check in checks]}
         for title, checks in sections.items()

@@ -1,6 +1,6 @@
 """`instancemap new-plugin STAGE NAME`: create a package with a working plugin.
 
-framework/templates has one folder for each stage, one for viewers and one for common files.
+framework/templates has one folder of templates for each stage, one for viewers and one for all stages.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ PLACES = {  # path of each template in the new package; templates of the stage t
     "gitignore": ".gitignore",
     "test.yml": ".github/workflows/test.yml",
 }
-LONGEST_NAME = 30  # maximum length of a name, characters; keeps the lines of templates within 120 characters
-FOLDERS = ("conf", "tests")  # folder names, which are invalid as plugin names
+LONGEST_NAME = 30  # maximum number of characters of a name; keeps lines of generated files within 120 characters
+FOLDERS = ("conf", "tests")  # names of generated folders, not allowed as plugin names
 SMALL = "dataset=synthetic dataset.frames=30 dataset.width=320 dataset.height=240"
 FIRST = "hydra.sweep.dir=outputs/first_sweep"
-TRIES = {  # by stage: command that compares a new plugin with an existing plugin; viewers are only run
+TRIES = {  # by stage: command that compares the new plugin with an existing plugin (viewer: a single run)
     "detector": f"instancemap -m detector=mask_rcnn_rooms,$name {SMALL} {FIRST}",
     "tracker": f"instancemap -m tracker=voxel_hashing_icp,$name detector=simulated {SMALL} {FIRST}",
     "refiner": f"instancemap -m refiner=gmm_em,$name detector=simulated {SMALL} {FIRST}",
@@ -54,7 +54,7 @@ runs a sweep and prints `outputs/first_sweep/table.md`; `overview.png` of each r
 WATCHED = """\
 maps thirty frames of a synthetic scene with it: `outputs/first_run/frames.jsonl` has a line for each frame.
 `instancemap dataset=desk viewer=$name` maps a real sequence."""
-DATA: dict[str, tuple[type, ...]] = {  # by stage: types of its arguments and results
+DATA: dict[str, tuple[type, ...]] = {  # by stage: data types of its arguments and results, shown in the README
     "detector": (Frame, Camera, Detections),
     "tracker": (Frame, Camera, SurfaceView, Pose),
     "refiner": (PointClusters, Frame, Camera),
@@ -75,7 +75,7 @@ VARIANTS = {  # by stage: changed parameter of the example variant in the README
 def main() -> None:
     """Run the command `instancemap new-plugin`."""
     parser = argparse.ArgumentParser(
-        description="Create the files of a repository with a working plugin: package, config option, tests and CI."
+        description="Create a package with a working plugin: code, config option, tests and CI."
     )
     parser.add_argument("stage", metavar="STAGE", choices=GROUPS, help=f"stage of the plugin: {', '.join(GROUPS)}")
     parser.add_argument("name", metavar="NAME", help="name of the plugin, such as my_refiner for refiner=my_refiner")
@@ -85,7 +85,7 @@ def main() -> None:
         metavar="DIR",
         type=Path,
         default=Path(),
-        help="parent folder of the repository; default: working folder",
+        help="parent folder of the repository; default: working directory",
     )
     parsed = arguments(parser)
     with one_line_errors():
@@ -97,9 +97,9 @@ def main() -> None:
 
 
 def write_repository(stage: str, name: str, folder: Path) -> Path:
-    """Create the repository in `folder` atomically and return its path.
+    """Create the repository of a plugin in `folder` atomically, and return its path.
 
-    Raises ConfigError for an invalid or existing name, and DataError if the folder cannot be written.
+    Raises ConfigError for an invalid or existing name or a missing folder, and DataError if `folder` is not writable.
     """
     check_name(stage, name)
     if not folder.is_dir():
@@ -107,7 +107,7 @@ def write_repository(stage: str, name: str, folder: Path) -> Path:
     place = folder / names_of(stage, name)["distribution"]
     if os.path.lexists(place):
         raise ConfigError(
-            f"{place}: expected a new folder, got an existing folder; choose another name, or another folder with --in"
+            f"{place}: expected a missing path, got an existing one; choose another NAME or another folder with --in"
         )
     try:
         with tempfile.TemporaryDirectory(prefix=".new-plugin-", dir=folder) as temporary:
@@ -117,7 +117,10 @@ def write_repository(stage: str, name: str, folder: Path) -> Path:
                 (half / path).write_text(text, encoding="utf-8", newline="\n")
             half.rename(place)
     except OSError as error:
-        raise DataError(f"{place}: expected a writable folder, got {error.strerror or error}") from error
+        raise DataError(
+            f"{place}: expected a writable folder, got an error ({error.strerror or error}); choose another "
+            "folder with --in"
+        ) from error
     return place
 
 
@@ -125,13 +128,13 @@ def check_name(stage: str, name: str) -> None:
     """Raise ConfigError unless the name is valid for a module and a new option of the stage."""
     if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) > LONGEST_NAME:
         raise ConfigError(
-            f"NAME: expected words of a-z and 0-9 joined by _, with a letter first and at most {LONGEST_NAME} "
-            f"characters, got {name!r}; choose a name such as my_{stage}"
+            f"NAME: expected at most {LONGEST_NAME} characters a-z, 0-9 or single _, with a letter first, got "
+            f"{name!r}; choose a name such as my_{stage}"
         )
     if is_value(name):
         raise ConfigError(
-            f"NAME: expected a YAML string, got {name} (null, boolean or number in YAML); choose another name such as "
-            f"my_{name}"
+            f"NAME: expected a name that YAML reads as a string, got {name} (null, a boolean or a number); choose "
+            f"another name such as my_{name}"
         )
     if keyword.iskeyword(name) or name in FOLDERS:
         raise ConfigError(
@@ -145,19 +148,19 @@ def check_name(stage: str, name: str) -> None:
     class_name = names_of(stage, name)["class_name"]
     if any(re.search(rf"\b{class_name}\b", _template(stage, template)) for template in ("plugin.py", "test.py")):
         raise ConfigError(
-            f"NAME: expected a class name that is unused in the template, got {class_name} (from {name}); choose a "
-            "longer name"
+            f"NAME: expected a name whose class name is not used in the template, got {name} (class "
+            f"{class_name}); choose another name such as my_{name}"
         )
 
 
 def is_value(name: str) -> bool:
-    """Return True if Hydra or YAML parses the word as null, a boolean or a number."""
+    """Return True if Hydra or YAML parses `name` as null, a boolean or a number."""
     on_a_line = OverridesParser.create().parse_override(f"option={name}").value()
     return not (isinstance(on_a_line, str) and isinstance(OmegaConf.create(f"option: {name}").option, str))
 
 
 def names_of(stage: str, name: str) -> dict[str, str]:
-    """Return the values of the placeholders in the templates."""
+    """Return the values of the template placeholders by name."""
     own = {
         "stage": stage,
         "name": name,
@@ -173,13 +176,13 @@ def names_of(stage: str, name: str) -> dict[str, str]:
 
 
 def fields_of(data: type) -> str:
-    """Return the fields of a dataclass with the comments of its source."""
+    """Return the source lines of a dataclass: its name and its fields with their comments."""
     body = inspect.getsource(data).partition("\n    def ")[0]
     return "\n".join([f"class {data.__name__}:", *re.findall(r"^    \w+: .*", body, re.MULTILINE)])
 
 
 def files_of(stage: str, name: str) -> dict[str, str]:
-    """Return the contents of the new repository's files by path."""
+    """Return the text of each file of the new repository, by path relative to the repository."""
     names = names_of(stage, name)
     return {
         Template(place).substitute(names): Template(_template(stage, template)).substitute(names)

@@ -1,6 +1,7 @@
-"""`instancemap plugins [STAGE [NAME]]`: the plugins of each stage, with documentation and parameters.
+"""`instancemap plugins [STAGE [NAME]]`: list the plugins of each stage with documentation and parameters.
 
-The list includes options of installed packages (entry point `instancemap.configs`) and of --config-dir.
+The list includes options of installed packages (entry point `instancemap.configs`) and options in the folders of
+--config-dir.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a plugin, with the comment in the option's YAML."""
+    """One parameter of a plugin, with its comment in the YAML file of the option."""
 
     name: str
     type: str
@@ -48,13 +49,14 @@ class Option:
     stage: str
     name: str
     target: str
-    provider: str  # provider in Hydra's search path: main, or the third-party package
-    documentation: str  # summary of the class and change of a derived option, or error of an unusable option
+    provider: str  # provider of the file in Hydra's search path: main, or the name of a third-party package
+    # first paragraph of the class docstring and the change of a variant, or the error of an unusable option
+    documentation: str
     parameters: tuple[Parameter, ...]
 
 
 def registered(*stages: str, only: str | None = None) -> list[Option]:
-    """Return the options of these config groups by stage and name, or only the options named `only`."""
+    """Return the options of the config groups `stages`; with `only`, only the options of this name."""
     with config_loader() as loader:
         files = CachingConfigRepository(loader.repository)  # shared, because the options have most configs in common
         return [
@@ -66,7 +68,7 @@ def registered(*stages: str, only: str | None = None) -> list[Option]:
 
 
 def options_of(stage: str) -> list[str]:
-    """Return the names of the stage's options, usable or not."""
+    """Return the names of all options of a stage, including unusable options."""
     with config_loader() as loader:
         return list(loader.get_group_options(stage))
 
@@ -77,7 +79,7 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
     try:
         own: Any = files.load_config(f"{stage}/{name}")
         target = str(own.config.get("_target_"))
-        made_of = composition(files, stage, name)  # the file of the option, and included files
+        made_of = composition(files, stage, name)  # package of the option's file and of each included file, by path
         texts, configs = [], []
         for path in (path for path, package in made_of.items() if package == stage):
             part: Any = files.load_config(path)
@@ -109,7 +111,7 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
 
 
 def _nested(made_of: Mapping[str, str], place: str, plugin_class: type) -> str:
-    """Return the options in the field at `place`, such as detector.detector: one option, or several by name."""
+    """Return the comma-separated names of the options in the plugin field `place`, such as detector.detector."""
     if holds_one(plugin_class, place.rpartition(".")[2]):
         own = [path for path, package in made_of.items() if package == place]
         return own[-1].rpartition("/")[2] if own else ""  # after the inherited options
@@ -124,13 +126,13 @@ def _default(field: dataclasses.Field[Any]) -> object:
 
 
 def _text(source: str, name: str) -> str:
-    """Return the text of a YAML file; "" for Hydra's own configs, which have no comments."""
+    """Return the text of the YAML file `name` in a config source; "" for Hydra's own, uncommented configs."""
     scheme, _, root = source.partition("://")
     return Path(root, name).read_text() if scheme == "file" else ""
 
 
 def describe(option: Option) -> str:
-    """Return an option as indented text: name, description and a line for each parameter."""
+    """Return an option as indented text: name, documentation, and one line for each parameter."""
     origin = "" if option.provider == "main" else f"  [from {option.provider}]"
     lines = [
         f"  {option.name}{origin}",
@@ -152,7 +154,7 @@ def main() -> None:
     parsed = arguments(parser)
     with one_line_errors():
         stages = [parsed.stage] if parsed.stage else list(GROUPS)
-        # garbage collection of torch's objects would take a fifth of the time here, and again at exit
+        # garbage collection of torch's objects would add a fifth to the run time of the command, here and at exit
         atexit.register(gc.freeze)
         gc.disable()
         options = registered(*stages, only=parsed.name)

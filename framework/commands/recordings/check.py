@@ -1,6 +1,6 @@
-"""`instancemap check dataset=D [out=FILE]`: validate a recording and suggest parameter fixes.
+"""`instancemap check dataset=D [out=FILE]`: validate an RGB-D sequence and suggest parameter fixes.
 
-Exit status 1 means that the recording is not usable.
+Exit status 1 means that the sequence is not usable.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ jobs = Jobs()
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="check")
 @jobs.reported
 def job(config: DictConfig) -> None:
-    """Check the dataset of the config, print the findings, and save an image of them."""
+    """Check the dataset of the config, print the problems, and save the figure of depth, color and pose alignment."""
     out = checked_file("out", config.out, ".png") if config.out is not None else Path("outputs", "check.png").absolute()
 
     from framework.checking.recording_check import check

@@ -1,7 +1,7 @@
-"""`instancemap convert-oni FILE.oni OUT`: convert a raw SceneNN recording to images for `dataset=scenenn`.
+"""`instancemap convert-oni FILE.oni OUT`: convert a SceneNN recording to images for `dataset=scenenn`.
 
-OpenNI 2 plays the recording. OUT is the scene's folder, DIR/NNN, and gets image/, depth/ and timestamp.txt with the
-file names of SceneNN's own converter.
+OpenNI 2 decodes the recording. OUT is the scene folder DIR/NNN. The command writes image/, depth/ and timestamp.txt
+to OUT, with the file names of SceneNN's own converter.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from framework.datasets.scenenn.scene_files import MICROSECONDS, write_timestamp
 from framework.errors import DataError
 from framework.files.atomic_write import atomic_write
 
-PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # higher levels take longer than playback
+PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # higher compression takes longer than decoding the recording
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
         description="Convert an OpenNI recording to images for dataset=scenenn. Requires OpenNI 2: apt-get install "
         "libopenni2-0."
     )
-    parser.add_argument("source", metavar="FILE.oni", type=Path, help="recording of SceneNN, oni/NNN.oni")
+    parser.add_argument("source", metavar="FILE.oni", type=Path, help="SceneNN recording, oni/NNN.oni")
     scene = "SceneNN scene folder DIR/NNN; must not contain image/, depth/ or timestamp.txt yet"
     parser.add_argument("target", metavar="OUT", type=Path, help=scene)
     parsed = arguments(parser)
@@ -39,9 +39,10 @@ def main() -> None:
 
 
 def convert(source: Path, target: Path) -> None:
-    """Convert `source` and print a summary. Frames that were written before an error are kept.
+    """Convert the recording `source` to images in `target`, and print a summary.
 
-    Raises DataError if `source` cannot be converted to its end, or `target` has images.
+    Frames that were written before an error are kept. Raises DataError if `source` is truncated or has no frames, or if
+    `target` already contains images.
     """
     contents = read_contents(source)
     image, depth, timestamp = target / "image", target / "depth", target / "timestamp.txt"
@@ -73,7 +74,7 @@ def convert(source: Path, target: Path) -> None:
     left_out = {stream: count - number for stream, count in counts.items()}
     print(
         f"{target}: {number} frames; skipped {left_out[Stream.COLOR]} color and {left_out[Stream.DEPTH]} "
-        "depth images (damaged or without a pair)"
+        "depth images (damaged or unpaired)"
     )
     if contents.cut_off:
         raise DataError(

@@ -1,4 +1,4 @@
-"""`instancemap import SOURCE DIR`: convert a phone or sensor recording to a folder for `dataset=rgbd_folder`."""
+"""`instancemap import SOURCE DIR`: convert a phone or sensor recording to an RGB-D folder."""
 
 from __future__ import annotations
 
@@ -23,20 +23,25 @@ def main() -> None:
     )
     add = parser.add_argument
     add("source", metavar="SOURCE", type=Path, help="recording: a folder or file in a supported format")
-    add("directory", metavar="DIR", type=Path, help="new or empty folder")
+    add("directory", metavar="DIR", type=Path, help="output RGB-D folder; must be new or empty")
     width = f"image width before rotation, px; default: {LONGER_SIDE} px for the longer side"
     add("--width", metavar="PX", type=int, default=default.width, help=width)
-    add("--stride", metavar="N", type=int, default=default.stride, help="step between imported frames; default: 1")
+    step = "step between imported frames, in frames; 1 = every frame; default: 1"
+    add("--stride", metavar="N", type=int, default=default.stride, help=step)
     confidence = "minimum depth confidence of phone recordings: 0 (low), 1 (medium), 2 (high); default: 1"
     add("--confidence", metavar="LEVEL", type=int, default=default.confidence, help=confidence)
     rotation = "clockwise image rotation, degrees: 90, 180 or 270; default: no rotation"
     add("--rotate", metavar="DEGREES", type=int, default=default.rotate, help=rotation)
     add("--turn", dest="rotate", type=int, default=argparse.SUPPRESS, help=argparse.SUPPRESS)  # earlier name
-    add = parser.add_argument_group("topics of a ROS bag; default: detected from types and names").add_argument
+    add = parser.add_argument_group("ROS bag topics (default: detected by type and name)").add_argument
     add("--color", metavar="TOPIC", default="", help="color images")
     add("--depth", metavar="TOPIC", default="", help="depth images")
     add("--camera-info", metavar="TOPIC", default="", help="intrinsics of the color camera")
-    add("--poses", metavar="TOPIC", default="", help="camera poses: nav_msgs/Odometry or geometry_msgs/PoseStamped")
+    poses = (
+        "camera poses: nav_msgs/Odometry or geometry_msgs/PoseStamped, in optical axes if the frame name contains "
+        '"optical" or is missing, otherwise in ROS axes (x forward)'
+    )
+    add("--poses", metavar="TOPIC", default="", help=poses)
     parsed = arguments(parser)
     with one_line_errors():
         writing = Writing(parsed.width, parsed.stride, parsed.confidence, parsed.rotate)
@@ -49,6 +54,6 @@ def main() -> None:
         best = upright(written.ups)
         if best is not None and best != writing.turned:
             degrees = QUARTER * best.quarters
-            print(f"the images are not upright, which lowers detection quality; import again with --rotate {degrees}")
+            print(f"the images are not upright, which reduces detection accuracy; import again with --rotate {degrees}")
         print(f"check it: instancemap check dataset=rgbd_folder dataset.root={root}")
         print(f"map it: instancemap dataset=rgbd_folder dataset.root={root}")

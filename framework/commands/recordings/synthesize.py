@@ -1,4 +1,4 @@
-"""`instancemap synthesize DIR`: render a benchmark of synthetic scenes in SceneNN format."""
+"""`instancemap synthesize DIR`: render the benchmark of synthetic scenes in SceneNN format."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("directory", metavar="DIR", type=Path, help="new folder, or a partly written folder to complete")
+    add("directory", metavar="DIR", type=Path, help="output folder: new, or incomplete from an earlier call")
     add("--scenes", metavar="NAMES", default=",".join(SCENES), help="comma-separated scene names; default: all scenes")
     add("--seed", metavar="N", type=int, default=default.seed, help="random seed of the scenes; default: 0")
     add("--frames", metavar="N", type=int, default=default.frames, help="number of frames per scene; default: 120")

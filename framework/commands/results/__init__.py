@@ -1,1 +1,1 @@
-"""Commands for stored runs."""
+"""Commands that evaluate, export and visualize stored runs."""

@@ -1,4 +1,4 @@
-"""`instancemap diff RUN RUN`: list the changes between two runs with the same world frame."""
+"""`instancemap diff RUN RUN`: list the changed objects between two runs with the same world frame."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def main() -> None:
     with one_line_errors():
         if not in_world(parsed.after, parsed.before):
             message = (
-                "%s: expected the world frame of %s, got another or an unknown frame; map it again with "
-                "localize_in=%s, or map both with tracker=ground_truth"
+                "%s: expected the world frame of %s, got a different or unknown world frame; run it again with "
+                "localize_in=%s, or run both with tracker=ground_truth"
             )
             log.warning(message, parsed.after, parsed.before, parsed.before)
         found = changes(visit_of(parsed.before), visit_of(parsed.after))
@@ -47,18 +47,18 @@ def main() -> None:
         shown = [change for change in found if parsed.all or change.kind not in UNCHANGED]
         print("\n".join(map(line, shown)) or "no changes")
         rest = {kind: sum(change.kind is kind for change in found) for kind in UNCHANGED}
-        print(f"{rest[Kind.STAYED]} stayed, {rest[Kind.NOT_SEEN]} not seen by the other run")
+        print(f"{rest[Kind.STAYED]} stayed, {rest[Kind.NOT_SEEN]} not observed in the other run")
 
 
 def visit_of(run: Path) -> Visit:
-    """Read the map and trajectory of a stored run. Raises DataError."""
+    """Return the map and trajectory of a stored run. Raises DataError if a file is missing or invalid."""
     from framework.api import scene_of  # slow import: after the arguments are checked
 
     return Visit(scene_of("diff", run), read_tum(run / TRAJECTORY)[1])
 
 
 def in_world(run: Path, world: Path) -> bool:
-    """Return True if the configs or metrics of two runs imply the same world frame."""
+    """Return True if the stored configs or metrics imply that `run` has the world frame of the run `world`."""
     config = load_yaml(run / CONFIG) if path_exists(run / CONFIG) else None
     worlds = [config.get(key) for key in ("localize_in", "resume_from")] if isinstance(config, DictConfig) else []
     if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in worlds):
@@ -68,7 +68,7 @@ def in_world(run: Path, world: Path) -> bool:
 
 
 def line(change: Change) -> str:
-    """Format a change as one line of text."""
+    """Return a change as one line of text, with lengths in meters."""
     x, y, z = change.place
     where = f"at ({x:.2f}, {y:.2f}, {z:.2f}) m"
     if change.kind is Kind.MOVED:
@@ -78,7 +78,7 @@ def line(change: Change) -> str:
 
 
 def entry(change: Change) -> dict[str, object]:
-    """Return the JSON entry of a change."""
+    """Return the JSON entry of a change, with lengths in meters."""
     return {
         "kind": change.kind.value,
         "class": change.name,

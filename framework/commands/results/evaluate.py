@@ -1,4 +1,4 @@
-"""`instancemap evaluate RUN...`: re-evaluate stored runs without mapping them again."""
+"""`instancemap evaluate RUN...`: re-evaluate stored runs without re-running them."""
 
 from __future__ import annotations
 
@@ -34,15 +34,16 @@ def main() -> None:
         choices=[transfer.value for transfer in Transfer],
         default=Transfer.TO_TRUTH.value,
         help="direction of the label transfer for the printed metrics: to_truth (each ground-truth point gets the "
-        "instance of the nearest map vertex) or to_map (the reverse); both are stored; default: to_truth",
+        "instance of the nearest map vertex) or to_map (each map vertex gets the instance of the nearest "
+        "ground-truth point); both are stored; default: to_truth",
     )
     parser.add_argument(
         "--ground-truth",
         metavar="PATH",
         help="ground truth, as in dataset.ground_truth: labeled mesh or run directory; '' = ground truth of the "
-        "dataset; default: ground truth of the run",
+        "dataset; default: ground truth used by the run",
     )
-    changed = "evaluate even if the ground truth changed since the run; implied by --ground-truth"
+    changed = "evaluate even if the ground truth has changed since the run; implied by --ground-truth"
     parser.add_argument("--allow-changed-ground-truth", action="store_true", help=changed)
     parser.add_argument(  # earlier name
         "--other-truth",
@@ -69,7 +70,7 @@ def evaluate_runs(
 ) -> int:
     """Evaluate all runs in `roots` and their subfolders, print a line per run, and return the number of failures.
 
-    `ground_truth` is as in `dataset_of`.
+    `ground_truth` is the value of --ground-truth; None = ground truth used by the run.
     """
     records, failures = _find(roots)
     for failure in failures:
@@ -80,7 +81,7 @@ def evaluate_runs(
         return str(dataset_of(record, ground_truth))
 
     with tqdm(total=len(records), unit=" runs", disable=None, dynamic_ncols=True) as bar:
-        # by dataset, so that only one ground truth is in memory
+        # sorted by dataset, so that only one ground truth is in memory at a time
         for _, group in groupby(sorted(records, key=key), key):
             truth: Truth | None = None
             for record in group:
@@ -98,7 +99,7 @@ def evaluate_runs(
 
 
 def summary(found: Reevaluation, transfer: Transfer) -> str:
-    """Return the changes as text: the main metrics of one label transfer, and the number of other changes."""
+    """Return the changes as text: the main metrics with this label transfer, and the number of other changes."""
     changed, added = found.changed, found.added
     prefix = "instances." if transfer is Transfer.TO_TRUTH else f"instances.{transfer.value}."
     shown = [key for key in (*(prefix + name for name in MAIN_FIGURES), "annotation_release") if key in changed]
@@ -116,7 +117,10 @@ def _step(old: Any, new: Any) -> str:
 
 
 def _find(roots: Sequence[Path]) -> tuple[list[Record], list[DataError]]:
-    """Return the completed runs without duplicates, and an error for each incomplete run."""
+    """Return the complete runs in `roots`, and an error for each incomplete run and each root without runs.
+
+    Each run is listed once.
+    """
     records: dict[Path, Record] = {}
     failures: dict[Path, DataError] = {}
     for root in roots:

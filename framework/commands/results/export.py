@@ -1,4 +1,4 @@
-"""`instancemap export RUN [--to glb usd ...]`: export a run to the formats of other programs."""
+"""`instancemap export RUN [--to glb usd ...]`: export a run to standard 3D and map formats."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from framework.commands.command_line import arguments, one_line_errors
 def main() -> None:
     """Run the command `instancemap export`."""
     parser = argparse.ArgumentParser(
-        description="Export a run to the formats of other programs: the scene, separate objects (upright, at the "
-        "origin, in meters), a floor plan or a scene graph."
+        description="Export the scene, individual objects (upright, at the origin, in meters), a floor plan or a "
+        "scene graph to standard file formats."
     )
     add = parser.add_argument
     formats = ("glb", "ply", "usd", "obj", "floorplan", "graph")
     add("run", metavar="RUN", type=Path, help="run directory, complete or partial")
-    listed = f"one or several of {', '.join(formats)}; default: glb"
+    listed = f"one or more of {', '.join(formats)}; floorplan also writes the ROS map; default: glb"
     add("--to", metavar="FORMAT", nargs="+", default=["glb"], choices=formats, help=listed)
     add("--out", metavar="DIR", type=Path, help="output folder; default: RUN/export")
     only = "id or class of the exported objects; repeatable; default: all objects"
@@ -36,8 +36,8 @@ def main() -> None:
     add("--colors", choices=colors, default="appearance", help="vertex colors; default: appearance")
     add("--collision", choices=("hull", "box"), default="hull", help="collision shape of objects in USD; default: hull")
     add = parser.add_argument_group("floor plan and ROS map").add_argument
-    add("--resolution", metavar="M", type=float, default=0.05, help="cell size, m, in [0.01, 1]; default: 0.05")
-    height = "minimum height of observed empty space above a free cell, m, in [0.1, 3]; default: 1"
+    add("--resolution", metavar="M", type=float, default=0.05, help="side of a cell, m, in [0.01, 1]; default: 0.05")
+    height = "robot height, m, in [0.1, 3]; cells are free if observed empty up to this height; default: 1"
     add("--robot-height", metavar="M", type=float, default=1.0, help=height)
     parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)

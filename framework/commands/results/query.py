@@ -14,14 +14,14 @@ from framework.queries.text_search import BY, WITH_EMBEDDINGS, Match, QueryResul
 def main() -> None:
     """Run the command `instancemap query`."""
     parser = argparse.ArgumentParser(
-        description="Rank the objects of a stored run by a text query. Uses image embeddings if the run used "
+        description="Rank the objects of a stored run by a text query, using image embeddings if the run used "
         f"{WITH_EMBEDDINGS}, otherwise class names and surface colors."
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="run directory")
     parser.add_argument("text", metavar="QUERY", help='text query, such as "a red chair"')
     parser.add_argument("--top", metavar="N", type=int, default=5, help="number of listed objects; default: 5")
     parser.add_argument("--by", choices=BY, help="ranking method; default: embeddings if available")
-    model = "embedding model of the query, id on huggingface.co or folder; default: model of the run's detector"
+    model = "embedding model for the query: id on huggingface.co or folder; default: model of the run's detector"
     parser.add_argument("--model", metavar="MODEL", help=model)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parsed = arguments(parser)
@@ -45,11 +45,11 @@ def main() -> None:
 
 
 def heading(answer: QueryResult, wanted: str | None) -> str:
-    """Return a line with the ranking method, and the reason for it if embeddings are unavailable."""
+    """Return a line with the ranking method and, if the run has no embeddings, the override that adds them."""
     if answer.by == "embeddings":
         return f"by embeddings of {answer.space}"
     unavailable = wanted is None and not answer.space
-    reason = f", because this run has no embeddings; map it again with {WITH_EMBEDDINGS}" if unavailable else ""
+    reason = f", because this run has no embeddings; run it again with {WITH_EMBEDDINGS}" if unavailable else ""
     return f"by class names and colors{reason}"
 
 
@@ -70,7 +70,7 @@ def table(found: Sequence[Match], measure: str) -> str:
 
 
 def entry(found: Match) -> dict[str, object]:
-    """Return a JSON entry with lengths in meters."""
+    """Return the JSON entry of a matched object, with lengths in meters."""
     return {
         "id": found.instance.id,
         "class": found.name,

@@ -1,4 +1,4 @@
-"""`instancemap raycast RUN`: draw the view of a run's map from a frame's pose (the paper's Figure 2)."""
+"""`instancemap raycast RUN`: draw a ray-cast view of a run's map from the pose of a frame, as in Figure 2."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ PICTURE = "raycast.png"
 def main() -> None:
     """Run the command `instancemap raycast`."""
     parser = argparse.ArgumentParser(
-        description="Draw a ray-cast view of the map of a run in five panels: depth, normals, vertices, RGB and object "
-        "indices."
+        description="Draw a ray-cast view of the map of a run in five panels: depth, normals, vertex map, RGB and "
+        "object indices."
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="run directory")
     view = parser.add_mutually_exclusive_group()
     view.add_argument("--frame", metavar="N", type=int, help="number of a mapped frame; default: middle frame")
     pose = ("TX", "TY", "TZ", "QX", "QY", "QZ", "QW")
-    pose_help = "camera pose T_world_camera: position, m, and unit quaternion"
+    pose_help = "camera pose T_world_camera: translation, m, and unit quaternion"
     view.add_argument("--pose", metavar=pose, nargs=7, type=float, help=pose_help)
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"PNG file; default: {PICTURE} in the run directory")
     parsed = arguments(parser)
@@ -42,10 +42,10 @@ def main() -> None:
 
 
 def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> None:
-    """Write the ray-cast image of a run, as seen from `pose`, or from the pose of `frame`. Raises DataError.
+    """Write a figure of a run's map, ray-cast from `pose` or from the pose of the frame with number `frame`.
 
-    `pose` is T_world_camera as position tx, ty, tz, m, and unit quaternion qx, qy, qz, qw. If both arguments are None,
-    the middle frame is used.
+    `pose` is T_world_camera as translation tx, ty, tz, m, and unit quaternion qx, qy, qz, qw. If `pose` and `frame` are
+    None, the middle frame is used. Raises DataError if the frame was not mapped or the map is not in view.
     """
     from framework.api import scene_of  # slow import: after the arguments are checked
     from framework.figures.raycast_figure import write_raycast
@@ -63,29 +63,35 @@ def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> N
         place = f"pose {' '.join(f'{value:g}' for value in pose)}"
     source = RunSource.of(contents)
     if source.camera is None:
-        log.warning("the camera of the run is unknown (%s); rendering with the camera of a Kinect", source.why_not)
+        log.warning("camera of the run unknown (%s); rendering with the intrinsics of a Kinect", source.why_not)
     objects = scene.instances()
     names = {key: scene.classes[int(one.class_probabilities.argmax())] for key, one in objects.items()}
     view = scene.render(source.camera or NOT_CAMERA, T_world_camera)
     if not (view.depth > 0).any():
-        raise DataError(f"raycast: expected a pose with the map in view, got {place}; set another --frame or --pose")
+        raise DataError(
+            f"raycast: expected a pose with the map in view, got an empty view from {place}; set another --frame or "
+            "--pose"
+        )
     centers = {key: one.aabb.center for key, one in objects.items()}
     note = f"{contents.name}, {place}, ray-cast from the final map. Commit {contents.record.commit}."
     write_raycast(out, view, names, centers, note)
 
 
 def pose_of_frame(contents: RunContents, frame: int | None) -> int:
-    """Return the index of a frame's pose in the trajectory; None = middle pose. Raises DataError without any pose."""
+    """Return the index of the pose of a frame in the trajectory; None = middle pose.
+
+    Raises DataError if the frame was not mapped.
+    """
     numbers, lost = contents.frame_numbers, contents.lost_frames
     if not numbers:
-        raise DataError(f"{contents.record.directory}: expected mapped frames, got none; set --pose")
+        raise DataError(f"{contents.record.directory}: expected at least one mapped frame, got none; set --pose")
     if frame is None:
         return len(numbers) // 2
     if frame in numbers:
         return numbers.index(frame)
     known = (*numbers, *lost)
     if not min(known) <= frame <= max(known):
-        raise DataError(f"--frame: expected a number from {min(known)} to {max(known)}, got {frame}")
+        raise DataError(f"--frame: expected a frame number from {min(known)} to {max(known)}, got {frame}")
     nearest = min(numbers, key=lambda number: abs(number - frame))
     what = "a lost frame" if frame in lost else "a frame that was not mapped"
     raise DataError(f"--frame: expected a mapped frame, got {frame} ({what}); use the nearest one, --frame {nearest}")

@@ -21,8 +21,8 @@ COMPARISON = "comparison.html"
 def main() -> None:
     """Run the command `instancemap report`."""
     parser = argparse.ArgumentParser(
-        description="Write an interactive HTML report of a run: map, objects, trajectory, times, and errors if ground "
-        "truth is available. For several runs, also writes a comparison. Each report is a single file."
+        description="Write an interactive HTML report of a run: map, objects, trajectory, run times and, with ground "
+        "truth, accuracy. For several runs, also write a comparison. Each report is a single file."
     )
     parser.add_argument("run", metavar="RUN", nargs="+", type=Path, help="run directory")
     default = f"default: {REPORT} in the run directory, or {COMPARISON} in the common parent folder of the runs"
@@ -34,9 +34,10 @@ def main() -> None:
 
 
 def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[Path]:
-    """Write the reports and return their paths. The last path is the comparison, or the only report.
+    """Write the report of each run and, for several runs, their comparison. Return the paths, the comparison last.
 
-    Raises DataError before any file is written if a run cannot be read.
+    `out` is the path of the only report or of the comparison; None = default path. Raises DataError before any file is
+    written if a run cannot be read.
     """
     from framework.reporting.comparison_page import Comparison
     from framework.reporting.run_contents import RunContents
@@ -44,10 +45,10 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
 
     places = [directory.resolve() for directory in directories]
     if again := [place for k, place in enumerate(places) if place in places[:k]]:
-        raise DataError(f"{again[0]}: expected each run once, got it twice; remove the duplicate")
+        raise DataError(f"{again[0]}: expected distinct runs, got this run twice; remove the duplicate")
     if out is not None:
         if not out.parent.is_dir():
-            raise DataError(f"{out}: expected a file in an existing folder, got the missing {out.parent}; create it")
+            raise DataError(f"{out}: expected an existing parent folder, got none; create {out.parent}")
         if out.exists():
             check_regular(out)
     runs = [RunContents.read(directory) for directory in directories]

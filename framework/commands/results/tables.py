@@ -10,6 +10,6 @@ def main() -> None:
     """Run the command `instancemap tables`."""
     print_for_directories(
         "Write table.md, table.tex and table.csv of the runs in DIR and its subfolders, and print table.md.",
-        "folder of a sweep, or of several runs",
+        "folder of a sweep or of several runs",
         write_tables,
     )

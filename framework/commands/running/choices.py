@@ -24,17 +24,17 @@ from framework.errors import ConfigError
 from framework.runs.provenance import OF_SPEED, leaves, relevant
 from framework.runs.stored_runs import GROUPS
 
-GLOB_COUNT = 1_000_000  # upper bound on the number of values of a glob(), which depends on the file system
+GLOB_COUNT = 1_000_000  # assumed upper bound on the number of values of a glob(), which Hydra resolves later
 COUNTED = (ValueType.SIMPLE_CHOICE_SWEEP, ValueType.CHOICE_SWEEP, ValueType.RANGE_SWEEP)
 
 Choices = Mapping[str, str | None]
 
 OmegaConf.register_new_resolver("all_of", lambda by_name: ",".join(map(str, by_name)), replace=True)
-"""`${all_of:${rows}}`: the names of all rows, as a choice for Hydra's sweeper."""
+"""Resolver `${all_of:${rows}}`: the names of all rows, comma-separated, as a choice sweep for Hydra."""
 
 
 def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, Choices]:
-    """Return a job's config and its choices by group, with the overrides of the job's row.
+    """Return a job's config with the overrides of its row, and the chosen option of each config group.
 
     Raises ConfigError for an unknown row, and for an invalid `table` or `figure`.
     """
@@ -61,9 +61,9 @@ def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, C
 def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
     """Return an upper bound on the number of runs of a sweep.
 
-    Raises ConfigError for an empty sweep, and for a row that is not in `rows` of the experiment.
+    Raises ConfigError for a key without values, and for a row that is not among the `rows` of the experiment.
     """
-    runs: dict[str, int] = {}  # by key; the last override takes precedence
+    runs: dict[str, int] = {}  # number of values by key; the last override of a key takes precedence
     for override in _parsed(overrides):
         values = _values(override)
         runs[override.get_key_element()] = len(values) or GLOB_COUNT
@@ -112,7 +112,7 @@ def _alternatives(overrides: Sequence[str], rows: Mapping[str, Sequence[str]]) -
 
 
 def swept_keys(overrides: Sequence[str]) -> set[str]:
-    """Return the keys and groups with several values. The last override of a key takes precedence."""
+    """Return the swept keys and config groups. The last override of a key takes precedence."""
     last = {override.key_or_group: override for override in _parsed(overrides)}
     return {key for key, override in last.items() if override.is_sweep_override()}
 
@@ -124,7 +124,7 @@ def of_tables(overrides: Sequence[str]) -> list[str]:
 
 
 def check_row(chosen: Sequence[str], rows: Collection[str]) -> None:
-    """Raise ConfigError for the first chosen row that is missing in the experiment."""
+    """Raise ConfigError if a chosen row is not among the `rows` of the experiment."""
     for row in chosen:
         if row not in rows:
             close = get_close_matches(row, rows, n=1)
@@ -133,7 +133,7 @@ def check_row(chosen: Sequence[str], rows: Collection[str]) -> None:
 
 
 def error_of_first_run(words: Sequence[str]) -> HydraException | None:
-    """Return the error of the first run of a sweep started by an experiment; None = no error.
+    """Return the error in the config of the first run of a sweep; None = no error.
 
     If the experiment's config cannot be composed, Hydra treats the command line as a single run and reports its swept
     values as errors. `words` is the command line.
@@ -148,7 +148,7 @@ def error_of_first_run(words: Sequence[str]) -> HydraException | None:
 
 
 def single_run(overrides: Sequence[str]) -> list[str]:
-    """Return the overrides of the first run of a sweep."""
+    """Return the overrides of the first run of a sweep: the first value of each swept key."""
     chosen = []
     for override in _parsed(overrides):
         values = _values(override)
@@ -162,7 +162,7 @@ def _parsed(overrides: Sequence[str]) -> list[Override]:
 
 
 def _values(override: Override) -> list[str]:
-    """Return the values of an override in order; empty if they depend on the file system."""
+    """Return the values of an override in order; [] if they are known only to Hydra, as for a glob()."""
     try:
         return [*override.sweep_string_iterator()] if override.is_sweep_override() else [str(override.value())]
     except HydraException:

@@ -1,6 +1,6 @@
-"""`instancemap detect detector=X dataset=D out=FILE`: write the detections of a sequence as a COCO result file.
+"""`instancemap detect detector=X dataset=D out=FILE`: write detections of a sequence to a COCO results file.
 
-With ground truth, it also reports mask AP and the rates of detection errors.
+If the sequence has ground truth, the command also reports the mask AP and the rates of detection errors.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def job(config: DictConfig) -> None:
 
 
 def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> int:
-    """Write a result file that `detector=precomputed` reads, and return the number of detections.
+    """Write a COCO results file for `detector=precomputed`, and return the number of detections.
 
     Unusable frames are logged and skipped. Raises DataError if no frame is usable.
     """
@@ -76,7 +76,7 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
     log.info("%s: %d detections in %d frames of %s", path, results.count, results.frames, sequence.name)
     if precision.objects:
         log.info(
-            "mask AP50 %.2f, AP %.2f: mean of %d classes, %d ground-truth objects of at least %d px",
+            "mask AP50 %.2f, mask AP %.2f (mean of %d classes, %d ground-truth objects of at least %d px)",
             precision.ap50,
             precision.ap,
             sum(not math.isnan(ap) for ap in precision.ap50_by_class.values()),
@@ -91,7 +91,7 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
 def _written(
     results: ResultWriter, detector: Detector, sequence: RGBDSequence, errors: DetectionErrors
 ) -> Iterator[tuple[Bool, list[str | None], Detections]]:
-    """Write the detections frame by frame; with ground truth, count errors and yield the input of `mask_ap`."""
+    """Write the detections frame by frame. With ground truth, count errors, and yield the input of `mask_ap`."""
     with logging_redirect_tqdm(), tqdm(total=len(sequence), unit=" frames", disable=None, dynamic_ncols=True) as bar:
         for k in range(len(sequence)):
             bar.update()
@@ -119,7 +119,7 @@ def _written(
 
 
 def write_labels(path: Path, classes: tuple[str, ...]) -> Path:
-    """Write the class names next to a result file, one per line."""
+    """Write the class names to a text file next to a results file, one per line, and return its path."""
     from framework.files.atomic_write import atomic_write
 
     labels = path.with_suffix(".labels.txt")

@@ -37,7 +37,7 @@ def job(config: DictConfig) -> None:
         received_from_sweep().check()
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
-    # workers of a killed sweep may still write here; a single run has already locked its directory
+    # workers of a killed sweep may still be writing here; a single run has already locked its directory
     with locked(directory, wait=True) if is_of_sweep(hydra_config) else nullcontext():
         if config.skip_completed and is_recorded(directory, config):
             return
@@ -47,15 +47,15 @@ def job(config: DictConfig) -> None:
 
 
 def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) -> Interruption:
-    """Map the config's video with its stages and write the outputs to `directory`.
+    """Map the sequence or live video of the config, and write the outputs to `directory`.
 
-    `choices` are the chosen options by config group. A run ends in one of three ways:
+    `choices` contains the chosen option of each config group. A run ends in one of three ways:
 
     - completed: the outputs are complete. The returned Interruption contains a signal that arrived during writing, or
       that ended a live video.
-    - partial: a signal, or an error of a stage or of the disk, ended the run after the first mapped frame. The outputs
-      are written as far as possible, and marked as partial. Raises Interrupted, or PartialRunError from the cause.
-    - nothing was mapped: raises the cause.
+    - partial: a signal, an error of a stage or a disk error ended the run after the first mapped frame. The available
+      outputs are written and marked as partial. Raises Interrupted, or PartialRunError with the error as its cause.
+    - nothing was mapped: raises the error that ended the run.
 
     The first signal takes effect after the current frame or output, the second signal immediately.
     """
@@ -72,9 +72,9 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     settings.apply()
     pipeline = begin(config)
     settings.apply()  # apply to torch, if a stage has loaded it
-    gc.collect()  # otherwise a collection delays one of the first few hundred frames
-    video = build(RGBDVideo, config.get("dataset"))  # after the stages, because a synthetic scene takes longest
-    compile_for_run()  # kernels of its renderer
+    gc.collect()  # otherwise, a garbage collection would delay one of the first few hundred frames
+    video = build(RGBDVideo, config.get("dataset"))  # last, because a synthetic scene takes the longest to build
+    compile_for_run()  # kernels of the synthetic renderer
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
     length = f"{len(video)} frames" if isinstance(video, RGBDSequence) else "live until Ctrl-C"

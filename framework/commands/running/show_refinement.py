@@ -50,17 +50,20 @@ def job(config: DictConfig) -> None:
     refiner = build(ClusterRefiner, config.refiner)
     position, frame, detections = detected(sequence, detector, config.frame)
     if len(detections) == 0:
-        log.warning("frame %d of %s: no detections, nothing to refine", position, sequence.name)
+        log.warning("frame %d of %s: no detections to refine; set frame=K or another detector", position, sequence.name)
     hydra_config = HydraConfig.get()
     choices, overrides = hydra_config.runtime.choices, hydra_config.overrides.task
-    number = "" if frame.index == position else f" (number {frame.index} of the video)"
+    number = "" if frame.index == position else f" (frame {frame.index} of the recording)"
     title = f"{sequence.name}, frame {position}{number}, detector={choices['detector']}"
     write_refinement(out, Refinement.of(refiner, detections, frame), title, called(choices["refiner"], overrides))
     log.info("%s: %d detections in frame %d of %s", out, len(detections), position, sequence.name)
 
 
 def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tuple[int, Frame, Detections]:
-    """Return `position` with its frame and detections; None selects the candidate frame with the most detections.
+    """Return a position among the selected frames, its frame and the detections.
+
+    If `position` is None, the candidate frame with the most detections is returned.
+
 
     Raises ConfigError for an invalid position, FrameError for an unusable frame, DataError if no candidate is usable.
     """
@@ -87,12 +90,12 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
         if best is None or len(found) > len(best[2]):
             best = k, frame, found
     if best is None:
-        raise DataError(f"{sequence.name}: expected a usable frame, got none of {len(tried)} tried frames; set frame=K")
+        raise DataError(f"{sequence.name}: expected a usable frame, got none of {len(tried)} candidates; set frame=K")
     return best
 
 
 def called(refiner: str, overrides: Iterable[str]) -> str:
-    """Return the overrides that choose the refiner and its parameters."""
+    """Return the overrides on the command line that select the refiner and set its parameters, as one string."""
     return " ".join(
         [f"refiner={refiner}", *(item for item in overrides if item.lstrip("+~").startswith(("refiner.", "refiner@")))]
     )

@@ -30,16 +30,16 @@ from framework.runtime.process_settings import available_cores
 from framework.runtime.signals import signals_passed_on
 
 ending = ExitStack()
-"""Cleanup of this process after its run or sweep."""
+"""Stack of contexts that this process closes after its run or sweep."""
 
 
 def cores_of(threads: int) -> int:
-    """Return the number of cores of a job with `threads` threads; 0 = all cores."""
+    """Return the number of cores for a job with `threads` threads; `threads` 0 = all cores."""
     return threads or available_cores()
 
 
 def jobs_at_once(threads: int) -> int:
-    """Return the number of concurrent jobs with `threads` threads each."""
+    """Return the number of jobs with `threads` threads each that run concurrently on this machine, at least 1."""
     return max(1, available_cores() // cores_of(threads))
 
 
@@ -50,41 +50,42 @@ OmegaConf.register_new_resolver("new_directory", new_directory, use_cache=True, 
 
 
 @dataclass
-class PlaceCallback(Callback):
-    """Hydra callback at the start of a run or sweep.
+class DirectoryLockCallback(Callback):
+    """Hydra callback that locks the directory of a run or sweep at its start.
 
-    Hydra calls it in the main process, before writing anything, but not in workers.
+    Hydra calls it in the main process before it writes any file, but not in workers.
     """
 
     of_run: bool = True  # True if a run has its own directory; False for commands that write one file
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        HydraConfig.instance().set_config(config)  # as Hydra does later; the directory contains the name of the dataset
+        # as Hydra does later; the resolver of the directory needs the name of the dataset
+        HydraConfig.instance().set_config(config)
         if self.of_run:
             self.take(
-                lambda: run_in(place_of("hydra.run.dir", config.hydra.run.dir), wait=config.skip_completed is True)
+                lambda: run_in(directory_of("hydra.run.dir", config.hydra.run.dir), wait=config.skip_completed is True)
             )
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         self.take(lambda: sweep_of(config, with_table=self.of_run))
 
-    def take(self, place: Callable[[], AbstractContextManager[None]]) -> None:
+    def take(self, lock: Callable[[], AbstractContextManager[None]]) -> None:
         try:
-            ending.enter_context(place())
+            ending.enter_context(lock())
         except (InstanceMapError, OSError, OmegaConfBaseException) as error:  # Hydra would only warn
             sys.exit(f"error: {one_line(error)}")
 
 
-def place_of(key: str, chosen: str) -> Path:
-    """Return the chosen directory. Raises ConfigError for an empty name, which would select the working folder."""
+def directory_of(key: str, chosen: str) -> Path:
+    """Return the directory `chosen` for `key`. Raises ConfigError for an empty name (the working directory)."""
     if not chosen.strip():
-        raise ConfigError(f"{key}: expected a folder, got an empty name; set {key}=. for the working folder")
+        raise ConfigError(f"{key}: expected a folder, got an empty name; set {key}=. for the working directory")
     return Path(chosen)
 
 
 @contextmanager
 def run_in(directory: Path, wait: bool) -> Iterator[None]:
-    """Lock `directory` inside the context. Raises DataError."""
+    """Lock the directory of a run inside the context. Raises DataError if it is in use and `wait` is False."""
     with locked(directory, wait):
         if (directory / LOG).exists():
             check_regular(directory / LOG)  # Hydra would block on a pipe
@@ -92,10 +93,10 @@ def run_in(directory: Path, wait: bool) -> Iterator[None]:
 
 
 def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[None]:
-    """Return the context of a sweep with at least one run. Raises InstanceMapError.
+    """Return the context of a sweep. Raises InstanceMapError if the sweep has no runs.
 
-    joblib is limited to one worker per run. A signal from the terminal would end an idle worker, and joblib would then
-    end all workers.
+    joblib is limited to one worker per run. Otherwise, a signal from the terminal would end an idle worker, and joblib
+    would then end all workers.
     """
     own = config.hydra
     swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
@@ -110,15 +111,15 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
         workers = min(joblib_workers(own.launcher.n_jobs), runs)
         with flag_override(own, "readonly", False):
             own.launcher.n_jobs = workers
-    directory = place_of("hydra.sweep.dir", own.sweep.dir)
+    directory = directory_of("hydra.sweep.dir", own.sweep.dir)
     return sweep_in(directory, with_table, config.get("figure") is not None, workers > 1)
 
 
 def _name_by(own: DictConfig, swept: Collection[str], of_outputs: Collection[str]) -> None:
-    """Add swept keys to the names of job directories, although they do not affect results, and omit `of_outputs`.
+    """Include swept keys in the names of job directories, even if they do not affect results, and omit `of_outputs`.
 
-    Jobs that differ only in swept keys would share a directory. Workers compose each job again from the overrides that
-    this function extends.
+    Otherwise, jobs that differ only in such keys would share a directory. The function extends Hydra's overrides,
+    because workers compose each job again from them.
     """
     left_out = [*own.job.config.override_dirname.exclude_keys]
     still = [*(key for key in left_out if key not in swept), *(key for key in of_outputs if key not in left_out)]
@@ -133,7 +134,7 @@ def by_joblib(own: DictConfig | HydraConf) -> bool:
 
 
 def joblib_workers(n_jobs: int | None) -> int:
-    """Return the number of processes that joblib uses for `n_jobs`; 1 = jobs run in this process."""
+    """Return the number of worker processes that joblib starts for `n_jobs`; 1 = jobs run in this process."""
     from joblib import effective_n_jobs  # type: ignore[import-untyped]
 
     return int(effective_n_jobs(n_jobs))
@@ -141,12 +142,13 @@ def joblib_workers(n_jobs: int | None) -> int:
 
 @contextmanager
 def sweep_in(directory: Path, with_table: bool, with_figure: bool, workers: bool = False) -> Iterator[None]:
-    """Lock `directory` inside the context, and print the table of its runs at the end, also after errors.
+    """Lock the directory of a sweep inside the context. At the end, print the table of its runs, even after an error.
 
-    The figure is also drawn, except after Ctrl-C. Raises InstanceMapError if a launcher fails because a worker was
-    killed. With `workers`, signals are forwarded to the workers, which store partial results before the sweep ends.
+    With `with_figure`, the figure is also drawn, except after Ctrl-C. With `workers`, signals are forwarded to the
+    workers, which store partial results before the sweep ends. Raises InstanceMapError if a launcher fails because a
+    worker was killed.
     """
-    # joblib stops its workers, and Python's resource tracker warns about it
+    # Python's resource tracker would warn when joblib stops its workers
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker")))
     with locked(directory):
         remove_left_over(directory)
@@ -166,13 +168,13 @@ def sweep_in(directory: Path, with_table: bool, with_figure: bool, workers: bool
 
 
 def at_work_in(directory: Path) -> list[BaseProcess]:
-    """Return the child processes that execute a run of this sweep."""
+    """Return the child processes that are executing a run in `directory`."""
     busy = {holder(run) for run in directory.iterdir() if is_locked(run)}
     return [worker for worker in active_children() if holder_name(worker.pid) in busy]
 
 
 def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
-    """Write tables and figures of the runs in `directory`, in the main process."""
+    """Write the tables and the figure of the runs in `directory`."""
     if with_table:
         from framework.tables.experiment_tables import write_tables
 
@@ -185,5 +187,5 @@ def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
 
 
 def _is_of_a_launcher(error: BaseException) -> bool:
-    """Return True for errors of a launcher: RuntimeErrors of joblib and submitit, and errors of Ray."""
+    """Return True for an error of a launcher: a RuntimeError, as raised by joblib and submitit, or an error of Ray."""
     return isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] == "ray"

@@ -1,4 +1,4 @@
-"""Cameras and numbers in JSON files, with format-specific keys."""
+"""Readers of cameras and numbers in JSON files with format-specific keys."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class StoredCamera(NamedTuple):
 
 
 def read_json_object(path: Path, most: int = MAX_TEXT) -> dict[str, Any]:
-    """Return the JSON object in a file of at most `most` bytes. Raises DataError that names the file."""
+    """Return the JSON object in a file of at most `most` bytes. Raises a DataError that names the file."""
     found = read_json(path, most)
     if not isinstance(found, dict):
         raise DataError(f"{path}: expected a JSON object, got {type(found).__name__}")
@@ -42,7 +42,7 @@ def read_json_object(path: Path, most: int = MAX_TEXT) -> dict[str, Any]:
 
 
 def read_camera(path: Path) -> StoredCamera:
-    """Return the calibration in a camera.json. Raises DataError that names the file and the key."""
+    """Return the calibration in a camera.json. Raises a DataError that names the file and the key."""
     content = read_json_object(path)
     check_keys(path, content, (*CAMERA_KEYS, DISTORTION, SENSOR))
     camera = camera_of(path, content, CAMERA_KEYS)
@@ -52,7 +52,7 @@ def read_camera(path: Path) -> StoredCamera:
 def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tuple[Camera, float]:
     """Return the camera and the depth scale (units per meter) from the values of `keys`.
 
-    `keys` are the names of the CAMERA_KEYS in this file, in the same order. Raises DataError that names the file and
+    `keys` are the names of the CAMERA_KEYS in this file, in the same order. Raises a DataError that names the file and
     the key.
     """
     *camera, depth_scale = numbers_of(path, content, *keys)
@@ -65,7 +65,10 @@ def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tu
 
 
 def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Camera:
-    """Return the pinhole camera with this image size and these intrinsics, px. Raises DataError that names `where`."""
+    """Return the pinhole camera with this image size and these intrinsics, px.
+
+    Raises a DataError that names `where` if they are invalid.
+    """
     if width != int(width) or height != int(height):
         raise DataError(f"{where}: width, height: expected whole numbers of px, got {width:g}x{height:g}")
     with errors_of(where):
@@ -86,7 +89,7 @@ def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> 
 def number_list(where: Path | str, values: Any, count: int) -> list[float]:
     """Return the numbers of a JSON list.
 
-    Raises DataError that names `where` if `values` is not a list of `count` finite numbers.
+    Raises a DataError that names `where` if `values` is not a list of `count` finite numbers.
     """
     if not isinstance(values, list) or len(values) != count or not all(map(_is_number, values)):
         raise DataError(f"{where}: expected a list of {count} numbers, got {values!r:.60}")
@@ -94,7 +97,7 @@ def number_list(where: Path | str, values: Any, count: int) -> list[float]:
 
 
 def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> list[float]:
-    """Return the finite numbers under `keys` in `content`. Raises DataError that names `where` and the key."""
+    """Return the finite numbers under `keys` in `content`. Raises a DataError that names `where` and the key."""
     for key in keys:
         if key not in content:
             raise DataError(f"{where}: expected a key {key!r}, got none")
@@ -104,14 +107,20 @@ def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> lis
 
 
 def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
-    """Return the lens distortion in the content of a camera.json; None = pinhole camera. Raises DataError."""
+    """Return the lens distortion in the content of a camera.json; None = pinhole camera.
+
+    Raises DataError if it is not a list of five finite numbers.
+    """
     if DISTORTION not in content:
         return None
     return Distortion(*number_list(f"{path}: distortion [k1, k2, p1, p2, k3]", content[DISTORTION], 5))
 
 
 def sensor_of(path: Path, content: Mapping[str, Any]) -> SensorKind:
-    """Return the kind of the depth sensor in the content of a camera.json; KINECT_V1 if missing. Raises DataError."""
+    """Return the kind of the depth sensor in the content of a camera.json; KINECT_V1 if missing.
+
+    Raises DataError if it is not the name of a SensorKind.
+    """
     name = content.get(SENSOR, SensorKind.KINECT_V1.name)
     if not isinstance(name, str) or name not in SensorKind.__members__:
         raise DataError(

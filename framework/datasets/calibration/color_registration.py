@@ -33,7 +33,7 @@ class ColorRegistration:
 
     @property
     def _fine(self) -> int:
-        """Color pixels per depth pixel along an axis, rounded."""
+        """Color pixels per depth pixel along an axis, rounded, at least 1."""
         return max(1, round(min(self.color.fx / self.depth.fx, LONGEST_SIDE)))
 
     def apply(self, image: UInt8) -> UInt8:

@@ -41,12 +41,12 @@ class Calibration:
         object.__setattr__(self, "lens", Undistortion(self.camera, self.distortion) if self.distortion else None)
 
     def color(self, raw: UInt8, name: Path | str) -> UInt8:
-        """Return the undistorted color (H, W, 3). Raises FrameError that names an image of the wrong size."""
+        """Return the undistorted color (H, W, 3), RGB. Raises a FrameError that names an image of the wrong size."""
         self.check_size(name, raw.shape)
         return self.lens.smooth(raw) if self.lens else raw
 
     def depth(self, raw: UInt16, name: Path | str) -> Float32:
-        """Return the depth (H, W) in m, 0 = no reading. Raises FrameError that names an image of the wrong size."""
+        """Return the depth (H, W) in m, 0 = no reading. Raises a FrameError that names an image of the wrong size."""
         self.check_size(name, raw.shape)
         depth = raw.astype(np.float32)
         depth /= np.float32(self.depth_scale)
@@ -56,7 +56,7 @@ class Calibration:
         return self.lens.exact(depth) if self.lens else depth
 
     def labels(self, raw: UInt16, name: Path | str) -> UInt16:
-        """Return the undistorted labels (H, W). Raises FrameError that names an image of the wrong size."""
+        """Return the undistorted instance ids (H, W). Raises a FrameError that names an image of the wrong size."""
         self.check_size(name, raw.shape)
         return self.lens.exact(raw) if self.lens else raw
 

@@ -20,7 +20,7 @@ from framework.data import Camera, Float64, UInt8
 from framework.errors import DataError
 
 Value = TypeVar("Value", bound=np.generic)
-FARTHEST_SHIFT = 0.5  # fraction of the image width; a larger shift indicates another lens model or a typo
+FARTHEST_SHIFT = 0.5  # maximum shift of a pixel, as a fraction of the image width; rejects other lens models
 
 
 @dataclass(frozen=True)

@@ -34,12 +34,17 @@ class DepthCamera(LiveVideo):
     brand: ClassVar[str]
     default_sensor: ClassVar[SensorKind]  # kind of the depth sensor in devices with unknown names
     serial: str = ""  # serial number of the device; "" = the first device found
-    width: int = 640  # width of the color image, px, in [64, 4096]
-    height: int = 480  # height of the color image, px, in [64, 4096]
-    fps: int = 30  # frame rate, Hz, in [1, 300]; size and rate must be a mode of the device
-    max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
-    color_delay: str = AUTO  # time from depth to color with equal timestamps, s, in [-0.2, 0.2]; AUTO = estimated
-    sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = of the device, otherwise of its brand
+    width: int = 640  # width of the color image and of the registered depth image, px, in [64, 4096]
+    height: int = 480  # height of the color image and of the registered depth image, px, in [64, 4096]
+    # frame rate, Hz, in [1, 300]; width, height and fps must be a mode of the device
+    fps: int = 30
+    max_depth: float = 10.0  # maximum depth, m, >= 0; farther readings are dropped; 0 = unlimited
+    # delay of color relative to depth at equal timestamps, s, in [-0.2, 0.2]; positive = color captured later; AUTO =
+    # estimated during the run, 0 until then
+    color_delay: str = AUTO
+    # depth sensor, which selects the noise model: AUTO (from the device), EXACT (rendered depth), KINECT_V1,
+    # REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR
+    sensor: SensorChoice = SensorChoice.AUTO
 
     def __post_init__(self) -> None:
         check_bounds(self, width=(64, 4096), height=(64, 4096), fps=(1, 300))
@@ -53,7 +58,10 @@ class DepthCamera(LiveVideo):
 
     @abstractmethod
     def start(self) -> None:
-        """Start streaming. Raises ConfigError if the library is not installed."""
+        """Start streaming.
+
+        Raises ConfigError if the library is not installed, and one of `self.errors` if the device cannot stream.
+        """
 
     @abstractmethod
     def stop(self) -> None:
@@ -61,7 +69,7 @@ class DepthCamera(LiveVideo):
 
     @abstractmethod
     def wait(self) -> Any:
-        """Return both images, not yet registered, or None if nothing is received within WAIT_MS."""
+        """Return the color and depth images in the library's type, not yet registered; None = none within WAIT_MS."""
 
     @abstractmethod
     def calibrate(self, images: Any) -> Calibration | None:
@@ -80,12 +88,20 @@ class DepthCamera(LiveVideo):
         return None
 
     def distortion(self, coefficients: Sequence[float], model: object, brown_conrady: object) -> Distortion | None:
-        """Return the lens distortion; None = pinhole camera. Unsupported models are logged and ignored."""
+        """Return the lens distortion; None = pinhole camera.
+
+        `coefficients` are k1, k2, p1, p2, k3 and possibly others. `model` is the lens model of the device, and
+        `brown_conrady` is the library's name for the supported model. Other models, and nonzero coefficients after k3,
+        are logged, and the distortion is ignored.
+        """
         if not any(coefficients):
             return None
         if model != brown_conrady or any(coefficients[5:]):
-            message = "%s: expected Brown-Conrady lens distortion, got %s; images are not undistorted"
-            log.warning(message, self.name, model)
+            message = (
+                "%s: expected Brown-Conrady lens distortion (k1, k2, p1, p2, k3), got %s with the coefficients %s; "
+                "images are not undistorted"
+            )
+            log.warning(message, self.name, model, list(coefficients))
             return None
         return Distortion(*coefficients[:5])
 
@@ -97,7 +113,8 @@ class DepthCamera(LiveVideo):
             mode = f"{self.width}x{self.height} at {self.fps} Hz"
             raise DataError(
                 f"{self.brand}: expected {which} with {mode}, got an error ({in_one_line(error)}); check the "
-                "connection and dataset.serial, and set a size and rate that the device supports"
+                "connection and dataset.serial, or set dataset.width, dataset.height and dataset.fps to a supported "
+                "mode"
             ) from error
         number = count()
         calibration: Calibration | None = None
@@ -139,7 +156,7 @@ class DepthCamera(LiveVideo):
 
 
 def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images | None]:
-    """Yield the results of `wait`. Raises DataError after LONGEST_SILENCE seconds without images."""
+    """Yield the results of `wait`, None = no images. Raises DataError after LONGEST_SILENCE seconds without images."""
     last_time = time.monotonic()
     while True:
         images = wait()

@@ -46,12 +46,14 @@ log = logging.getLogger(__name__)
 class FolderWatch(LiveVideo):
     """Frames written into a folder by another program during mapping."""
 
-    root: Path  # existing folder of frames from another program, relative to the working or project folder
+    root: Path  # existing folder of frames from another program, relative to the working or project directory
     idle_timeout: float = 0.0  # maximum time without a new frame before the run ends, s, in [0, 86400]; 0 = unlimited
     camera_timeout: float = 30.0  # maximum wait for camera.json, s, in [0, 86400]
     poll_interval: float = 0.01  # interval between polls of the folder, s, in [0.001, 0.1]
-    max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
-    sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = of camera.json, otherwise KINECT_V1
+    max_depth: float = 10.0  # maximum depth, m, >= 0; farther readings are dropped; 0 = unlimited
+    # depth sensor, which selects the noise model: AUTO (from camera.json, else KINECT_V1), EXACT (rendered depth),
+    # KINECT_V1, REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR
+    sensor: SensorChoice = SensorChoice.AUTO
 
     def __post_init__(self) -> None:
         waits = (0.0, LONGEST_WAIT)
@@ -108,7 +110,7 @@ def _read(
 
 
 class Arrivals:
-    """Detector of new frames in a folder."""
+    """New frames in a folder, from the images that arrived since the last poll."""
 
     def __init__(self, folder: Path) -> None:
         self._color, self._depth = NewImages(folder / "color", COLOR), NewImages(folder / "depth", DEPTH)
@@ -116,9 +118,10 @@ class Arrivals:
         self._halves: set[int] = set()  # numbers of skipped frames with only one image so far
 
     def look(self, to_the_end: bool) -> Iterator[tuple[int, StoredImages | str]]:
-        """Yield new frames in ascending order, up to the newest complete frame, or all frames at the end.
+        """Yield the new frames in ascending order up to the newest complete frame.
 
-        Each item is the frame number, and either the images or the reason for skipping the frame.
+        If `to_the_end` is True, later incomplete frames are also yielded. Each item is the frame number, and either
+        the images or the reason for skipping the frame.
         """
         self._color.look()
         self._depth.look()

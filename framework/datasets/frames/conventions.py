@@ -19,7 +19,7 @@ from framework.geometry import inverse
 COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # depth units per meter; most sensors have 1000
 LONGEST_DELAY = 1000  # frames, maximum absolute delay of poses and depth images
 AUTO = "AUTO"  # value of `dataset.color_delay`: estimate the delay
-LONGEST_COLOR_DELAY = 0.2  # s, maximum absolute delay of color
+LONGEST_COLOR_DELAY = 0.2  # s, maximum absolute delay of color behind depth
 
 
 class PoseKind(Enum):
@@ -62,7 +62,7 @@ class PoseReading:
 
     pose_kind: PoseKind = PoseKind.T_WORLD_CAMERA  # direction of the stored transforms
     camera_axes: CameraAxes = CameraAxes.OPENCV  # camera axes of the stored poses
-    quaternion_order: QuaternionOrder = QuaternionOrder.XYZW  # order of the stored quaternions
+    quaternion_order: QuaternionOrder = QuaternionOrder.XYZW  # component order of the stored quaternions
     pose_unit: float = 1.0  # length of one unit of the translations, m, in [1e-6, 1e6]; 0.001 = millimeters
     pose_delay: int = 0  # offset of the pose index, in [-1000, 1000]; image k has pose k + offset
 
@@ -76,7 +76,7 @@ class PoseReading:
         )
 
     def pose(self, stored: Float64) -> Float64:
-        """Convert a stored rigid transform (4, 4) to T_world_camera (4, 4)."""
+        """Convert a stored rigid transform (4, 4) to T_world_camera (4, 4) in m and OpenCV's axes."""
         if self == PoseReading():
             return stored
         T = stored.copy()
@@ -90,7 +90,10 @@ class PoseReading:
 
 
 def color_delay_of(parameter: str) -> float | None:
-    """Return the value of `dataset.color_delay` in s; None = AUTO. Raises ConfigError for other values."""
+    """Return the delay in s set by `dataset.color_delay`; None = AUTO.
+
+    Raises ConfigError for a delay above LONGEST_COLOR_DELAY or any other text.
+    """
     if parameter == AUTO:
         return None
     try:

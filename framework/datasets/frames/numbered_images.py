@@ -47,7 +47,7 @@ def paired_images(colors: dict[int, Path], depths: dict[int, Path]) -> dict[int,
 
 
 def _missing(files: dict[int, Path], number: int) -> Path:
-    """Return the expected path of a missing image."""
+    """Return the path that a missing image would have, named like the other `files`."""
     first = next(iter(files.values()))
     before = _before_number(first)
     return first.with_stem(before + str(number).zfill(len(first.stem) - len(before)))
@@ -63,7 +63,8 @@ def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[in
             errors.append(str(error))
             continue
         return width, height
-    raise DataError(f"expected a readable image, got none among {len(errors)} images; first error: {errors[0]}")
+    found = f"got none among {len(errors)} images; first error: {errors[0]}"
+    raise DataError(f"{path.parent}: expected a readable image, {found}")
 
 
 def number_of(path: Path) -> int | None:

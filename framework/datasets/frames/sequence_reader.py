@@ -81,7 +81,7 @@ class RecordedFrame:
 
     @classmethod
     def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
-        """Return a frame with the pose that `pose` returns, or with the error message if `pose` raises DataError."""
+        """Return a frame with the pose returned by `pose`, or with the error message if `pose` raises DataError."""
         try:
             return cls(images, timestamp, pose())
         except DataError as error:
@@ -104,26 +104,32 @@ class Contents:
 class Recording(RGBDSequence):
     """An RGB-D video on disk. A subclass lists the stored frames (`open`) and provides the recording's ground truth.
 
-    `ground_truth` replaces the recording's own ground truth by a complete mesh, independent of the frame selection. The
-    ground-truth instances in a frame are rendered from this mesh.
+    `ground_truth` replaces the recording's own ground truth with a complete mesh, independent of the frame selection.
+    The ground-truth instances in a frame are rendered from this mesh.
 
     Errors of the whole recording raise DataError when the recording is opened. Errors of one frame raise FrameError
     when the frame is read. The pipeline counts and skips such frames.
     """
 
-    root: Path  # folder of the recording or of the scenes, relative to the working or project folder
+    root: Path  # folder of the recording or of the scenes, relative to the working or project directory
     scene: str = ""  # subfolder of root; "" = root itself
     start: int = 0  # index of the first frame
-    stop: int = TO_THE_END  # index after the last frame; -1 = end of the sequence
-    stride: int = 1  # step between frames; 1 = every frame
+    stop: int = TO_THE_END  # index of the first frame after the selection, >= 0; -1 = end of the sequence
+    stride: int = 1  # step between selected frames, in frames, >= 1; 1 = every frame
     frame_fraction: float = 1.0  # randomly selected fraction of the frames, in (0, 1]; 1 = all frames
-    seed: int = 0  # seed of the random frame selection
-    max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
-    ground_truth: Path | None = None  # labeled mesh or run directory for the evaluation; None = the recording's own
-    sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = of the recording, otherwise KINECT_V1
+    seed: int = 0  # seed of the random frame selection, >= 0
+    max_depth: float = 10.0  # maximum depth, m, >= 0; farther readings are dropped; 0 = unlimited
+    # ground truth for the evaluation: labeled mesh (PLY with instances.json) or run directory; None = ground truth of
+    # the recording
+    ground_truth: Path | None = None
+    # depth sensor, which selects the noise model: AUTO (from the recording, else KINECT_V1), EXACT (rendered depth),
+    # KINECT_V1, REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR
+    sensor: SensorChoice = SensorChoice.AUTO
     pose_reading: PoseReading = field(default_factory=PoseReading)
     depth_reading: DepthReading = field(default_factory=DepthReading)
-    color_delay: str = AUTO  # time from depth to color with equal timestamps, s, in [-0.2, 0.2]; AUTO = estimated
+    # delay of color relative to depth at equal timestamps, s, in [-0.2, 0.2]; positive = color captured later; AUTO =
+    # estimated during the run, 0 until then
+    color_delay: str = AUTO
 
     def __post_init__(self) -> None:
         check_selection(self.start, self.stop, self.stride, self.frame_fraction)
@@ -132,7 +138,7 @@ class Recording(RGBDSequence):
         self.root = folder_of(Path(self.root))
         self.folder = self.root / self.scene
         if not self.folder.is_dir():
-            project = "" if self.root.is_absolute() else ", missing from the working and the project folder"
+            project = "" if self.root.is_absolute() else ", found in neither the working nor the project directory"
             raise DataError(f"dataset.root: expected an existing folder, got {self.folder}{project}")
         self.name = self.folder.resolve().name
         self.named_truth = None if self.ground_truth is None else read_named_truth(Path(self.ground_truth))
@@ -155,7 +161,7 @@ class Recording(RGBDSequence):
 
     @abstractmethod
     def open(self) -> Contents:
-        """Return the contents of `self.folder`. Raises DataError that names the file if the format is invalid."""
+        """Return the contents of `self.folder`. Raises a DataError that names the file if the format is invalid."""
 
     def truth_in(self, index: int) -> FrameTruth | None:
         """Return the recording's own ground-truth instances in stored frame `index`; None = unknown."""
@@ -192,7 +198,7 @@ class Recording(RGBDSequence):
 
     def has_poses(self) -> bool:
         frames = [self.contents.frames[index] for index in self.chosen]
-        # a frame with an invalid pose raises its error when it is read
+        # frames with an invalid pose count; their error is raised when they are read
         return any(recorded.T_world_camera is not None or recorded.error for recorded in frames)
 
     def __getitem__(self, k: int) -> Frame:
@@ -215,7 +221,10 @@ class Recording(RGBDSequence):
         )
 
     def metric_depth(self, index: int) -> Float32:
-        """Return the depth (H, W) of stored frame `index` in m, 0 = no reading. Raises FrameError."""
+        """Return the depth (H, W) of stored frame `index` in m, 0 = no reading.
+
+        Raises FrameError if the image cannot be read or has the wrong size.
+        """
         images = self.contents.frames[index].images
         return self.calibration.depth(images.depth(), images.depth_name)
 
@@ -245,7 +254,10 @@ class Recording(RGBDSequence):
         raise ConfigError(f"{KEY}: {expected}; set another run, or select other frames")
 
     def _check_first_image(self) -> None:
-        """Raise FrameError if the first images have the wrong size, instead of skipping every frame."""
+        """Raise FrameError if the images of the first selected frame have the wrong size.
+
+        Otherwise, every frame would be skipped.
+        """
         images = self.contents.frames[self.chosen[0]].images
         for name, read in ((images.color_name, images.color), (images.depth_name, images.depth)):
             try:
@@ -301,13 +313,16 @@ def _with_plausible_image_times(name: str, frames: Sequence[RecordedFrame]) -> S
 
 
 def _with_later(frames: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[RecordedFrame, RecordedFrame | None]]:
-    """Yield each frame, and the frame `delay` frames later, None = no such frame."""
+    """Yield each frame and the frame `delay` frames later; None = no such frame."""
     for k, frame in enumerate(frames):
         yield frame, frames[k + delay] if 0 <= k + delay < len(frames) else None
 
 
 def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
-    """Return the frame with its pose in the default convention, or with an error if the pose is far from the origin."""
+    """Return the frame with its pose converted to the default convention.
+
+    If the pose is more than FARTHEST m from the origin, the frame has an error instead.
+    """
     if recorded.T_world_camera is None:
         return recorded
     T_world_camera = reading.pose(recorded.T_world_camera)

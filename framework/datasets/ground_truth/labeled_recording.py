@@ -30,9 +30,9 @@ class LabeledRecording(Recording):
         super().__post_init__()
 
     def load_mesh(self, files: Sequence[Path], read: Callable[..., LabeledMesh]) -> None:
-        """Load the mesh with `read` if all of its files exist and `ground_truth` is not set.
+        """Load the mesh with `read(*files)` if all `files` exist and `ground_truth` is not set.
 
-        Raises DataError if a file is missing and `frame_ground_truth` requires the mesh.
+        Raises DataError if a file is missing and `frame_ground_truth` is set.
         """
         if self.named_truth is not None:
             return
@@ -40,7 +40,7 @@ class LabeledRecording(Recording):
         if not missing:
             self.mesh = read(*files)
         elif self.frame_ground_truth:
-            expected = f"expected a labeled mesh {missing[0]}, got no such file"
+            expected = f"expected the labeled mesh {missing[0]}, got no such file"
             raise DataError(f"dataset.frame_ground_truth: {expected}; add the file, or set this key to false")
         elif len(missing) < len(files):
             log.warning("%s: expected a file of ground-truth instances, got none; instances not evaluated", missing[0])

@@ -26,7 +26,7 @@ from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import path_exists
 from framework.files.json_file import read_json
 from framework.files.number_lines import SHOWN
-from framework.files.ply import PlyMesh, read_ply
+from framework.files.ply import PlyMesh, found_property, read_ply
 from framework.files.search_paths import candidates
 from framework.files.tum_trajectory import read_tum
 from framework.vocabulary.label_spaces import COCO
@@ -60,7 +60,7 @@ class NamedTruth:
 def read_named_truth(path: Path) -> NamedTruth:
     """Return the ground truth in a run directory or a labeled mesh.
 
-    Raises ConfigError if the path does not exist. Raises DataError that names the file if it is invalid.
+    Raises ConfigError if the path does not exist. Raises a DataError that names the file if it is invalid.
     """
     files = truth_files(path)
     mesh, names = files[0], files[1]
@@ -87,7 +87,7 @@ def truth_files(path: Path) -> list[Path]:
     """
     found = next((place for place in candidates(path) if place.exists()), None)
     if found is None:
-        raise ConfigError(f"{KEY}: expected a labeled mesh (PLY) or a run directory, got nonexistent {path}")
+        raise ConfigError(f"{KEY}: expected a labeled mesh (PLY) or a run directory, got the nonexistent path {path}")
     mesh = found / MESH if found.is_dir() else found
     if not path_exists(mesh):
         raise DataError(f"{KEY}: expected {MESH} in the directory {found}, got none; set {KEY} to the labeled mesh")
@@ -100,7 +100,10 @@ def truth_files(path: Path) -> list[Path]:
 
 
 def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
-    """Return the class of each annotated instance, None = unknown. Raises DataError that names the file."""
+    """Return the class of each instance id in the JSON file of a labeled mesh; None = unknown.
+
+    Raises a DataError that names the file if it is invalid or contains an id above `largest_id`.
+    """
     content = read_json(path)
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected a JSON object, got {type(content).__name__}")
@@ -116,7 +119,7 @@ def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
 
 def _class_of(where: str, entry: Any) -> str | None:
     if not isinstance(entry, dict) or "class" not in entry:
-        expected = '{"name": "...", "class": a COCO name, or null if unknown}'
+        expected = 'a JSON object with the key "class" (a COCO name, or null if unknown)'
         raise DataError(f"{where}: expected {expected}, got {entry!r:.60}")
     name = entry["class"]
     if name is None or (isinstance(name, str) and name in COCO):
@@ -130,8 +133,8 @@ def _labels_of(path: Path, ply: PlyMesh) -> Int32:
     """Return the instance ids (V,) of the vertices of a mesh with triangles."""
     labels = ply.properties.get(LABELS)
     if labels is None or labels.dtype.kind not in "iu":
-        found = f"got {', '.join(sorted(ply.properties)) or 'none'}"
-        raise DataError(f"{path}: expected a vertex property {LABELS!r} of integers, {found}; label the mesh")
+        found = found_property(ply, labels)
+        raise DataError(f"{path}: expected an integer vertex property {LABELS!r}, got {found}; label the mesh")
     if not len(ply.triangles):
         raise DataError(f"{path}: expected faces to render masks from, got none; set {KEY} to a mesh with faces")
     if labels.min() < 0 or labels.max() > LARGEST_ID:
@@ -151,7 +154,8 @@ def _classes_of_run(path: Path, entries: Sequence[Any]) -> dict[int, str | None]
     for number, entry in enumerate(entries, start=1):
         key, name = (entry.get("id"), entry.get("class", ...)) if isinstance(entry, dict) else (None, None)
         if type(key) is not int or not 0 < key <= LARGEST_ID or not (name is None or isinstance(name, str)):
-            raise DataError(f"{path}, entry {number}: expected an id and a class, got {entry!r:.60}; repeat the run")
+            expected = "expected a JSON object with an id and a class"
+            raise DataError(f"{path}, entry {number}: {expected}, got {entry!r:.60}; repeat the run")
         class_names[key] = name
     return class_names
 

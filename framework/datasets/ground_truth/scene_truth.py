@@ -26,7 +26,7 @@ class LabeledDepth:
 
 
 def check_truth_voxel(size: float) -> None:
-    """Raise ConfigError for an implausible spacing of ground-truth points, m."""
+    """Raise ConfigError if `size`, the spacing of ground-truth points in m, is not in [0.001, 1]."""
     require(1e-3 <= size <= 1, "dataset.ground_truth_spacing", size, "a value in [0.001, 1] m")
 
 
@@ -58,7 +58,8 @@ def fuse_scene_truth(
         if taken < 0:
             farthest = KEY_OFFSET * ground_truth_spacing
             raise DataError(
-                f"ground truth: expected points within {farthest:.0f} m of the origin, got a point farther away"
+                f"dataset.ground_truth_spacing: expected all points within {farthest:.0f} m of the world origin, got a "
+                "point farther away; increase this spacing, or check dataset.pose_unit"
             )
     points, ids = _elect(slots)
     return SceneTruth(points_world=points, instance_ids=ids, class_names=dict(class_names))

@@ -14,13 +14,13 @@ KEY_OFFSET = 1 << (KEY_BITS - 1)  # added to voxel coordinates, which makes them
 
 
 class Slots(NamedTuple):
-    """A hash table with linear probing, as arrays (S,). A slot without votes is empty."""
+    """A hash table with linear probing and S slots. S is a power of two. A slot without votes is empty."""
 
-    keys: Int64  # packed voxel coordinates
-    ids: Int32  # instance id
-    votes: Int64  # number of points
+    keys: Int64  # (S,) packed voxel coordinates
+    ids: Int32  # (S,) instance id
+    votes: Int64  # (S,) number of points
     sums: Float64  # (S, 3) m, sum of the points
-    first: Int64  # position in the order of first observation
+    first: Int64  # (S,) position in the order of first observation
 
     @classmethod
     def empty(cls, capacity: int) -> Slots:
@@ -30,7 +30,7 @@ class Slots(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _slot(slots: Slots, key: np.int64, instance: np.int32) -> np.int64:
-    """Return the slot of (key, instance), or the empty slot for its insertion."""
+    """Return the index of the slot of (key, instance), or of the empty slot for its insertion."""
     keys, ids, votes, _, _ = slots
     mask = len(keys) - 1
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(instance) * np.uint64(0xC2B2AE3D27D4EB4F)
@@ -46,10 +46,10 @@ def _slot(slots: Slots, key: np.int64, instance: np.int32) -> np.int64:
 def vote(
     depth: Float32, instance_ids: Int32, intrinsics: Float64, T: Float64, scale: float, slots: Slots, taken: int
 ) -> int:
-    """Add the pixels of a view and return the number of occupied slots; -1 = a point is too far from the origin.
+    """Add the pixels with depth and return the number of occupied slots; -1 = a point is too far from the origin.
 
-    `depth`: (H, W) m. `instance_ids`: (H, W). `intrinsics`: (fx, fy, cx, cy) px. `T`: T_world_camera (4, 4). `scale`:
-    voxels per m. `taken`: number of slots occupied before.
+    `depth`: (H, W) m, 0 = no reading. `instance_ids`: (H, W). `intrinsics`: (fx, fy, cx, cy) px. `T`: T_world_camera
+    (4, 4). `scale`: voxels per m. `taken`: number of slots occupied before.
     """
     keys, ids, votes, sums, first = slots
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]

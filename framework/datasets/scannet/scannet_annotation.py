@@ -1,4 +1,4 @@
-"""ScanNet's instances: segments of a mesh, objects as sets of segments, and classes of object names."""
+"""Reader of ScanNet annotations: mesh segments, objects as sets of segments, and classes of object names."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
     benchmark.
 
     `nyu40` is the result of `read_label_table`; empty = no table. Names match even if they differ in spaces and
-    punctuation, such as trashcan and trash can. Raises DataError that names the file for invalid or inconsistent files,
-    or for names that are not in the table.
+    punctuation, such as trashcan and trash can. Raises a DataError that names the file for invalid or inconsistent
+    files, or for names that are not in the table.
     """
     ply = read_ply(mesh)
     segments = _whole_numbers(f"{segs}: segIndices", _read_list(segs, "segIndices"))
@@ -66,8 +66,8 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
     strange = sorted({group.label for group in groups if _spelled(group.label, spellings) not in spellings})
     if nyu40 and strange:
         raise DataError(
-            f"{aggregation}: expected names of the label table, got "
-            f"{', '.join(f'{label!r:.60}' for label in strange)}; add a line to {LABEL_TABLE}, or put "
+            f"{aggregation}: expected labels from {LABEL_TABLE}, got "
+            f"{', '.join(f'{label!r:.60}' for label in strange)}; add a line for each of them, or put "
             f"{FIRST_LABEL_TABLE} next to it for annotations of ScanNet's first release"
         )
     unlabeled = max((group.object_id + 2 for group in groups), default=1)
@@ -99,7 +99,7 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
 
 
 def read_aggregation(path: Path) -> tuple[SegGroup, ...]:
-    """Return the objects of a scene in file order. Raises DataError that names the file and the object."""
+    """Return the objects of a scene in file order. Raises a DataError that names the file and the object."""
     groups = _read_list(path, "segGroups")
     found = tuple(_group(f"{path}: segGroups[{k}]", group) for k, group in enumerate(groups))
     labels: dict[int, str] = {}
@@ -114,7 +114,7 @@ def read_aggregation(path: Path) -> tuple[SegGroup, ...]:
 def read_label_table(path: Path) -> Mapping[str, str]:
     """Return the NYU40 class of each name in a label table of either release; "" = no class.
 
-    Raises DataError that names the file and the line.
+    Names and classes are in lower case. Raises a DataError that names the file and the line.
     """
     header, *rows = read_text(path, LARGEST_FILE).rstrip("\r\n").split("\n")
     columns = header.rstrip("\r").split("\t")
@@ -163,7 +163,7 @@ def _group(where: str, group: Any) -> SegGroup:
 def _read_list(path: Path, key: str) -> Sequence[Any]:
     found = read_json_object(path, LARGEST_FILE).get(key)
     if not isinstance(found, list):
-        raise DataError(f"{path}: expected a list {key!r}, got {type(found).__name__}")
+        raise DataError(f"{path}: expected a list {key!r}, got {'none' if found is None else type(found).__name__}")
     return found
 
 

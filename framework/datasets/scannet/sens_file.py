@@ -86,7 +86,7 @@ class SensFrame:
         return f"{self.path}, depth of frame {self.number} at byte {self.byte + self.color_bytes}"
 
     def color(self) -> UInt8:
-        """Return the color (H, W, 3), RGB, of the color camera. Raises FrameError."""
+        """Return the color (H, W, 3), RGB, of the color camera. Raises FrameError if it cannot be read."""
         data = self._read(self._color_name, self.byte, self.color_bytes)
         if self.header.color_compression != RAW:
             return decode_color(self._color_name, data)
@@ -95,7 +95,10 @@ class SensFrame:
         return np.frombuffer(data, np.uint8).reshape(shape)
 
     def depth(self) -> UInt16:
-        """Return the depth (H, W) of the depth camera in units of the header, 0 = no reading. Raises FrameError."""
+        """Return the depth (H, W) of the depth camera in units of 1 / depth_scale m, 0 = no reading.
+
+        Raises FrameError if it cannot be read.
+        """
         data = self._read(self._depth_name, self.byte + self.color_bytes, self.depth_bytes)
         shape = self.header.depth_camera.shape
         length = 2 * prod(shape)
@@ -110,7 +113,7 @@ class SensFrame:
                 file.seek(byte)
                 data = file.read(length)
         except OSError as error:
-            raise FrameError(f"{name}: expected a readable file, got {error.strerror or error}") from error
+            raise FrameError(f"{name}: expected a readable file, got an error ({error.strerror or error})") from error
         _check_length(name, len(data), length)
         return data
 
@@ -125,7 +128,7 @@ class SensFile:
 
 
 def open_sens(path: Path) -> SensFile:
-    """Read the header and the frame positions. Raises DataError that names the byte of an invalid header."""
+    """Read the header and the frame positions. Raises a DataError that names the byte of an invalid header."""
     check_regular(path)
     try:
         with path.open("rb", buffering=0) as file:
@@ -134,9 +137,10 @@ def open_sens(path: Path) -> SensFile:
             header = _read_header(path, file, length)
             frames, cut = _find_frames(path, file, length, header)
     except OSError as error:
-        raise DataError(f"{path}: expected a readable file, got {error.strerror or error}") from error
+        raise DataError(f"{path}: expected a readable file, got an error ({error.strerror or error})") from error
     if not frames:
-        raise DataError(f"{path}: expected frames, got none: {cut or '0 according to its header'}")
+        reason = cut or "frame count in the header: 0"
+        raise DataError(f"{path}: expected at least one complete frame, got none ({reason})")
     return SensFile(header, tuple(frames), cut)
 
 

@@ -25,10 +25,10 @@ from framework.datasets.scenenn.oni_records import Images, OniContents, Stream, 
 from framework.errors import ConfigError, DataError, InstanceMapError, errors_of
 
 LARGEST_TIME_DIFFERENCE = 33_000  # us, maximum between the two images of a frame, as in SceneNN's playback
-WAITING = 30  # maximum number of unpaired images of a stream (1 s), in case the other stream ends
+WAITING = 30  # maximum number of unpaired images of a stream (1 s at 30 Hz); older ones are dropped
 LIBRARIES = ("libOpenNI2.so.0", "libOpenNI2.so", "libOpenNI2.dylib", "OpenNI2.dll")
 LONGEST_PATH = 255  # bytes, limit of OpenNI 2
-PATIENCE = 10_000  # ms, maximum time without an image; playback then counts as stalled
+PATIENCE = 10_000  # ms; playback counts as stalled after this time without an image
 
 # constants from OniCAPI.h, OniCEnums.h and OniCProperties.h of OpenNI 2.2
 API_VERSION = 2002
@@ -77,23 +77,24 @@ class OniFrame:
 def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
     """Yield the frames of a recording.
 
-    A truncated recording is repaired in a copy in the folder `scratch`. Raises ConfigError if OpenNI 2 is not
-    installed. Raises DataError if OpenNI 2 cannot play the whole recording, or if color and depth do not match.
+    If the recording is truncated, a repaired copy in the folder `scratch` is read. Raises ConfigError if OpenNI 2 is
+    not installed. Raises DataError if OpenNI 2 cannot play the whole recording, or if color and depth have different
+    sizes.
     """
     with (
         errors_of(contents.path),
         playable(contents, scratch) as path,
-        closing(play_apart(path, contents.streams)) as images,
+        closing(play_in_subprocess(path, contents.streams)) as images,
     ):
         yield from pair(images)
 
 
 def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
-    """Yield frames from images in file order.
+    """Pair color and depth images, given in file order, and yield each pair as a frame.
 
-    If the next color and depth images are too far apart in time, the earlier image is dropped. The published
-    trajectories use the frame numbers of SceneNN's playback, which drops the same images. Raises DataError if color
-    and depth have different sizes.
+    If the next color and depth images are more than LARGEST_TIME_DIFFERENCE apart, the earlier image is dropped. The
+    published trajectories use the frame numbers of SceneNN's playback, which drops the same images. Raises DataError
+    if color and depth have different sizes.
     """
     waiting = {stream: deque[OniImage](maxlen=WAITING) for stream in Stream}
     colors, depths = waiting[Stream.COLOR], waiting[Stream.DEPTH]
@@ -112,8 +113,11 @@ def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
             depths.popleft()
 
 
-def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """Run `play` in a separate process, because OpenNI 2 crashes on some damaged recordings."""
+def play_in_subprocess(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
+    """Yield the images of `play`, which runs in a separate process.
+
+    OpenNI 2 crashes on some damaged recordings. Raises DataError in this case.
+    """
     spawn = multiprocessing.get_context("spawn")  # the library's threads and locks do not survive a fork
     receiver, sender = spawn.Pipe(duplex=False)
     player = spawn.Process(target=_deliver, args=(sender, path, streams), daemon=True)
@@ -127,7 +131,8 @@ def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniIma
     except (EOFError, OSError):
         player.join()
         raise DataError(
-            f"expected an intact recording, got a crash of OpenNI 2 with status {player.exitcode}; download it again"
+            f"expected an intact recording, got an OpenNI 2 crash (exit status {player.exitcode}); download or record "
+            "it again"
         ) from None
     finally:
         player.terminate()
@@ -136,7 +141,7 @@ def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniIma
 
 
 def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -> None:
-    """Send the images and then None, or an error, to the parent process."""
+    """Send each image, and finally None or an error, to the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the parent ends the child
     try:
         with closing(play(path, streams)) as images:
@@ -150,11 +155,15 @@ def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -
 
 
 def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """Decode a file with OpenNI 2 and yield its complete images, up to the last image of each stream."""
+    """Decode a file with OpenNI 2 and yield its complete images until the last image of each stream is read.
+
+    Raises ConfigError if OpenNI 2 is not installed, and DataError if it cannot play the file.
+    """
     openni = _library()
     file = os.fsencode(path)
     if len(file) > LONGEST_PATH:
-        raise DataError(f"expected a path of at most {LONGEST_PATH} bytes for OpenNI 2, got {len(file)}; move the file")
+        expected = f"expected a path of at most {LONGEST_PATH} bytes for OpenNI 2"
+        raise DataError(f"{expected}, got {len(file)}; move the file to a shorter path")
     with ExitStack() as stack:
         _check(openni.oniInitialize(API_VERSION), openni, "initialize")
         stack.callback(openni.oniShutdown)
@@ -177,16 +186,16 @@ def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
 
 
 def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """Yield the images of the streams. `handles` are in the order of Stream."""
+    """Yield the complete images in playback order. `handles` are the stream handles in the order of Stream."""
     waited = (ctypes.c_void_p * len(handles))(*handles)
     last = dict.fromkeys(Stream, 0)
     while any(last[stream] < streams[stream].last for stream in Stream):
         which = ctypes.c_int()
         status = openni.oniWaitForAnyStream(waited, len(handles), ctypes.byref(which), PATIENCE)
         if status == TIME_OUT:
-            reached = ", ".join(f"{stream.name.lower()} {last[stream]} of {streams[stream].last}" for stream in Stream)
-            found = f"got a stall of OpenNI 2 after images {reached}"
-            raise DataError(f"expected an intact recording, {found}; download it again")
+            reached = (f"{stream.name.lower()} image {last[stream]} of {streams[stream].last}" for stream in Stream)
+            found = f"got a stall of OpenNI 2 after {' and '.join(reached)}"
+            raise DataError(f"expected an intact recording, {found}; download or record it again")
         _check(status, openni, "play the recording")
         stream = list(Stream)[which.value]
         frame = ctypes.POINTER(_Frame)()
@@ -202,7 +211,10 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
 
 
 def _pixels(stream: Stream, frame: _Frame) -> npt.NDArray[Any] | None:
-    """Return a copy of the pixels, or None for an incomplete image."""
+    """Return a copy of the pixels, as in OniImage, or None for an incomplete image.
+
+    Raises DataError for an unsupported pixel format.
+    """
     pixel_format, shape = frame.mode.pixel_format, (frame.height, frame.width)
     if frame.data_size < frame.stride * frame.height:
         return None
@@ -212,10 +224,8 @@ def _pixels(stream: Stream, frame: _Frame) -> npt.NDArray[Any] | None:
     if stream == Stream.DEPTH and pixel_format in (DEPTH_1_MM, DEPTH_100_UM):
         depth = np.ascontiguousarray(rows[:, : 2 * frame.width]).view(np.uint16)
         return depth if pixel_format == DEPTH_1_MM else ((depth.astype(np.uint32) + 5) // 10).astype(np.uint16)
-    raise DataError(
-        f"{stream.name.lower()}: expected OpenNI pixel format {RGB888} (RGB) for color, {DEPTH_1_MM} (1 mm) or "
-        f"{DEPTH_100_UM} (100 um) for depth, got {pixel_format}"
-    )
+    known = f"{RGB888} (RGB)" if stream == Stream.COLOR else f"{DEPTH_1_MM} (1 mm) or {DEPTH_100_UM} (100 um)"
+    raise DataError(f"{stream.name.lower()}: expected OpenNI pixel format {known}, got {pixel_format}")
 
 
 def _library() -> Any:

@@ -25,8 +25,8 @@ VERSIONS = (1, 0, 0, 4), (1, 0, 1, 0)  # first and last version that OpenNI 2 su
 FIRST_WIDE = (1, 0, 1, 0)  # first version with 64-bit file positions
 IMAGE_FIELDS = struct.Struct("<QI")  # time, us; number
 RECORD_MAGIC = b"NIR\0"
-LARGEST_NODE = 255  # recorders number nodes from 1; OpenNI allocates the declared number of nodes
-LARGEST_FIELDS = 2**20  # bytes; OpenNI reads the fields into a buffer of 5.8 MB without a check
+LARGEST_NODE = 255  # maximum node id; ids begin at 1; OpenNI allocates as many nodes as the header declares
+LARGEST_FIELDS = 2**20  # bytes per record; OpenNI reads the fields into a buffer of 5.8 MB without a check
 
 
 class OniRecord(IntEnum):
@@ -48,7 +48,7 @@ class Stream(IntEnum):
 
 @dataclass
 class Images:
-    """The complete images of one stream."""
+    """The node and image count of one stream. Only complete images are counted."""
 
     node: int  # node id of this stream's records
     count: int = 0
@@ -78,14 +78,15 @@ def read_contents(path: Path) -> OniContents:
         with path.open("rb") as file:
             return _read_contents(path, file)
     except OSError as error:
-        raise DataError(f"{path}: expected a readable file, got {error.strerror or error}") from error
+        raise DataError(f"{path}: expected a readable file, got an error ({error.strerror or error})") from error
 
 
 @contextmanager
 def playable(contents: OniContents, scratch: Path) -> Iterator[Path]:
     """Yield a file for OpenNI 2: the recording, or a repaired copy in `scratch` if it is truncated.
 
-    OpenNI reads the seek tables at the end of the recording. It rejects a recording without seek tables.
+    A recording ends with seek tables, to which earlier records point. OpenNI rejects a truncated recording, because
+    these tables are missing. In the copy, the pointers are 0 (no table), and an end record is added.
     """
     if not contents.cut_off:
         yield contents.path
@@ -95,7 +96,7 @@ def playable(contents: OniContents, scratch: Path) -> Iterator[Path]:
         copy = Path(folder) / "repaired.oni"
         shutil.copyfile(contents.path, copy)
         with copy.open("r+b") as file:
-            file.seek(LARGEST_NODE_AT)  # not written if the recorder was killed
+            file.seek(LARGEST_NODE_AT)  # missing in the header if the recorder was killed
             file.write(struct.pack("<I", contents.largest_node))
             for note in contents.table_notes:
                 file.seek(note)
@@ -106,8 +107,8 @@ def playable(contents: OniContents, scratch: Path) -> Iterator[Path]:
 
 
 class _Record(NamedTuple):
-    kind: int
-    node: int
+    kind: int  # record type, usually an OniRecord
+    node: int  # node id
     fields: bytes
     fields_end: int  # bytes, file position after the fields
     end: int  # bytes, file position after the record
@@ -147,7 +148,8 @@ def _read_contents(path: Path, file: BinaryIO) -> OniContents:
 def _layouts(wide: bool) -> tuple[struct.Struct, struct.Struct]:
     """Return the struct layouts of a file position and a record header.
 
-    A header contains the magic number, kind, node, two sizes and a file position.
+    A record header contains the magic number, the record type, the node id, the sizes of the fields and the payload in
+    bytes, and a file position.
     """
     position = "Q" if wide else "I"
     return struct.Struct(f"<{position}"), struct.Struct(f"<4s4I{position}")
@@ -187,7 +189,10 @@ def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
 
 
 def _added_stream(path: Path, record: _Record) -> Stream | None:
-    """Return the stream of a node, or None for a device, infrared or audio node."""
+    """Return the stream of an added node, or None for a device, infrared or audio node.
+
+    Raises DataError for an incomplete record.
+    """
     try:
         (name_size,) = struct.unpack_from("<I", record.fields)
         (node_type,) = struct.unpack_from("<I", record.fields, 4 + name_size)

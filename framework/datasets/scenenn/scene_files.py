@@ -23,7 +23,7 @@ from framework.files.atomic_write import MAX_TEXT, atomic_write, read_bytes
 from framework.files.number_lines import SHOWN, number, read_lines
 from framework.geometry import nearest_rigid
 
-LARGEST_FRAME = 2**31 - 2  # frame+1 is also an int32
+LARGEST_FRAME = 2**31 - 2  # maximum frame number; frame + 1 must also fit into an int32
 BLOCK = 5  # lines per frame
 LAST_ROW = "0.000000 0.000000 0.000000 1.000000"  # as in the published files
 MICROSECONDS = 1e6  # per second
@@ -53,8 +53,8 @@ class _Line(NamedTuple):
 def read_trajectory_log(path: Path) -> TrajectoryLog:
     """Return the poses of a trajectory.log.
 
-    A frame with two different poses is unusable, and so is a truncated last frame. Raises DataError that names the file
-    and the line for other invalid lines.
+    A frame with two different poses is unusable, and so is a truncated last frame. Raises a DataError that names the
+    file and the line for other invalid lines.
     """
     content = read_bytes(path, MAX_TEXT).removeprefix(BOM_UTF8)
     numbered = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))
@@ -77,7 +77,8 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
             before, first_matrix = given[frame]
             if matrix is None or not np.array_equal(matrix, first_matrix, equal_nan=True):
                 poses.pop(frame, None)
-                unusable[frame] = f"expected one pose, got two, in lines {before} and {header.number}"
+                lines_of_both = f"lines {before} and {header.number}"
+                unusable[frame] = f"expected one pose, got different poses on {lines_of_both}"
             continue
         if matrix is None:
             unusable[frame] = "expected a full pose, got the end of the file"
@@ -93,14 +94,14 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
 def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
     """Write the pose T_world_camera (4, 4) of each frame atomically.
 
-    The reader returns the nearest exactly rigid transforms. Raises DataError for a negative frame number, a pose that
-    is not rigid, or a failed write.
+    `read_trajectory_log` returns the nearest exactly rigid transforms. Raises DataError for a negative frame number, a
+    pose that is not rigid, or a failed write.
     """
     lines = []
     for frame, T_world_camera in sorted(poses.items()):
         if not 0 <= frame <= LARGEST_FRAME:
             raise DataError(f"{path}: expected frame numbers from 0 to {LARGEST_FRAME}, got {frame}")
-        check_rigid(f"{path}: the pose of frame {frame}", T_world_camera)
+        check_rigid(f"{path}: frame {frame}: pose", T_world_camera)
         lines.append(f"{frame} {frame} {frame + 1}")
         lines.extend(" ".join(repr(float(value)) for value in row) for row in T_world_camera[:3])
         lines.append(LAST_ROW)
@@ -109,7 +110,10 @@ def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
 
 
 def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
-    """Return the matrix (4, 4) of four rows, possibly not finite, or None if the file ends before the last row."""
+    """Return the matrix (4, 4) in four lines, or None if the file ends before the last row.
+
+    Values may be NaN or infinite. Raises DataError for a line that does not contain four numbers.
+    """
     matrix = np.empty((4, 4))
     for k, line in enumerate(rows):
         try:
@@ -127,14 +131,14 @@ def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
 
 
 def _is_frame(word: str) -> bool:
-    """Return True for a valid number in a frame header."""
+    """Return True if `word` is a valid number in a frame header."""
     return word.isascii() and word.isdigit() and len(word) < 11 and int(word) <= LARGEST_FRAME + 1
 
 
 def read_timestamps(path: Path) -> Mapping[int, tuple[float, float]]:
     """Return the timestamps of color and depth (s) by image number.
 
-    Raises DataError that names the file and the line for an invalid line or a repeated image number.
+    Raises a DataError that names the file and the line for an invalid line or a repeated image number.
     """
     times: dict[int, tuple[float, float]] = {}
     for n, line in enumerate(read_lines(path), start=1):
@@ -157,7 +161,7 @@ def read_timestamps(path: Path) -> Mapping[int, tuple[float, float]]:
 def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mapping[int, float] | None = None) -> None:
     """Write the timestamps of color and depth (s) of each image number atomically.
 
-    `times` contains the timestamps of depth. If `color_times` is None, these are also written for color.
+    `times` contains the timestamps of depth. They are also written for color if `color_times` is None.
     """
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for image, time in times.items():
@@ -169,8 +173,8 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
     """Return fx, fy, cx, cy in px, from lines `key value`, `key = value` or `key: value`.
 
     Keys may be in upper case. Comments (# or ;), section headers and other keys are ignored. Without cx or cy, half of
-    depth_width or depth_height is used, as in ethz-asl/scenenn_to_rosbag. Raises DataError that names the file and the
-    line for a missing or repeated key or a value that is not finite. Focal lengths and sizes must be positive.
+    depth_width or depth_height is used, as in ethz-asl/scenenn_to_rosbag. Raises a DataError that names the file and
+    the line for a missing or repeated key or a value that is not finite. Focal lengths and sizes must be positive.
     """
     values: dict[str, float] = {}
     lines = read_bytes(path, LARGEST_INTRINSICS).removeprefix(BOM_UTF8).decode("latin-1").splitlines()

@@ -33,7 +33,7 @@ from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import DataError
 from framework.files.atomic_write import path_exists, read_text
 from framework.files.image_files import read_color
-from framework.files.ply import read_ply
+from framework.files.ply import found_property, read_ply
 from framework.sensors.noise_models import SensorKind
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 
 class SceneNNIntrinsics(Enum):
-    """Intrinsics files of the recordings. The value is the kind of the depth sensor."""
+    """Intrinsics files of SceneNN. The value of a member is the kind of the depth sensor."""
 
     ASUS = SensorKind.KINECT_V1
     KINECT2 = SensorKind.TIME_OF_FLIGHT
@@ -58,9 +58,11 @@ class SceneNN(LabeledRecording):
     pose for the frame.
     """
 
-    scene: str = "011"  # number of the sequence
+    scene: str = "011"  # number of the scene
     intrinsics: SceneNNIntrinsics = SceneNNIntrinsics.ASUS  # intrinsics file
-    release: str = ""  # annotation release for tables (two exist, with different results); "" = from release.txt
+    # name of the annotation release, shown in tables, because the results of the two releases differ; "" = content of
+    # ROOT/release.txt
+    release: str = ""
 
     def open(self) -> Contents:
         if (self.root / MADE_BY).is_file():
@@ -97,7 +99,7 @@ def _recorded(
 
 
 def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, tuple[float, float]]:
-    """Return the timestamps of color and depth (s) of all images, or no timestamps if any are missing.
+    """Return the timestamps of color and depth (s) by image number; empty if the timestamps of any image are missing.
 
     This prevents a mix of recorded timestamps and timestamps derived from the frame rate.
     """
@@ -119,20 +121,19 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
 
     Labels without a name or an annotation have the class None: detections there are not evaluated. Labels of other
     classes (wall, cabinet, ...) and label 0 become instance 0: detections of the nine classes there are false
-    positives. Raises DataError that names the file if a file cannot be read or the mesh has no labels.
+    positives. Raises a DataError that names the file if a file cannot be read or the mesh has no labels.
     """
     ply = read_ply(mesh)
     labels = ply.properties.get("label")
     if labels is None or labels.dtype.kind not in "iu":
-        found = f"got {', '.join(sorted(ply.properties)) or 'none'}"
-        raise DataError(f"{mesh}: expected a vertex property 'label' of integers, {found}")
+        raise DataError(f"{mesh}: expected an integer vertex property 'label', got {found_property(ply, labels)}")
     if len(labels) and (labels.min() < 0 or labels.max() > LARGEST_ID):
         raise DataError(f"{mesh}: label: expected values in [0, {LARGEST_ID}], got {labels.min()} to {labels.max()}")
     names = {one.id: one for one in read_annotation(annotation)}
     present, inverse = np.unique(labels.astype(np.int32), return_inverse=True)
     unlisted = set(present.tolist()) - names.keys() - {0}
     if unlisted:
-        message = "%s: expected an entry in %s for each label, got none for %d labels, such as %d; not evaluated"
+        message = "%s: expected an entry in %s for each label, got none for %d labels, such as %d; ignored these labels"
         log.warning(message, mesh, annotation.name, len(unlisted), min(unlisted))
     class_names: dict[int, str | None] = {}
     ids = np.zeros(len(present), np.int32)

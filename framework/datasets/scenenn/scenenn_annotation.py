@@ -1,4 +1,4 @@
-"""SceneNN's annotation, NNN.xml: the object of each mesh label."""
+"""Reader and writer of SceneNN annotations (NNN.xml), which describe the object of each mesh label."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 
 @dataclass(frozen=True)
 class Annotated:
-    """A mesh label. Missing or invalid values are "", NO_COLOR or None."""
+    """The annotation of a mesh label. Missing or invalid values are "", NO_COLOR or None."""
 
     id: int  # the value of the mesh's vertex property `label`, 0 to LARGEST_ID
     text: str  # name given by the annotators
-    nyu_class: str  # NYU class
+    nyu_class: str  # class name in the NYU label set
     color: tuple[int, int, int] = NO_COLOR  # RGB
     aabb: Float64 | None = None  # (2, 3) m, minimum and maximum corner of the axis-aligned box
     obb: Box | None = None  # oriented box
@@ -42,9 +42,9 @@ class Annotated:
 def read_annotation(path: Path) -> tuple[Annotated, ...]:
     """Return the labels of an annotation in file order.
 
-    Unknown elements and attributes are ignored. Raises DataError that names the line if the file is not XML or declares
-    a document type, which could define entities and default attributes. It also raises DataError for a file without
-    labels, a label without an integer id, or different labels with the same id.
+    Unknown elements and attributes are ignored. Raises a DataError that names the line if the file is not XML or
+    declares a document type, which could define entities and default attributes. It also raises DataError for a file
+    without labels, a label without an integer id, or different labels with the same id.
     """
     content = read_bytes(path, LARGEST_FILE)
     labels = _Labels(path)
@@ -57,7 +57,7 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
         raise labels.error("expected XML without a document type or entities, got a declaration; remove it") from error
     except ParseError as error:
         raise DataError(
-            f"{path}, line {error.position[0]}: expected valid XML, got {ErrorString(error.code)}"
+            f"{path}, line {error.position[0]}: expected valid XML, got an error ({ErrorString(error.code)})"
         ) from error
     except (ValueError, LookupError) as error:
         raise labels.error("expected UTF-8, got an unknown encoding") from error
@@ -124,7 +124,7 @@ class _Labels:
         before, line = self.found.setdefault(id_, (attributes, self.expat.CurrentLineNumber))
         if attributes != before:
             name = min(key for key, _ in attributes.items() ^ before.items())
-            expected = f"expected {name:.40}={before.get(name)!r:.40} as in line {line}"
+            expected = f"expected {name:.40}={before.get(name)!r:.40} as on line {line}"
             raise self.error(f"label {id_}: {expected}, got {attributes.get(name)!r:.40}")
 
     def error(self, message: str) -> DataError:

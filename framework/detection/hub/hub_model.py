@@ -76,7 +76,7 @@ def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
 
 
 def _listed(index: Path) -> list[str]:
-    """Return the names of the weight files in an index."""
+    """Return the names of the weight files listed in the index file `index`."""
     try:
         return [*read_json(index)["weight_map"].values()]
     except (DataError, KeyError, TypeError, AttributeError) as error:
@@ -87,7 +87,7 @@ def _listed(index: Path) -> list[str]:
 
 
 def _weights(names: Collection[str]) -> list[str]:
-    """Return the weight files among `names` that transformers would load; empty if there are none."""
+    """Return the names of the weight files among `names` that transformers would load; empty if there are none."""
     if WHOLE in names:
         return [WHOLE]
     if INDEX in names:
@@ -117,7 +117,8 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
         wanted = [CONFIG, PREPROCESSING, *_published(more, files), *(_weights(files) or [WHOLE])]
         if missing := [name for name in wanted if name not in files]:
             raise DataError(
-                f"detector.model: expected {' and '.join(missing)} in {model} on {constants.ENDPOINT}, got none"
+                f"detector.model: expected {' and '.join(missing)} in {model} on {constants.ENDPOINT}, got no such "
+                "file; choose another model"
             )
         size = sum(files[name].size or 0 for name in wanted)
         license_ = next((t.removeprefix("license:") for t in info.tags or () if t.startswith("license:")), "unknown")
@@ -136,13 +137,16 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
 
 
 def forbidden_by() -> str:
-    """Return the name of the environment variable that disables downloads, or ""."""
+    """Return the name of the environment variable that disables downloads; "" = downloads are enabled."""
     forbidding = [name for name in HUB_OFFLINE if os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE")]
     return (forbidding + [OFFLINE] * bool(os.environ.get(OFFLINE)) + [""])[0]
 
 
 def _check(path: Path, published: Any) -> None:
-    """Raise DataError unless a large file has the published SHA-256; huggingface_hub checks only the size."""
+    """Check that a large file (Git LFS) has the published SHA-256, because huggingface_hub checks only the size.
+
+    Otherwise, delete the file and raise DataError.
+    """
     if published.lfs is None or (found := path_hash(path)) == published.lfs.sha256:
         return
     path.resolve().unlink()  # the content, if the cache uses symbolic links
@@ -159,7 +163,10 @@ def imported_transformers() -> Any:
 
 
 def read_part(parameter: str, folder: Path, what: str, auto_class: Any, **options: Any) -> Any:
-    """Load `what`, a part of a model, from a folder. Raises DataError for `parameter` if loading fails."""
+    """Load a part of a model from a folder with a class of transformers.
+
+    `parameter` (a config key) and `what` (a noun for the part) appear in errors. Raises DataError if loading fails.
+    """
     try:
         return auto_class.from_pretrained(str(folder), local_files_only=True, **options)
     except Exception as error:  # transformers, tokenizers and safetensors raise many types for invalid files

@@ -90,7 +90,7 @@ class ImageTextModel:
 
     @torch.inference_mode()
     def embed_crops(self, crops: UInt8) -> Float32:
-        """Return the unit vectors (N, D) of crops (N, side, side, 4), RGB and mask; masks are ignored."""
+        """Return the embeddings (N, D), unit vectors, of crops (N, side, side, 4), RGB and mask; masks are ignored."""
         images = torch.from_numpy(crops[..., :3]).to(self._device).permute(0, 3, 1, 2).float() * self._factor
         mean, std = (torch.tensor(values, device=self._device)[:, None, None] for values in (self._mean, self._std))
         pixels = ((images - mean) / std).to(self._network.dtype)
@@ -98,7 +98,7 @@ class ImageTextModel:
 
     @torch.inference_mode()
     def embed_text(self, text: str) -> Float32:
-        """Return the unit vector (D,) of a phrase such as "a red chair"."""
+        """Return the embedding (D,), a unit vector, of a phrase such as "a red chair"."""
         prompt = self._family.prompt.format(text.lower() if self._family.lower else text)
         length = min(MAX_TOKENS, int(self._network.config.text_config.max_position_embeddings))
         tokens = self._tokenizer(
@@ -115,9 +115,9 @@ class ImageTextModel:
         vectors = tensor.float().cpu().numpy()
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
         if not np.isfinite(lengths).all() or (lengths == 0).any():
+            fix = "; set detector.half_precision=false" if self._network.dtype == torch.float16 else ""
             raise DataError(
-                f"{self.space}: expected finite, nonzero embeddings, got NaN, infinity or 0; set "
-                "detector.half_precision=false"
+                f"detector.model: expected finite, nonzero embeddings from {self.space}, got NaN, infinity or 0{fix}"
             )
         return np.asarray(vectors / lengths, np.float32)
 
@@ -139,7 +139,10 @@ def _normalization(path: Path, family: ImageTextFamily) -> tuple[tuple[float, ..
 
 
 def _space(folder: Path, model: str) -> str:
-    """Return the model id with its commit, or the folder name with a hash of config and weights."""
+    """Return the name of the embedding space.
+
+    It is the model id with its commit, or the name of a local folder with a hash of its config and weights.
+    """
     if commit := commit_of(folder):
         return f"{model}@{commit}"
     weights = sorted(folder.glob("*.safetensors")) + sorted(folder.glob("pytorch_model*.bin"))
@@ -163,7 +166,7 @@ def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundi
 
 
 def _square_crop(image: UInt8, box: Float32, side: int, context: float, surroundings: float) -> UInt8:
-    """Return the crop (side, side, 4) of an image (H, W, 4), RGB and mask, around the mask's tight box."""
+    """Return the crop (side, side, 4) of an image (H, W, 4), RGB and mask, around `box`, the mask's tight box."""
     height, width = image.shape[:2]
     x1, y1, x2, y2 = (int(value) for value in box)
     wide = max(1, round(context * (max(x2 - x1, y2 - y1) + 1)))  # px
@@ -179,6 +182,6 @@ def _square_crop(image: UInt8, box: Float32, side: int, context: float, surround
 
 
 def network_pixels(image: UInt8, mean: Sequence[float], std: Sequence[float], device: torch.device) -> Tensor:
-    """Return the normalized input (1, 3, H, W) of an RGB image (H, W, 3)."""
+    """Return the normalized input (1, 3, H, W) of an RGB image (H, W, 3); `mean`, `std`: RGB, of values 0..1."""
     pixels = torch.from_numpy(np.ascontiguousarray(image)).to(device).permute(2, 0, 1)[None].float() / 255
     return (pixels - torch.tensor(mean, device=device)[:, None, None]) / torch.tensor(std, device=device)[:, None, None]

@@ -54,7 +54,10 @@ class TextPromptedBoxes:
 
     @torch.inference_mode()
     def __call__(self, color: UInt8) -> tuple[Float32, Float32]:
-        """Return boxes (P, 4) x1 y1 x2 y2 px, pixel centers at integers, and the probabilities (P, T) of T texts."""
+        """Return P candidate boxes (P, 4) and the probability (P, T) of each of the T texts for each box.
+
+        Boxes are x1 y1 x2 y2, px of the image `color` (H, W, 3), with pixel centers at integers.
+        """
         long = max(color.shape[:2])
         square = np.full((long, long, 3), PADDING, np.uint8)
         square[: color.shape[0], : color.shape[1]] = color
@@ -65,10 +68,8 @@ class TextPromptedBoxes:
         boxes = corners(output.pred_boxes[0].float().cpu().numpy()) * np.float32(long) - 0.5  # from 0..1 of the square
         probabilities = torch.sigmoid(output.logits[0].float()).cpu().numpy()
         if not (np.isfinite(boxes).all() and np.isfinite(probabilities).all()):
-            raise DataError(
-                f"detector.model: expected finite outputs from {self.folder}, got NaN or infinity; set "
-                "detector.half_precision=false"
-            )
+            fix = "; set detector.half_precision=false" if self._network.dtype == torch.float16 else ""
+            raise DataError(f"detector.model: expected finite outputs from {self.folder}, got NaN or infinity{fix}")
         return boxes.astype(np.float32), probabilities
 
 
@@ -91,7 +92,7 @@ class BoxPromptedMasks:
 
     @torch.inference_mode()
     def __call__(self, color: UInt8, boxes: Float32) -> Bool:
-        """Return the masks (N, H, W) of the objects in boxes (N, 4) px, pixel centers at integers."""
+        """Return the masks (N, H, W) of the objects in boxes (N, 4) x1 y1 x2 y2 px, pixel centers at integers."""
         height, width = color.shape[:2]
         if not len(boxes):
             return np.zeros((0, height, width), np.bool_)
@@ -106,9 +107,9 @@ class BoxPromptedMasks:
         output = self._network(pixel_values=pixels.to(dtype), input_boxes=prompts, multimask_output=False)
         logits = output.pred_masks[0, :, 0].float()
         if not torch.isfinite(logits).all():
+            fix = "; set detector.half_precision=false" if dtype == torch.float16 else ""
             raise DataError(
-                f"detector.mask_model: expected finite outputs from {self._model}, got NaN or infinity; set "
-                "detector.half_precision=false"
+                f"detector.mask_model: expected finite outputs from {self._model}, got NaN or infinity{fix}"
             )
         whole = functional.interpolate(logits[None], (self._side, self._side), mode="bilinear", align_corners=False)
         inside = whole[..., : resized[1], : resized[0]]

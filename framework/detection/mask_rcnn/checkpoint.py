@@ -63,7 +63,7 @@ def domain_of_network(path: Path) -> str:
 
 
 def _read_torch(path: Path) -> dict[str, Tensor]:
-    """Return the state_dict in a file of torch.save."""
+    """Return the state_dict in a file written by torch.save."""
     check_regular(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -99,7 +99,7 @@ def from_torchvision(
             )
         tensors, classes = _without_gaps(tensors), COCO
     elif len(classes) != labels - 1:
-        raise DataError(f"{where}: expected {labels - 1} classes, got {len(classes)}")
+        raise DataError(f"{where}: expected {labels - 1} classes, got {len(classes)}; set them with --classes")
     architecture = Architecture(
         classes=classes,
         backbone=_backbone(tensors, norm_eps, where),

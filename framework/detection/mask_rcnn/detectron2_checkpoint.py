@@ -1,6 +1,6 @@
 """Conversion of detectron2's Mask R-CNN with ResNet-FPN (github.com/facebookresearch/detectron2) to a MaskRCNN.
 
-Its conventions differ from torchvision:
+Its conventions differ from those of torchvision:
 
 - Images are BGR with a standard deviation of 1.
 - The first convolution of a bottleneck has the stride, as in MSRA's networks.
@@ -68,7 +68,7 @@ def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str,
         raise DataError(f"{where}: expected COCO's {len(COCO)} classes, got {found}; set the classes with --classes")
     classes = classes or COCO
     if len(classes) != found:
-        raise DataError(f"{where}: expected {found} classes, got {len(classes)}")
+        raise DataError(f"{where}: expected {found} classes, got {len(classes)}; set them with --classes")
     stem = "backbone.body.conv1.weight"
     tensors[stem] = required(tensors, stem, where).flip(1)  # BGR to RGB
     _put_background_first(tensors, where)
@@ -97,7 +97,7 @@ def read_pickle(path: Path) -> dict[str, Tensor]:
         with path.open("rb") as file:
             content = ArraysOnly(file, encoding="latin1").load()
     except Exception as error:  # a damaged pickle can raise almost any exception
-        raise DataError(f"{path}: expected a pickle of numpy arrays, got {in_one_line(error)}") from error
+        raise DataError(f"{path}: expected a pickle of numpy arrays, got an error ({in_one_line(error)})") from error
     state = content.get("model", content) if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(array, np.ndarray) for array in state.values()):
         raise DataError(f"{path}: expected a dictionary of detectron2's numpy arrays, got {type(content).__name__}")
@@ -147,7 +147,10 @@ def _renamed(name: str, where: str) -> str:
 
 
 def _check_input(state: Mapping[str, Tensor], where: str) -> None:
-    """Check the normalization, which older checkpoints contain; other values indicate another backbone."""
+    """Raise DataError if a checkpoint contains another normalization than PIXEL_MEAN and PIXEL_STD.
+
+    Only older checkpoints contain the normalization. Other values indicate another backbone.
+    """
     for name, expected in (("pixel_mean", PIXEL_MEAN[::-1]), ("pixel_std", PIXEL_STD)):
         if name in state and not torch.allclose(state[name].float().flatten(), torch.tensor(expected), atol=1e-2):
             found = [round(value, 3) for value in state[name].flatten().tolist()]
@@ -155,9 +158,10 @@ def _check_input(state: Mapping[str, Tensor], where: str) -> None:
 
 
 def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:
-    """Return the anchor sides in px, one per level.
+    """Return the anchor sides, px of the network's input, one per pyramid level.
 
-    Only older checkpoints contain anchors. The default is the anchor sides of detectron2.
+    Only older checkpoints contain anchors. Otherwise, return the default sides of detectron2. Raises DataError for
+    aspect ratios other than those of `Architecture`.
     """
     sides = list(Architecture.anchor_sides)
     for level in range(len(sides)):

@@ -28,9 +28,10 @@ from framework.detection.masks.boxes import anchor_grid, clip, decode, suppress_
 STRIDES = (4, 8, 16, 32, 64)  # px of the input per cell of a level, P2 to P6
 POOLED_LEVELS = 4  # P2 to P5; only proposals use P6
 BOX_BINS, MASK_BINS = 7, 14  # number of bins of RoIAlign per side
-CANONICAL_SIDE, CANONICAL_LEVEL = 224.0, 2  # a box with this side, px, is pooled from P4 (Lin et al. 2017, eq. 1)
-DELTA_WEIGHTS = (10.0, 10.0, 5.0, 5.0)  # factors in the box head's deltas
-PROPOSAL_NMS = 0.7  # IoU
+# a box with this side, px, is pooled from the level with this index, P4 (Lin et al. 2017, eq. 1)
+CANONICAL_SIDE, CANONICAL_LEVEL = 224.0, 2
+DELTA_WEIGHTS = (10.0, 10.0, 5.0, 5.0)  # the box head predicts deltas dx, dy, dw, dh multiplied by these factors
+PROPOSAL_NMS = 0.7  # IoU threshold of non-maximum suppression among the proposals of a level
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Architecture:
 
 
 class MaskRCNN(nn.Module):
-    """The network; `extract`, `score_anchors`, `classify` and `segment` are its steps."""
+    """Mask R-CNN, with its steps `normalize`, `extract`, `score_anchors`, `classify` and `segment`."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
@@ -77,7 +78,7 @@ class MaskRCNN(nn.Module):
         return self.roi_heads.box_predictor.cls_score.weight.dtype
 
     def normalize(self, images: Tensor) -> Tensor:
-        """Return RGB images (N, 3, H, W), 0..255, normalized, and padded at the right and bottom to multiples of 32."""
+        """Normalize RGB images (N, 3, H, W), 0..255, and pad them at the right and bottom to multiples of 32 px."""
         mean, std = (
             torch.tensor(values, device=images.device)[:, None, None]
             for values in (self.architecture.pixel_mean, self.architecture.pixel_std)
@@ -87,12 +88,18 @@ class MaskRCNN(nn.Module):
         return padded.to(self.dtype)
 
     def extract(self, images: Tensor) -> list[Tensor]:
-        """Return the feature pyramid of normalized images: P2 to P6, each (N, C, H / stride, W / stride)."""
+        """Return the feature pyramid of normalized images (N, 3, H, W).
+
+        The levels P2 to P6 are (N, F, H / stride, W / stride), with F = `fpn_channels` and STRIDES.
+        """
         levels: list[Tensor] = self.backbone(images)
         return levels
 
     def score_anchors(self, pyramid: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the objectness logits (N, A) and deltas (N, A, 4) of all levels, in the order of `anchors`."""
+        """Return the objectness logits (N, A) and deltas (N, A, 4) of the A anchors of all levels.
+
+        Their order is that of `anchors`.
+        """
         objectness, deltas = zip(*(self.rpn["head"](level) for level in pyramid), strict=True)
         n = len(pyramid[0])
         return (
@@ -101,7 +108,10 @@ class MaskRCNN(nn.Module):
         )
 
     def anchors(self, pyramid: Sequence[Tensor]) -> list[Float32]:
-        """Return the anchors (A, 4) px of each level; repeated calls with equal shapes return the same arrays."""
+        """Return the anchors of each level as an array (A, 4), px, where A depends on the level.
+
+        Repeated calls with equal shapes return the same arrays.
+        """
         shapes = [(level.shape[2], level.shape[3]) for level in pyramid]
         known, grids = self._grids
         if shapes != known:
@@ -115,18 +125,24 @@ class MaskRCNN(nn.Module):
         return grids
 
     def classify(self, pyramid: Sequence[Tensor], boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the logits (P, 1 + C) and deltas (P, 1 + C, 4) of boxes (P, 4) in one image."""
+        """Return the class logits (P, 1 + C) and box deltas (P, 1 + C, 4) of boxes (P, 4), px, in one image.
+
+        The first of the 1 + C labels is the background.
+        """
         x = self.roi_heads.box_head(self.pool(pyramid, boxes, BOX_BINS))
         logits, deltas = self.roi_heads.box_predictor(x)
         return logits, deltas.view(*logits.shape, 4)  # -1 would be ambiguous without boxes
 
     def segment(self, pyramid: Sequence[Tensor], boxes: Tensor) -> Tensor:
-        """Return the mask logits (P, 1 + C, 28, 28) of each class over boxes (P, 4) in one image."""
+        """Return the mask logits (P, 1 + C, 28, 28) of each label over boxes (P, 4), px, in one image."""
         logits: Tensor = self.roi_heads.mask_predictor(self.roi_heads.mask_head(self.pool(pyramid, boxes, MASK_BINS)))
         return logits
 
     def pool(self, pyramid: Sequence[Tensor], boxes: Tensor, bins: int) -> Tensor:
-        """Return the features (P, C, bins, bins) of boxes (P, 4), each from the level for its size (Lin, eq. 1)."""
+        """Return the features (P, F, bins, bins) of boxes (P, 4), px, with F = `fpn_channels`.
+
+        The size of a box determines its level (Lin et al. 2017, eq. 1).
+        """
         sides = (boxes[:, 2:] - boxes[:, :2]).clamp(min=0).prod(dim=1).sqrt()
         level = torch.floor(CANONICAL_LEVEL + torch.log2(sides / CANONICAL_SIDE) + 1e-6)
         level = level.clamp(0, POOLED_LEVELS - 1)
@@ -219,7 +235,7 @@ def _convolution(channels: int, out: int) -> nn.Sequential:
 
 
 def _anchors(side: float, architecture: Architecture) -> Float32:
-    """Return the anchors (R, 4) px of one cell, centered on the origin."""
+    """Return the anchors (R, 4), px, of one cell with R aspect ratios; their centers are at (0, 0)."""
     ratios = np.array(architecture.anchor_ratios)
     widths, heights = side / np.sqrt(ratios), side * np.sqrt(ratios)
     anchors = np.stack([-widths, -heights, widths, heights], axis=1).astype(np.float64) / 2
@@ -235,10 +251,11 @@ def propose(
     after_nms: int,
     extent: float = 0.0,
 ) -> Float32:
-    """Return the box proposals (P, 4) for one image of `shape` (height, width), best first.
+    """Return the box proposals (P, 4), px, for one image of `shape` (height, width) px, best first.
 
-    `anchors`: (A, 4) of each level. `objectness` (A,) and `deltas` (A, 4): of all levels in order. At most `before_nms`
-    anchors of each level are decoded, and at most `after_nms` boxes of all levels are kept.
+    `anchors`: one array (A_k, 4) for each level k. `objectness` (A,) and `deltas` (A, 4): of the anchors of all levels
+    in order. At most the best `before_nms` anchors of each level are decoded. At most `after_nms` boxes of all levels
+    remain. `extent`: the box convention, see `framework.detection.masks.boxes`.
     """
     boxes, scores, levels = [], [], []
     start = 0
@@ -277,8 +294,9 @@ def select(
 ) -> tuple[Float32, Int32, Int32]:
     """Return the boxes (N, 4), indices of their proposals (N,) and labels (N,) after suppression, best first.
 
-    `probabilities`: (P, 1 + C). `deltas`: (P, 1 + C, 4). Labels start at 1. Each label of a proposal with a score above
-    `score_threshold` is a candidate with its own deltas. `nms`: IoU threshold of the suppression within a label.
+    `proposals`: (P, 4) px. `probabilities`: (P, 1 + C). `deltas`: (P, 1 + C, 4). `shape`: (height, width) px. Label 0
+    is the background. Each other label of a proposal with a probability above `score_threshold` is a candidate with its
+    own deltas. `nms`: IoU threshold of the suppression within a label. `limit`: maximum number of boxes, N.
     """
     proposal, label = np.nonzero(probabilities[:, 1:] > score_threshold)
     label += 1

@@ -39,10 +39,10 @@ class NetworkDescription:
 
 
 def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: bool = False) -> None:
-    """Write the network to `path` atomically; `half`: store weights as float16.
+    """Write the network to `path` atomically.
 
-    Only weights with two or more dimensions become float16. Biases and statistics are few, and variances may exceed the
-    range of float16.
+    `half`: True = weights with two or more dimensions are stored as float16. Biases and statistics remain float32,
+    because they are few and variances may exceed the range of float16.
 
     Raises DataError if a weight is not finite or the file cannot be written.
     """
@@ -59,7 +59,7 @@ def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: 
         try:
             save_file(tensors, temporary, metadata)
         except safetensors.SafetensorError as error:
-            raise DataError(f"{path}: expected a writable file, got {in_one_line(error)}") from error
+            raise DataError(f"{path}: expected a writable file, got an error ({in_one_line(error)})") from error
 
 
 def load_network(path: Path) -> MaskRCNN:
@@ -92,7 +92,7 @@ def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str
         with torch.device("meta"):  # saves memory and random initialization of weights that are replaced below
             network = MaskRCNN(architecture)
     except (KeyError, ValueError, RuntimeError) as error:
-        raise DataError(f"{where}: expected a known architecture, got {in_one_line(error)}") from error
+        raise DataError(f"{where}: expected a known architecture, got an error ({in_one_line(error)})") from error
     expected = _stored(network)
     given = {name: tensor for name, tensor in tensors.items() if not name.endswith(COUNTERS)}
     _check_names(expected.keys(), given.keys(), where)
@@ -125,7 +125,7 @@ def _check_names(expected: typing.AbstractSet[str], found: typing.AbstractSet[st
 
 
 def _first_of(names: typing.AbstractSet[str]) -> str:
-    """Return the first name, and the number of other names."""
+    """Format the first name and the number of other names for messages."""
     return f"{min(names)} and {len(names) - 1} more" if len(names) > 1 else min(names)
 
 
@@ -174,7 +174,7 @@ def _parsed(kind: Any, value: Any, name: str) -> Any:
             raise ValueError(f"{name}: expected a JSON object, got {value!r}")
         kinds = typing.get_type_hints(kind)
         if unknown := sorted(value.keys() - kinds.keys()):
-            raise ValueError(f"{name}: expected known fields, got {unknown[0]}; update InstanceMap for newer files")
+            raise ValueError(f"{name}: expected known fields, got {unknown[0]!r}; update InstanceMap for newer files")
         fields = {field: _parsed(kinds[field], part, f"{name}.{field}") for field, part in value.items()}
         no_value = dataclasses.MISSING
         required = [f.name for f in dataclasses.fields(kind) if f.default is no_value is f.default_factory]
@@ -192,5 +192,5 @@ def _parsed(kind: Any, value: Any, name: str) -> Any:
         return tuple(_parsed(part, v, name) for part, v in zip(kinds_of_parts, value, strict=True))
     accepted = (int, float) if kind is float else kind
     if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
-        raise ValueError(f"{name}: expected {kind.__name__}, got {value!r}")
+        raise ValueError(f"{name}: expected a value of type {kind.__name__}, got {value!r}")
     return kind(value)

@@ -72,7 +72,7 @@ def networks_folder() -> Path:
 def find_network(weights: Path) -> Path:
     """Return the file of `weights`, a path or a name in PUBLISHED.
 
-    A missing published file is downloaded. A relative path is searched in the working folder, then in the project
+    A missing published file is downloaded. A relative path is searched in the working directory, then in the project
     folder. Raises DataError if the file does not exist, cannot be downloaded, or has a wrong hash.
     """
     if published := PUBLISHED.get(str(weights)):
@@ -92,7 +92,7 @@ def check(published: PublishedNetwork) -> None:
     try:
         found = published.digest_of(published.file)
     except OSError as error:
-        raise DataError(f"{published.file}: expected a readable file, got {error.strerror}") from error
+        raise DataError(f"{published.file}: expected a readable file, got an error ({error.strerror})") from error
     if found != published.digest:
         raise DataError(
             f"{published.file}: expected {published.algorithm} {published.digest}, got {found}; delete it to "
@@ -109,7 +109,7 @@ def download(published: PublishedNetwork) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DataError(f"{path.parent}: expected a writable folder, got {error.strerror}") from error
+        raise DataError(f"{path.parent}: expected a writable folder, got an error ({error.strerror})") from error
     with atomic_write(path) as temporary:
         with temporary.open("wb") as file:
             file.writelines(_received(published, by_hand))
@@ -120,7 +120,7 @@ def download(published: PublishedNetwork) -> None:
 
 
 def _received(published: PublishedNetwork, by_hand: str) -> Iterator[bytes]:
-    """Yield the blocks from the server. Raises DataError that contains the fix `by_hand` for connection errors."""
+    """Yield the blocks of the file from the server. Raises DataError with the fix `by_hand` for connection errors."""
     url, name = published.url, published.file.name
     try:
         with (
@@ -136,6 +136,6 @@ def _received(published: PublishedNetwork, by_hand: str) -> Iterator[bytes]:
                 yield block
     except (OSError, http.client.HTTPException) as error:
         reason = in_one_line(getattr(error, "reason", None) or error)
-        raise DataError(f"{url}: expected a download, got {reason}; {by_hand}") from error
+        raise DataError(f"{url}: expected a download, got an error ({reason}); {by_hand}") from error
     if received < announced:
         raise DataError(f"{url}: expected {announced} bytes, got {received}; try again, or {by_hand}")

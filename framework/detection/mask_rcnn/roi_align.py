@@ -26,9 +26,9 @@ def roi_align(
     """Return the pooled features (N, C, bins, bins) of N boxes, in channels-last memory format.
 
     A bin is the mean of bilinear samples on a regular grid. `features`: (1, C, H, W). `boxes`: (N, 4) x1 y1 x2 y2 px of
-    the image. `spatial_scale`: cells per pixel. `sampling_ratio`: samples per side of a bin, 0 = one per covered cell.
-    `half_pixel`: True = "aligned"; False = the older convention. In the older convention, the center of cell i is at
-    image coordinate i / spatial_scale, and a box is at least one cell wide.
+    the network's input. `spatial_scale`: cells per pixel. `sampling_ratio`: number of samples per side of a bin, 0 =
+    one per covered cell. `half_pixel`: True = "aligned"; False = the older convention. In the older convention, the
+    center of cell i is at input coordinate i / spatial_scale, and a box is at least one cell wide.
 
     Bilinear weights factorize into x and y, and so does their mean over a grid. A pooled box is A_y F A_x^T with a
     (bins, H) and a (bins, W) matrix, which costs O(bins H W) per box. Each row of the matrices is zero outside of a
@@ -58,7 +58,11 @@ class Samples:
 
     @classmethod
     def along(cls, start: Tensor, end: Tensor, bins: int, cells: int, ratio: int, shortest: float) -> Samples:
-        """Create the samples between `start` and `end` (N,), in cells; shorter boxes are extended to `shortest`."""
+        """Create the samples between `start` and `end` (N,), in cells.
+
+        `ratio`: number of samples per bin, 0 = one per covered cell. Boxes shorter than `shortest`, in cells, are
+        extended to it.
+        """
         size = (end - start).clamp(min=shortest)
         counts = torch.full_like(size, ratio) if ratio else (size / bins).ceil().clamp(min=1.0)
         spread = size / bins * (counts - 1) / counts  # distance between the first and last sample of a bin
@@ -99,9 +103,10 @@ def _products(cells: Tensor, x: Samples, y: Samples) -> Tensor:
 
 
 def _sums(cells: Tensor, x: Samples, y: Samples) -> Tensor:
-    """Return the pooled features (N, C, bins, bins) as sums over windows.
+    """Return the pooled features (N, C, bins, bins) as weighted sums over windows of cells.
 
-    A chunk contains windows of similar size, because the largest one determines the cost.
+    The boxes are processed in chunks with windows of similar size, because the largest window of a chunk determines its
+    cost.
     """
     sizes = x.windows * y.windows
     largest = int(sizes.max()) if len(sizes) else 1

@@ -12,15 +12,15 @@ from framework.detection.masks.letterbox import Letterbox
 
 
 def paste_masks(grids: Float32, borders: Float32, shape: tuple[int, int], threshold: float = 0.5) -> Bool:
-    """Return the masks (N, H, W) of grids of probabilities, resized to their boxes in an image of `shape`.
+    """Return the masks (N, H, W) of grids of probabilities, resampled to their boxes in an image of `shape`.
 
     Pixels above `threshold` after bilinear interpolation are inside a mask. `grids`: (N, G, G) probabilities over each
-    box. `borders`: (N, 4) boxes x1 y1 x2 y2 px, pixel centers at integers. A ring of zero cells is added, as in
-    Detectron, so that a mask ends at the border of its box even if all cells are filled.
+    box. `borders`: (N, 4) boxes x1 y1 x2 y2 px, pixel centers at integers. The grids are padded with one cell of zeros,
+    as in Detectron, so that a mask ends at the border of its box even if all cells are filled.
     """
-    ringed = np.pad(grids.astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
+    padded = np.pad(grids.astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
     masks = np.zeros((len(grids), *shape), np.bool_)
-    paste(ringed, np.ascontiguousarray(borders, np.float64), np.float32(threshold), masks)
+    paste(padded, np.ascontiguousarray(borders, np.float64), np.float32(threshold), masks)
     return masks
 
 
@@ -34,9 +34,10 @@ def masks_from_prototypes(
 ) -> Bool:
     """Return the masks (N, H, W): thresholded weighted sums of prototypes (Bolya et al., "YOLACT").
 
-    `coefficients`: (N, M). `prototypes`: (M, h, w), whose cells cover the complete input of the network. `borders`:
-    (N, 4) boxes x1 y1 x2 y2 px of the image, the limits of the masks. The sums are logits. They are interpolated
-    bilinearly between cell centers before the comparison with `threshold`.
+    `coefficients`: (N, M). `prototypes`: (M, h, w), whose cells cover the complete input of the network. `borders`: (N,
+    4) boxes x1 y1 x2 y2 px of the image, the limits of the masks. `letterbox`: the placement of the image in the input.
+    `shape`: (height, width) px of the image. The sums are logits, interpolated bilinearly between cell centers.
+    `threshold`: minimum mask probability of a pixel in the mask.
     """
     count, rows, columns = prototypes.shape
     logits = (coefficients @ prototypes.reshape(count, -1)).reshape(len(coefficients), rows, columns)

@@ -39,7 +39,10 @@ def mask_bounds(masks):
 
 @njit(cache=True, nogil=True)
 def shared_pixels(masks, bounds):
-    """Return the number of common pixels (N, N) of each pair of masks; `bounds` (N, 4) are their boxes."""
+    """Return the number of common pixels (N, N) of each pair of masks (N, H, W).
+
+    `bounds`: their bounds (N, 4) x1 y1 x2 y2 px, first and last pixels inside.
+    """
     n = len(masks)
     shared = np.zeros((n, n), np.int64)
     for i in range(n):
@@ -57,9 +60,10 @@ def shared_pixels(masks, bounds):
 
 @njit(cache=True, nogil=True)
 def _grid_cells(start, end, cells, pixels):
-    """Return the first pixel of a grid along one axis, and for each pixel a cell and the weight of the next cell.
+    """Return the first pixel, and for each pixel the lower cell index and the interpolation weight of the next cell.
 
-    `cells` excludes the ring of zeros. The pixels are those inside the box and up to half a cell outside of it.
+    The pixels are those along one axis of a box from `start` to `end`, px, and up to half a cell outside of it, in an
+    image of `pixels` pixels. `cells`: number of grid cells along the axis without the padding. Index 0 is the padding.
     """
     cell = (end - start) / cells  # px
     first = max(0, int(np.ceil(start - 0.5 * cell)))
@@ -68,7 +72,7 @@ def _grid_cells(start, end, cells, pixels):
     lower = np.empty(n, np.int64)
     weight = np.empty(n, np.float32)
     for i in range(n):
-        position = (first + i - start) / cell + 0.5  # 0 is the center of the ring's first cell, cells + 1 of its last
+        position = (first + i - start) / cell + 0.5  # cells; the centers of the padding are at 0 and cells + 1
         position = min(max(position, 0.0), cells + 1.0)
         lower[i] = min(int(position), cells)
         weight[i] = position - lower[i]
@@ -76,13 +80,14 @@ def _grid_cells(start, end, cells, pixels):
 
 
 @njit(cache=True, nogil=True)
-def paste(ringed, borders, threshold, masks):
-    """Write the masks (N, H, W) of the grids `ringed` (N, G + 2, G + 2), which have a ring of zeros.
+def paste(padded, borders, threshold, masks):
+    """Write to `masks` (N, H, W) the zero-padded probability grids `padded` (N, G + 2, G + 2), resampled to boxes.
 
-    Interpolation along y comes first and is shared by a row of pixels.
+    `borders`: the boxes (N, 4) x1 y1 x2 y2, px. A pixel is set if its probability exceeds `threshold`. Each row of
+    pixels is interpolated first along y, then along x.
     """
     n, height, width = masks.shape
-    cells = ringed.shape[1] - 2
+    cells = padded.shape[1] - 2
     row = np.empty(cells + 2, np.float32)
     for i in range(n):
         x1, y1, x2, y2 = borders[i, 0], borders[i, 1], borders[i, 2], borders[i, 3]
@@ -92,7 +97,7 @@ def paste(ringed, borders, threshold, masks):
         v0, above, v_weight = _grid_cells(y1, y2, cells, height)
         for j in range(len(above)):
             for c in range(cells + 2):
-                row[c] = ringed[i, above[j], c] + v_weight[j] * (ringed[i, above[j] + 1, c] - ringed[i, above[j], c])
+                row[c] = padded[i, above[j], c] + v_weight[j] * (padded[i, above[j] + 1, c] - padded[i, above[j], c])
             for k in range(len(left)):
                 value = row[left[k]] + u_weight[k] * (row[left[k] + 1] - row[left[k]])
                 masks[i, v0 + j, u0 + k] = value > threshold
@@ -100,7 +105,11 @@ def paste(ringed, borders, threshold, masks):
 
 @njit(cache=True, nogil=True)
 def _prototype_cells(start, end, pixels, scale, shift, cells):
-    """Return the first pixel of a box along one axis, and for each pixel a cell and the weight of the next cell."""
+    """Return the first pixel, and for each pixel the lower cell index and the interpolation weight of the next cell.
+
+    The pixels are those along one axis of a box from `start` to `end`, px, in an image of `pixels` pixels. The position
+    of pixel u among the `cells` cells is u * scale + shift; 0 is the center of the first cell.
+    """
     first, stop = max(0, int(np.ceil(start))), min(pixels, int(np.ceil(end)))
     n = max(0, stop - first)
     lower = np.empty(n, np.int64)
@@ -114,9 +123,10 @@ def _prototype_cells(start, end, pixels, scale, shift, cells):
 
 @njit(cache=True, nogil=True)
 def sample_prototypes(logits, borders, affine, least, masks):
-    """Write the masks (N, H, W) of prototype logits (N, h, w) above `least`.
+    """Write to `masks` (N, H, W) the pixels inside the boxes `borders` with interpolated logits above `least`.
 
-    Interpolation along y comes first and is shared by a row of pixels.
+    `logits`: (N, h, w). `borders`: (N, 4) x1 y1 x2 y2, px. `affine`: (2, 2) scale and shift from pixels to cells, along
+    x and y. Each row of pixels is interpolated first along y, then along x.
     """
     n, height, width = masks.shape
     rows, columns = logits.shape[1:]
@@ -134,9 +144,10 @@ def sample_prototypes(logits, borders, affine, least, masks):
 
 @njit(cache=True, nogil=True)
 def contacts(ids, depth):
-    """Return the pairs (M, 2) of touching instances in images of ids and depth (H, W), m; pairs may repeat.
+    """Return the M pairs (M, 2) of ids of touching instances, smaller id first; pairs may repeat.
 
-    The smaller id of a pair comes first.
+    `ids`: (H, W), not positive = no instance. `depth`: (H, W), m. Two instances touch at neighboring pixels whose
+    depths differ by less than CONTACT_DEPTH.
     """
     height, width = ids.shape
     pairs = np.empty((2 * height * width, 2), np.int32)

@@ -27,8 +27,9 @@ def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float | tuple
 
 
 def decode(boxes: Float32, deltas: Float32, extent: float = 1.0) -> Float32:
-    """Return boxes (N, 4), px, moved and scaled by deltas dx dy dw dh (N, 4) relative to their centers and sizes.
+    """Return boxes (N, 4), px, moved and scaled by deltas (N, 4) dx dy dw dh.
 
+    dx and dy are in units of the box's width and height; dw and dh are the logarithms of scale factors.
     Source: Girshick et al., "Rich feature hierarchies ...", 2014, appendix C, with Detectron's pixel conventions.
     """
     sizes = boxes[:, 2:] - boxes[:, :2] + np.float32(extent)
@@ -40,7 +41,7 @@ def decode(boxes: Float32, deltas: Float32, extent: float = 1.0) -> Float32:
 
 
 def clip(boxes: Float32, shape: tuple[int, int], extent: float = 1.0) -> Float32:
-    """Clip boxes (N, 4) to an image of `shape` (height, width)."""
+    """Clip boxes (N, 4), px, to an image of `shape` (height, width) px."""
     height, width = shape
     largest = np.array([width, height, width, height], np.float32) - np.float32(extent)
     return np.clip(boxes, np.float32(0), largest)

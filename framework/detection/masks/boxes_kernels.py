@@ -8,9 +8,10 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def suppress_sorted(boxes, classes, order, iou, extent, limit):
-    """Return the entries of order (N,) for the boxes (N, 4) that remain after suppression; boxes are best first.
+    """Return the entries of `order` (N,) for at most `limit` boxes that remain after non-maximum suppression.
 
-    Each box is compared only with the remaining boxes, at most `limit`.
+    `boxes`: (N, 4) x1 y1 x2 y2 px, best first. `classes`: (N,). A box is removed if its IoU with an earlier remaining
+    box of its class exceeds `iou`. `extent`: the box convention, see boxes.py.
     """
     survivors = np.empty(min(limit, len(boxes)), np.int32)
     n = 0

@@ -49,7 +49,7 @@ class Letterbox:
         return cls(input_shape, resized, top, left, resized[1] / width, resized[0] / height)
 
     def fill(self, color: UInt8, padding: int) -> UInt8:
-        """Return the input (H, W, 3) for the image `color` (h, w, 3), padded with the value `padding`."""
+        """Return the input (H, W, 3) for the image `color` (h, w, 3), padded with the gray value `padding`."""
         height, width = self.resized
         canvas = np.full((*self.input_shape, 3), padding, np.uint8)
         canvas[self.top : self.top + height, self.left : self.left + width] = cv2.resize(
@@ -58,7 +58,7 @@ class Letterbox:
         return canvas
 
     def to_image(self, boxes: Float32) -> Float32:
-        """Convert boxes x1 y1 x2 y2 in the input to borders (N, 4) in px of the image."""
+        """Convert boxes (N, 4) x1 y1 x2 y2 from px of the input to px of the image."""
         shift = np.array([self.left, self.top] * 2)
         scale = np.array([self.scale_x, self.scale_y] * 2)
         return np.asarray((boxes - shift) / scale - 0.5, np.float32)
@@ -67,7 +67,7 @@ class Letterbox:
 def network_input(canvas: UInt8, dtype: str, bgr: bool, black: float, white: float) -> np.ndarray[Any, Any]:
     """Convert an RGB image (H, W, 3) to a network's dtype, with 0 mapped to `black` and 255 to `white`.
 
-    The input of a uint8 network is 0..255.
+    For the dtype uint8, the values 0..255 are unchanged. `bgr`: True = the channels are reversed to BGR.
     """
     image = canvas[..., ::-1] if bgr else canvas
     if dtype == "uint8":

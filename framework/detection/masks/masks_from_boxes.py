@@ -31,7 +31,7 @@ def masks_in_boxes(
     borders: Float32, depth: Float32, camera: Camera, significance: float, max_slant: float, min_readings: float,
     sensor: SensorKind = SensorKind.KINECT_V1,
 ) -> tuple[Bool, Bool]:  # fmt: skip
-    """Return the masks (N, H, W) of the objects in boxes, and a mask (N,) of the boxes with enough depth readings.
+    """Return the masks (N, H, W) of the objects in boxes, and an array (N,), True for boxes with enough depth readings.
 
     The masks of other boxes are empty.
 
@@ -41,7 +41,7 @@ def masks_in_boxes(
         camera: The camera of the depth image.
         significance: Minimum fraction of the weighted readings in the foreground.
         max_slant: Maximum angle between the image plane and a surface, degrees.
-        min_readings: Minimum fraction of the box's pixels with a reading.
+        min_readings: Minimum fraction of a box's pixels that have a depth reading.
         sensor: The kind of the depth sensor.
     """
     height, width = depth.shape
@@ -57,7 +57,10 @@ def masks_in_boxes(
 
 
 def _close_holes(mask: Bool, has_reading: Bool) -> None:
-    """Close the holes of `mask` (h, w), except holes at the border and large holes with readings."""
+    """Close the holes of `mask` (h, w) in place, except holes at its border and large holes with depth readings.
+
+    `has_reading`: (h, w), True where a pixel has a depth reading.
+    """
     count, component = cv2.connectedComponents((~mask).view(np.uint8), connectivity=4)
     sizes = np.bincount(component.ravel(), minlength=count)
     readings = np.bincount(component[has_reading], minlength=count)

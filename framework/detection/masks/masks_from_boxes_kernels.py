@@ -9,15 +9,17 @@ from framework.sensors.noise_models_kernels import axial_sigma
 
 BIN = 0.02  # width of a bin of log depth: 2% of the depth
 NEAREST, FARTHEST = 0.05, 100.0  # m, range of the histogram
-VALLEY = 0.15  # fraction of a mode's peak below which a bin ends the mode
+VALLEY = 0.15  # fraction of a mode's peak below which a bin can end the mode
 SIGMAS = 3.0  # depth step that noise may cause, in standard deviations
 
 
 @njit(cache=True, nogil=True)
 def fill_masks(borders, windows, depth, significance, step, noise, min_readings, masks):
-    """Write the masks of the objects in the boxes, with holes; `windows` (N, 4) are the boxes in whole pixels.
+    """Write the masks of the objects in the boxes to `masks` (N, H, W), before holes are closed.
 
-    Returns an array (N,), True if a mask was found.
+    `borders`: the boxes (N, 4) x1 y1 x2 y2, px. `windows`: the pixels u1 <= u < u2, v1 <= v < v2 of the boxes, as (N,
+    4) u1 v1 u2 v2. `step`: maximum depth step between neighboring pixels per meter of depth. `noise`: the noise model
+    of the sensor. See `masks_in_boxes` for the other arguments. Returns an array (N,), True where a mask was found.
     """
     found = np.zeros(len(masks), np.bool_)
     for i in range(len(masks)):
@@ -38,16 +40,20 @@ def fill_masks(borders, windows, depth, significance, step, noise, min_readings,
 
 @njit(cache=True, nogil=True)
 def _tent(start, end, first, stop):
-    """Return the weights of pixels first to stop - 1 along one axis of a box: 1 at its center, 0 at its borders."""
+    """Return the weights of pixels `first` to `stop` - 1 along one axis of a box from `start` to `end`, px.
+
+    They decrease linearly from 1 at its center to 0 at its borders; 1e-6 is added to all weights.
+    """
     center, half = 0.5 * (start + end), 0.5 * (end - start)
     return np.maximum(0.0, 1.0 - np.abs(np.arange(first, stop) - center) / half) + 1e-6
 
 
 @njit(cache=True, nogil=True)
 def _foreground(window, weight_x, weight_y, significance):
-    """Return the depth interval (near, far), m, of the nearest significant mode.
+    """Return the depth interval (near, far), m, of the nearest mode with at least `significance` of the weight.
 
-    If no mode is significant, return the interval of the mode with the largest weight.
+    If there is none, return the interval of the mode with the largest weight. `window`: depth (h, w), m. The weight of
+    pixel (u, v) is weight_x[u] * weight_y[v].
     """
     bins = int(np.log(FARTHEST / NEAREST) / BIN) + 1
     histogram = np.zeros(bins + 2)
@@ -89,7 +95,10 @@ def _foreground(window, weight_x, weight_y, significance):
 
 @njit(cache=True, nogil=True)
 def _grow(window, weight_x, weight_y, near, far, step, noise, mask):
-    """Write the connected component with the largest weight, at depths from near to far (m), to `mask` (h, w)."""
+    """Write to `mask` (h, w) the connected component of the largest weight with depths from `near` to `far`, m.
+
+    See `fill_masks` and `_foreground` for the other arguments.
+    """
     height, width = window.shape
     label = np.zeros((height, width), np.int32)
     stack = np.empty((height * width, 2), np.int32)
@@ -125,5 +134,5 @@ def _grow(window, weight_x, weight_y, near, far, step, noise, mask):
 
 @njit(cache=True, nogil=True)
 def _largest_step(z, step, noise):
-    """Return the largest difference in depth, m, between neighboring pixels of one surface at depth z m."""
+    """Return the largest difference in depth, m, between neighboring pixels of one surface at depth `z`, m."""
     return step * z + SIGMAS * axial_sigma(z, noise)

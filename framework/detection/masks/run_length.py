@@ -23,7 +23,7 @@ MAX_CHARACTERS = 7  # maximum number of characters per number; its range exceeds
 
 
 def encode(masks: Bool) -> list[bytes]:
-    """Encode masks (N, H, W) as packed run lengths."""
+    """Encode masks (N, H, W) as packed run lengths, one string for each mask."""
     columns_first = np.asfortranarray(masks.transpose(1, 2, 0).view(np.uint8))
     return [run["counts"] for run in coco.encode(columns_first)] if len(masks) else []
 

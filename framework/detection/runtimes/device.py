@@ -27,7 +27,7 @@ def torch_device(device: str, name: str = "detector.device") -> torch.device:
 
 
 def ready(network: Any, device: torch.device, half_precision: bool) -> Any:
-    """Return the network on the device, in inference mode; half precision is used only on CUDA."""
+    """Move the network to the device and set it to inference mode; half precision is used only on CUDA."""
     dtype = torch.float16 if half_precision and device.type == "cuda" else torch.float32
     return network.to(device, dtype).eval()
 

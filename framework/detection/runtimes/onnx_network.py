@@ -28,10 +28,15 @@ CUDA = "CUDAExecutionProvider"
 
 
 class OnnxNetwork:
-    """A network from one image to named arrays, on the CPU or with CUDA.
+    """An ONNX network that computes named arrays from one image, on the CPU or with CUDA.
 
     The network uses as many threads as OpenCV (`threads` in the config). The default of onnxruntime would be all cores.
     Idle threads sleep, because mapping runs at the same time.
+
+    Attributes:
+        shape: (height, width) px of the input.
+        dtype: NumPy type of the input: float32, float16 or uint8.
+        channels_last: True = the input is (1, H, W, 3), False = (1, 3, H, W).
     """
 
     def __init__(self, path: Path, sha256: str, device: str, input_size: int) -> None:
@@ -71,7 +76,7 @@ class OnnxNetwork:
             arrays = self._session.run(names, {self._name: np.ascontiguousarray(blob)})
         except Exception as error:  # errors of onnxruntime have no common base class
             raise DataError(
-                f"{self.path}: expected a successful run in onnxruntime, got {in_one_line(error)}"
+                f"{self.path}: expected a successful run in onnxruntime, got an error ({in_one_line(error)})"
             ) from error
         outputs = {name: np.asarray(array, np.float32) for name, array in zip(names, arrays, strict=True)}
         for name, array in outputs.items():
@@ -81,7 +86,7 @@ class OnnxNetwork:
 
 
 class ImageNetworkParameters(Protocol):
-    """Common parameters of detectors with an image network; see the fields of the detectors."""
+    """Common parameters of detectors with an ONNX network; see the fields of the detectors for their meaning."""
 
     weights: Path
     sha256: str
@@ -121,7 +126,7 @@ class ImageNetwork:
         self._detector = detector
 
     def __call__(self, color: UInt8) -> tuple[Outputs, Letterbox]:
-        """Return the outputs by name for an RGB image (h, w, 3), and the placement of the image in the input."""
+        """Return the outputs by name for an RGB image (h, w, 3), uint8, and the placement of the image in the input."""
         detector = self._detector
         letterbox = Letterbox.fit(color.shape[:2], self.shape, detector.placement)
         canvas, levels = letterbox.fill(color, detector.padding), (detector.black_level, detector.white_level)
@@ -149,7 +154,9 @@ def _loaded(path: Path, device: str) -> InferenceSession:
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # errors of onnxruntime have no common base class
-        raise DataError(f"{path}: expected an ONNX file for onnxruntime, got {in_one_line(error)}") from error
+        raise DataError(
+            f"{path}: expected an ONNX file for onnxruntime, got an error ({in_one_line(error)})"
+        ) from error
     if device == "cuda" and CUDA not in session.get_providers():
         raise ConfigError("detector.device: expected cpu or auto because CUDA did not start, got cuda")
     return session
@@ -172,7 +179,7 @@ def _input_shape(
 ) -> tuple[int, int]:
     """Return the (height, width) px of the input.
 
-    Dynamic dimensions are set to `input_size`, else to the size in the file's metadata.
+    Dynamic dimensions are set to `input_size`, px, or if it is 0, to the size in the file's metadata.
     """
     shape, described = _shape(image), _described(image)
     height, width = shape[1:3] if channels_last else shape[2:]
@@ -200,7 +207,10 @@ def _shape(tensor: NodeArg) -> Shape:
 
 
 def find_file(path: Path) -> Path:
-    """Return the file `path`. A relative path is searched in the working folder, then in the project folder."""
+    """Return the path of an existing file. Raises DataError if there is none.
+
+    A relative path is searched in the working directory, then in the project folder.
+    """
     for candidate in candidates(path):
         if candidate.is_file():
             return candidate
@@ -215,7 +225,9 @@ def checked_hash(path: Path, sha256: str) -> str:
     try:
         found = path_hash(path)
     except OSError as error:
-        raise DataError(f"detector.weights: {path}: expected a readable file, got {error.strerror}") from error
+        raise DataError(
+            f"detector.weights: {path}: expected a readable file, got an error ({error.strerror})"
+        ) from error
     if sha256 and found != sha256.lower():
         raise DataError(f"detector.weights: {path}: expected sha256 {sha256}, got {found}")
     return found

@@ -44,14 +44,14 @@ class CacheMode(Enum):
 
 @runtime_checkable
 class ReadsFields(Protocol):
-    """Interface of detectors with a declared set of input fields, so that more frames share an entry."""
+    """Interface of detectors that declare the fields of Frame they read, so that more frames share an entry."""
 
     reads: tuple[str, ...]  # names of fields of Frame
 
 
 @runtime_checkable
 class Fingerprinted(Protocol):
-    """Interface of detectors with weights that parameters do not identify, such as a model name on a hub."""
+    """Interface of detectors whose parameters do not identify their weights, such as the name of a model on a hub."""
 
     def fingerprint(self) -> str:
         """Return a hash of all inputs of the detections except the frame. It must include `fingerprint(self)`."""
@@ -139,12 +139,12 @@ def _checksum(path: Path, content: bytes) -> bytes:
 
 
 def fields_read(detector: Detector) -> tuple[str, ...]:
-    """Return the input fields of the detector; all fields of Frame unless the detector declares `reads`."""
+    """Return the names of the Frame fields that the detector reads: `reads`, or all fields if it does not define it."""
     return detector.reads if isinstance(detector, ReadsFields) else FRAME_FIELDS
 
 
 def identity_of(detector: Detector) -> str:
-    """Return the fingerprint defined by the detector, or the hash of its class, code and parameters."""
+    """Return the fingerprint defined by the detector, or if it defines none, the hash from `fingerprint(detector)`."""
     if not isinstance(detector, Fingerprinted):
         return fingerprint(detector)
     try:
@@ -234,7 +234,7 @@ def pack(detections: Detections) -> bytes:
 
 
 def unpack(content: bytes, classes: tuple[str, ...]) -> Detections:
-    """Unpack the detections from an entry with a valid checksum."""
+    """Unpack the detections from the content of an entry, whose checksum must be valid."""
     from safetensors.numpy import load
 
     stored = load(content)

@@ -1,4 +1,4 @@
-"""COCO result files: a JSON list with an object for each detection of each image (cocodataset.org/#format-results).
+"""COCO results files: a JSON list with an entry for each detection of each image (cocodataset.org/#format-results).
 
 In addition to COCO's keys, an entry may have `category_name` and the complete distribution `class_probabilities`.
 pycocotools is not used for reading, because it requires the annotations of the images and does not validate entries.
@@ -53,11 +53,12 @@ class CategoryIds(Enum):
 
 
 def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[StoredDetection]:
-    """Read the detections from a result file, in the order of the file.
+    """Read the detections from a results file, in the order of the file.
 
     `segmentation`: run lengths (packed or a list) or polygons. `image_id`: `Frame.index`, as a number or as the file
-    name of the image ("color/000012.png"). `category_id` is used only without `category_name`. Raises DataError with
-    the file and the entry for an invalid entry.
+    name of the image ("color/000012.png"). `labels`: the names in the file's label space. `ids`: the numbering of
+    `category_id`, which is used only without `category_name`. Raises DataError with the file and the entry for an
+    invalid entry.
     """
     entries = read_json(path)
     if not isinstance(entries, list):
@@ -69,7 +70,7 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
     for k, entry in enumerate(entries):
         where = f"{path}, entry {k}"
         if not isinstance(entry, Mapping):
-            raise DataError(f"{where}: expected an object, got {entry!r}")
+            raise DataError(f"{where}: expected a JSON object, got {entry!r:.200}")
         if names is None and entry.get("category_name") is None:
             names = dict(zip(ids.of(labels), labels, strict=True))
         with errors_of(where):
@@ -124,7 +125,8 @@ def _read_box(found: Any) -> Float32 | None:
     whole = isinstance(found, list) and len(found) == 4
     if not whole or not all(isinstance(x, int | float) and abs(x) <= MAX_PIXELS for x in found) or min(found[2:]) < 0:
         raise DataError(
-            f"bbox: expected [x, y, width, height] px, at most {MAX_PIXELS} each, with sizes >= 0, got {found!r:.200}"
+            f"bbox: expected [x, y, width, height] px, at most {MAX_PIXELS} px each, width and height >= 0, got "
+            f"{found!r:.200}"
         )
     x, y, width, height = found
     return np.array([x, y, x + width, y + height], np.float32)
@@ -157,12 +159,12 @@ def _read_polygons(found: Sequence[Any]) -> Polygons:
         if not all(isinstance(x, int | float) and np.isfinite(x) for x in outline):
             raise DataError(f"polygon: expected finite coordinates in px, got {outline!r:.100}")
     if not found:
-        raise DataError("segmentation: expected a polygon, got none")
+        raise DataError("segmentation: expected at least one polygon, got an empty list")
     return Polygons(tuple(tuple(float(x) for x in outline) for outline in found))
 
 
 class ResultWriter:
-    """Writer of a result file, frame by frame."""
+    """Writer of a results file, frame by frame."""
 
     def __init__(self, file: TextIO, classes: tuple[str, ...]) -> None:
         self._file = file
@@ -195,7 +197,7 @@ class ResultWriter:
 
 @contextmanager
 def results_file(path: Path, classes: tuple[str, ...]) -> Iterator[ResultWriter]:
-    """Open a result file for a detector with these classes; the file appears atomically at the end of the block."""
+    """Open a results file for a detector with these classes; the file appears atomically at the end of the block."""
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write("[\n")
         yield ResultWriter(file, classes)
@@ -203,5 +205,5 @@ def results_file(path: Path, classes: tuple[str, ...]) -> Iterator[ResultWriter]
 
 
 def _shortest(values: Float32) -> list[float]:
-    """Return float32 values rounded to the fewest digits that identify them, which halves the file size."""
+    """Return float32 values rounded to the fewest decimal digits that identify them, which halves the file size."""
     return [float(text) for text in values.astype(str)]

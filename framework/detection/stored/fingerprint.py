@@ -26,8 +26,8 @@ def fingerprint(detector: object) -> str:
 
     The code comprises the modules of the class and its base classes, framework.detection, and the versions of numerical
     libraries. A path, or a str that names an existing file or folder, is identified by its content. A folder includes
-    all files below it. Relative paths are searched in the working folder, then in the project folder. `device: auto` is
-    identified by the selected device. The number of threads is not included.
+    all files below it. Relative paths are searched in the working directory, then in the project folder. `device: auto`
+    is identified by the selected device. The number of threads is not included.
 
     Raises ConfigError for a missing path and for code without a source file, such as a class in a notebook. Such a
     class must define a method `fingerprint`.
@@ -45,7 +45,8 @@ def _code(kind: type) -> Iterator[str]:
         source = getattr(sys.modules.get(module), "__file__", None)
         if source is None:
             raise ConfigError(
-                f"{kind.__qualname__}: expected a class in a source file, got none; implement fingerprint()"
+                f"{kind.__qualname__}: expected a class defined in a source file, got one without; define a method "
+                "fingerprint()"
             )
         yield path_hash(Path(source))
     framework = Path(__file__).resolve().parents[2]

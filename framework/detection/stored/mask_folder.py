@@ -37,7 +37,8 @@ class InstanceOfImage(Segmentation):
         ids = _read_ids(self.path)
         if ids.shape != shape:
             raise DataError(
-                f"image: expected {shape[1]}x{shape[0]} px (as the frame), got {ids.shape[1]}x{ids.shape[0]} px"
+                f"image: expected the frame's size, {shape[1]}x{shape[0]} px, got {ids.shape[1]}x{ids.shape[0]} px; "
+                "use masks at the resolution of the sequence"
             )
         return np.asarray(ids == self.id, np.bool_)
 
@@ -45,9 +46,9 @@ class InstanceOfImage(Segmentation):
 def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetection]:
     """Read the detections from a mask folder.
 
-    NNNNNN is `Frame.index`. The PNG has one channel of 16 bits. The JSON is a list of {"id", "class", "score"} and
-    optionally "class_probabilities". Unlisted ids are not detections. Masks cannot overlap. Raises DataError with the
-    file and the entry for an invalid entry.
+    NNNNNN is `Frame.index`. The PNG has one channel of 16 bits. The JSON is a list of objects with the keys "id",
+    "class", "score" and optionally "class_probabilities". `labels`: the names in the folder's label space. Unlisted ids
+    are not detections. Masks cannot overlap. Raises DataError with the file and the entry for an invalid entry.
     """
     index = {name: k for k, name in enumerate(labels)}
     found: list[StoredDetection] = []
@@ -64,7 +65,9 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
         ids: set[int] = set()
         entries = read_json(description)
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise DataError(f"{description}: expected a list of objects with id, class and score, got {entries!r:.100}")
+            raise DataError(
+                f"{description}: expected a list of JSON objects with id, class and score, got {entries!r:.100}"
+            )
         for k, entry in enumerate(entries):
             where = f"{description}, entry {k}"
             with errors_of(where):

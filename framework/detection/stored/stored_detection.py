@@ -36,7 +36,7 @@ class RunLengths(Segmentation):
     def mask(self, shape: tuple[int, int]) -> Bool:
         if self.shape != shape:
             raise DataError(
-                f"mask: expected {shape[1]}x{shape[0]} px (as the frame), got {self.shape[1]}x{self.shape[0]} "
+                f"mask: expected the frame's size, {shape[1]}x{shape[0]} px, got {self.shape[1]}x{self.shape[0]} "
                 "px; use masks at the resolution of the sequence"
             )
         return np.asarray(decode([self.counts], shape)[0], np.bool_)
@@ -63,7 +63,7 @@ class Polygons(Segmentation):
 
 @dataclass(frozen=True)
 class StoredDetection:
-    """One object in one image."""
+    """A detection from a file: one object in one image."""
 
     where: str  # file and entry, for errors
     frame: int  # Frame.index
@@ -72,7 +72,7 @@ class StoredDetection:
     segmentation: Segmentation
     probabilities: Float32 | None = None  # (C,) distribution over the file's label space; None = label only
     box: Float32 | None = None  # (4,) x1 y1 x2 y2 px; None = tight box of the mask
-    exact: bool = False  # as in Detections
+    exact: bool = False  # True = ground-truth mask, which refiners do not change
 
 
 def read_score(found: Any) -> float:
@@ -83,7 +83,7 @@ def read_score(found: Any) -> float:
 
 
 def read_label(found: Any, index: Mapping[str, int]) -> str:
-    """Return a name in the label space. Raises DataError for other values."""
+    """Return the name if it is in the label space `index`. Raises DataError for other values."""
     if not isinstance(found, str) or found not in index:
         raise DataError(
             f"label: expected one of the {len(index)} names in detector.label_space, got {found!r}; set "
@@ -93,10 +93,11 @@ def read_label(found: Any, index: Mapping[str, int]) -> str:
 
 
 def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
-    """Return the distribution (C,) over the label space in a list or a mapping; None = not given.
+    """Return the distribution (C,) over the label space from a JSON list or object; None = not given.
 
-    A mapping has class names as keys; missing names have the probability 0. Only rounded distributions are normalized.
-    Raises DataError for other values.
+    `index`: the index of each name in the label space. An object has class names as keys; missing names have the
+    probability 0. A sum that differs from 1 by at most ROUNDED_SUM, due to rounded digits, is normalized. Raises
+    DataError for other values.
     """
     if found is None:
         return None
@@ -105,13 +106,13 @@ def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
         if unknown:
             raise DataError(
                 f"class_probabilities: expected only the {len(index)} names in detector.label_space, got "
-                f"{', '.join(map(repr, unknown))}"
+                f"{', '.join(map(repr, unknown))}; set detector.label_space to the label space of the file"
             )
         given: Sequence[Any] = [found.get(name, 0.0) for name in index]
     elif isinstance(found, list):
         given = found
     else:
-        raise DataError(f"class_probabilities: expected a list or an object, got {found!r}")
+        raise DataError(f"class_probabilities: expected a JSON list or a JSON object, got {found!r:.200}")
     if len(given) != len(index):
         raise DataError(f"class_probabilities: expected {len(index)} values, one for each label, got {len(given)}")
     if not all(isinstance(p, int | float) and 0 <= p <= MAX_PROBABILITY for p in given):  # rejects NaN

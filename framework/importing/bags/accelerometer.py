@@ -29,13 +29,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Accelerometer:
-    """Accelerometer measurements in the axes of the color camera."""
+    """Accelerometer measurements, rotated to the axes of the color camera."""
 
     times: Float64  # (N,) s, ascending
     measured: Float64  # (N, 3) m/s^2
 
     def up(self, timestamp: float) -> Float64 | None:
-        """Return the up direction (3,) in the camera frame at a time in s; None = no measurements near this time."""
+        """Return the unit up vector (3,) in the camera frame at a time in s; None = no measurement within NEAR s."""
         first, end = np.searchsorted(self.times, (timestamp - NEAR, timestamp + NEAR))
         if first == end:
             return None

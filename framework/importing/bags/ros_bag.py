@@ -62,7 +62,7 @@ def open_source(path: Path, given: Topics) -> Source:
     topics = found_topics(bag, given)
     info = bag.first(topics.camera_info)
     if info is None:
-        raise DataError(f"{path}: {topics.camera_info}: expected messages, got none")
+        raise DataError(f"{path}: {topics.camera_info}: expected at least one message, got none")
     camera = _camera(f"{path}: {topics.camera_info}", info)
     pairs = _pairs(bag, topics)
     registration, unit = _registration(bag, topics, camera), _depth_unit(bag, topics)
@@ -103,8 +103,9 @@ class Device:
         metric = depth_of(f"{where}: {depth.topic}", self.bag.decoded(depth), self.depth_unit)
         if self.registration is not None:
             if metric.shape != self.registration.depth.shape:
-                expected = f"expected depth of shape {self.registration.depth.shape} px as in its camera"
-                raise FrameError(f"{where}: {expected}, got {metric.shape}")
+                sizes = [f"{width}x{height}" for height, width in (self.registration.depth.shape, metric.shape)]
+                expected = f"expected depth of {sizes[0]} px as in its CameraInfo"
+                raise FrameError(f"{where}: {expected}, got {sizes[1]} px")
             metric = self.registration.apply(metric)
         return DeviceFrame(
             name=where,
@@ -119,7 +120,10 @@ class Device:
 
 
 def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
-    """Return the pairs matched by header timestamps, or by recording times if the clocks of the headers differ."""
+    """Return the pairs matched by header timestamps, or by recording times if the clocks of the headers differ.
+
+    The clocks count as different if header timestamps give less than half as many pairs.
+    """
     sensed: dict[str, list[float]] = {topics.color: [], topics.depth: []}
     stored: dict[str, list[float]] = {topics.color: [], topics.depth: []}
     try:
@@ -141,7 +145,7 @@ def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
 
 
 def _associated(color_times: Sequence[float], depth_times: Sequence[float]) -> list[Pair]:
-    """Return the pairs matched by time (s).
+    """Return the pairs of color and depth images matched by time (s).
 
     Only the first image of each time is used, because some recorders write zero for all times.
     """
@@ -187,7 +191,7 @@ def _raise(error: DataError) -> DeviceFrame:
 
 
 def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading]:
-    """Return the poses of a topic and their convention."""
+    """Return the poses of a topic (None = no topic) and their convention. Raises DataError if it has no messages."""
     if not topic:
         return None, PoseReading()
     lines = []
@@ -204,7 +208,7 @@ def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading
         p, q = pose.position, pose.orientation
         lines.append(TumLine(bag.path, number, bag.sensed_at(message), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)))
     if not lines:
-        raise DataError(f"{bag.path}: {topic}: expected messages, got none")
+        raise DataError(f"{bag.path}: {topic}: expected at least one message, got none")
     axes = CameraAxes.OPENCV if "optical" in frame_id else CameraAxes.ROS
     if axes is CameraAxes.ROS:
         log.warning("%s: poses of frame %r are used as camera poses, with x forward and z up", topic, frame_id)
@@ -265,7 +269,7 @@ def _camera(where: str, info: Any) -> Camera:
 
 
 def _distortion(topics: Topics, info: Any) -> Distortion | None:
-    """Return the lens distortion of color, or None without distortion or for rectified images."""
+    """Return the lens distortion of color; None = no distortion, rectified images or an unsupported lens model."""
     values = _numbers(info, "d")
     if "rect" in topics.color.rpartition("/")[2] or not any(values):
         return None

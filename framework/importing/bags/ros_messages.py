@@ -54,7 +54,7 @@ class RosBag:
     """A ROS 1 bag, or a ROS 2 bag as a folder, .mcap file or .db3 file."""
 
     def __init__(self, path: Path) -> None:
-        """Open a bag. Raises DataError that names the bag if it cannot be read."""
+        """Open a bag. Raises a DataError that names the bag if it cannot be read."""
         self.path = path
         import_optional("rosbags", "reads ROS bags", "ros")
         from rosbags import rosbag1, rosbag2, typesys
@@ -88,12 +88,12 @@ class RosBag:
             raise DataError(f"{self.path}: expected readable messages, got an error ({reason})") from error
 
     def first(self, topic: str) -> Any:
-        """Return the decoded first message of a topic, or None without messages. Raises DataError."""
+        """Return the decoded first message of a topic; None = no messages. Raises DataError for a damaged bag."""
         message = next(self.messages([topic]), None)
         return None if message is None else self.decoded(message)
 
     def decoded(self, message: Message) -> Any:
-        """Return the content of a message. Raises FrameError that names the topic if the message is damaged."""
+        """Return the content of a message. Raises a FrameError that names the topic if the message is damaged."""
         decode = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
         try:
             return decode(message.raw, message.kind)
@@ -104,7 +104,10 @@ class RosBag:
             ) from error
 
     def sensed_at(self, message: Message) -> float:
-        """Return the measurement time in s from the header of a message. The header must be the first field."""
+        """Return the measurement time in s from the header of a message.
+
+        The header must be the first field. Raises FrameError if the message is too short for a header.
+        """
         try:
             if self._is_ros1:
                 seconds, nanoseconds = struct.unpack_from("<xxxxII", message.raw)
@@ -117,7 +120,7 @@ class RosBag:
 
 
 def color_of(where: str, message: Any) -> UInt8:
-    """Return the color (H, W, 3), RGB, of an Image or a CompressedImage. Raises FrameError that names `where`."""
+    """Return the color (H, W, 3), RGB, of an Image or a CompressedImage. Raises a FrameError that names `where`."""
     if hasattr(message, "format"):
         return decode_color(where, message.data.tobytes())
     if message.encoding not in COLOR_CHANNELS:
@@ -130,7 +133,7 @@ def color_of(where: str, message: Any) -> UInt8:
 def depth_of(where: str, message: Any, unit: float) -> Float32:
     """Return the depth (H, W) in m, 0 = no reading, of an Image or a CompressedImage.
 
-    `unit` is the unit of integer depth in m. Raises FrameError that names `where`.
+    `unit` is the unit of integer depth in m. Raises a FrameError that names `where`.
     """
     if hasattr(message, "format"):
         return _compressed_depth(where, message, unit)
@@ -148,10 +151,10 @@ def _whole(stored: Array, unit: float) -> Float32:
 
 
 def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
-    """Return the depth (H, W) in m of a PNG image.
+    """Return the depth (H, W) in m of a PNG image, 0 = no reading. `unit` is the unit of integer depth in m.
 
     In the compressedDepth format, a 12-byte header precedes the image. For float depth, the header contains the
-    quantization of inverse depth.
+    quantization of inverse depth: depth = A / (value - B).
     """
     encoding, _, codec = message.format.partition(";")
     data = message.data.tobytes()

@@ -51,18 +51,19 @@ def found_topics(bag: RosBag, given: Topics) -> Topics:
     info = given.camera_info or camera_info_of(bag, color)
     if not info:
         expected = f"expected a {CAMERA_INFO} topic next to {color}"
-        raise DataError(f"{bag.path}: {expected}, got none; set --camera-info")
+        raise DataError(f"{bag.path}: {expected}, got none{_choice(bag, 'camera_info')}")
     posed = bag.topics(*POSES)
     if len(posed) > 1 and not given.poses:
-        raise ConfigError(f"{bag.path}: expected one topic with poses, got {', '.join(posed)}; set --poses")
+        raise ConfigError(
+            f"{bag.path}: expected one topic with poses, got {', '.join(posed)}; set --poses to one of them"
+        )
     topics = replace(given, color=color, depth=depth, camera_info=info, poses=given.poses or "".join(posed))
     for name, kinds in KINDS.items():
         topic = getattr(topics, name)
         if topic and bag.kinds.get(topic) not in kinds:
             found = f"{topic} of type {bag.kinds[topic]}" if topic in bag.kinds else f"unknown topic {topic}"
-            existing = ", ".join(bag.topics(*kinds)) or "none"
             expected = f"{OPTIONS[name]}: expected a topic of type {' or '.join(kinds)}"
-            raise ConfigError(f"{expected}, got {found}; set one of these topics: {existing}")
+            raise ConfigError(f"{expected}, got {found}{_choice(bag, name)}")
     return topics
 
 
@@ -78,11 +79,19 @@ def camera_info_of(bag: RosBag, image: str) -> str:
 
 
 def _one(bag: RosBag, name: str, candidates: Sequence[str], preferred: re.Pattern[str]) -> str:
-    """Return the single matching topic. Topics with a preferred name, and uncompressed topics, have precedence."""
+    """Return the single matching topic. Topics with a preferred name, and uncompressed topics, have precedence.
+
+    Raises ConfigError if no topic or several topics match.
+    """
     fitting = [topic for topic in candidates if preferred.search(topic)] or list(candidates)
     left = [topic for topic in fitting if bag.kinds[topic] == IMAGE] or fitting
     if len(left) == 1:
         return left[0]
     expected = f"expected one {name} topic, got {', '.join(left) or 'none'}"
-    existing = ", ".join(bag.topics(*IMAGES)) or "none"
-    raise ConfigError(f"{bag.path}: {expected}; set {OPTIONS[name]}; available image topics: {existing}")
+    raise ConfigError(f"{bag.path}: {expected}{_choice(bag, name)}")
+
+
+def _choice(bag: RosBag, name: str) -> str:
+    """Return the end of an error message that lists the possible topics of an option; "" = none."""
+    existing = bag.topics(*KINDS[name])
+    return f"; set {OPTIONS[name]} to one of these topics: {', '.join(existing)}" if existing else ""

@@ -13,7 +13,7 @@ from framework.errors import DataError
 from framework.importing.bags.ros_messages import TRANSFORMS, RosBag
 
 REALSENSE = "/device_"  # prefix of topics of RealSense's recorder
-SMALLEST_QUATERNION = 0.5  # minimum length of a valid quaternion
+SMALLEST_QUATERNION = 0.5  # minimum norm of a valid quaternion
 
 
 def stream_motion(bag: RosBag, stream: str) -> Float64 | None:

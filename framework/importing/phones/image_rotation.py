@@ -1,4 +1,4 @@
-"""Rotation of images, cameras, poses and lenses by quarter turns, because phones store images in sensor orientation.
+"""Rotation of images, cameras, poses and lenses by quarter turns. Phones store images in sensor orientation.
 
 A clockwise quarter turn moves the pixel (u, v) of an image of height H to (H - 1 - v, u). A point
 (x, y, z) in the camera frame becomes (-y, x, z).
@@ -18,7 +18,7 @@ from framework.datasets.calibration.undistortion import Distortion
 
 Value = TypeVar("Value", bound=np.generic)
 QUARTER = 90  # degrees
-# minimum length of the mean up direction in the image plane; it is smaller if the camera faces up or down
+# minimum length of the mean up vector's projection onto the image plane; smaller if the camera faces up or down
 SIDEWAYS = 0.5
 
 

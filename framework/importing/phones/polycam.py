@@ -34,7 +34,7 @@ ROWS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 
 
 def keyframes(path: Path) -> Path:
-    """Return the folder with the images: `path` or its subfolder."""
+    """Return the subfolder keyframes/ of `path`, or `path` itself if there is no such subfolder."""
     return path / "keyframes" if (path / "keyframes").is_dir() else path
 
 
@@ -49,8 +49,11 @@ def open_source(path: Path) -> Source:
     stems = [entry.stem for entry in (folder / "cameras").glob("*.json")]
     stems = sorted((stem for stem in stems if re.fullmatch("[0-9]{1,18}", stem)), key=int)
     if not (folder / "depth").is_dir() or not stems:
-        expected = "expected cameras/ with camera files, and depth/, got none"
-        raise DataError(f"{path}: {expected}; record with a LiDAR device, and export with Polycam's developer mode on")
+        expected = "expected camera files in cameras/ and a folder depth/"
+        found = "got no folder depth/" if stems else "got no camera files"
+        raise DataError(
+            f"{path}: {expected}, {found}; record with a LiDAR device, and export with Polycam's developer mode on"
+        )
     frames = [partial(_read, folder, stem) for stem in stems]
     return Source("Polycam", frames, len(frames), posed=True, sensor=SensorKind.PHONE_LIDAR)
 
@@ -79,9 +82,9 @@ def _read(folder: Path, stem: str) -> DeviceFrame:
 
 
 def _pose(path: Path, content: dict[str, Any]) -> Float64:
-    """Return T_world_camera (4, 4) in the content of a camera file. Raises DataError that names the file."""
+    """Return T_world_camera (4, 4) in the content of a camera file. Raises a DataError that names the file."""
     rows = np.reshape(numbers_of(path, content, *ROWS), (3, 4))
     return arkit_pose(path, np.vstack([rows, [[0, 0, 0, 1]]]))
 
 
-FORMAT = Format("polycam", "a folder with keyframes/, exported as raw data from Polycam", recognized, open_source)
+FORMAT = Format("polycam", "a folder with keyframes/, exported from Polycam as raw data", recognized, open_source)

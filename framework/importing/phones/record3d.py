@@ -94,7 +94,7 @@ class R3dFile:
     """Images of an .r3d file, with the methods of `ExrFolder`."""
 
     def __init__(self, path: Path) -> None:
-        """Open an .r3d file. Raises DataError that names the file if it is not a zip archive."""
+        """Open an .r3d file. Raises a DataError that names the file if it is not a zip archive."""
         self.path = path
         try:
             self._zip = zipfile.ZipFile(path)
@@ -228,7 +228,7 @@ def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) 
 
 
 def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDArray[np.floating]:
-    """Return the depth (h, w), m. The header is checked first, because it determines the required memory."""
+    """Return the stored depth (h, w), m. The header is checked first, because it determines the required memory."""
     OpenEXR = _load_openexr()
     try:
         header = OpenEXR.File(io.BytesIO(data), header_only=True).header()
@@ -238,8 +238,8 @@ def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDAr
     except Exception as error:  # OpenEXR has no common base exception
         raise FrameError(f"{path}: expected an EXR file, got an error ({in_one_line(error)[:SHOWN]})") from error
     if found != shape or names != [CHANNEL] or math.prod(shape) > MAX_PIXELS:
-        expected = f"expected {shape[1]}x{shape[0]} px of {CHANNEL}"
-        raise FrameError(f"{path}: {expected}, got {found[1]}x{found[0]} px of {', '.join(names)[:60]}")
+        expected = f"expected {shape[1]}x{shape[0]} px with the channel {CHANNEL}"
+        raise FrameError(f"{path}: {expected}, got {found[1]}x{found[0]} px with {', '.join(names)[:60]}")
     try:
         image = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()[CHANNEL].pixels
     except Exception as error:
@@ -257,6 +257,6 @@ def _is_r3d(path: Path) -> bool:
     return path.suffix.lower() == ".r3d" and path.is_file()
 
 
-EXPORT = 'a folder with metadata.json, rgb/ and depth/, exported as "EXR + RGB" from Record3D'
+EXPORT = 'a folder with metadata.json, rgb/ and depth/, exported from Record3D as "EXR + RGB"'
 FOLDER_FORMAT = Format("record3d_exr", EXPORT, _is_export, open_folder)
 FILE_FORMAT = Format("record3d", "an .r3d file exported from Record3D", _is_r3d, open_file)

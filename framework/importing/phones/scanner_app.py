@@ -64,5 +64,5 @@ def _read(folder: Path, number: str) -> DeviceFrame:
     )
 
 
-NEEDS = 'a folder with frame_00000.json, exported as "All Data" from 3D Scanner App'
+NEEDS = 'a folder with frame_00000.json, exported from 3D Scanner App as "All Data"'
 FORMAT = Format("scanner_app", NEEDS, recognized, open_source)

@@ -116,10 +116,10 @@ def _read_camera(path: Path, video: Video) -> Camera:
 
 
 class Video:
-    """Reader of video frames in sensor orientation, like depth. The rotation in the metadata is ignored."""
+    """Reader of video frames in sensor orientation, as for depth. The rotation in the metadata is ignored."""
 
     def __init__(self, path: Path) -> None:
-        """Open a video. Raises DataError that names the file if it cannot be decoded."""
+        """Open a video. Raises a DataError that names the file if it cannot be decoded."""
         check_regular(path)
         with path.open("rb") as file:
             if not (start := file.read(KIND_AT + len(KIND))).endswith(KIND):
@@ -141,9 +141,9 @@ class Video:
         self._next = 0
 
     def frame(self, number: int) -> UInt8:
-        """Return the color (H, W, 3), RGB, of frame `number` (0 = first). Raises FrameError.
+        """Return the color (H, W, 3), RGB, of frame `number` (0 = first).
 
-        Frames must be read in ascending order.
+        Raises FrameError if frames are not read in ascending order or the frame cannot be decoded.
         """
         if number < self._next - 1:
             raise FrameError(f"{self.path}: expected increasing frames, got {number} after {self._next - 1}")

@@ -29,7 +29,7 @@ from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
-VOTES_ACROSS = 320  # number of voting pixels per image row; more pixels take longer without improving the result
+VOTES_ACROSS = 320  # approximate number of voting pixels per image row; more take longer without improving the result
 
 
 class InstanceSource(Enum):
@@ -44,7 +44,7 @@ class OverlapRule(Enum):
 
     SMALLER = "size of the smaller of cluster and instance, so that a part of an object matches the whole"
     IOU = "number of pixels in the union of cluster and instance"
-    CLUSTER = "size of the cluster, so that a small part of an object matches it, but not always the reverse"
+    CLUSTER = "size of the cluster, so that a detected part of an object matches the whole; the reverse may fail"
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,13 @@ class Overlaps:
     stride: int  # distance between the samples in `seen`, px
 
     def by(self, rule: OverlapRule, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return the overlaps (N, M) in [0, 1] by a rule; see `over_smaller` for `min_pixels`."""
+        """Return the overlaps (N, M), in [0, 1], with the denominator `rule`, which is at least `min_pixels`."""
         if rule is OverlapRule.CLUSTER:
             return np.asarray(self.votes / np.maximum(self.sizes[:, None], min_pixels))
         return self.over_smaller(min_pixels) if rule is OverlapRule.SMALLER else self.over_union(min_pixels)
 
     def over_union(self, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return the IoUs (N, M) in [0, 1] of clusters and visible instances; a union has at least `min_pixels`."""
+        """Return the IoUs (N, M), in [0, 1], of clusters and instances, with a union of at least `min_pixels`."""
         union = self.sizes[:, None] + self.visible[None, :] - self.votes
         return np.asarray(self.votes / np.maximum(union, min_pixels))
 
@@ -79,9 +79,10 @@ class Overlaps:
 
 
 def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> Overlaps:
-    """Return the overlaps of clusters with `instance_ids` (h, w), 0 = none, sampled at every stride-th pixel.
+    """Return the overlaps of the clusters in `points` with the visible instances.
 
-    Each sample counts as stride^2 pixels.
+    `instance_ids` (h, w), 0 = none, samples every stride-th pixel of every stride-th row. Each sample counts as
+    stride^2 pixels.
     """
     is_seen = np.zeros(instance_ids.max() + 1, np.bool_)
     find_seen(instance_ids, is_seen)
@@ -102,15 +103,15 @@ def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> 
 
 
 def class_agreement(clusters: Float32, instances: Float32) -> npt.NDArray[np.float64]:
-    """Return the Bhattacharyya coefficients (N, M) in [0, 1] of distributions (N, C) and (M, C); 1 = equal."""
+    """Return the Bhattacharyya coefficients (N, M), in [0, 1], of class distributions (N, C) and (M, C); 1 = equal."""
     return np.asarray(np.sqrt(clusters.astype(np.float64)) @ np.sqrt(instances.astype(np.float64)).T)
 
 
 def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int32:
     """Return the matched column (N,) of each row, -1 = unmatched.
 
-    The matching of the `allowed` pairs (N, M) is greedy, largest preference first. Ties go to the smaller column, then
-    to the smaller row.
+    The matching of the `allowed` pairs (N, M) is greedy, in order of decreasing `preference` (N, M). Ties go to the
+    smaller column, then to the smaller row.
     """
     match = np.full(len(allowed), -1, np.int32)
     rows, columns = np.nonzero(allowed)
@@ -136,7 +137,7 @@ class LabeledMap(Protocol):
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
         """Return the most likely instance (ceil(H / stride), ceil(W / stride)) at the measured surface, 0 = none.
 
-        Samples every stride-th depth reading of every stride-th row of `frame.depth`. Unlike ray casting, the
+        The samples are every stride-th depth reading of every stride-th row of `frame.depth`. Unlike ray casting, the
         look-up never returns an instance that is hidden behind a new object.
         """
 
@@ -160,8 +161,8 @@ class Matches:
 def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min_pixels: int) -> None:
     """Update the table with the `class_evidence` (N, C) of the clusters.
 
-    An instance is in view if it is visible in at least `min_pixels` pixels, or if it was detected. Frames without a
-    detector run are ignored.
+    An instance is in view if it is visible in at least `min_pixels` pixels, or if it was detected. Frames on which the
+    detector did not run are ignored.
     """
     if not matches.clusters.detected:
         return
@@ -178,7 +179,10 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min
 
 
 def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding]:
-    """Return the embedding of each cluster, weighted by its score. Clusters without an embedding are omitted."""
+    """Return the embedding of each cluster by index, weighted by its score.
+
+    Clusters without an embedding or with score 0 are omitted.
+    """
     if clusters.embeddings is None:
         return {}
     embedded = np.flatnonzero(clusters.embeddings.any(axis=1) & (clusters.scores > 0))
@@ -193,17 +197,20 @@ class Association:
     association: InstanceSource = InstanceSource.SURFACE_LOOKUP
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # denominator of the overlap
-    # minimum Bhattacharyya coefficient of the class distributions to match, in [0, 1]; 0 = any classes match
+    # minimum Bhattacharyya coefficient of the class distributions of a cluster and an instance to match, in [0, 1]; 0 =
+    # any classes match
     min_class_agreement: float = 0.0
-    create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; updates have no minimum
+    create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; no minimum for updates
     # minimum number of points of a cluster to create an instance, >= 1; also the minimum denominator of the overlap
     create_points: int = 50
     split_instances: bool = True  # True = create an instance for the second of two clusters that match an instance
     # minimum overlap of two instances with one cluster to merge them, in [0, 1]; 1 = no merging
     merge_overlap: float = 1.0
-    # minimum number of frames with a joint cluster, minus frames with separate clusters, to merge, >= 1
+    # minimum number of frames in which two instances share a cluster, minus the frames in which they match separate
+    # clusters, for a merge, >= 1
     merge_frames: int = 3
-    # minimum Bhattacharyya coefficient of the class distributions to merge, in [0, 1]; 0 = any classes are merged
+    # minimum Bhattacharyya coefficient of the class distributions of two instances to merge them, in [0, 1]; 0 = any
+    # classes are merged
     merge_agreement: float = 0.1
 
     def __post_init__(self) -> None:
@@ -234,7 +241,10 @@ class Association:
         return count_overlaps(points, scene.instances_seen(frame, pose.T_world_camera, stride), stride)
 
     def associate(self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, frame_index: int) -> Matches:
-        """Return the matches. An unmatched cluster creates an instance if its score and size are sufficient."""
+        """Match the clusters to instances, and return the matches.
+
+        An unmatched cluster creates an instance if it meets `create_score` and `create_points`.
+        """
         frame_index = table.number_of(frame_index)
         allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
@@ -250,7 +260,7 @@ class Association:
         return Matches(frame_index, clusters, overlaps, instance_ids)
 
     def _agree(self, table: InstanceTable, clusters: PointClusters, instance_ids: Int32) -> Bool:
-        """Return an array (N, M), True if the classes of a cluster and an instance allow a match."""
+        """Return a Boolean array (N, M), True where the classes of cluster n and instance m allow a match."""
         if self.min_class_agreement == 0 or not len(instance_ids):
             return np.ones((len(clusters), len(instance_ids)), np.bool_)
         known = np.stack([table.class_probabilities(table.records[int(k)]) for k in instance_ids])
@@ -261,7 +271,10 @@ class Association:
         observe(table, matches, class_evidence, self.create_points)
 
     def merge(self, scene: LabeledMap, matches: Matches) -> None:
-        """Merge two instances that often share one cluster and are rarely detected separately (as in Voxblox++)."""
+        """Merge two instances that often share a cluster and are rarely detected separately (as in Voxblox++).
+
+        At most one pair is merged per frame.
+        """
         matched = sorted(set(matches.instance_ids[matches.instance_ids > 0].tolist()))
         self._merge_votes.subtract(combinations(matched, 2))
         for k, row in enumerate(matches.overlaps.over_smaller(self.create_points)):
@@ -272,15 +285,15 @@ class Association:
                 self._merge_votes[pair] += 1
                 if self._merge_votes[pair] >= self.merge_frames and self._same_class(scene.table, *pair):
                     scene.merge(*pair)
-                    self._forget(pair[1])
+                    self._remove_votes(pair[1])
                     return  # the overlaps are now outdated; other pairs can be merged in later frames
 
     def _same_class(self, table: InstanceTable, a: int, b: int) -> bool:
-        """Return True if the classes of two instances allow a merge, unlike those of a book and a table."""
+        """Return True if the classes of two instances allow a merge; a book and a table, for example, do not."""
         known = [table.class_probabilities(table.records[k])[None] for k in (a, b)]
         return bool(class_agreement(*known)[0, 0] >= self.merge_agreement)
 
-    def _forget(self, instance_id: int) -> None:
+    def _remove_votes(self, instance_id: int) -> None:
         self._merge_votes = Counter({pair: n for pair, n in self._merge_votes.items() if instance_id not in pair})
 
 
@@ -291,7 +304,7 @@ def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str,
     """
     if known and known != found:
         raise DataError(
-            f"detector: expected the {len(known)} classes of the map, got {len(found)} different classes in the "
-            "frame's clusters; use one detector, or map all detectors to one label space"
+            f"detector: expected the label space of the map (length {len(known)}), got a different label space "
+            f"(length {len(found)}); use one detector, or map all detectors to one label space"
         )
     return found

@@ -22,8 +22,8 @@ def look_up_instances(
 ) -> None:
     """Fill instance_ids (ceil(H / stride), ceil(W / stride)) with the most likely instances of voxels, 0 = none.
 
-    Looks up the voxel nearest to every stride-th depth reading of every stride-th row of `depth` (H, W), m. `view`
-    contains T_world_camera.
+    The voxels are those nearest to the surface points of every stride-th depth reading of every stride-th row of
+    `depth` (H, W), m. `view` contains T_world_camera.
     """
     columns = instance_ids.shape[1]
     for row in prange(instance_ids.shape[0]):
@@ -68,8 +68,9 @@ def _add_run(count, list_id, label, offsets, clusters, column, votes):
 def count_votes(points, instance_ids, stride, column, votes):
     """Add the number of pixels of each cluster (row) on each instance (column) to votes (CHUNKS, N + 1, M + 1).
 
-    The last row counts all pixels. The kernel counts runs of equal pixels, because incrementing a counter in memory for
-    each pixel would be slower.
+    The last row counts all pixels. `instance_ids` (h, w) samples every stride-th pixel of every stride-th row, and
+    `column` maps an instance id to its column. The kernel counts runs of pixels with the same list and instance,
+    because incrementing a counter in memory for each pixel would be slower.
     """
     list_ids, offsets, clusters = points.list_ids, points.offsets, points.clusters
     rows = instance_ids.shape[0]

@@ -16,7 +16,7 @@ from framework.mapping.instances.association import agreed_classes
 from framework.mapping.instances.instance_table import InstanceRecord, InstanceTable
 from framework.mapping.storage.map_header import MapHeader
 
-MIN_VERTICES = 4  # minimum number of vertices that span a box
+MIN_VERTICES = 4  # minimum number of mesh vertices of an instance, enough to span a box
 
 
 class InstanceClass(Enum):
@@ -43,7 +43,7 @@ class Confirmation:
 
     @classmethod
     def of(cls, saved: MapHeader) -> Confirmation:
-        """Return the conditions in a map's header. Raises DataError or ConfigError if they are invalid."""
+        """Return the conditions in the header of a map file. Raises DataError or ConfigError if they are invalid."""
         return cls(saved.whole("min_observations"), saved.number("min_confidence"), saved.number("min_area"))
 
     def is_met(self, record: InstanceRecord) -> bool:
@@ -51,18 +51,21 @@ class Confirmation:
         return record.observations >= self.min_observations and record.confidence >= self.min_confidence
 
     def counts(self, table: InstanceTable) -> Bool:
-        """Return an array (last id + 1,), indexed by id: True = all conditions except the minimum area are met."""
+        """Return a Boolean array (last id + 1,), indexed by id, True where all conditions except `min_area` are met."""
         counts = np.zeros(table.last_id + 1, np.bool_)
         for record in table.records.values():
             counts[record.id] = self.is_met(record)
         return counts
 
     def min_vertices(self, voxel_size: float) -> int:
-        """Return the number of mesh vertices of an instance with an area of `min_area`."""
+        """Return the number of mesh vertices of an instance with the area `min_area`; `voxel_size` is in m."""
         return vertices_of_area(self.min_area, voxel_size)
 
     def too_small(self, instance_ids: Int32, voxel_size: float) -> Bool:
-        """Return an array (V,), True for each vertex of an instance below `min_area`. `instance_ids` is (V,)."""
+        """Return a Boolean array (V,), True where the instance of a vertex has a smaller area than `min_area`.
+
+        `instance_ids` (V,) holds the instance of each vertex, and `voxel_size` is in m.
+        """
         return np.asarray((np.bincount(instance_ids) < self.min_vertices(voxel_size))[instance_ids])
 
 
@@ -121,8 +124,8 @@ class InstanceTableMap(SceneMap):
 def vertices_of_area(area: float, voxel_size: float) -> int:
     """Return the number of vertices of a surface of `area` m^2, at least MIN_VERTICES.
 
-    A vertex counts as voxel_size^2. The area is exact if the surface is parallel to the grid. The mesh has one vertex
-    for each voxel that the surface crosses, so other surfaces have up to sqrt(3) times as many vertices.
+    A vertex counts as voxel_size^2, m^2. The area is exact if the surface is parallel to the grid. The mesh has one
+    vertex for each voxel that the surface crosses, so other surfaces have up to sqrt(3) times as many vertices.
     """
     return max(MIN_VERTICES, round(area / voxel_size**2))
 
@@ -149,7 +152,7 @@ def box_around(points: Float32, up: Float64 | None) -> Box:
 
 
 def upright_box(points: Float32, up: Float64) -> Box:
-    """Return the box around points (M, 3), m, with its third axis along `up` (3,) and the smallest footprint."""
+    """Return the box around points (M, 3), m, with its third axis along the unit vector `up` and minimum footprint."""
     ground_axes = np.linalg.svd(up[None])[2][1:]  # (2, 3)
     center = points.mean(axis=0, dtype=np.float64)
     ground, heights = (points - center) @ ground_axes.T, (points - center) @ up
@@ -164,7 +167,7 @@ def upright_box(points: Float32, up: Float64) -> Box:
 
 def oriented_box(points: Float32) -> Box:
     """Return the box along the principal axes of the convex hull of points (M, 3), m, which may be coplanar."""
-    import open3d as o3d  # takes half a second and 170 MB; most maps have gravity and do not need it
+    import open3d as o3d  # takes 0.5 s and 170 MB; maps with known gravity do not need it
 
     four = np.resize(points, (max(len(points), 4), 3))  # Qhull needs four points; repeated points do not change the box
     box = o3d.geometry.OrientedBoundingBox.create_from_points(

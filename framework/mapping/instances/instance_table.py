@@ -87,23 +87,23 @@ class InstanceTable:
         self._offset = 0  # offset of the frame indices of this sequence
         self.combine = combine
         self.logarithmic = logarithmic
-        self.embedding_space = ""  # space of the instances' embeddings; "" = no embeddings
+        self.embedding_space = ""  # space of the embeddings of the instances; "" = no embeddings
 
     def create(self, classes: int, frame_index: int) -> InstanceRecord:
-        """Create an instance without observations, with zero evidence for each of `classes` classes."""
+        """Create an instance in a frame, without observations and with zero evidence for each of `classes` classes."""
         self.last_id += 1
         record = InstanceRecord(self.last_id, np.zeros(classes), first_frame=frame_index, last_frame=frame_index)
         self.records[self.last_id] = record
         return record
 
     def begin_recording(self) -> None:
-        """Begin another sequence, whose frame indices may repeat those of previous sequences."""
+        """Begin another sequence. Its frame indices may repeat frame indices of previous sequences."""
         spans = [span[1] for record in self.records.values() for span in record.in_view.spans[-1:]]
         self._last_before = max([*spans, *(record.last_frame for record in self.records.values())], default=-1)
         self._offset = 0
 
     def number_of(self, frame_index: int) -> int:
-        """Return the index of a frame in this map, offset to be above all frames of previous sequences."""
+        """Return `frame_index` plus an offset, so that the result exceeds all frame indices of previous sequences."""
         if frame_index + self._offset <= self._last_before:
             self._offset = self._last_before + 1
         return frame_index + self._offset
@@ -116,7 +116,7 @@ class InstanceTable:
         frame_index: int,
         embedding: ObjectEmbedding | None = None,
     ) -> None:
-        """Add one detection with the evidence (C,) for its classes."""
+        """Add one detection to an instance: its class evidence (C,), score, frame and optional embedding."""
         record = self.records[instance_id]
         record.class_evidence = _combined(record.class_evidence, class_evidence, self.combine)
         record.last_frame = max(record.last_frame, frame_index)

@@ -13,7 +13,10 @@ from framework.errors import DataError
 from framework.mapping.storage.map_header import LARGEST_COUNT, MapHeader
 
 ARRAYS = ("embedding_ids", "embedding_sums", "embedding_weights", "embedding_counts")
-"""Arrays of a map file with embeddings: (M,) int32, (M, D) float64, (M,) float64, (M,) int64."""
+"""Arrays of a map file with D-dimensional embeddings of M instances.
+
+Their shapes and types are (M,) int32, (M, D) float64, (M,) float64 and (M,) int64.
+"""
 
 SPACE = "embedding_space"  # key of the embedding space in a saved table
 MAX_WEIGHT = 1e12  # maximum weight of an embedding
@@ -21,7 +24,7 @@ MAX_WEIGHT = 1e12  # maximum weight of an embedding
 
 @dataclass(frozen=True)
 class ObjectEmbedding:
-    """A weighted sum of unit vectors."""
+    """The embedding of an object: the weighted sum of the unit embedding vectors of its detections."""
 
     sum: Float64  # (D,)
     weight: float  # > 0, the sum of the weights
@@ -35,20 +38,20 @@ class ObjectEmbedding:
     def __add__(self, other: ObjectEmbedding) -> ObjectEmbedding:
         if self.sum.shape != other.sum.shape:
             raise DataError(
-                f"embeddings: expected equal lengths, got {len(self.sum)} and {len(other.sum)}; map again with one "
-                "embedding model"
+                f"detector: expected embeddings of equal length, got {len(self.sum)} and {len(other.sum)} numbers; map "
+                "again with one embedding model"
             )
         return ObjectEmbedding(self.sum + other.sum, self.weight + other.weight, self.count + other.count)
 
     @property
     def mean(self) -> Float32:
-        """The unit vector (D,) along the sum; 0 if the vectors cancel out."""
+        """Unit vector (D,) along the sum; zeros if the vectors cancel out."""
         length = float(np.linalg.norm(self.sum))
         return np.asarray(self.sum / length if length > 0 else self.sum, np.float32)
 
     @property
     def spread(self) -> float:
-        """1 - |mean of the unit vectors|, in [0, 1]; 0 = all equal."""
+        """1 minus the length of the weighted mean of the unit vectors, in [0, 1]; 0 = all equal."""
         return float(np.clip(1 - np.linalg.norm(self.sum) / self.weight, 0, 1))
 
 
@@ -66,8 +69,8 @@ def agreed_space(known: str, found: str) -> str:
     """
     if known and known != found:
         raise DataError(
-            f"detector: expected embeddings from {known} (as in the map), got {found}; use the model of the "
-            "map, or map again"
+            f"detector: expected embeddings from {known} (as in the map), got {found}; use the embedding "
+            "model of the map, or map again"
         )
     return found
 

@@ -5,8 +5,8 @@ Therefore, these intrinsics emit vector instructions, which LLVM compiles for an
 has other types and more slots, and uses loops with the same results.
 
 A quantized score is a log-odds (or a vote) times the scale of the label rule, rounded. Each entry of `cluster_scores`
-(NO_CLASS + 1,) holds the score of a class in the upper bits. Bit m of the lowest NEW_CLASSES bits is set for the m-th
-named class.
+(NO_CLASS + 1,), indexed by class, holds the score of the class in the bits above the lowest NEW_CLASSES bits. Bit m of
+the lowest NEW_CLASSES bits is set for the m-th named class of the cluster.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from framework.mapping.voxels.voxel_grid_kernels import device
 
 CLASS_SLOTS = 16  # number of class slots of a voxel in compact storage
 NO_CLASS = 255  # class id of a free slot; slots are filled from the front
-NEW_CLASSES = 8  # number of classes that a cluster names and can add to the slots of a voxel
-ALL_NAMED = (1 << NEW_CLASSES) - 1
+NEW_CLASSES = 8  # maximum number of named classes of a cluster; only these can be added to the slots of a voxel
+ALL_NAMED = (1 << NEW_CLASSES) - 1  # bits of all named classes
 
 _OPTIONS = {"forceinline": True, "error_model": "numpy", "_nrt": False}  # the options of `device`
 
 
 @device
 def add_scores(classes, scores, cluster_scores, limit):
-    """Add the scores of a cluster to the scores (T,) of a voxel's classes (T,). Scores stay at -limit or above.
+    """Add `cluster_scores` (NO_CLASS + 1,) to the `scores` (T,) of the `classes` (T,) of a voxel.
 
-    Returns the bits of the named classes that have a slot, the number of filled slots, and the excess of the largest
-    score over `limit`.
+    Sums below -limit become -limit. Returns the bits of the named classes that have a slot, the number of filled slots,
+    and the largest sum minus `limit`.
     """
     return _add_scores(classes, scores, cluster_scores, limit)
 
 
 @device
 def most_likely_slot(classes, scores):
-    """Return the slot with the highest score; ties go to the smaller class."""
+    """Return the slot of the class with the highest score; ties go to the smaller class id."""
     return _most_likely_slot(classes, scores)
 
 
@@ -111,7 +111,7 @@ class _Slots:
         stored.align = 1
 
     def gather(self, table: Any, indices: Any) -> Any:
-        """Return the entries of a table at the byte vector `indices`."""
+        """Return the entries of the table at address `table`, at the CLASS_SLOTS byte indices at address `indices`."""
         found = ir.Constant(_vector(table.type.pointee), ir.Undefined)
         for s in range(CLASS_SLOTS):
             index = self.builder.zext(self.builder.load(self.builder.gep(indices, [_INT32(s)])), _INT32)

@@ -1,7 +1,7 @@
 """Storage and update of the evidence rows of `label_evidence.py`.
 
 In compact storage, a labeled voxel takes 80 bytes of slots: 8 for each instance slot and 3 for each class slot. A row
-takes 2 KiB. Only voxels near the surface that were under a mask are labeled.
+takes 2 KiB. A voxel becomes labeled when it is near the measured surface and projects to a pixel inside a mask.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
 INSTANCE_SLOTS = 4  # number of instance slots of a voxel in compact storage
-RESERVED = 128  # number of labeled voxels reserved per block of the budget; most blocks have fewer; grows if needed
-ANY_INSTANCE = np.uint64(2**BITS - 1)
-SLOTS = Evidence._fields[1:]
+RESERVED = 128  # number of labeled voxels reserved per block of the budget; grows if needed; most blocks need fewer
+ANY_INSTANCE = np.uint64(2**BITS - 1)  # instance set with every bit set
+SLOTS = Evidence._fields[1:]  # fields with one row per labeled voxel
 
 
 class Storage(Enum):
-    """Labels that a voxel stores: the most likely labels, or all labels."""
+    """Labels that a voxel stores: COMPACT = the most likely labels, EXACT = all labels."""
 
     COMPACT = "compact"
     EXACT = "exact"
@@ -73,7 +73,7 @@ class EvidenceRows:
         self._free()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without reserved capacity, which takes gigabytes."""
+        """Return the state without reserved capacity, which may be gigabytes."""
         rows = {name: getattr(self, name)[: self.row_count] for name in ("_labeled", "_row_bits")}
         used = {**rows, "_slots": self._slots[: self.voxel_count]}
         return {**vars(self), **used, "evidence": None}
@@ -94,7 +94,10 @@ class EvidenceRows:
         return Evidence(self.evidence.labeled[: self.row_count], **slots)
 
     def fill(self, saved: Evidence) -> None:
-        """Copy evidence into new slots: that of a saved map, or its own evidence when the number of slots increases."""
+        """Replace the evidence with a copy of `saved`, which may have fewer slots per voxel.
+
+        `saved` is the evidence of a map file, or the current evidence if the number of instance slots increases.
+        """
         self._instance_slots = max(self._instance_slots, saved.instance_ids.shape[1])
         self._free()
         self._reserve(len(saved.labeled), len(saved.instance_ids))
@@ -131,17 +134,18 @@ class EvidenceRows:
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:
-        """Combine the evidence for instance `dropped` with that for `kept` in every voxel.
+        """Combine the evidence for instance `dropped` with the evidence for `kept` in every voxel.
 
-        Merging is rare. It visits only the blocks whose instance set has the bit of the dropped instance.
+        Merging visits only the rows whose instance set contains the bit of `dropped`.
         """
         row_bits = self._row_bits[: self.row_count]
         merge_instances(self.evidence, row_bits, np.int32(kept), np.int32(dropped), int(self.combine))
 
     def classes_of_instances(self, counts: Bool, classes: int) -> Float64:
-        """Return the evidence (ids + 1, classes) of each instance with counts[id], summed over its voxels.
+        """Return the class evidence (ids + 1, classes) of each instance, indexed by id, summed over its voxels.
 
-        A voxel belongs to its most likely instance among the counted instances.
+        A voxel belongs to its most likely instance among those with `counts[id]` True. The evidence of the other
+        instances is 0.
         """
         sums = np.zeros((len(counts), classes), np.int64)
         sum_classes_of_instances(self.in_use(), counts, sums)
@@ -161,7 +165,7 @@ class EvidenceRows:
         self.evidence = Evidence(self._labeled, **{name: self._slots[name] for name in SLOTS})
 
     def _free_classes(self) -> UInt8:
-        """Return the class slots of a new voxel: free slots, or every class in exact storage."""
+        """Return the class ids (T,) in the slots of a new voxel: free slots, or every class in exact storage."""
         named = np.arange(self._class_slots) if self.storage is Storage.EXACT else np.full(self._class_slots, NO_CLASS)
         return named.astype(np.uint8)
 

@@ -18,7 +18,7 @@ from framework.mapping.voxels.integration_kernels import GROUP
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, device, one_more
 from framework.mapping.voxels.voxel_walk import prefetch_line, prefetch_row
 
-BITS = 64  # bits of the instance set of a row or a list; instance k is bit k % BITS
+BITS = 64  # number of bits of the instance set of a row or a list; instance k sets bit k % BITS
 
 
 @device
@@ -29,7 +29,7 @@ def _has_clusters(measurement, list_id):
 
 @device
 def _label(evidence, row, n, voxel, free_classes):
-    """Assign the slots at index `voxel` to voxel n of a row."""
+    """Assign the slots at index `voxel` to voxel n of a row, and clear them."""
     evidence.labeled[row, n] = voxel
     for s in range(evidence.instance_ids.shape[1]):
         evidence.instance_ids[voxel, s] = 0
@@ -41,7 +41,10 @@ def _label(evidence, row, n, voxel, free_classes):
 
 @device
 def _prefetch_slots(evidence, voxel):
-    """Prefetch the slots of a labeled voxel; in compact storage, all of its slots."""
+    """Prefetch the first and the last cache line of the slots of a labeled voxel.
+
+    In compact storage, these lines contain all of its slots.
+    """
     size = evidence.instance_ids.strides[0]
     start = np.int64(voxel) * size
     prefetch_line(evidence.instance_ids, start)
@@ -55,7 +58,7 @@ def _instance_bit(instance):
 
 @njit(cache=True, nogil=True)
 def find_list_bits(offsets, clusters, instance_id, list_bits):
-    """Fill list_bits (L,) with the instance bits of each list."""
+    """Fill list_bits (L,) with the instance set of each list of clusters; instance k sets bit k % BITS."""
     for i in range(list_bits.shape[0]):
         list_bits[i] = 0
         for entry in range(offsets[i], offsets[i + 1]):
@@ -64,10 +67,10 @@ def find_list_bits(offsets, clusters, instance_id, list_bits):
 
 @njit(cache=True, nogil=True, parallel=True)
 def update_rows(grid, seen, evidence, measurement, list_bits, row_bits, new, evicted):
-    """Update the voxels near the surface that have slots, and the instance bits row_bits (R,) of their rows.
+    """Update the voxels near the surface that have slots, and the instance sets row_bits (R,) of their rows.
 
-    Sets new (A,) to the number of near voxels in each block without slots and with clusters in their list. Sets evicted
-    (A,) to the number of evictions.
+    Sets new (A,) to the number of near voxels of each block that have no slots, but a cluster at their pixel. Sets
+    evicted (A,) to the number of evictions in each block.
     """
     list_ids = measurement.list_ids.ravel()
     blocks = seen.blocks.shape[0]
@@ -102,7 +105,9 @@ def update_rows(grid, seen, evidence, measurement, list_bits, row_bits, new, evi
 def number_new(blocks, new, row_of, row_count, voxel_count, rows, first_new):
     """Fill rows (A,) with the row of each block and first_new (A,) with the index of its first new voxel.
 
-    A block without a row gets a row if it has new (A,) voxels. Returns the numbers of rows and voxels.
+    `blocks` (A,) are the updated blocks, new (A,) the number of new voxels of each, and row_of (B,) the row of every
+    block, -1 = none. A block without a row gets one if it has new voxels. Returns row_count and voxel_count, including
+    the new rows and voxels.
     """
     for a in range(blocks.shape[0]):
         rows[a], first_new[a] = row_of[blocks[a]], voxel_count
@@ -117,7 +122,7 @@ def number_new(blocks, new, row_of, row_count, voxel_count, rows, first_new):
 def label_new(grid, seen, evidence, measurement, list_bits, row_bits, new, free_classes, evicted):
     """Assign slots to the `new` voxels of each block, and update them as update_rows() does.
 
-    free_classes (T,) are the class slots of a voxel without evidence. Evictions are added to evicted (A,).
+    free_classes (T,) are the class ids in the slots of a voxel without evidence. Evictions are added to evicted (A,).
     """
     row_of = grid.label_row  # numba 0.68 loses assignments to an element of a tuple's array within prange
     list_ids = measurement.list_ids.ravel()
@@ -149,7 +154,7 @@ def fewest_free(instance_ids):
 
 @device
 def _merge_voxel(ids, values, kept, dropped, combine):
-    """Move a voxel's evidence for instance `dropped`, if any, to `kept`."""
+    """Combine the evidence of a voxel for instance `dropped`, if any, with the evidence for `kept`, and free a slot."""
     for s in range(len(ids)):
         if ids[s] == dropped:
             value = values[s]
@@ -181,7 +186,7 @@ def merge_instances(evidence, row_bits, kept, dropped, combine):
 def sum_classes_of_instances(evidence, counts, sums):
     """Add the quantized class scores of every labeled voxel to the sums (ids + 1, C) of its instance.
 
-    The instance of a voxel is its most likely instance with counts[id].
+    The instance of a voxel is its most likely instance among those with `counts[id]` True.
     """
     for voxel in range(evidence.class_ids.shape[0]):
         instance = best_counted_instance(evidence, voxel, counts)

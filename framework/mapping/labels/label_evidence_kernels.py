@@ -23,10 +23,10 @@ class Combine(IntEnum):
 
     SUM = 0
     LARGEST = 1
-    LATEST = 2  # removes the other labels
+    LATEST = 2  # the new label replaces all others
 
 
-UNBOUNDED = np.float32(np.inf)
+UNBOUNDED = np.float32(np.inf)  # `limit` of add_evidence() for unlimited sums
 SUM, LARGEST, LATEST = (int(combine) for combine in Combine)  # for the kernels
 
 
@@ -51,7 +51,10 @@ def best_instance(evidence, voxel):
 
 @device
 def best_counted_instance(evidence, voxel, counts):
-    """Return a labeled voxel's most likely instance with counts[id], 0 if unnamed instances are more likely."""
+    """Return the most likely instance of a labeled voxel among those with `counts[id]` True.
+
+    Returns 0 if unnamed instances are more likely.
+    """
     best = np.int32(0)
     best_value = np.float32(0.0)
     for s in range(evidence.instance_ids.shape[1]):
@@ -72,10 +75,11 @@ def best_class(evidence, voxel):
 
 @device
 def add_evidence(labels, values, free, label, added, combine, limit):
-    """Combine the evidence `added` with the value of a label, and limit the sum to +-`limit`.
+    """Combine the evidence `added` with the value of a label, by the rule `combine`, and limit sums to +-`limit`.
 
-    A new label gets a free slot, or the slot of the least likely label if it is more likely. Returns 1 if no slot was
-    free, so that a label was evicted or not stored.
+    `labels` and `values` are the slots (S,) of a voxel, and `free` is the label of a free slot. A new label gets a free
+    slot. If no slot is free, it replaces the least likely label if that label has less evidence. Returns 1 if a label
+    was evicted or not stored, otherwise 0.
     """
     if combine == LATEST:
         for s in range(1, len(labels)):
@@ -103,7 +107,7 @@ def add_evidence(labels, values, free, label, added, combine, limit):
 
 @device
 def best_first(labels, values, free):
-    """Move the most likely label to slot 0. Ties go to the smaller label, so that slot order has no effect."""
+    """Swap the most likely label into slot 0. Ties go to the smaller label, so that slot order has no effect."""
     best = 0
     for s in range(1, len(labels)):
         if labels[s] == free:  # slots are filled from the front
@@ -117,7 +121,7 @@ def best_first(labels, values, free):
 
 @device
 def best_class_first(classes, scores):
-    """Move the most likely class to slot 0, as best_first() does."""
+    """Swap the most likely class into slot 0, as best_first() does."""
     best = most_likely_slot(classes, scores)
     if best > 0:
         classes[0], classes[best] = classes[best], classes[0]
@@ -126,7 +130,7 @@ def best_class_first(classes, scores):
 
 @device
 def sum_classes(classes, scores, measurement, k):
-    """Add the evidence of cluster k to the class slots of a voxel. Returns the number of evictions."""
+    """Add the class scores of cluster k to the class slots of a voxel. Returns the number of classes not kept."""
     limit, cluster_scores = measurement.max_score, measurement.class_scores[k]
     known, filled, excess = add_scores(classes, scores, cluster_scores, limit)
     for s in range(filled if excess > 0 else 0):  # subtracting preserves the differences between scores
@@ -159,7 +163,10 @@ def sum_classes(classes, scores, measurement, k):
 
 @device
 def update_voxel(evidence, voxel, measurement, list_id):
-    """Apply both recursions to a labeled voxel at a pixel of list `list_id`. Returns the number of evictions."""
+    """Update the instance and class evidence of a labeled voxel, by both recursions, from the clusters at its pixel.
+
+    These are the clusters of list `list_id`. Returns the number of evictions.
+    """
     start, end = measurement.offsets[list_id], measurement.offsets[list_id + 1]
     ids = evidence.instance_ids[voxel]
     id_values = evidence.instance_value[voxel]

@@ -36,33 +36,34 @@ class LabelRule(NamedTuple):
     """Storage and combination of the evidence for labels."""
 
     combine: Combine  # rule for combining new evidence with old evidence
-    logarithmic: bool  # True = evidence is log-likelihoods; False = evidence is proportional, such as votes
+    logarithmic: bool  # True = evidence is log-likelihoods; False = proportional to probability, such as votes
     score_scale: int = 64  # quantized class score for evidence of 1 in compact storage
 
     def quantization(self, storage: Storage) -> int:
-        """Return the quantized class score for evidence of 1."""
+        """Return the quantized class score for evidence of 1 in the given storage."""
         return self.score_scale if storage is Storage.COMPACT else self.score_scale << EXACT_BITS
 
 
 class DetectionEvidence(NamedTuple):
     """Evidence of a frame's N clusters."""
 
-    instances: Float32  # (N,) evidence for the matched instance of each cluster over any other instance
+    instances: Float32  # (N,) evidence for the matched instance of each cluster, relative to any other instance
     classes: Float64  # (N, C) evidence for each class
     absence: float = 0.0  # evidence for a matched instance outside its mask, <= 0
 
 
 def floored_log(class_probabilities: Float32, floor: float) -> Float64:
-    """Return log P(O_u = c | I_t) (N, C) of eq. (7), mixed with a fraction `floor` of the uniform distribution.
+    """Return the class log-likelihoods (N, C), log P(O_u = c | I_t) of eq. (7) in docs/method.md, of N detections.
 
-    The mixture prevents a zero probability from the detector from ruling out a class.
+    Each distribution in `class_probabilities` (N, C) is mixed with a fraction `floor` of the uniform distribution, so
+    that a probability of 0 does not exclude a class.
     """
     p = class_probabilities.astype(np.float64)
     return np.asarray(np.log((1 - floor) * p + floor / max(p.shape[1], 1)))
 
 
 def vote_for_best(clusters: PointClusters, weights: Float32) -> DetectionEvidence:
-    """Return the votes of the clusters for their instances and most likely classes, with `weights` (N,)."""
+    """Return one vote per cluster, with the weight in `weights` (N,), for its instance and its most likely class."""
     classes = np.zeros(clusters.class_probabilities.shape)
     if len(clusters):
         classes[np.arange(len(clusters)), clusters.class_probabilities.argmax(axis=1)] = weights
@@ -75,12 +76,14 @@ class LabeledVoxels:
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    # maximum area ratio of overlapping clusters to assign pixels to the smaller cluster, in [0, 1]; 0 = off
+    # maximum area ratio (smaller / larger) of two overlapping clusters to assign their common pixels to the smaller one
+    # only, in [0, 1]; 0 = off
     occlusion_area_ratio: float = 0.25
-    # minimum fraction of an instance inside a larger mask of another class to apply the support rule, in [0, 1];
-    # 1 = off
+    # minimum fraction of an instance inside a larger mask of another class for the mask not to update the instance
+    # (e.g. a book on a table), in [0, 1]; 1 = off
     support_overlap: float = 0.6
-    update_unmatched: bool = False  # True = clusters without an instance also update class distributions
+    # True = clusters without a matched instance also update the class distributions of voxels
+    update_unmatched: bool = False
     instance_class: InstanceClass = InstanceClass.DETECTIONS  # source of an instance's class
     storage: Storage = Storage.COMPACT  # labels stored per voxel: COMPACT = top few labels, EXACT = all labels
 
@@ -130,7 +133,10 @@ class LabeledVoxels:
     def measurement(
         self, table: InstanceTable, points: PixelLists, matches: Matches, evidence: DetectionEvidence, rule: LabelRule
     ) -> Measurement:
-        """Return the evidence of a frame's clusters in the form used by the voxel update."""
+        """Return the evidence of the clusters of a frame for the voxel update.
+
+        The lists of `points` are reduced by the occlusion order and the support rule.
+        """
         updating = np.ones_like(matches.instance_ids) if self.update_unmatched else matches.instance_ids
         points = keep_on_top(points, updating, self.occlusion_area_ratio)
         supported = self.supported_instances(table, matches)
@@ -158,11 +164,12 @@ class LabeledVoxels:
         )
 
     def supported_instances(self, table: InstanceTable, matches: Matches) -> Bool:
-        """Return an array (N, ids + 1), True if a cluster's object supports an instance, as a table supports a book.
+        """Return a Boolean array (N, ids + 1), True where the object of a cluster supports an instance.
 
-        A supported instance is confirmed and of another class. Most of its visible part is inside the cluster's mask,
-        and it is at most half as large as the cluster. The mask of the large object covers the instance, but is not
-        evidence for its voxels.
+        For example, a table supports a book. A supported instance is confirmed and of another class. At least the
+        fraction `support_overlap` of its visible pixels is inside the mask of the cluster, and it has at most half as
+        many pixels as the cluster. The mask of the large object covers the instance, but is not evidence for the voxels
+        of the instance.
         """
         overlaps, clusters = matches.overlaps, matches.clusters
         supported = np.zeros((len(clusters), table.last_id + 1), np.bool_)

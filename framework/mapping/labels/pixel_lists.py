@@ -9,7 +9,7 @@ its list, so that operations on lists are fast. Example for two overlapping mask
     . 1 1        0 3 3                2      0, 1        1
                                       3      1           3           offsets[4] = 4
 
-The pixels shared by two clusters determine duplicates of one object and the occlusion order.
+The number of pixels shared by two clusters determines the occlusion order and duplicate detections of an object.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class PixelLists(NamedTuple):
 
 
 class ListTree(NamedTuple):
-    """Tree of the lists during construction. A list consists of one cluster, its head, and of its parent list."""
+    """Tree of the lists during construction. A list consists of its head, which is one cluster, and its parent list."""
 
-    head: Int32  # (capacity,) cluster of each list
+    head: Int32  # (capacity,) head of each list
     parent: Int32  # (capacity,) parent of each list
     child: Int32  # (capacity,) most recent list with this parent, 0 = none
     sibling: Int32  # (capacity,) previous list with the same parent, 0 = none
@@ -75,7 +75,7 @@ def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> P
 
     Large masks are coarse and cover small objects, such as a book on a couch. Therefore, a pixel keeps only clusters
     that are at most 1 / `area_ratio` times as large as its smallest cluster. If `area_ratio` is 0, a pixel keeps all
-    clusters. `instance_ids` (N,) holds the instance of each cluster, 0 = none.
+    clusters with an instance. `instance_ids` (N,) holds the instance of each cluster, 0 = none.
     """
     offsets, kept = np.empty_like(points.offsets), np.empty_like(points.clusters)
     keep_smallest(points.pixel_counts, points.offsets, points.clusters, instance_ids, area_ratio, offsets, kept)
@@ -87,8 +87,8 @@ def remove_supports(points: PixelLists, supported: Bool, seen: Int32, stride: in
 
     Args:
         points: Lists of clusters at the pixels.
-        supported: (N, ids + 1) True if the cluster's object supports the instance.
-        seen: The map's instance at every stride-th pixel of every stride-th row, 0 = none.
+        supported: (N, ids + 1) True where the object of the cluster supports the instance.
+        seen: Instance in the map at every stride-th pixel of every stride-th row, 0 = none.
         stride: Distance between the samples in `seen`, px.
     """
     instances = np.flatnonzero(supported.any(axis=0))

@@ -12,7 +12,7 @@ CHUNKS = 16  # number of chunks of image rows
 
 @device
 def _are_inside(coordinates, width, height):
-    """Return True if all pixels (2 P,), alternating u and v, are in the image."""
+    """Return True if all P pixels are inside the image; `coordinates` (2 P,) alternates u and v."""
     right = bottom = np.uint32(0)  # negative coordinates become large unsigned numbers
     for p in range(coordinates.shape[0] // 2):
         right = max(right, np.uint32(coordinates[2 * p]))
@@ -24,8 +24,8 @@ def _are_inside(coordinates, width, height):
 def link_points(coordinates, cluster, list_ids, tree):
     """Fill list_ids (H, W) and the ListTree, whose capacity is the number of points plus one.
 
-    The coordinates (2 P,) of the points alternate u and v. Returns the number of lists, 0 if a point is
-    outside the image.
+    `coordinates` (2 P,) alternates u and v of the points, and `cluster` (P,) is the cluster of each point, < 0 = none.
+    Returns the number of lists, 0 if a point is outside the image.
     """
     head, parent, child, sibling, pixel_count, length = tree
     width = list_ids.shape[1]
@@ -101,7 +101,8 @@ def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kep
 def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
     """Fill new_ids (H, W) with replacement[i, column[k]] for pixels of list i at instance k of the map.
 
-    Adds the number of pixels that get each new list to moved (CHUNKS, lists), which must start at 0.
+    `seen` holds the instance at every stride-th pixel of every stride-th row, and column[k] is 0 for instances without
+    a replacement. Adds the number of pixels that get each new list to moved (CHUNKS, lists), initially 0.
     """
     height, width = list_ids.shape
     for chunk in prange(CHUNKS):
@@ -122,8 +123,9 @@ def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
 def lists_without(offsets, clusters, supported, instances, replacement, origin, ends, kept):
     """Fill replacement (L, 1 + J) with the list that replaces each list at pixels of each instance in `instances` (J,).
 
-    Column 0 is for pixels without one of these instances. Sets `origin` to the list that each new list replaces, and
-    `ends` to the end of its clusters in `kept`. Returns the number of new lists and the number of their clusters.
+    Column 0 is for pixels without one of these instances. Sets `origin` to the list that each new list replaces, `kept`
+    to the clusters of the new lists, and `ends` to the end of each new list in `kept`. Returns the number of new lists
+    and the number of their clusters.
     """
     lists = offsets.shape[0] - 1
     new = length = 0

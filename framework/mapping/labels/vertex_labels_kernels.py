@@ -17,15 +17,16 @@ from framework.mapping.voxels.voxel_grid_kernels import (
 from framework.mapping.voxels.voxel_walk import voxel_number
 
 CORNERS = 8  # number of voxels around a vertex
-REACH = 2.0  # maximum distance of voting voxels from the surface, voxels; other pixels observed farther voxels
+REACH = 2.0  # maximum distance of voting voxels from the surface, voxels; farther ones may have labels of other objects
 CHUNK = 1024  # number of vertices that share scratch arrays
 
 
 @device
 def corner_voxels(grid, vertex, blocks, voxels, weights):
-    """Fill `blocks` (-1 = absent), `voxels` and trilinear `weights`, (8,) each, of the voxels around a vertex (3,), m.
+    """Fill `blocks`, `voxels` and `weights`, (8,) each, for the eight voxels around a world-frame vertex (3,), m.
 
-    Returns True if any voxel has label evidence.
+    `blocks` are block indices, -1 = not allocated, `voxels` are indices in the block, and `weights` are trilinear.
+    Returns True if the block of any voxel has label evidence.
     """
     scale = np.float32(1.0) / grid.voxel_size
     x, y, z = vertex[0] * scale, vertex[1] * scale, vertex[2] * scale
@@ -45,7 +46,7 @@ def corner_voxels(grid, vertex, blocks, voxels, weights):
 
 @device
 def keep_near(grid, blocks, voxels, weights):
-    """Set the weights (8,) of unobserved voxels and of voxels far from the surface to 0."""
+    """Set the weights (8,) of unobserved voxels and of voxels farther than REACH from the surface to 0."""
     near = np.float32(REACH) * grid.voxel_size
     for c in range(CORNERS):
         stored = grid.tsdf[blocks[c], voxels[c]] if blocks[c] >= 0 else np.int16(UNSEEN)
@@ -77,7 +78,7 @@ def majority(labels, weights):
 
 @device
 def _elect(grid, evidence, counts, blocks, voxels, weights, ids):
-    """Return the instance and class of a vertex by majority vote of its corners; 0 and -1 without a majority."""
+    """Return the instance and class of a vertex by majority vote of its eight voxels; 0 and -1 without a majority."""
     keep_near(grid, blocks, voxels, weights)
     for c in range(CORNERS):
         voxel = labeled_voxel(grid, evidence, blocks[c], voxels[c]) if weights[c] > 0 else np.int32(-1)
@@ -90,7 +91,7 @@ def _elect(grid, evidence, counts, blocks, voxels, weights, ids):
 
 @device
 def color_of(color, voxel, out):
-    """Write the color of a voxel, numbered as in an UnlabeledMesh, into `out` (3,)."""
+    """Write the RGB color of a voxel, numbered as in an UnlabeledMesh, into `out` (3,), in [0, 255]."""
     red, green, blue = unpack_color(color[voxel // BLOCK_VOXELS, voxel % BLOCK_VOXELS])
     out[0], out[1], out[2] = red / 4, green / 4, blue / 4
 
@@ -104,11 +105,11 @@ def color_vertices(color, voxels, colors):
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_vertices(grid, evidence, counts, surface, colors, instance_ids, class_ids):
-    """Fill colors (V, 3), instance_ids (V,) and class_ids (V,) of the vertices of an UnlabeledMesh.
+    """Fill colors (V, 3), instance_ids (V,), 0 = none, and class_ids (V,), -1 = none, of an UnlabeledMesh's vertices.
 
     The color comes from the nearest voxel. The instance is the majority of the eight surrounding voxels, weighted
-    trilinearly. Each voxel votes for its most likely instance with counts[id]. Vertices without an instance have no
-    class.
+    trilinearly. Each voxel votes for its most likely instance among those with `counts[id]` True. The class comes from
+    the voxel with the largest weight in the majority. Vertices without an instance have no class.
     """
     vertices = surface.vertices
     for chunk in prange(-(-len(vertices) // CHUNK)):

@@ -25,7 +25,7 @@ from framework.mapping.voxels.voxel_grid_kernels import FARTHEST_BLOCK
 
 DEFLATE_LEVEL = 1  # zlib level; files are at most a tenth larger than at level 6 and take half the time
 
-HEADER = "header"
+HEADER = "header"  # name of the array with the JSON header
 LARGEST_HEADER = 2**28  # maximum size of the header, bytes; an hour of mapping with thousands of instances takes 10 MB
 LARGEST_ID = 2**24  # maximum instance id
 MAX_EVIDENCE = 1e12  # maximum absolute evidence for a class
@@ -33,8 +33,12 @@ MAX_ARRAYS = 100  # maximum number of arrays listed in the header of a file
 MAX_MEMORY_FRACTION = 0.5  # maximum fraction of the machine's memory for a loaded map
 
 
+class _TooLargeError(DataError):
+    """A map file that exceeds the memory limit. Its message contains the fix."""
+
+
 def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-    """Write a lightly compressed .npz file without timestamps, readable by np.load."""
+    """Write the header and the arrays to a .npz file without timestamps, readable by np.load."""
     if not isinstance(cast(object, path), str | Path):
         raise DataError(f"map file: expected a path, got {path!r:.60}")
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -84,6 +88,8 @@ def map_file_errors(path: Path | str) -> Iterator[None]:
     """Convert errors during reading of a map file into a DataError that names the file."""
     try:
         yield
+    except _TooLargeError as error:
+        raise DataError(f"{path}: {error}") from error
     except InstanceMapError as error:
         raise DataError(f"{path}: {error}; map again") from error
     except Exception as error:  # zipfile and numpy raise many types for damaged archives
@@ -99,9 +105,9 @@ def _opened(path: Path | str) -> Iterator[zipfile.ZipFile]:
         unpacked = sum(info.file_size for info in archive.infolist())
         limit = MAX_MEMORY_FRACTION * machine_memory()
         if unpacked > limit:
-            raise DataError(
-                f"expected at most {limit:.0f} unpacked bytes (half of this machine's memory), got {unpacked}; use a "
-                "machine with more memory or a larger fuser.voxel_size"
+            raise _TooLargeError(
+                f"expected at most {limit:.0f} unpacked bytes (half of this machine's memory), got {unpacked}; open it "
+                "on a machine with more memory, or map again with a larger fuser.voxel_size"
             )
         yield archive
 
@@ -140,13 +146,16 @@ def machine_memory() -> int:
 
 
 def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], length: int, prefix: str = "") -> None:
-    """Raise DataError unless the arrays have `length` rows, and the types and row shapes of the `expected` arrays."""
+    """Raise DataError unless the arrays have `length` rows, and the types and row shapes of the `expected` arrays.
+
+    The names in `arrays` begin with `prefix`.
+    """
     for name, like in expected.items():
         check_array(prefix + name, arrays[prefix + name], (length, *like.shape[1:]), like.dtype)
 
 
 def check_known(name: str, array: Array, known: Iterable[int]) -> None:
-    """Raise DataError unless all values of the array are in `known`, because kernels use the values as indices."""
+    """Raise DataError unless all values of the array are in `known`, because kernels use them as indices."""
     unknown = array[~np.isin(array, list(known))]
     if unknown.size:
         raise DataError(f"{name}: expected ids in the map, got {unknown[0]}")

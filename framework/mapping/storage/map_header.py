@@ -28,7 +28,7 @@ class MapHeader:
     def of(cls, found: object, name: str = "header") -> MapHeader:
         """Return a JSON object as a header. Raises DataError for other types."""
         if not isinstance(found, dict):
-            raise DataError(f"{name}: expected an object, got {found!r:.60}")
+            raise DataError(f"{name}: expected a JSON object, got {found!r:.60}")
         return cls(found, name)
 
     def part(self, key: str) -> MapHeader:

@@ -39,7 +39,9 @@ class Allocator:
         return {**vars(self), "_stamp": self._stamp[: self.voxels.block_count]}
 
     def active_blocks(self, frame: Frame, T_world_camera: Float64) -> Int32:
-        """Return the blocks (A,) around the measured surface, allocated if new, and existing blocks in front of it.
+        """Return the indices (A,) of the blocks that a frame updates.
+
+        These are the blocks around the measured surface, allocated if new, and existing blocks in front of it.
 
         Raises MapFullError if the block budget is reached.
         """
@@ -54,7 +56,9 @@ class Allocator:
         return active[:count].copy()
 
     def allocate(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
-        """Allocate and return the blocks (N,), with repetitions, along the truncation bands of `depth` (H, W), m.
+        """Allocate the blocks along the truncation bands of `depth` (H, W), m.
+
+        Returns the indices (N,) of these blocks, with repetitions.
 
         Raises:
             MapFullError: If the block budget is reached. No memory is allocated if a single frame exceeds the budget.
@@ -91,9 +95,9 @@ class Allocator:
                 break
             if counts.sum() > max(REPEATS * self.voxels.max_blocks, MIN_KEYS):
                 raise MapFullError(
-                    f"the map is full: expected at most {self.voxels.max_blocks} blocks, got "
-                    f"{counts.sum() // REPEATS} or more for one frame; raise fuser.voxel_size or fuser.max_blocks, "
-                    "or lower fuser.max_depth"
+                    f"fuser.max_blocks: expected at most {self.voxels.max_blocks} blocks in the map, got at least "
+                    f"{counts.sum() // REPEATS} for one frame; raise fuser.max_blocks or fuser.voxel_size, or lower "
+                    "fuser.max_depth"
                 )
             self._found = np.empty((CHUNKS, 2 * int(counts.max())), np.int64)
         keys = np.concatenate([self._found[chunk, :n] for chunk, n in enumerate(counts)])

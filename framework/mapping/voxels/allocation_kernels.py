@@ -28,8 +28,9 @@ def _remembered(recent, key):
 
 @device
 def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
-    """Write the keys of blocks at `samples` points along the truncation bands of a row of readings to keys[1:].
+    """Write the keys of the blocks at `samples` points along the truncation band of each reading of a row to keys[1:].
 
+    `readings` (W,), m, are every stride-th depth reading of image row v. Readings out of range get NO_KEY.
     The loop reads local variables only, so that the compiler vectorizes it.
     """
     width = readings.shape[0]
@@ -56,8 +57,8 @@ def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
 def surface_blocks(depth, view, sensor, block_size, stride, samples, found, counts):
     """Write the keys of blocks along the band of every stride-th depth reading to `found` (CHUNKS, M), by chunk.
 
-    Samples every stride-th row. Writes the number of keys of each chunk to counts (CHUNKS,); counts above M mean that
-    `found` is too small.
+    Only every stride-th row is used, and `block_size` is in m. Writes the number of keys of each chunk to counts
+    (CHUNKS,); counts above M mean that `found` is too small.
     """
     height, width = depth.shape
     rows, columns = (height + stride - 1) // stride, (width + stride - 1) // stride
@@ -109,7 +110,11 @@ def _extent(camera, size, margin):
 
 @device
 def _bounds(camera, x, y, z, extent, near, far, shape):
-    """Return (visible, z0, z1, u0, u1, v0, v1) of the box around a world point: its depths, m, and inclusive pixels."""
+    """Return (visible, z0, z1, u0, u1, v0, v1): the depth range, m, and the inclusive pixel window of a box in view.
+
+    The box is aligned with the camera axes. Its center is the world point (x, y, z), m, and `extent` is half its side
+    lengths, m. Depths are limited to [near, far], m, and pixels to an image of `shape` (H, W).
+    """
     height, width = shape
     pz = camera.R[2, 0] * x + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
     z0, z1 = max(pz - extent[2], near), min(pz + extent[2], far)
@@ -186,7 +191,8 @@ def _sees_through(depth, sensor, z0, pixels):
 def choose_blocks(grid, found, region_count, depth, camera, sensor, stamp, frame, active):
     """Write the blocks `found` (N,) and the existing blocks in front of the surface to `active`. Returns their number.
 
-    Each block is written once. `camera` contains T_camera_world.
+    Each block is written once. `stamp` (B,) holds the last frame in which each block was active; `frame` is the current
+    frame. `camera` contains T_camera_world.
     """
     n = 0
     for i in range(found.shape[0]):

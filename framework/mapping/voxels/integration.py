@@ -1,8 +1,9 @@
 """Integration of depth images into the running averages of the visible voxels.
 
-The signed distance is projective, along z. Its running average is the TSDF of Curless and Levoy (1996). The truncation
-distance increases with depth, as the sensor noise does. Observations have full weight up to the depth at which sensor
-noise starts to increase. Beyond it, the weight falls with the square of the depth.
+The signed distance is projective: it is measured along the z axis of the camera. Its running average is the TSDF of
+Curless and Levoy (1996). The truncation distance increases with depth, as the sensor noise does. Observations have full
+weight up to the depth at which sensor noise starts to increase. Beyond this depth, the weight is inversely proportional
+to the square of the depth.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from framework.mapping.voxels.integration_parameters import Sensor, pinhole
 from framework.mapping.voxels.voxel_grid import VoxelGrid, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-GOLDEN = 0.6180339887498949  # equidistributed rounding offsets frac(k * GOLDEN) avoid bias in rounded averages
+GOLDEN = 0.6180339887498949  # golden ratio - 1; the rounding offsets frac(k * GOLDEN) avoid biased averages
 
 
 class SeenBlocks(NamedTuple):
@@ -30,7 +31,7 @@ class SeenBlocks(NamedTuple):
     """
 
     blocks: Int32  # (A,) block indices
-    near_start: Int64  # (A,) start of the near voxels of each block
+    near_start: Int64  # (A,) start of the near voxels of each block in near_voxel and near_pixel
     near_count: Int32  # (A,) number of near voxels of each block
     near_voxel: UInt16  # (512 A,) index of each near voxel in its block, ascending
     near_pixel: Int32  # (512 A,) index v * width + u of the pixel of each near voxel
@@ -56,7 +57,7 @@ class Integrator:
         return {**vars(self), "_near_voxel": self._near_voxel[:0], "_near_pixel": self._near_pixel[:0]}
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near_band: float) -> SeenBlocks:
-        """Integrate one frame, and return the updated blocks and their voxels within near_band m of the surface.
+        """Integrate one frame, and return the updated blocks and their voxels within `near_band` m of the surface.
 
         Raises MapFullError if the block budget is reached; in this case the frame is not integrated.
         """

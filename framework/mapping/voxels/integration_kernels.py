@@ -31,8 +31,8 @@ MIN_WEIGHT_BEHIND = 0.02
 def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
     """Project the voxels of a block (eq. (6) of docs/method.md) to pixel indices and depths.
 
-    Writes the indices to pixel (512,) and the depths, m, to scratch[:512]. Voxels outside the image get pixel 0 and a
-    depth larger than any reading.
+    `camera` contains T_camera_world. Writes the indices to pixel (512,) and the depths, m, to scratch[:512]. Voxels
+    outside the image get pixel 0 and a depth larger than any reading.
     """
     zero, half, one = np.float32(0.0), np.float32(0.5), np.float32(1.0)
     seven, three = np.int32(7), np.int32(3)
@@ -71,7 +71,8 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
 
     On input, scratch[:512] holds the depths, m, of the voxels, and scratch[512:] their depth readings, m. On output,
     scratch[:512] holds their distances to the measured surface, m, and scratch[512:] the weights of the new
-    observations in the color averages, 0 = no color.
+    observations in the color averages, 0 = no color. `voxel` is the voxel size, m, and `to_units` the stored distance
+    units per m.
 
     Returns the number of voxels with a new color, and the number of voxels within near_band m of the surface.
     """
@@ -148,7 +149,7 @@ def _is_colored(scratch, start):
 
 @device
 def _list_near(pixel, near_band, near_voxel, near_pixel, entry, scratch):
-    """List the voxels whose distance in scratch[:512] is within +-near_band, m, and their pixels.
+    """List the voxels whose distance in scratch[:512] is in [-near_band, near_band], m, and their pixels.
 
     The list begins at index `entry` of near_voxel and near_pixel. The comparisons of a layer are bits of a word, so
     that the compiler vectorizes them.

@@ -8,7 +8,7 @@ import numpy as np
 
 from framework.data import Camera, Float32, Float64
 
-BOUNDS = {  # bounds of the parameters of Tsdf and VoxelHashing, in the units given there
+BOUNDS = {  # bounds of voxel_size, m, and of the fields of Sensor, in their units
     "voxel_size": (1e-4, 1.0),
     "truncation": (1e-4, 100.0),
     "truncation_slope": (0.0, 1.0),

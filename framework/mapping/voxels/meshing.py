@@ -42,7 +42,7 @@ class UnlabeledMesh(NamedTuple):
     """A mesh without colors and labels."""
 
     vertices: Float32  # (V, 3) m, world frame
-    triangles: Int32  # (F, 3) vertex indices; faces point to the observed side
+    triangles: Int32  # (F, 3) vertex indices; face normals point to the observed side
     voxels: Int32  # (V,) nearest voxel, as block * 512 + index in the block
 
 

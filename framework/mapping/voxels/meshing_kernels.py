@@ -48,7 +48,11 @@ def mark_stale(grid, changed, stale):
 
 @device
 def _any_and_all(words, around, z):
-    """Return two words with one bit per cell of slice z: if any, and if all, of its corners in the slice are set."""
+    """Return two words with one bit per cell: 1 if any, and 1 if all, of its four corners in slice z are set.
+
+    `words` (B + 1, 8) has one bit per voxel. `around` (8,) are the blocks at +0 or +1
+    along each axis. Slice z = 8 is slice 0 of the next block.
+    """
     up = 4 * (z >> 3)
     z &= 7
     here, block_x = words[around[up], z], words[around[up + 1], z]
@@ -60,7 +64,7 @@ def _any_and_all(words, around, z):
 
 @device
 def _cell_corners(tsdf, around, x, y, z, corners):
-    """Write the stored distances at the corners of cell (x, y, z) of a block to corners (8,)."""
+    """Write the stored distances at the corners of cell (x, y, z) of a block to corners (8,), x fastest."""
     for c in range(8):
         i, j, k = x + (c & 1), y + ((c >> 1) & 1), z + (c >> 2)
         corners[c] = tsdf[around[(i >> 3) + 2 * (j >> 3) + 4 * (k >> 3)], voxel_number(i, j, k)]
@@ -134,7 +138,11 @@ def _cell_vertex(corners):
 
 @njit(cache=True, nogil=True, parallel=True)
 def place_vertices(grid, stale, cells, starts, old_starts, old, vertices, voxels):
-    """Place the vertices of the stale blocks, and copy the other vertices from the `old` surface."""
+    """Fill vertices (V, 3), m, in the world frame, and their nearest voxels (V,), numbered as in an UnlabeledMesh.
+
+    Computes the vertices of blocks with `stale` (B,) True. Copies the others from the `old` surface, in which the first
+    vertices of the slices have the indices `old_starts` (B, 8).
+    """
     tsdf, block_coords, voxel_size = grid.tsdf, grid.block_coords, grid.voxel_size
     half = np.float32(0.5)
     old_vertices, old_voxels = old.vertices, old.voxels
@@ -218,7 +226,7 @@ def count_quads(grid, inside, cells, counts):
 
 @device
 def _vertex(cells, starts, before, x, y, z):
-    """Return the vertex index of a cell. Coordinates of -1 refer to cells of the previous blocks."""
+    """Return the vertex index of cell (x, y, z) of a block. Coordinates of -1 refer to the blocks in `before` (8,)."""
     block = before[(x < 0) + 2 * (y < 0) + 4 * (z < 0)]
     n = np.uint64((y & 7) * 8 + (x & 7))
     return starts[block, z & 7] + count_bits(cells[block, z & 7] & ((ONE << n) - ONE))
@@ -226,7 +234,7 @@ def _vertex(cells, starts, before, x, y, z):
 
 @njit(cache=True, nogil=True, parallel=True)
 def write_triangles(grid, inside, cells, starts, quad_starts, counts, triangles):
-    """Write two triangles for each quad. The triangles of a block start at 2 * quad_starts[block]."""
+    """Write two triangles for each quad to `triangles` (F, 3). The first row of a block is 2 * quad_starts[block]."""
     for block in prange(len(counts)):
         if counts[block] == 0:
             continue

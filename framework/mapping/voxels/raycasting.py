@@ -39,7 +39,10 @@ MAX_STRIDE = 8  # maximum distance between coarse rays, px
 
 
 def tile_bounds(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float32]:
-    """Return the minimum and maximum depth (Y, X), m, of the blocks in view in each tile of TILE x TILE pixels."""
+    """Return the minimum and maximum depth (Y, X), m, of the blocks in view in each tile of TILE x TILE pixels.
+
+    In a tile without blocks, the minimum is larger than the maximum.
+    """
     tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
     tile_near, tile_far = np.full(tiles, sensor.max_depth), np.full(tiles, sensor.min_depth)
     view = pinhole(camera, inverse(T_world_camera))
@@ -84,7 +87,7 @@ def _stride(camera: Camera, voxel_size: float, max_depth: float) -> int:
 
 
 def render(voxels: VoxelGrid, evidence: Evidence, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> View:
-    """Return the view of the map between the sensor's nearest and farthest depth."""
+    """Return the view of the map, with labels, between the minimum and the maximum depth of `sensor`."""
     surface = render_surface(voxels, sensor, camera, T_world_camera)
     instance_ids = np.empty(camera.shape, np.int32)
     class_ids = np.empty(camera.shape, np.int32)

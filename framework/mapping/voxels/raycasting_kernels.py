@@ -24,7 +24,7 @@ from framework.sensors.noise_models_kernels import axial_sigma_single
 
 TILE = 8  # side of a tile, px; the rays of a tile share blocks in the cache
 REFINEMENTS = 4  # maximum number of Newton steps of a ray; a plane needs one, a curved surface two or three
-CONVERGED = 0.2  # maximum last Newton step, voxels; the remaining error is a few hundredths of a voxel
+CONVERGED = 0.2  # maximum length of the last Newton step, voxels; the remaining error is a few hundredths of a voxel
 REACH = 3.0  # maximum distance from the start of a refinement to the surface, voxels
 DETAIL = 4.0  # maximum spacing of coarse rays, voxels; maps have few details smaller than the truncation band
 MARGIN = 8.0  # maximum protrusion of a surface between the coarse rays that hit it, voxels
@@ -44,8 +44,9 @@ def _ray(view, scale, u, v):
 def _refined(grid, o, d, step, z, reach, key, region):
     """Return (z, nx, ny, nz, key, region): the zero of the trilinear field within `reach` m of depth z.
 
-    (nx, ny, nz) is the gradient, stored units per voxel. z is 0 if there is no zero. A zero where the field increases
-    along the ray is a back face and is ignored.
+    The ray is o + z * d, in voxels, and `step` is the depth step, m, of a voxel along it. (nx, ny, nz) is the gradient,
+    stored units per voxel. z is 0 if there is no zero. A zero where the field increases along the ray is a back face
+    and is ignored. See find_block() for `key` and `region`.
     """
     zero = np.float32(0.0)
     nx = ny = nz = zero
@@ -71,7 +72,10 @@ def _refined(grid, o, d, step, z, reach, key, region):
 
 @device
 def _first_surface(grid, o, d, step, near, far, key, region):
-    """Return (z, nx, ny, nz, key, region) of the first front face between depths `near` and `far`, m; z = 0: none."""
+    """Return (z, nx, ny, nz, key, region) of the first front face between depths `near` and `far`, m; z is 0 if none.
+
+    See _refined() for the parameters and the other results.
+    """
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     to_voxels = grid.tsdf_unit / grid.voxel_size
     reach = np.float32(REACH) * step
@@ -96,7 +100,7 @@ def _first_surface(grid, o, d, step, near, far, key, region):
             continue
         stored = grid.tsdf[np.uint32(block), np.uint32(voxel_number(i, j, k))]
         if stored == UNSEEN:
-            z += step + step  # skips no surface: more than one observed voxel is in front of each
+            z += step + step  # this skips no surface, because more than one observed voxel is in front of each surface
             from_front = False
             continue
         distance = np.float32(stored) * to_voxels
@@ -150,6 +154,7 @@ def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near
 
     Sets near and far (X,) to the depth range, m, of a surface in the cell; far 0 = no surface. Sets corners (4, X) to
     the inverse depths of the surface, 1 / m, in row order, if the cell has exactly one surface, otherwise to 0.
+    `resolved` is the maximum depth, m, at which coarse rays resolve all details, and `voxel` is the voxel size, m.
     """
     zero, one, none = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
     margin, rise = np.float32(MARGIN) * voxel, np.float32(STEEPEST) * voxel
@@ -260,7 +265,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, 
     """Fill `depth` as cast_coarse() does, but start the search at the camera's depth readings (H, W), m.
 
     No pixel is searched beyond its depth in `limits` (H, W), m. If the limit is 0, the depth is -1 (not searched),
-    because neighboring pixels may still be searched.
+    because neighboring pixels may still be searched. `noise` contains the depth noise parameters of the sensor.
 
     Depth readings are noisy, and a wrong pose displaces them. Therefore, the search starts at the extrapolation of the
     two previous rays if the reading agrees with it. Otherwise it starts at the reading plus the last displacement.
@@ -300,7 +305,10 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def paint(grid, view, depth, color):
-    """Fill color (H, W, 3) with the map's color at the surface at `depth` (H, W), m, seen from `view`."""
+    """Fill color (H, W, 3), RGB, with the color of the map at the surface at `depth` (H, W), m.
+
+    `view` contains T_world_camera.
+    """
     height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size
     for v in prange(height):
@@ -328,7 +336,7 @@ def voxel_seen(grid, view, u, v, z, key, region):
 def label(grid, evidence, view, depth, instance_ids, class_ids):
     """Fill instance_ids, 0 = none, and class_ids, -1 = none, (H, W) from the voxels nearest to the surface.
 
-    The surface is at `depth` (H, W), m.
+    The surface is at `depth` (H, W), m. `view` contains T_world_camera.
     """
     height, width = depth.shape
     for v in prange(height):

@@ -141,10 +141,11 @@ class Tsdf:
     """Parameters of a truncated signed distance field with labels near the measured surface."""
 
     voxel_size: float = 0.01  # side of a voxel, m, > 0
-    truncation: float = 4.0  # truncation distance at depth 0, in voxels, >= 1
+    truncation: float = 4.0  # truncation distance at depth 0, in voxels, in [1, 100]
     min_depth: float = 0.2  # minimum depth of integrated readings, m, > 0
     max_depth: float = 5.0  # maximum depth of integrated readings, m, > min_depth
-    label_band: float = 2.0  # maximum distance of labeled voxels from the measured surface, in voxels, >= 1
+    # maximum distance of labeled voxels from the measured surface, in voxels, in [1, truncation]
+    label_band: float = 2.0
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -39,7 +39,10 @@ FIRST_RESERVED = 1024  # initial capacity, blocks or voxels
 
 
 class Grid(NamedTuple):
-    """The arrays of a VoxelGrid for the kernels. B and S are capacities; only the first entries are in use."""
+    """The arrays of a VoxelGrid for the kernels.
+
+    B (blocks) and S (regions) are capacities; only the first entries are in use.
+    """
 
     voxel_size: np.float32  # m
     tsdf_unit: np.float32  # distance represented by a stored tsdf of 1, m
@@ -104,7 +107,7 @@ class VoxelGrid:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without reserved capacity, which takes gigabytes."""
+        """Return the state without reserved capacity, which may be gigabytes."""
         blocks = {name: getattr(self.grid, name)[: self.block_count] for name in OF_BLOCKS}
         return {**vars(self), "grid": self.grid._replace(**blocks)}
 
@@ -130,9 +133,9 @@ class VoxelGrid:
                 return blocks
             if self.block_count == self.max_blocks:
                 raise MapFullError(
-                    f"the map is full: expected at most {self.max_blocks} blocks of {BLOCK_SIDE}^3 voxels "
-                    f"({self.byte_count / 2**20:.0f} MiB), got up to {self.block_count + len(coords) - done}; "
-                    "raise fuser.max_blocks or fuser.voxel_size"
+                    f"fuser.max_blocks: expected at most {self.max_blocks} blocks of {BLOCK_SIDE}^3 voxels in the map "
+                    f"({self.byte_count / 2**20:.0f} MiB), got at least {self.max_blocks + 1}; raise "
+                    "fuser.max_blocks or fuser.voxel_size"
                 )
             self._grow()
 

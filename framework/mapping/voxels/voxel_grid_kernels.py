@@ -30,7 +30,7 @@ _KEY_MASK = (1 << _KEY_BITS) - 1
 
 @device
 def pack_key(x, y, z):
-    """Return the key, >= 0, of the coordinates of a region or a block."""
+    """Return the key, >= 0, of the coordinates (x, y, z) of a region or a block, each in [-2^20, 2^20)."""
     return (
         ((np.int64(x) + _KEY_OFFSET) & _KEY_MASK) << (2 * _KEY_BITS)
         | ((np.int64(y) + _KEY_OFFSET) & _KEY_MASK) << _KEY_BITS
@@ -57,7 +57,7 @@ def _slot(key, size):
 
 @device
 def find_region(grid, key):
-    """Return the region with this key by linear probing, -1 = none."""
+    """Return the index of the region with this key by linear probing, -1 = none."""
     size = grid.table_keys.shape[0]
     slot = _slot(key, size)
     while True:
@@ -71,13 +71,13 @@ def find_region(grid, key):
 
 @device
 def child_number(bx, by, bz):
-    """Return the index of a block in the table of its region."""
+    """Return the index of the block at block coordinates (bx, by, bz) in the table of its region."""
     return ((bz & 7) * 8 + (by & 7)) * 8 + (bx & 7)
 
 
 @device
 def find_block(grid, bx, by, bz, last_key, last_region):
-    """Return (block, key, region) at block coordinates; block -1 = not allocated.
+    """Return (block, key, region) at block coordinates (bx, by, bz); block -1 = not allocated, region -1 = none.
 
     `last_key` and `last_region` come from the previous call. This cache makes look-ups in the same region fast.
     """

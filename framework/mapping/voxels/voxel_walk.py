@@ -121,7 +121,10 @@ def corners(grid, values, block, i, j, k, missing):
 
 @device
 def interpolate(s, fx, fy, fz):
-    """Return (value, d/dx, d/dy, d/dz) at fractions (fx, fy, fz) of a voxel between eight corners `s`, x fastest."""
+    """Return (value, d/dx, d/dy, d/dz) at fractions (fx, fy, fz) of a voxel between eight corners `s`, x fastest.
+
+    The derivatives are per voxel.
+    """
     x00, x10, x01, x11 = np.float32(s[0]), np.float32(s[2]), np.float32(s[4]), np.float32(s[6])
     dx00, dx10 = np.float32(s[1]) - x00, np.float32(s[3]) - x10
     dx01, dx11 = np.float32(s[5]) - x01, np.float32(s[7]) - x11
@@ -137,13 +140,13 @@ def interpolate(s, fx, fy, fz):
 
 @device
 def all_seen(s):
-    """Return True if all eight corners were observed."""
+    """Return True if all eight voxels with the stored distances `s` were observed."""
     return min(min(min(s[0], s[1]), min(s[2], s[3])), min(min(s[4], s[5]), min(s[6], s[7]))) != UNSEEN
 
 
 @device
 def trilinear(grid, block, x, y, z):
-    """Return (value, d/dx, d/dy, d/dz, valid): the stored distance and its gradient at (x, y, z), voxels.
+    """Return (value, d/dx, d/dy, d/dz, valid): the distance and its gradient at (x, y, z), voxels, in stored units.
 
     `block` contains the voxel at the floor of the point. The result is valid if all eight voxels around the point were
     observed.
@@ -215,7 +218,10 @@ def prefetch_row(array, row):
 
 @device
 def directions(view, scale, v):
-    """Return the ray of pixel (0, v), voxels per m of depth, and its change per pixel; `scale` is in voxels per m."""
+    """Return the world-frame ray of pixel (0, v), voxels per m of depth, and its change per pixel.
+
+    `scale` is in voxels per m, and `view` contains T_world_camera.
+    """
     x, y, z = ray_direction(view, 0, v)
     # not the difference of two rays, because its rounding error would accumulate along the row
     change = scale / view.fx
@@ -224,7 +230,10 @@ def directions(view, scale, v):
 
 @device
 def points_of_row(view, scale, v, depth, points):
-    """Fill `points` (3, W), in voxels, with the points of row v at `depth` (W,), m."""
+    """Fill `points` (3, W), world frame, in voxels, with the points of image row v at `depth` (W,), m.
+
+    `scale` is in voxels per m, and `view` contains T_world_camera.
+    """
     origin, change = directions(view, scale, v)
     tx, ty, tz = view.t[0] * scale, view.t[1] * scale, view.t[2] * scale
     for n in range(depth.shape[0]):
@@ -292,7 +301,10 @@ def step_to_surface(view, scale, v, found, points, converged, reach, limits, dep
 
 @device
 def blend_colors(found, points, color):
-    """Fill color (W, 3) by interpolation between the packed colors `found` (8, W) around `points` (3, W)."""
+    """Fill color (W, 3), RGB, by interpolation between the packed colors `found` (8, W) around `points` (3, W).
+
+    `points`, in voxels, is overwritten.
+    """
     half = np.float32(0.5)
     for n in range(points.shape[1]):
         x, y, z = points[0, n], points[1, n], points[2, n]

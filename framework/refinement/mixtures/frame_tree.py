@@ -22,7 +22,7 @@ from framework.refinement.mixtures.mixture_tree import Level, MixtureTree, cut, 
 from framework.refinement.neighborhood_kernels import grouped
 
 NOWHERE = 1e6  # coordinates of the center of a mask without points, m
-MIN_NODE = 32  # minimum number of points of a node with children
+MIN_SPLIT_POINTS = 32  # minimum number of points of a node to be split
 
 
 class Initialization(Enum):
@@ -37,10 +37,10 @@ class FrameTree:
     """A tree over the points of N masks."""
 
     levels: tuple[Level, ...]
-    masks: tuple[Int64, ...]  # (M,) mask of each node, for each level
+    masks: tuple[Int64, ...]  # for each level, the mask (M,) of each of its M nodes
 
     def leaves(self) -> tuple[Float64, Float64, Float64, Int64]:
-        """Return the weights (L,), means (L, 3), m, covariances (L, 3, 3), m^2, and masks (L,) of the leaves."""
+        """Return the weights (L,), means (L, 3), m, covariances (L, 3, 3), m^2, and masks (L,) of the L leaves."""
         parts = []
         for k, (level, masks) in enumerate(zip(self.levels, self.masks, strict=True)):
             below = self.levels[k + 1].firsts if k + 1 < len(self.levels) else np.zeros(len(level) + 1, np.int64)
@@ -50,7 +50,7 @@ class FrameTree:
         return weights, means, covariances, masks
 
     def masks_of(self, points: Float32) -> Int32:
-        """Return the mask (S,) of the most probable leaf for each point (S, 3), m; -1 if the tree has no leaf."""
+        """Return the mask (S,) of the most probable leaf for each of S points (S, 3), m; -1 if the tree has no leaf."""
         weights, means, covariances, masks = self.leaves()
         best = np.empty(len(points), np.int32)
         find_most_probable(points, coefficients(weights, means, covariances), best)
@@ -61,10 +61,12 @@ def grow(
     points: Float32, masks: Int32, count: int, settings: EmSettings, *, levels: int, children: int,
     gaussians_per_mask: int, initialization: Initialization, min_support: float,
 ) -> FrameTree:  # fmt: skip
-    """Grow a tree of at most `levels` levels over points (S, 3), m, with ascending masks (S,) in [0, `count`).
+    """Grow a tree of at most `levels` levels over S points (S, 3), m, of `count` masks.
 
-    A node with at least MIN_NODE points gets `children` children. A node is dropped in favor of its siblings if its
-    weight is below `min_support`, or if it has too few points for a covariance.
+    `masks`: the mask (S,) of each point, in ascending order. Level 1 has `gaussians_per_mask` Gaussians for each mask,
+    with initial responsibilities by `initialization`. A node with at least MIN_SPLIT_POINTS points gets `children`
+    children (2, 4 or 8). A node is dropped in favor of its siblings if its weight is below `min_support` (fraction of
+    all points), or if it has too few points for a covariance.
     """
     labels = _start(points, masks, count, gaussians_per_mask, initialization, settings.max_iterations)
     components = count * gaussians_per_mask
@@ -73,10 +75,10 @@ def grow(
     level, kept = _level(fitted, all_points, np.ones(1), min_support)
     grown, roots = [level], [kept // gaussians_per_mask]
     for _ in range(1, levels):
-        child = MixtureTree((level,)).passed(0, points, starts)
+        child = MixtureTree((level,)).best_nodes(0, points, starts)
         order, starts = grouped(child.astype(np.int32), len(level))
         points = points[order]
-        chosen = np.flatnonzero(np.diff(starts) >= MIN_NODE)
+        chosen = np.flatnonzero(np.diff(starts) >= MIN_SPLIT_POINTS)
         if not len(chosen):
             break
         own, own_starts = ranges(points, starts, chosen)
@@ -90,10 +92,11 @@ def grow(
 
 
 def corners(means: Float64, covariances: Float64, children: int) -> Mixtures:
-    """Return the initial children of M Gaussians, offset by one standard deviation along the longest axes.
+    """Return the initial children of M Gaussians as M mixtures of J = `children` components, with J = 2, 4 or 8.
 
-    The offsets have both signs. Therefore, 2, 4 or 8 children lie along one, two or three axes. The children have equal
-    weights and a quarter of the covariance.
+    `means`: (M, 3), m. `covariances`: (M, 3, 3), m^2. The children are offset from the mean by plus and minus one
+    standard deviation along the longest one, two or three principal axes. They have equal weights and a quarter of the
+    covariance.
     """
     count, axes = len(means), children.bit_length() - 1
     values, vectors = np.linalg.eigh(covariances)  # ascending
@@ -112,7 +115,10 @@ def corners(means: Float64, covariances: Float64, children: int) -> Mixtures:
 
 
 def _level(fitted: Mixtures, chosen: Int64, above: Float64, min_support: float) -> tuple[Level, Int64]:
-    """Return the level below the nodes with weights `above`, and the index of the component of each new node."""
+    """Return the level below Q nodes with weights `above` (Q,), and the component of each new node in its mixture.
+
+    `fitted`: the mixtures of the nodes with indices `chosen`; other nodes get no children.
+    """
     boxes = np.zeros((len(chosen), 2, 3))  # without a uniform component
     level = level_below(fitted, boxes, chosen, above, min_support)
     kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
@@ -122,7 +128,10 @@ def _level(fitted: Mixtures, chosen: Int64, above: Float64, min_support: float) 
 def _start(
     points: Float32, masks: Int32, count: int, gaussians: int, initialization: Initialization, max_iterations: int
 ) -> Int32:
-    """Return the index (S,) of the initial Gaussian of each point; the Gaussians of mask k start at k * `gaussians`."""
+    """Return the index (S,) of the initial Gaussian of each point (S, 3), m, with ascending `masks` (S,).
+
+    Mask k has the Gaussians k * `gaussians` to (k + 1) * `gaussians` - 1.
+    """
     starts = np.searchsorted(masks, np.arange(count + 1))
     labels = np.asarray(masks * np.int32(gaussians), np.int32)
     if gaussians > 1:

@@ -13,7 +13,10 @@ from framework.refinement.mixtures.mixture_tree_kernels import take_better
 
 @njit(cache=True, nogil=True)
 def keep_best_cluster(pixels: Int32, cluster: Int32, rank: Int32, owner: Int32, kept: Bool) -> None:
-    """Set `kept` to True for points of the cluster with the lowest rank at their pixel; `owner` (H, W) starts as -1."""
+    """Set `kept` (P,) to True for points whose cluster has the lowest `rank` (N,) of the clusters at their pixel.
+
+    `pixels`: (P, 2) u, v. `cluster`: (P,), -1 = none. `owner`: (H, W), initially -1, becomes this cluster.
+    """
     for i in range(len(cluster)):
         k, u, v = cluster[i], pixels[i, 0], pixels[i, 1]
         if k >= 0 and (owner[v, u] < 0 or rank[k] < rank[owner[v, u]]):
@@ -24,7 +27,10 @@ def keep_best_cluster(pixels: Int32, cluster: Int32, rank: Int32, owner: Int32, 
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_most_probable(points: Float32, rows: Float32, best: Int32) -> None:
-    """Set best (S,) to the Gaussian with the largest weighted density at a point, -1 = none; ties go to the first."""
+    """Set `best` (S,) to the Gaussian with the largest weighted density at each point (S, 3), m; -1 = none.
+
+    `rows`: the coefficients (M, 10) of the Gaussians, from `coefficients`. Ties go to the first Gaussian.
+    """
     for block in prange((len(points) + BLOCK - 1) // BLOCK):
         begin = block * BLOCK
         n = min(BLOCK, len(points) - begin)

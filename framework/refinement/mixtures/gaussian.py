@@ -24,7 +24,10 @@ SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vect
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32) -> None:
-    """Set out[i] = log(pi_k N(x_i | mu_k, Sigma_k)), given the coefficients `row` of component k."""
+    """Set out[i] = log(pi_k N(x_i | mu_k, Sigma_k)) for the points (x[i], y[i], z[i]), m.
+
+    `row`: the coefficients (10,) of component k, from `set_coefficients`.
+    """
     c, mx, my, mz = row[0], row[1], row[2], row[3]  # unpacking the array takes longer than the loop
     w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
@@ -36,7 +39,7 @@ def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to_density(x: Float32, y: Float32, z: Float32, row: Float32, values: Float32) -> None:
-    """Set values[i] to the maximum of values[i] and the result of log_densities() for point i."""
+    """Set values[i] to the maximum of values[i] and the log density of point i, as in `log_densities`."""
     c, mx, my, mz = row[0], row[1], row[2], row[3]
     w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
@@ -56,7 +59,7 @@ def add_to(values: Float32, summands: Float32) -> None:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to(values: Float32, others: Float32, n: int) -> None:
-    """Set the first n values to max(values, others), by a comparison, which vectorizes, unlike max()."""
+    """Set the first `n` values to max(values, others), with a comparison, because max() would not be vectorized."""
     for i in range(n):
         values[i] = others[i] if others[i] > values[i] else values[i]
 
@@ -81,14 +84,14 @@ def _exp(t: np.float32) -> np.float32:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def constant_exponential(log_density: np.float32, largest: Float32, evidence: Float32, n: int) -> None:
-    """Set the first n values of `evidence` to exp(log_density - largest)."""
+    """Set the first `n` values of `evidence` to exp(log_density - largest)."""
     for i in range(n):
         evidence[i] = _exp(log_density - largest[i])
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int) -> None:
-    """Set the first n densities to exp(densities - largest) and add them to the evidence."""
+    """Set the first `n` log densities in `densities` to exp(densities - largest), and add them to `evidence`."""
     for i in range(n):
         densities[i] = _exp(densities[i] - largest[i])
         evidence[i] += densities[i]
@@ -96,9 +99,9 @@ def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int
 
 @njit(cache=True, nogil=True)
 def log_evidence(largest: Float32, evidence: Float32, n: int) -> float:
-    """Return sum_i largest[i] + log(evidence[i]) over the first n points, with one logarithm per FACTORS factors.
+    """Return sum_i largest[i] + log(evidence[i]) over the first `n` points, with one logarithm per FACTORS points.
 
-    A factor is between 1 and 1 + the number of components.
+    The logarithm is that of a product of evidences, each between 1 and 1 + the number of components.
     """
     total = 0.0
     for begin in range(0, n, FACTORS):
@@ -125,7 +128,7 @@ def _product(values: Float32) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def invert(values: Float32, others: Float32, n: int) -> float:
-    """Set the first n values to 1 / values; return the sum of others / values."""
+    """Set the first `n` values to 1 / values; return the sum of others / values with the old values."""
     total = np.float32(0.0)
     for i in range(n):
         values[i] = np.float32(1.0) / values[i]
@@ -135,9 +138,9 @@ def invert(values: Float32, others: Float32, n: int) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: Float32, moment: Float64) -> None:
-    """Add sum_i gamma_i (1, x_i, x_i x_i^T) with gamma_i = densities[i] * scale[i] to the moment.
+    """Add sum_i gamma_i (1, x_i, x_i x_i^T) with gamma_i = densities[i] * scale[i] to `moment` (10,).
 
-    Single precision suffices within a block.
+    The last six entries are the upper triangle of the symmetric matrix. Single precision suffices within a block.
     """
     zero = np.float32(0.0)
     s, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -160,7 +163,7 @@ def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: F
 
 @njit(cache=True, nogil=True)
 def add_point(moment: Float64, point: Float32, center: Float64, gamma: float) -> None:
-    """Add gamma * (1, x, x x^T) of the centered point x, with only the upper triangle of the symmetric matrix."""
+    """Add gamma * (1, x, x x^T) with x = point - center to `moment` (10,), as in `add_moments`."""
     x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
     gx, gy, gz = gamma * x, gamma * y, gamma * z
     moment[0] += gamma

@@ -10,7 +10,7 @@ from framework.data import Bool, Float32, Float64, Int32, Int64
 
 @njit(cache=True, nogil=True, parallel=True)
 def lloyd_all(points: Float32, starts: Int64, centers: Float64, max_iterations: int, labels: Int32) -> None:
-    """Run Lloyd iterations on each set of points."""
+    """Run Lloyd iterations on each set `points[starts[k]:starts[k + 1]]`; update `centers` and `labels` in place."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             lloyd(points[starts[k] : starts[k + 1]], centers[k], max_iterations, labels[starts[k] : starts[k + 1]])
@@ -18,7 +18,7 @@ def lloyd_all(points: Float32, starts: Int64, centers: Float64, max_iterations: 
 
 @njit(cache=True, nogil=True)
 def lloyd(points: Float32, centers: Float64, max_iterations: int, labels: Int32) -> None:
-    """Run Lloyd iterations on one set, and update `centers` and `labels` in place."""
+    """Run Lloyd iterations on one set (S, 3); update `centers` (K, 3) and `labels` (S,) in place."""
     sums = np.zeros((len(centers), 4))
     for _ in range(max_iterations):
         changed = False
@@ -41,7 +41,7 @@ def lloyd(points: Float32, centers: Float64, max_iterations: int, labels: Int32)
 
 @njit(cache=True, nogil=True)
 def nearest(point: Float32, centers: Float64) -> int:
-    """Return the index of the nearest center."""
+    """Return the index of the center (K, 3) nearest to a point (3,)."""
     nearest, least = 0, np.inf
     for j in range(len(centers)):
         x, y, z = point[0] - centers[j, 0], point[1] - centers[j, 1], point[2] - centers[j, 2]
@@ -53,7 +53,7 @@ def nearest(point: Float32, centers: Float64) -> int:
 
 @njit(cache=True, nogil=True, parallel=True)
 def nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) -> Int32:
-    """Return the index (S,) of each point's nearest center, -1 outside the ranges."""
+    """Return the result of `nearest_centers`."""
     labels = np.full(len(points), -1, np.int32)
     for k in range(len(begins)):
         for i in prange(begins[k], ends[k]):
@@ -117,7 +117,7 @@ def start_all(
     points: Float32, log_odds: Float32, starts: Int64, mask_counts: Int64, object_components: int,
     background_components: int, iterations: int, labels: Int32,
 ) -> None:  # fmt: skip
-    """Set the initial component of each point of each cluster."""
+    """Set `labels` (S,) to the initial component of each point; see `start_labels` for the arguments."""
     for k in prange(len(starts) - 1):
         own = slice(starts[k], starts[k + 1])
         _start_one(
@@ -149,7 +149,10 @@ def _start_one(
 
 @njit(cache=True, nogil=True)
 def _group(points: Float32, chosen: Bool, groups: int, first_label: int, iterations: int, labels: Int32) -> Float64:
-    """Set the labels of the chosen points, and return the centers (groups, 3), m, of their groups."""
+    """Group the chosen points by Lloyd iterations from groups by depth; return the centers (groups, 3), m.
+
+    Set their labels to `first_label` plus the index of their group. Other labels are unchanged.
+    """
     own, own_labels, count = np.empty_like(points), np.empty(len(points), np.int32), 0
     for i in range(len(points)):
         if chosen[i]:

@@ -31,8 +31,8 @@ def fit(
 ) -> Mixtures:  # fmt: skip
     """Fit a mixture to each point set `points[starts[k]:starts[k + 1]]` by expectation maximization.
 
-    `labels` (S,) in [0, `components`) are hard responsibilities for the first M-step. The uniform component covers the
-    set's bounding box.
+    `points`: (S, 3), m. `labels` (S,) in [0, `components`) are hard responsibilities for the first M-step. The uniform
+    component covers the set's bounding box.
 
     `prior_log_odds` (S,) is the evidence of each point for the first `own_components`. Their densities at point i are
     multiplied by exp(prior_log_odds[i]) in eq. (2). The log-likelihood uses the weighted densities, so it is defined
@@ -59,9 +59,9 @@ def likely_members(
 ) -> Bool:  # fmt: skip
     """Return an array (S,), True for `points[begins[k]:ends[k]]` with a posterior above `min_posterior` in mixture k.
 
-    The posterior is the probability of the first `own_components`, which form the object. For a mixture without
-    components, all entries are True, because there is no evidence against the points. Entries outside the ranges are
-    False.
+    The posterior is the probability of the first `own_components`, which form the object. Their densities at point i
+    are multiplied by exp(prior_log_odds[i]), as in `fit`; None = 0. For a mixture without components, all entries are
+    True, because there is no evidence against the points. Entries outside the ranges are False.
     """
     weights, means, covariances = mixtures.weights, mixtures.means, mixtures.covariances
     rows = coefficients(weights.ravel(), means.reshape(-1, 3), covariances.reshape(-1, 3, 3))
@@ -75,7 +75,7 @@ def likely_members(
 
 
 def blocks_of(begins: Int64, ends: Int64, size: int) -> Blocks:
-    """Return blocks of at most `size` points that cover each range of points."""
+    """Return blocks of at most `size` points that cover each range of points from begins[k] to ends[k] - 1."""
     counts = -(-(ends - begins) // size)
     owner = np.repeat(np.arange(len(counts)), counts)
     firsts = begins[owner] + size * (np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts))

@@ -64,7 +64,7 @@ def fit_all(
     points: Float32, starts: Int64, labels: Int32, odds: Float32, own_components: int, settings: EmSettings,
     mixtures: Mixtures,
 ) -> None:  # fmt: skip
-    """Fit the mixture of each cluster."""
+    """Fit the mixture of each point set; see `mixture.fit` for the arguments. `mixtures` is set in place."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             own = slice(starts[k], starts[k + 1])
@@ -73,7 +73,10 @@ def fit_all(
 
 @njit(cache=True, nogil=True, parallel=True)
 def improve_all(points: Float32, starts: Int64, odds: Float32, settings: EmSettings, mixtures: Mixtures) -> None:
-    """Run EM on the mixture of each cluster, starting from its current parameters."""
+    """Run EM on the mixture of each point set, starting from its current parameters; update `mixtures` in place.
+
+    `odds`: the log-odds (S,) of the points; unused, because no component forms the object.
+    """
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             own = slice(starts[k], starts[k + 1])
@@ -143,9 +146,9 @@ def _any_left(weights: Float64) -> bool:
 def _expect(
     xyz: Float32, odds: Float32, own_components: int, rows: Float32, log_outlier: np.float32, moments: Float64
 ) -> tuple[float, float]:
-    """Run the E-step, eq. (2), and sum the moments of the M-step.
+    """Run the E-step, eq. (2), on centered points `xyz` (3, S), m, and add to the moments (K, 10) of the M-step.
 
-    Returns sum_i log p(x_i), and N_k of the uniform component.
+    Returns sum_i log p(x_i), and N_k of the uniform component, the sum of its responsibilities.
     """
     components = len(rows)
     densities = np.empty((components, BLOCK), np.float32)
@@ -178,7 +181,10 @@ def _maximize(
     moments: Float64, center: Float64, count: int, variance_floor: float, weights: Float64, means: Float64,
     covariances: Float64,
 ) -> None:  # fmt: skip
-    """Run the M-step, eqs. (3) and (4)."""
+    """Run the M-step, eqs. (3) and (4), on the moments (K, 10) of `count` points relative to `center`, m.
+
+    Set the weights, means and covariances of the components in place. A component with too few points gets weight 0.
+    """
     for j in range(len(weights)):
         N_k = moments[j, 0]
         if N_k < MIN_SUPPORT:
@@ -199,7 +205,7 @@ def _maximize(
 
 @njit(cache=True, nogil=True)
 def _center_and_volume(points: Float32, variance_floor: float) -> tuple[Float64, float]:
-    """Return the points' mean, m, and the volume of their bounding box, m^3.
+    """Return the mean (3,), m, of points (S, 3), m, and the volume of their bounding box, m^3.
 
     A side of the box is at least 4 times the square root of `variance_floor`.
     """
@@ -232,7 +238,12 @@ def claim(
     points: Float32, blocks: Blocks, odds: Float32, rows: Float32, log_outliers: Float32, own_components: int,
     min_posterior: float, claimed: Bool,
 ) -> None:  # fmt: skip
-    """Set `claimed` to True for each point of the blocks if own / (own + others) > min_posterior."""
+    """Set `claimed` (S,) to True for points of the blocks with a posterior above `min_posterior`.
+
+    The posterior is own / (own + others), where `own` is the density of the first `own_components` times exp(odds), and
+    `others` is the density of the other components and the uniform component. `rows`: (N, K, 10), from `coefficients`.
+    `log_outliers`: log density (N,) of the uniform component times its weight.
+    """
     for b in prange(len(blocks.sets)):
         k, begin, end = blocks.sets[b], blocks.begins[b], blocks.ends[b]
         absent = True
@@ -252,9 +263,10 @@ def _claim_batch(
     points: Float32, odds: Float32, rows: Float32, log_outlier: np.float32, own_components: int, min_posterior: float,
     claimed: Bool,
 ) -> None:  # fmt: skip
-    """Run `claim` for one batch, mostly without exponentials.
+    """Run `claim` for one batch of points of one mixture, mostly without exponentials.
 
-    They are unnecessary for most points, because a sum of n terms is between its largest term and n times this term.
+    Exponentials are unnecessary for most points, because a sum of n terms is between its largest term and n times this
+    term.
     """
     components = len(rows)
     log_bound = math.log(min_posterior / (1.0 - min_posterior))

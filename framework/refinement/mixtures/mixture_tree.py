@@ -55,21 +55,24 @@ class MixtureTree:
 
     levels: tuple[Level, ...]  # coarsest first; at least one
 
-    def passed(self, k: int, points: Float32, starts: Int64) -> Int64:
-        """Return the best node (S,) of level `k` for each point; -1 = the uniform component is more likely.
+    def best_nodes(self, k: int, points: Float32, starts: Int64) -> Int64:
+        """Return the best node (S,) of level `k` for each of S points; -1 = the uniform component is more likely.
 
-        `points[starts[q]:starts[q + 1]]` are the points of node q of the level above.
+        `points[starts[q]:starts[q + 1]]`, m, are the points of node q of the level above. The best node of a point is
+        the child of its node with the largest weighted density.
         """
         ratios, outlier_ratios = np.ones(len(self.levels[k]), np.float32), np.ones(len(starts) - 1, np.float32)
-        return self.shared(k, points, starts, ratios, outlier_ratios, np.zeros(len(points), np.float32))[0]
+        log_odds = np.zeros(len(points), np.float32)
+        return self.best_nodes_with_posteriors(k, points, starts, ratios, outlier_ratios, log_odds)[0]
 
-    def shared(
+    def best_nodes_with_posteriors(
         self, k: int, points: Float32, starts: Int64, ratios: Float32, outlier_ratios: Float32, log_odds: Float32
     ) -> tuple[Int64, Float32]:
-        """Return the result of `passed`, and the object's posterior (S,) at each point from the densities of level `k`.
+        """Return the best node (S,) of each point, as in `best_nodes`, and the posterior (S,) of the object.
 
-        `ratios` (M,) are the object's fractions of the nodes, and `outlier_ratios` (Q,) those of the uniform
-        components. The object's density is multiplied by exp(`log_odds`) (S,). The posterior of a point at a leaf is 0.
+        The posterior uses the densities of level `k`. `ratios` (M,) are the object's fractions of the nodes' densities,
+        and `outlier_ratios` (Q,) are its fractions of the uniform components. `log_odds` (S,): the object's density at
+        a point is multiplied by exp(log_odds). The posterior is 0 if the point's node in the level above is a leaf.
         """
         level = self.levels[k]
         child, posterior = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
@@ -107,7 +110,7 @@ def fit(
             break
         grown.append(level)
         if len(grown) < levels:
-            child = MixtureTree((level,)).passed(0, points, starts)
+            child = MixtureTree((level,)).best_nodes(0, points, starts)
             order, starts = grouped(child.astype(np.int32), len(level))
             points, above = points[order], level.weights
     return MixtureTree(tuple(grown))
@@ -116,8 +119,8 @@ def fit(
 def cut(points: Float32, starts: Int64, groups: int) -> Int32:
     """Return labels (S,) in [0, groups) that divide each set into compact groups, to initialize `mixture.fit`.
 
-    Variance-based bisection cuts the group with the largest scatter along one axis at its mean. A group is not cut if
-    one part would have too few points for a component.
+    Set k is `points[starts[k]:starts[k + 1]]`, m. Variance-based bisection cuts the group with the largest scatter
+    along one axis at its mean. A group is not cut if one part would have too few points for a component.
     """
     labels = np.zeros(len(points), np.int32)
     cut_all(points, starts, groups, labels)
@@ -125,11 +128,11 @@ def cut(points: Float32, starts: Int64, groups: int) -> Int32:
 
 
 def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: float) -> Float32:
-    """Return the object's fraction (M,) of each node j from its points' evidence `log_odds[starts[j]:starts[j + 1]]`.
+    """Return the object's fraction (M,) of the density of each node j.
 
-    The evidence o_i of a point is its log-likelihood ratio of object to background. The fraction rho maximizes sum_i
-    log(rho exp(o_i) + 1 - rho), with `above_points` additional points at the parent's fraction `above` (M,). It is the
-    fixed point of EM over the points' classes.
+    `log_odds[starts[j]:starts[j + 1]]` are the log-likelihood ratios o_i of object to background of the node's points.
+    The fraction rho maximizes sum_i log(rho exp(o_i) + 1 - rho). The fraction of the parent, `above` (M,), has the
+    weight of `above_points` additional points. rho is computed by EM over the classes of the points.
     """
     ratios = above.astype(np.float32)
     set_own_ratios(log_odds, starts, above_points, ratios)
@@ -137,14 +140,15 @@ def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: f
 
 
 def object_ratios(tree: MixtureTree, sample: Neighborhoods, odds: Float32, parent_points: float) -> list[Float32]:
-    """Return the object's fraction (M,) of each node, for each level, from the log-odds (S,) of the sample's points.
+    """Return, for each level, the object's fraction (M,) of the density of each of its M nodes; see `own_ratios`.
 
-    The parent's fraction has the weight of `parent_points` points.
+    `odds`: the log-odds (S,) of the points of `sample` for the object. The fraction of the parent has the weight of
+    `parent_points` points. The fraction above the first level is 0.5.
     """
     points, starts = sample.points_camera, sample.starts
     above, ratios = np.full(len(sample), 0.5, np.float32), []
     for k, level in enumerate(tree.levels):
-        order, starts = grouped(tree.passed(k, points, starts).astype(np.int32), len(level))
+        order, starts = grouped(tree.best_nodes(k, points, starts).astype(np.int32), len(level))
         points, odds = points[order], odds[order]
         above = own_ratios(odds, starts, above[level.parents], parent_points)
         ratios.append(above)
@@ -152,15 +156,16 @@ def object_ratios(tree: MixtureTree, sample: Neighborhoods, odds: Float32, paren
 
 
 def claimed(tree: MixtureTree, ratios: list[Float32], own: Neighborhoods, odds: Float32, min_posterior: float) -> Bool:
-    """Return an array (S,), True for points of the masks with a posterior above `min_posterior` at their deepest level.
+    """Return an array (S,), True for points with a posterior of the object above `min_posterior` at their last level.
 
-    `odds` (S,) are the log-odds of the points for the object.
+    `own`: the S points of the masks. `odds`: their log-odds (S,) for the object. `ratios`: from `object_ratios`. The
+    last level of a point is the deepest level with children of its node.
     """
     claimed, remaining = np.zeros(len(own.points_camera), bool), np.arange(len(own.points_camera))
     points, starts = own.points_camera, own.starts
     above = np.zeros(len(own), np.float32)
     for k, level in enumerate(tree.levels):
-        child, posterior = tree.shared(k, points, starts, ratios[k], above, odds)
+        child, posterior = tree.best_nodes_with_posteriors(k, points, starts, ratios[k], above, odds)
         claimed[remaining] = posterior > min_posterior
         if k + 1 < len(tree.levels):
             has_children = np.append(np.diff(tree.levels[k + 1].firsts) > 0, False)  # False for -1, an outlier
@@ -170,7 +175,11 @@ def claimed(tree: MixtureTree, ratios: list[Float32], own: Neighborhoods, odds: 
 
 
 def level_below(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64, min_support: float) -> Level:
-    """Return the level below the nodes with weights `above` (Q,). Only the `chosen` nodes have children."""
+    """Return the level below Q nodes with weights `above` (Q,). Only the nodes with indices `chosen` have children.
+
+    `fitted`: their mixtures. `boxes`: the boxes (chosen, 2, 3), m, of their uniform components. A child with a weight
+    below `min_support` is dropped.
+    """
     kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
     survivors = np.count_nonzero(kept, axis=1)
     weights = np.where(kept, fitted.weights, 0.0)
@@ -188,7 +197,10 @@ def level_below(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64,
 
 
 def ranges(points: Float32, starts: Int64, chosen: Int64) -> tuple[Float32, Int64]:
-    """Return the points of the chosen sets and the starts (chosen + 1,) of these sets."""
+    """Return the points of the sets with the ascending indices `chosen`, and the starts (chosen + 1,) of these sets.
+
+    Set k is `points[starts[k]:starts[k + 1]]`.
+    """
     counts = np.diff(starts)
     if len(chosen) == len(counts):
         return points, starts

@@ -14,7 +14,7 @@ RATIO_ITERATIONS = 20  # number of EM iterations for an object fraction; for dis
 
 @njit(cache=True, nogil=True, parallel=True)
 def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
-    """Divide each set of points into groups along the axes of largest scatter."""
+    """Set `labels` (S,) to the groups of each set of points; see `cut`."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             _cut_one(points[starts[k] : starts[k + 1]], groups, labels[starts[k] : starts[k + 1]])
@@ -22,7 +22,10 @@ def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _cut_one(points: Float32, groups: int, labels: Int32) -> None:
-    """Cut one set. The members of each group are contiguous in `order`, so that a cut reads only its own group."""
+    """Run `cut` on one set. The members of a group are contiguous in `order`, so that a cut reads only its own group.
+
+    `labels` are initially 0.
+    """
     n = len(points)
     order, upper = np.arange(n), np.empty(n, np.int64)
     begins, ends = np.zeros(groups, np.int64), np.zeros(groups, np.int64)
@@ -61,7 +64,7 @@ def _cut_one(points: Float32, groups: int, labels: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _measure(points: Float32, members: Int64, mean: Float64, scatter: Float64) -> None:
-    """Set the members' mean and their scatter along each axis."""
+    """Set `mean` (3,), m, and `scatter` (3,), the sum of squared deviations along each axis, m^2, of the members."""
     origin = points[members[0]]  # offsets from a member avoid cancellation in the variance
     count, sums, squares = len(members), np.zeros(3), np.zeros(3)
     for i in members:
@@ -93,7 +96,11 @@ def pass_down(
     points: Float32, log_odds: Float32, blocks: Blocks, rows: Float32, ratios: Float32, firsts: Int64,
     log_outliers: Float32, outlier_ratios: Float32, child: Int64, posterior: Float32,
 ) -> None:  # fmt: skip
-    """Set `child` (S,) to the child with the largest density at each point, and `posterior` (S,) to the object's."""
+    """Set `child` (S,) and `posterior` (S,) for the points of the blocks; the set of a block is their node.
+
+    `child` is the child with the largest weighted density at each point; -1 = uniform component or leaf. `posterior` is
+    the posterior probability of the object; see `MixtureTree.best_nodes_with_posteriors`.
+    """
     for b in prange(len(blocks.sets)):
         q, own = blocks.sets[b], slice(blocks.begins[b], blocks.ends[b])
         children = slice(firsts[q], firsts[q + 1])
@@ -137,7 +144,7 @@ def _pass_block(
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def take_better(densities: Float32, j: np.int32, largest: Float32, best: Int32) -> None:
-    """Set `best` to j, and `largest` to the density, for points where the density exceeds `largest`."""
+    """Set `best` to `j`, and `largest` to the density, where `densities` exceeds `largest`."""
     for i in range(len(largest)):
         better = densities[i] > largest[i]
         best[i] = j if better else best[i]
@@ -152,7 +159,7 @@ def _add_scaled(densities: Float32, scale: np.float32, values: Float32) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def set_own_ratios(log_odds: Float32, starts: Int64, above_points: float, ratios: Float32) -> None:
-    """Replace the parents' fractions in `ratios` (M,) with the fractions of the nodes."""
+    """Replace the parents' fractions in `ratios` (M,) with the fractions of the nodes; see `own_ratios`."""
     for j in prange(len(starts) - 1):
         if starts[j + 1] > starts[j]:
             odds = np.exp(log_odds[starts[j] : starts[j + 1]])

@@ -29,8 +29,8 @@ from framework.refinement.segmentation.convexity_kernels import (
     connected,
     count_edges,
     fit_planes,
+    mean_inverse_depth,
     pixel_labels,
-    sum_cells,
 )
 from framework.sensors.noise_models import SensorKind
 
@@ -39,28 +39,28 @@ from framework.sensors.noise_models import SensorKind
 class Limits:
     """Limits for a continuous and convex surface."""
 
-    noise_factor: float  # depth difference that counts as noise, in standard deviations
-    min_noise: float  # minimum standard deviation of depth for quantized readings, m
+    noise_factor: float  # maximum depth difference that counts as noise, in standard deviations
+    min_noise: float  # minimum standard deviation of depth, m; for quantized depth
     max_slope: float  # maximum change of depth with lateral distance, m per m
-    max_angle: float  # maximum angle of a concave bend in addition to noise, rad
+    max_angle: float  # maximum angle of a concave bend, in addition to the noise of the angle, rad
 
 
 def segments(
     depth: Float32, camera: Camera, *, cell: int, window: int, limits: Limits, closing: int, min_pixels: int,
     sensor: SensorKind = SensorKind.KINECT_V1,
 ) -> tuple[Int32, int]:  # fmt: skip
-    """Return the segment label (H, W) of each pixel, in [0, count) or -1 = none, and the count.
+    """Return the segment label (H, W) of each pixel, in [0, count) or -1 = none, and the number of segments, count.
 
-    Planes are fitted to windows of (2 `window` + 1)^2 cells of `cell` x `cell` px. Gaps of up to 2 `closing` cells in
-    edges are closed. Segments of fewer than `min_pixels` pixels are merged with their neighbors. `sensor` determines
-    the noise.
+    `depth`: (H, W) m, 0 = no reading. Planes are fitted to windows of (2 `window` + 1)^2 cells of `cell` x `cell` px.
+    Gaps of up to 2 `closing` cells in edges are closed. Segments of fewer than `min_pixels` pixels are merged with
+    their neighbors. `sensor` determines the noise.
     """
     slope = np.float32(limits.max_slope * cell * 2 / (camera.fx + camera.fy))  # relative change of depth per cell
     pinhole = np.array(
         [camera.fx / cell, camera.fy / cell, (camera.cx + 0.5) / cell - 0.5, (camera.cy + 0.5) / cell - 0.5], np.float32
     )
     noise = Noise(limits.noise_factor, limits.min_noise, *sensor.noise[:3])
-    inverse = sum_cells(depth, cell, noise, slope)
+    inverse = mean_inverse_depth(depth, cell, noise, slope)
     fits = fit_planes(inverse, window, noise, slope)
     planes = best_planes(inverse, fits, window, noise)
     edges = count_edges(planes, pinhole, noise, limits.max_angle, normal_sigma(1.0, window, cell, camera))
@@ -77,8 +77,9 @@ def segments(
 def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> float:
     """Return the standard deviation, rad, of the angle between two normals, fitted at 1 m with `depth_noise`, m.
 
-    It is proportional to 1 / z. The slope of a line through M readings has the standard deviation sigma / (sqrt(M) *
-    rms offset).
+    Normals are fitted to windows of (2 `window` + 1)^2 cells of `cell` x `cell` px. At depth z and for the same noise,
+    the result is proportional to 1 / z. The slope of a line through M readings has the standard deviation sigma /
+    (sqrt(M) * rms offset).
     """
     readings = (cell * (2 * window + 1)) ** 2
     offset = cell * np.sqrt(window * (window + 1) / 3) * 2 / (camera.fx + camera.fy)  # m at 1 m

@@ -33,19 +33,22 @@ _axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the cal
 
 @njit(cache=True, nogil=True)
 def _sigma(z: float, noise: Noise) -> float:
-    """Return the standard deviation, m, of depth z, m."""
+    """Return the standard deviation of a reading at depth `z`, both in m."""
     return float(max(axial_sigma(z, noise), noise.min_noise))
 
 
 @njit(cache=True, nogil=True)
 def _noise_at(inverse: float, noise: Noise) -> np.float32:
-    """Return the difference that counts as noise at an inverse depth, 1 / m."""
+    """Return the maximum difference of inverse depth, 1 / m, that counts as noise at the inverse depth `inverse`."""
     return np.float32(noise.factor * _sigma(1.0 / inverse, noise) * inverse * inverse)
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def sum_cells(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Float32:
-    """Return the mean inverse depth (rows, columns) of each cell's nearest surface, 1 / m; 0 = no reading."""
+def mean_inverse_depth(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Float32:
+    """Return the mean inverse depth (rows, columns), 1 / m, of the nearest surface in each cell; 0 = no reading.
+
+    `depth`: (H, W), m. `cell`: side of a cell, px. `slope`: maximum relative change of depth on a surface per cell.
+    """
     height, width = depth.shape
     rows, columns = -(-height // cell), -(-width // cell)
     inverse = np.zeros((rows, columns), np.float32)
@@ -75,7 +78,11 @@ def _add_offset(
     own: Float32, other: Float32, gate: Float32, gate_slope: Float32, x: np.float32, y: np.float32, reach: np.float32,
     sums: Float32,
 ) -> None:  # fmt: skip
-    """Add the moments of the cells at one offset (x, y), cells, to the sums of each cell of a row."""
+    """Add the moments of the cells at one offset (x, y), cells, to the `sums` (10, columns) of the cells of a row.
+
+    `own` and `other`: inverse depth, 1 / m, of the cells and of the cells at the offset. Pairs whose difference is
+    above gate + gate_slope * reach are skipped; `reach` is the length of the offset, cells.
+    """
     zero, one = np.float32(0), np.float32(1)
     n, sx, sy, sxx, sxy, syy, se, sxe, sye, see = sums
     for c in range(len(own)):
@@ -195,7 +202,11 @@ def _take_better(
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float) -> Bool:
-    """Return the edges (rows, columns): cells without a plane or with a surface border between opposite neighbors."""
+    """Return an array (rows, columns), True at edges: no plane, or a surface border between opposite neighbors.
+
+    `planes`: from `best_planes`. `pinhole`: fx, fy, cx, cy, in cells. `max_angle`: see `Limits`. `normal_sigma_1m`:
+    from `normal_sigma`, for a depth noise of 1 m.
+    """
     _, rows, columns = planes.shape
     surface = np.empty((9, rows, columns), np.float32)
     for r in prange(rows):
@@ -278,7 +289,7 @@ def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool
 def _unite_row(
     inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, r: int, upwards: bool, parents: Int32
 ) -> None:
-    """Unite the cells of row r with their left or upper neighbors, except across depth jumps."""
+    """Unite the cells of row `r` with their left or (`upwards`) upper neighbors, except at edges and depth jumps."""
     columns = inverse.shape[1]
     step = columns if upwards else 1
     flat_inverse, flat_edges = inverse.ravel(), edges.ravel()
@@ -293,7 +304,10 @@ def _unite_row(
 
 @njit(cache=True, nogil=True, parallel=True)
 def connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, min_cells: int) -> tuple[Int32, int]:
-    """Return the component label of each cell (rows, columns), in [0, count), and the count; -1 = edge or too small."""
+    """Return the component label (rows, columns) of each cell and the number of components, count.
+
+    Labels are in [0, count); -1 = an edge, or a component of fewer than `min_cells` cells.
+    """
     rows, columns = inverse.shape
     parents = np.arange(rows * columns).astype(np.int32)
     strips = -(-rows // STRIP)

@@ -23,7 +23,10 @@ MAX_PLANES = 32  # maximum number of planes; frames have fewer large planes
 
 @njit(cache=True, nogil=True, parallel=True)
 def sum_moments(depth: Float32, pinhole: Float32, moments: Float64) -> None:
-    """Set moments (rows, columns, 10) to each cell's sums of 1, x, y, x x, x y, y y, q, x q, y q, q q."""
+    """Set `moments` (rows, columns, 10) to the sums of 1, x, y, x x, x y, y y, q, x q, y q, q q over each cell.
+
+    For each reading, x = (u - cx) / fx, y = (v - cy) / fy, and q = 1 / depth, 1/m. `pinhole`: fx, fy, cx, cy, px.
+    """
     height, width = depth.shape
     fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
     for row in prange(moments.shape[0]):
@@ -51,9 +54,10 @@ def sum_moments(depth: Float32, pinhole: Float32, moments: Float64) -> None:
 
 @njit(cache=True, nogil=True)
 def _solve(moment: Float64, m: Float64) -> bool:
-    """Set m to the least-squares plane of the readings by Cramer's rule; return False if it is not determined.
+    """Set `m` (3,), 1/m, to the least-squares plane of the readings; return False if the plane is not determined.
 
-    The normal equations are centered, because x and y vary within a cell by only a hundredth of their size.
+    `moment`: the sums (10,) of the readings, from `sum_moments`. The system is solved by Cramer's rule. The normal
+    equations are centered, because x and y vary within a cell by only a hundredth of their size.
     """
     n = moment[0]
     if n < 3:
@@ -72,7 +76,7 @@ def _solve(moment: Float64, m: Float64) -> bool:
 
 @njit(cache=True, nogil=True)
 def _deviation(moment: Float64, m: Float64) -> float:
-    """Return the rms of q - m . r over the readings, 1/m."""
+    """Return the root mean square of q - m . r over the readings with the sums `moment` (10,), 1/m."""
     n, sx, sy, sxx, sxy = moment[0], moment[1], moment[2], moment[3], moment[4]
     syy, sq, sxq, syq, sqq = moment[5], moment[6], moment[7], moment[8], moment[9]
     a, b, c = m[0], m[1], m[2]
@@ -112,7 +116,11 @@ def _area(moment: Float64, m: Float64, spacing: float) -> float:
 
 @njit(cache=True, nogil=True)
 def write_flatness(cells: Float64, distance: float, noise: float, sensor: DepthNoise, flatness: Float64) -> None:
-    """Set flatness (C,) to the rms deviation, 1/m, of each cell that is full and flat enough to seed a plane."""
+    """Set `flatness` (C,) to the rms deviation, 1/m, of each of C cells that can start a plane; skip the other cells.
+
+    `cells`: the sums (C, 10) of the cells, from `sum_moments`. A cell can start a plane if at least half of its
+    readings exist and it is flat. See `find_planes` for the other arguments.
+    """
     m = np.zeros(3)
     for i in range(len(cells)):
         if 2 * cells[i, 0] >= FULL and _solve(cells[i], m) and _lies_in(cells[i], m, distance, noise, sensor):
@@ -124,7 +132,12 @@ def find_plane_cells(
     cells: Float64, columns: int, seeds: Int64, free: Bool, distance: float, noise: float, sensor: DepthNoise,
     min_area: float, spacing: float, found: Float64,
 ) -> int:  # fmt: skip
-    """Set `found` to m, deviation, area, fraction and behind of each plane, and clear `free` at its cells; return K."""
+    """Set the first K rows of `found` to the planes, and `free` (C,) to False at their cells; return K.
+
+    A row contains the values of `Planes`: m (3), deviation, area, fraction and behind. `cells`: the sums (C, 10) of the
+    cells, row by row. `columns`: number of cells per row. `seeds`: the cells that can start a plane, flattest first.
+    `spacing`: the distance of neighboring readings at 1 m, m. See `find_planes` for the other arguments.
+    """
     m, total = np.zeros(3), np.zeros(10)
     tried = np.zeros(len(cells), np.bool_)
     readings = 0.0
@@ -170,9 +183,10 @@ def _grow(
     cells: Float64, columns: int, seed: int, free: Bool, distance: float, noise: float, sensor: DepthNoise, m: Float64,
     region: Int64,
 ) -> int:  # fmt: skip
-    """Set `region` to the cells connected to the seed in one plane, and m to this plane; return the number of cells.
+    """Grow a plane from the cell `seed`.
 
-    The plane is fitted again with every new cell.
+    Set `region` (C,) to the indices of its cells and `m` (3,), 1/m, to the plane; return the number of cells. The plane
+    is refitted after each added cell. `cells`: (C, 10) moments from `sum_moments`.
     """
     seen, total = np.zeros(len(cells), np.bool_), cells[seed].copy()
     _solve(total, m)
@@ -203,7 +217,7 @@ def _grow(
 def _collect(
     cells: Float64, free: Bool, m: Float64, distance: float, noise: float, sensor: DepthNoise, deviations: Float64
 ) -> None:
-    """Set deviations (C,) to the rms deviation of each free cell on the plane, and to infinity for all other cells."""
+    """Set `deviations` (C,) to the rms deviation, 1/m, of each free cell on the plane `m`, infinity for other cells."""
     slope = distance * _length(m)
     for i in range(len(cells)):
         deviations[i] = np.inf
@@ -215,9 +229,10 @@ def _collect(
 
 @njit(cache=True, nogil=True)
 def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> None:
-    """Set m to the plane of the best-fitting cells, at least half of them, and `total` to the sum of their moments.
+    """Set `m` to the plane of the best-fitting cells, at least half of them, and `total` (10,) to their summed moments.
 
-    The other cells are on both sides of the intersection of two planes, and would tilt the planes towards each other.
+    The best-fitting cells are those with `deviations` (C,) of at most TRIM times the median. The other cells are on
+    both sides of the intersection of two planes, and would tilt the planes towards each other.
     """
     inside, count = np.empty(len(deviations)), 0
     for i in range(len(deviations)):
@@ -240,7 +255,10 @@ def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> N
 
 @njit(cache=True, nogil=True)
 def _order(values: Float64, k: int) -> float:
-    """Return the k-th smallest value, and reorder the values (Hoare 1961, "Find"); np.median compiles more slowly."""
+    """Return the value with index `k` in ascending order, and reorder the values (Hoare 1961, "Find").
+
+    np.median compiles more slowly.
+    """
     low, high = 0, len(values) - 1
     while low < high:
         pivot = values[(low + high) // 2]
@@ -264,7 +282,10 @@ def _order(values: Float64, k: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _readings_behind(cells: Float64, m: Float64, deviation: float, distance: float) -> float:
-    """Return the number of readings in cells whose mean is clearly behind the plane."""
+    """Return the number of readings in cells whose mean inverse depth is significantly behind the plane `m`.
+
+    `deviation`: the noise of the plane, 1/m. `distance`: the maximum distance from a plane along the normal, m.
+    """
     behind = 0.0
     for i in range(len(cells)):
         n = cells[i, 0]
@@ -281,7 +302,11 @@ def label_points(
     depth: Float32, pinhole: Float32, m: Float32, lengths: Float32, reach: Float32, sigmas: Float32,
     image: UInt8,
 ) -> None:  # fmt: skip
-    """Set image (H, W) to 1 + the index of the plane nearest to each depth reading within its reach."""
+    """Set `image` (H, W) to 1 + the index of the nearest plane of each depth reading that is on a plane.
+
+    `m`: the planes (K, 3), 1/m. `lengths`: |m| (K,), 1/m. A reading at depth z is on plane k if |z m . r - 1| is at
+    most reach[k] + sigmas[k] * z; `reach` (K,) has no unit, and `sigmas` (K,) is in 1/m.
+    """
     fx, fy, cx, cy = pinhole
     for v in prange(depth.shape[0]):
         y = np.float32(v - cy) / fy
@@ -300,7 +325,11 @@ def label_points(
 def find_off_planes(
     cluster: Int32, pixels: Int32, on_plane: UInt8, max_own: float, counts: Int64, stays: Bool, structure: Bool
 ) -> Bool:
-    """Return an array (P,), True for the kept points, and set `structure` to False at kept points on planes."""
+    """Return an array (P,), True for the points to keep, and set `structure` to False at kept points on planes.
+
+    `counts` (parts, N + 1, K + 1), initially 0, are the numbers of points by cluster and plane. `stays` (N + 1, K + 1),
+    initially True, are the pairs of cluster and plane whose points are kept. See `off_planes`.
+    """
     labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
     for part in prange(len(counts)):
         own = slice(part * PART, (part + 1) * PART)
@@ -315,7 +344,10 @@ def find_off_planes(
 
 @njit(cache=True, nogil=True)
 def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
-    """Set `stays` for each cluster (last row: points of no cluster) and each plane (column 0: points on no plane)."""
+    """Set `stays` to True where a cluster has more than a fraction `max_own` of a plane's readings, else to False.
+
+    The last row (points of no cluster) and column 0 (points on no plane) stay unchanged.
+    """
     parts, rows, columns = counts.shape
     for label in range(1, columns):
         most = max_own * _count(on_plane.ravel(), label)
@@ -328,7 +360,11 @@ def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
 
 @njit(cache=True, nogil=True)
 def _count_on_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, labels: UInt8, counts: Int64) -> None:
-    """Count points by cluster and plane. Runs of equal labels are counted together, to avoid a write for each point."""
+    """Add the numbers of points by cluster and plane to `counts` (N + 1, K + 1), and set `labels` to their planes.
+
+    A label is 1 + the index of the plane, 0 = none. Runs of equal labels are counted together, to avoid a write for
+    each point.
+    """
     k, label, count = 0, 0, 0
     for i in range(len(cluster)):
         labels[i] = on_plane[pixels[i, 1], pixels[i, 0]]

@@ -24,11 +24,11 @@ TOLERANCE = 1e-3  # maximum distance of a point from its depth reading, m
 def owned_segments(
     clusters: PointClusters, frame: Frame, labels: Int32, count: int, min_overlap: float, whole_segments: bool
 ) -> PointClusters:
-    """Return the clusters without points outside their segments; `labels` (H, W) in [0, `count`), -1 = none.
+    """Return the clusters without points outside their segments.
 
-    A segment belongs to the mask that covers the most of its pixels, if these are more than a fraction `min_overlap` of
-    the segment. With `whole_segments`, the readings of a cluster's segments outside its mask are added to the cluster,
-    if the points determine the camera pose.
+    `labels`: the segment (H, W) of each pixel in [0, `count`), -1 = none. A segment belongs to the mask that covers the
+    most of its pixels, if these are more than a fraction `min_overlap` of the segment. With `whole_segments`, the
+    readings of a cluster's segments outside its mask are added to the cluster, if the points determine the camera pose.
     """
     owners = find_owners(clusters.pixels, clusters.cluster, len(clusters), labels, count, min_overlap)
     kept, missing, missing_owner = judged(clusters.pixels, clusters.cluster, labels, owners)

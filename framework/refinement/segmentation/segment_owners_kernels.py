@@ -10,7 +10,11 @@ from framework.data import Bool, Int32
 
 @njit(cache=True, nogil=True)
 def find_owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, count: int, min_overlap: float) -> Int32:
-    """Return the cluster (count,) with the most pixels in each segment; -1 = too few pixels. Ties go to the first."""
+    """Return the cluster (count,) with the most points in each of `count` segments; -1 = none. Ties go to the first.
+
+    `pixels`: (P, 2) u, v. `cluster`: (P,) in [0, `clusters`), -1 = none. `labels`: (H, W), -1 = no segment. The points
+    must cover more than a fraction `min_overlap` of the segment.
+    """
     sizes, covered = np.zeros(count, np.int64), np.zeros((count, clusters), np.int64)
     for label in labels.ravel():
         if label >= 0:
@@ -29,7 +33,12 @@ def find_owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, cou
 
 @njit(cache=True, nogil=True)
 def judged(pixels: Int32, cluster: Int32, labels: Int32, owners: Int32) -> tuple[Bool, Int32, Int32]:
-    """Return an array (P,), True for kept points, the other pixels (A, 2) of owned segments, and their owners (A,)."""
+    """Return an array (P,), True for points to keep, and the A uncovered pixels of owned segments with their owners.
+
+    Points are kept if their cluster owns their segment, or if they belong to no cluster. A pixel of a segment with an
+    owner is uncovered if it has no kept point. Returns the uncovered pixels as (A, 2), u and v, and their owners, which
+    are clusters, as (A,). See `find_owners` for the arguments.
+    """
     height, width = labels.shape
     kept, covered = np.ones(len(cluster), np.bool_), np.zeros(labels.shape, np.bool_)
     for i in range(len(cluster)):

@@ -9,7 +9,7 @@ from framework.data import Int32
 
 @njit(cache=True, nogil=True)
 def root(parents: Int32, cell: int) -> int:
-    """Return the root of the cell's component, with path halving."""
+    """Return the root of the component of a cell; path halving updates `parents`."""
     while parents[cell] != cell:
         parents[cell] = parents[parents[cell]]
         cell = parents[cell]

@@ -1,6 +1,6 @@
 "use strict";
 
-// Connects the parts of a page: map, side panel, object table and buttons.
+// Controller of a page, which connects the map, the side panel, the object table and the buttons.
 
 const report = JSON.parse(document.getElementById("report-data").textContent);
 const byId = (id) => document.getElementById(id);

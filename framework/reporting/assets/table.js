@@ -25,7 +25,7 @@ class ObjectTable {
     });
   }
 
-  /** Sorts by a column: numbers in descending order, texts in ascending order. Another call reverses the order. */
+  /** Sorts by a column: numbers in descending order, texts in ascending order. A second call reverses the order. */
   sort(column) {
     const head = this.heads[column];
     const numeric = head.classList.contains("number");

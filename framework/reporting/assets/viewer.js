@@ -1,6 +1,6 @@
 "use strict";
 
-// 3D viewer of the map: colors, instances or classes; selection of objects; mapping progress.
+// 3D viewer of the map: recorded, instance or class colors; selection of objects; mapping progress.
 // Colors are mixed as in overview.png: one color per instance, with some texture.
 
 const VERTEX_SHADER = `
@@ -41,7 +41,7 @@ const FRAGMENT_SHADER = `
     gl_FragColor = vec4(min(shown, vec3(1.0)), 1.0);
   }`;
 
-const FLIGHT_MS = 600;
+const FLIGHT_MS = 600; // duration of a camera movement
 const FADED = 0.62; // fraction of the background color in unselected objects while an object is selected
 const PATH_WIDTH = 0.0022; // radius of the path's tube, relative to the distance from camera to target in the initial view
 const PATH_SIDES = 6; // number of sides of the path's tube
@@ -72,7 +72,7 @@ class MapViewer {
     this.listenForClicks();
   }
 
-  /** Adds the map in a GLB file (ArrayBuffer), with the map's data in the page, for `show`. */
+  /** Adds a map for `show`: `content` is its GLB file (ArrayBuffer), `data` the result of MapScene.data. */
   async add(content, data) {
     const { scene } = await new THREE.GLTFLoader().parseAsync(content, "");
     const map = { group: new THREE.Group(), data, parts: new Map(), path: pathTube(data) };

@@ -10,12 +10,12 @@ from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import Solid, cushion, cylinder, lathe, leg, panel, rounded_box, tube
 from framework.synthetic.paints import Material, Texture
 
-WEAVE = 0.04  # m, vertex spacing of cloth, fine enough for creases
-LAMP_GLOW = 2.2  # emission of a lampshade, 1 = a white wall in the mean light of the room
+WEAVE = 0.04  # m, vertex spacing of cloth with creases
+LAMP_GLOW = 2.2  # emission of a lampshade, 1 = radiance of a white wall in the mean light of the room
 
 
 def cupboard(rng: Rng) -> Furniture:
-    """Return a wardrobe with two doors."""
+    """Return a cupboard with two doors."""
     piece = Furniture("cupboard")
     width, depth, height = rng.uniform(0.9, 1.2), rng.uniform(0.45, 0.58), rng.uniform(1.8, 2.05)
     body, knob = paints.wood(rng), paints.metal(rng)
@@ -252,7 +252,7 @@ def door(rng: Rng) -> Furniture:
 
 
 def rug(rng: Rng, width: float, depth: float) -> Furniture:
-    """Return a random rug of `width` x `depth` m."""
+    """Return a random rug with sides of `width` and `depth` m."""
     piece = Furniture("rug")
     base = paints.pick(rng, paints.CLOTHS)
     other = paints.shade(paints.pick(rng, paints.CLOTHS), 1.2)
@@ -289,7 +289,7 @@ def throw_cushion(rng: Rng) -> Furniture:
 
 
 def blanket(rng: Rng, width: float, depth: float) -> Furniture:
-    """Return a blanket of `width` x `depth` m with creases up to 3 cm high."""
+    """Return a blanket with sides of `width` and `depth` m and with creases up to 3 cm high."""
     piece = Furniture("blanket")
     sheet = rounded_box(width, depth, 0.03, 0.012, 2, WEAVE)
     piece.add(_crumpled(sheet, rng, 0.03, 0.05), paints.patterned_cloth(rng), z=0.015)

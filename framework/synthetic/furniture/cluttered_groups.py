@@ -12,17 +12,17 @@ from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import SPACING
 from framework.synthetic.paints import Texture
 
-PILLOWS = 0.68  # m, distance from the wall to the free part of a bed
-BACKREST = 0.50  # m, distance from the wall to the free part of a couch
-BORDER = 0.06  # m, empty border of a bed or couch
+PILLOWS = 0.68  # m, distance from the wall to the part of a bed without pillows
+BACKREST = 0.50  # m, distance from the wall to the part of a couch in front of its backrest
+BORDER = 0.06  # m, width of the empty border of a bed or couch
 ARM = 0.24  # m, maximum width of a couch arm
 SINK = 0.012  # m, depth to which objects sink into soft surfaces
 PLACES = 60  # maximum number of candidate positions of each scattered object
 TOUCHING = (0.001, 0.005)  # m, range of the gap between touching objects, below the resolution of the sensor
-LADEN_CHAIRS = 0.5  # probability of an object on a chair of a row
-SEAT = 0.19  # m, distance from the front of a chair to the middle of its seat
+LADEN_CHAIRS = 0.5  # probability that a chair of a row has an object on it
+SEAT = 0.19  # m, distance from the front of a chair to the center of its seat
 LEATHER_COUCHES = 0.3  # fraction of the couches that have black leather
-RIM = 0.02  # m, empty border of a table
+RIM = 0.02  # m, width of the empty border of a table
 APRON = 0.13  # m, height of the blocked space below a table top
 
 
@@ -100,16 +100,16 @@ def _clutter_couch(group: Group, rng: Rng) -> None:
 def _scatter(
     group: Group, lying: list[Furniture], low: Float64, high: Float64, rng: Rng, things: list[Furniture]
 ) -> None:
-    """Place `things` on the first object of `lying`, in the area from the corner `low` to the corner `high` (2,), m.
+    """Place `things` on the first object of `lying`, in the area from the corner `low` (2,) to `high` (2,), m.
 
-    The other objects of `lying` are obstacles. Placed objects may overlap blankets, but not other objects. Objects
-    without a free position are omitted.
+    The other objects of `lying` are already on the first object and are obstacles. Placed objects may overlap blankets,
+    but not other objects. Objects without a free position are omitted.
     """
     lying = [*lying]
     in_the_way = [np.stack(piece.bounds()) for piece in lying[1:]]
     for thing in things:
         for _ in range(PLACES):
-            place = _random_place(thing, low, high, rng)
+            place = _placed_at_random(thing, low, high, rng)
             box = np.stack(place.bounds())
             if any(_overlap(box, other) for other in in_the_way):
                 continue
@@ -120,11 +120,11 @@ def _scatter(
             break
 
 
-def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Furniture:
+def _placed_at_random(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Furniture:
     """Return `thing` with a random rotation about z and a random position.
 
-    The position is in the area from the corner `low` to the corner `high` (2,), m. An object larger than the area is
-    centered.
+    The object is inside the area from the corner `low` (2,) to the corner `high` (2,), m. An object larger than the
+    area is centered on it.
     """
     turned = thing.placed(0.0, 0.0, 0.0, np.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.3, 0.3))
     turned_low, turned_high = turned.bounds()
@@ -140,7 +140,7 @@ def _overlap(box: Float64, other: Float64) -> bool:
 
 
 def _height(pieces: list[Furniture], low: Float64, high: Float64) -> float:
-    """Return the height, m, of the highest vertex of the objects in the area from `low` to `high` (2,), m."""
+    """Return the height, m, of the objects' highest vertex in the area from `low` (2,) to `high` (2,), m."""
     vertices = np.concatenate([solid.vertices for piece in pieces for solid, _ in piece.parts])
     within = ((vertices[:, :2] >= low) & (vertices[:, :2] <= high)).all(axis=1)
     return float(vertices[within, 2].max())
@@ -202,7 +202,7 @@ def laid_table_group(rng: Rng) -> Group:
 
 
 def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Furniture:
-    """Add a chair that is pushed under a table until its back or arms touch the table, and return it.
+    """Push a chair under a table until its back or arms touch the table, add it to the group, and return it.
 
     The table faces +y. The chair is offset by `x` m from the middle of the table.
     """
@@ -214,7 +214,7 @@ def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Fu
 
 
 def _between(piece: Furniture, bottom: float, top: float) -> Float64:
-    """Return the vertices (N, 3), m, of an object at heights from `bottom` to `top` m, with a margin of SPACING m."""
+    """Return the vertices (N, 3), m, of an object with heights from `bottom` - SPACING to `top` + SPACING, m."""
     solids = [solid.vertices for solid, _ in piece.parts]
     reaching = [v for v in solids if v[:, 2].max() > bottom and v[:, 2].min() < top]
     sections = [v[(v[:, 2] > bottom - SPACING) & (v[:, 2] < top + SPACING)] for v in reaching]
@@ -227,7 +227,7 @@ def strew_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) 
     there: list[Float64] = []
     for thing in things:
         for _ in range(PLACES):
-            place = _random_place(thing, low[:2] + RIM, high[:2] - RIM, rng)
+            place = _placed_at_random(thing, low[:2] + RIM, high[:2] - RIM, rng)
             box = np.stack(place.bounds())
             over_edge = (box[0, :2] < low[:2]).any() or (box[1, :2] > high[:2]).any()
             if over_edge or any(_overlap(box, other) for other in there):
@@ -255,7 +255,7 @@ def board_group(rng: Rng) -> Group:
 
 
 def laden(name: str, support: Furniture, rng: Rng) -> Group:
-    """Return a group of `support`, such as a cupboard or another tall object, with objects on top."""
+    """Return a group called `name`: the object `support`, such as a cupboard, with objects on top."""
     group = single(name, support)
     strew_on(group, group.pieces[0], rng, small_things.some(rng, small_things.ON_TOPS, 2))
     return group

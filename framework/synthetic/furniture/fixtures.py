@@ -94,7 +94,7 @@ def toilet(rng: Rng) -> Furniture:
 
 
 def _ring(a: float, b: float, inner_a: float, inner_b: float, height: float, front: float, inner_front: float) -> Solid:
-    """Return a toilet seat: an egg-shaped ring about y = 0.03 m, from z = 0 to `height` m.
+    """Return a toilet seat: an egg-shaped ring with its center at y = 0.03 m, from z = 0 to `height` m.
 
     `a`, `b` and `front` describe the outer edge, as in Section. `inner_a`, `inner_b` and `inner_front` describe the
     inner edge.

@@ -1,6 +1,6 @@
 """Furniture groups, such as a bed with a nightstand or a table with chairs and objects.
 
-The back of a group is at y = 0. The group is at the origin and faces +y.
+A group has its back at y = 0 and faces +y.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from framework.data import Bool, Float64
 from framework.synthetic.furniture import clutter, fixtures, seating, tabletops
 from framework.synthetic.furniture.piece import Furniture, Rng
 
-Place = tuple[float, float, float]  # x, y (m) and angle (rad, counter-clockwise from above)
+Place = tuple[float, float, float]  # x, y (m) and angle (rad, counterclockwise as seen from above)
 
 WALL_GAP = 0.015  # m, gap between a wall and adjacent furniture
 
@@ -46,12 +46,12 @@ class Group:
 
 
 def against_wall(piece: Furniture) -> float:
-    """Return the y offset (m) that places the back of an object at the wall, the plane y = 0."""
+    """Return the y offset, m, that places the back of an object at the distance WALL_GAP from the wall at y = 0."""
     return WALL_GAP - float(piece.bounds()[0][1])
 
 
 def on_top(piece: Furniture) -> float:
-    """Return the height (m) of a point 1 mm above the highest point of an object."""
+    """Return the height, m, of the plane 1 mm above an object, on which other objects are placed."""
     return float(piece.bounds()[1][2]) + 0.001
 
 
@@ -125,7 +125,7 @@ def tv_group(rng: Rng) -> Group:
 
 
 def dining_group(rng: Rng) -> Group:
-    """Return a table with chairs on up to three sides; two chairs are side by side and nearly touch."""
+    """Return a table with chairs on up to three sides. Two of the chairs are side by side and nearly touch."""
     group = Group("dining")
     table = tabletops.dining_table(rng)
     group.add(table, y=against_wall(table) + 0.03)
@@ -193,7 +193,10 @@ def desk_group(rng: Rng) -> Group:
 
 
 def single(name: str, piece: Furniture, z: float = 0.0, hung: bool = False) -> Group:
-    """Return a group with one object at the height `z` m; `hung` places its back directly on the wall."""
+    """Return a group with one object at the height `z` m.
+
+    The back of the object is at the distance WALL_GAP from the wall, or 2 mm if `hung` is True.
+    """
     group = Group(name)
     group.add(piece, y=0.002 if hung else against_wall(piece), z=z)
     return group

@@ -1,4 +1,4 @@
-"""Furniture in a local frame: at the origin, standing on z = 0 and facing +y."""
+"""Furniture in a local frame, m: it is at the origin, stands on z = 0 and faces +y."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Furniture:
         return lows.min(axis=0), highs.max(axis=0)
 
     def placed(self, x: float, y: float, z: float = 0.0, angle: float = 0.0) -> Furniture:
-        """Return a copy rotated by `angle` (rad, counter-clockwise from above), then translated by x, y, z m."""
+        """Return a copy rotated by `angle` (rad, counterclockwise as seen from above), then translated by x, y, z m."""
         parts = [(solid.turned("z", angle).moved(x, y, z), material) for solid, material in self.parts]
         return Furniture(self.kind, self.class_name, parts)
 

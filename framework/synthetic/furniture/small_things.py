@@ -125,7 +125,7 @@ def shelf(rng: Rng) -> Furniture:
 def _fill(piece: Furniture, rng: Rng, start: float, end: float, z: float, height: float) -> None:
     """Place binders, boxes and gaps side by side on a shelf board.
 
-    The board is at the height `z` m, and extends from `start` to `end` m along x. `height`: m, maximum object height.
+    The board is at the height `z` m, and extends from `start` to `end` m along x. Objects are at most `height` m high.
     """
     x = start
     while True:

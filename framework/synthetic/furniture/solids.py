@@ -1,9 +1,9 @@
 """Shapes of furniture: rounded boxes, lofts and tubes, as triangles with smooth normals.
 
-A shape is at the origin, with z up and lengths in meters. Its texture coordinates are its initial 3D coordinates in
-meters, so that a solid texture moves with the shape. Faces are subdivided, because light is baked into the vertices.
-`segments` is the number of subdivisions of a rounded edge or of a circumference. `spacing` is the maximum distance
-between adjacent vertices on flat faces, m.
+A shape is created at the origin, with z up and lengths in meters. Its texture coordinates are its initial 3D
+coordinates in meters, so that a solid texture moves with the shape. Faces are subdivided, because light is baked into
+the vertices. `segments` is the number of subdivisions of a rounded edge or of a circumference. `spacing` is the maximum
+distance between adjacent vertices on flat faces, m.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import numpy as np
 from framework.data import Float64, Int32
 
 SPACING = 0.07  # m, vertex spacing on flat faces, the resolution of baked shadows
-WELD = 1e-6  # m, maximum distance of merged vertices
+WELD = 1e-6  # m, rounding of vertex positions for the test whether they are equal
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A triangle mesh; triangles are counter-clockwise as seen from outside."""
+    """A triangle mesh; triangles are counterclockwise as seen from outside."""
 
     vertices: Float64  # (V, 3) m
     normals: Float64  # (V, 3) unit vectors
@@ -43,9 +43,9 @@ class Solid:
         return replace(self, vertices=vertices, normals=smooth_normals(vertices, self.triangles))
 
     def flat(self, along: int, up: int) -> Solid:
-        """Return a copy with texture coordinates (s, t, 0) in meters from the corner, for image textures.
+        """Return a copy with texture coordinates (s, t, 0) for image textures, in meters from the lower corner.
 
-        s and t run along the coordinate axes `along` and `up` of the vertices (0 = x, 1 = y, 2 = z).
+        s and t run along the axes `along` and `up` of the vertex coordinates (0 = x, 1 = y, 2 = z).
         """
         s = self.vertices[:, along] - self.vertices[:, along].min()
         t = self.vertices[:, up] - self.vertices[:, up].min()
@@ -114,15 +114,15 @@ def rounded_box(
 
 
 def _grain_first(vertices: Float64, size: Float64) -> Float64:
-    """Return the texture coordinates (V, 3), m: the vertices, with the axis of the longest side first.
+    """Return the vertices (V, 3), m, as texture coordinates, with the axis of the longest side first.
 
-    Wood grain therefore runs along a board. `size` (3,) are the side lengths, m.
+    Because of this order, wood grain runs along a board. `size` (3,) contains the side lengths, m.
     """
     return vertices[:, np.argsort(-size, kind="stable")]
 
 
 def cushion(x: float, y: float, z: float, plump: float = 0.5) -> Solid:
-    """Return a pillow with side lengths x, y, z m; at the seam, its thickness is reduced by the fraction `plump`."""
+    """Return a pillow with side lengths x, y, z m, whose thickness decreases by the fraction `plump` at the seam."""
     box = rounded_box(x, y, z, radius=0.45 * z, segments=4, spacing=min(x, y) / 9)
 
     def swell(p: Float64) -> Float64:
@@ -145,7 +145,7 @@ class Section:
     x: float = 0.0  # m, coordinate of the center
     y: float = 0.0  # m, coordinate of the center
     n: float = 2.0  # exponent; 2 = ellipse, larger = closer to a rectangle
-    front: float = 1.0  # scale of the half with positive y, for egg shapes
+    front: float = 1.0  # scale factor of the half in front of the center (+y), for egg shapes
 
 
 def loft(sections: Sequence[Section], segments: int = 24, spacing: float = SPACING) -> Solid:

@@ -52,7 +52,7 @@ def sums(evidence: ClassEvidence, classes: int) -> np.ndarray:
     return found
 
 
-def test_class_evidence_few_classes_are_exact() -> None:
+def test_class_evidence_few_classes_match_dense_recursion() -> None:
     rng = np.random.default_rng(0)
     log_ratios = rng.normal(0, 2, (30, 5))
     masks, evidence = masks_of(log_ratios), one_voxel(5)
@@ -73,7 +73,7 @@ def test_class_evidence_of_later_class_includes_earlier_masks() -> None:
     np.testing.assert_allclose(sums(evidence, 14), log_ratios.sum(axis=0), atol=1e-4)
 
 
-def test_class_evidence_full_voxel_drops_least_likely_class() -> None:
+def test_class_evidence_full_voxel_evicts_least_likely_class() -> None:
     message = np.full((3, 40), -5.0)
     message[0, :8], message[1, 8:16], message[2, 16:24] = 1.0, 2.0, 9.0
     masks, evidence = masks_of(message), one_voxel(40)

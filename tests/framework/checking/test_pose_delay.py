@@ -35,7 +35,7 @@ def uniform_path() -> list[Float64]:
 
 
 def pairs_of(true: Sequence[Float64], stored: Sequence[Float64 | None], noise: float = 0.0) -> list[MatchedPair]:
-    """Return pairs of frames with their stored poses and matches; `noise` is a standard deviation in px."""
+    """Return pairs of frames with stored poses and image matches; `noise` is the standard deviation of matches, px."""
     pairs = []
     for k, step in ((k, step) for k in range(8, FRAMES - 24, 6) for step in (4, 8, 16)):
         chosen = np.random.default_rng(k)

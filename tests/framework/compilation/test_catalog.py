@@ -144,7 +144,7 @@ def test_compile_all_exited_worker_raises(small: Path, monkeypatch: pytest.Monke
         "_worker",
         lambda: subprocess.Popen([sys.executable, "-c", ""], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True),
     )
-    with pytest.raises(DataError, match=r"kernel_caller\.small: expected a result, got the end of the worker process"):
+    with pytest.raises(DataError, match=r"kernel_caller\.small: expected a compiled kernel, got a terminated process"):
         compile_all([Kernel("kernel_caller", "small", "int64")])
 
 

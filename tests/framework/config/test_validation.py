@@ -25,8 +25,8 @@ def test_experiment_rows_give_overrides() -> None:
         ({"mine": "refiner=kmeans"}, r"rows\.mine: expected a list of overrides, got 'refiner=kmeans'"),
         ({"mine": {"refiner": "kmeans"}}, r"rows\.mine: expected a list of overrides"),
         ({"mine": [{"refiner": "kmeans"}]}, r"rows\.mine: expected a list of overrides"),
-        (["refiner=kmeans"], "rows: expected names with overrides"),
-        ("mine", "rows: expected names with overrides"),
+        (["refiner=kmeans"], "rows: expected a mapping of names to overrides"),
+        ("mine", "rows: expected a mapping of names to overrides"),
     ],
 )
 def test_experiment_rows_invalid_raise_one_line_error(rows: Any, message: str) -> None:

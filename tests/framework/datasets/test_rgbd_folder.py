@@ -177,11 +177,15 @@ def test_rgbd_folder_scene_truth_skips_unreadable_frames(folder):
     assert len(RgbdFolder(folder).scene_truth().points_world) > 100
 
 
-def test_rgbd_folder_distant_pose_raises_and_truth_skips_it(folder, caplog):
+def test_rgbd_folder_distant_pose_raises_for_its_frame(folder):
     set_pose_line(folder, 1, "0.1 0 1e4 0 0 0 0 1")
     RgbdFolder(folder)[1]
     set_pose_line(folder, 1, "0.1 0 1e5 0 0 0 0 1")
     assert "000001.png: expected a pose within 10000 m of the origin, got 100000 m" in read_all_but(folder, 1)
+
+
+def test_rgbd_folder_scene_truth_skips_frame_with_distant_pose(folder, caplog):
+    set_pose_line(folder, 1, "0.1 0 1e5 0 0 0 0 1")
     others = RgbdFolder(folder).scene_truth()
     assert np.abs(others.points_world).max() < 10
     assert "ground truth: frame skipped: frame 1: " in caplog.text
@@ -335,7 +339,7 @@ def test_rgbd_folder_instance_images_without_names_raise(folder):
             "expected unique instance ids, got 7 twice, the second time as '07'",
         ),
         ({"7": "chair"}, "instance 7: expected .* got 'chair'"),
-        ({"7": {"name": "n" * 5000}}, "instance 7: expected .*, or null if unknown}, got {'name': 'nnn"),
+        ({"7": {"name": "n" * 5000}}, r"instance 7: expected .*, or null if unknown\), got {'name': 'nnn"),
         ({"7": {"class": 3}}, "instance 7: class: expected a COCO name, or null if unknown, got 3$"),
         ({"7": {"class": "flurb" * 1000}}, "instance 7: class: expected a COCO name, .* got 'flurb"),
         ({"7": {"class": " Chairs"}}, r"instance 7: .* got ' Chairs'; did you mean 'chair'\?"),
@@ -564,7 +568,7 @@ def test_rgbd_folder_times_far_apart_are_not_used(folder, caplog):
     assert "expected timestamps of color and depth within 0.2 s of each other, got -9 s; using one" in caplog.text
 
 
-def test_recording_depth_delay_drops_times_of_images(folder):
+def test_recording_depth_delay_discards_image_timestamps(folder):
     (folder / "timestamps.txt").write_text("".join(f"{k}.25 {k}.26\n" for k in range(FRAMES)))
     frame = RgbdFolder(folder, depth_reading=DepthReading(depth_delay=1))[0]
     assert frame.color_time == frame.depth_time == frame.timestamp

@@ -146,7 +146,9 @@ def test_seven_scenes_missing_image_raises_for_its_frame(folder: Path, name: str
 
 
 def test_seven_scenes_empty_folder_error_gives_scene_example(folder: Path) -> None:
-    with pytest.raises(DataError, match=r"expected frame-000000\.color\.png .*; set dataset\.scene .* chess/seq-01"):
+    with pytest.raises(
+        DataError, match=r"expected images such as frame-000000\.color\.png, .*; set dataset\.scene .* chess/seq-01"
+    ):
         SevenScenes(folder.parents[1], scene="chess")
 
 

@@ -104,12 +104,12 @@ def test_decode_ssd_without_detections_is_empty():
         (
             OutputLayout.yolo,
             {"y": np.zeros((1, 20, 8))},
-            r"\(perhaps yolo_objectness\): expected 7 columns .*\(1, 20, 8\)",
+            r"expected 7 columns .*\(1, 20, 8\); .* detector.layout=yolo_objectness$",
         ),
         (
             OutputLayout.yolo_objectness,
             {"y": np.zeros((1, 7, 20))},
-            r"\(perhaps yolo\): expected 8 columns .*\(1, 7, 20\)",
+            r"expected 8 columns .*\(1, 7, 20\); .* detector.layout=yolo$",
         ),
         (
             OutputLayout.yolox,
@@ -125,7 +125,7 @@ def test_decode_ssd_without_detections_is_empty():
         (
             OutputLayout.ssd_unit,
             {"boxes": np.zeros((9, 4))},
-            r"detector\.layout: expected outputs boxes \(K, 4\) and either scores .*, got boxes \(9, 4\)",
+            r"detector\.layout: expected boxes \(K, 4\) with scores .*, got boxes \(9, 4\)",
         ),
         (
             OutputLayout.ssd_unit,

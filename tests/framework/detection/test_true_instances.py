@@ -38,5 +38,5 @@ def test_true_instances_missing_truth_or_unknown_class_raises():
         true_instances(frame_with(None), ("tv",))
     assert not isinstance(caught.value, FrameError)
     ids = np.ones((6, 8), np.int32)
-    with pytest.raises(DataError, match="got no class for sofa"):
+    with pytest.raises(DataError, match="classes of the detector, got 'sofa'"):
         true_instances(frame_with(FrameTruth(ids, {1: "sofa"})), ("tv",))

@@ -210,22 +210,28 @@ def test_label_transfer_to_map_counts_map_vertices():
     assert evaluate(twice, truth, transfer=Transfer.TO_MAP).best_ious[1] == pytest.approx(100 / 120)
 
 
-def test_evaluate_empty_map_has_zero_scores_and_empty_truth_none():
+EMPTY_MAP = PredictedInstances(
+    np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.int64), np.zeros(0), ()
+)
+
+
+def test_evaluate_empty_map_has_zero_scores():
     truth = scene([(1, 100)], {1: "chair"})
-    empty = PredictedInstances(
-        np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.int64), np.zeros(0), ()
-    )
-    metrics = evaluate(empty, truth).metrics()
+    metrics = evaluate(EMPTY_MAP, truth).metrics()
     assert metrics["instances.ap50"] == metrics["instances.mean_iou"] == metrics["instances.precision50"] == 0.0
+    assert evaluate(EMPTY_MAP, truth, transfer=Transfer.TO_MAP).metrics()["instances.ap50"] == 0.0
+
+
+def test_evaluate_empty_truth_has_no_metrics():
+    truth = scene([(1, 100)], {1: "chair"})
     nothing = SceneTruth(np.zeros((0, 3), np.float32), np.zeros(0, np.int32))
-    assert evaluate(empty, nothing).metrics() == {}
+    assert evaluate(EMPTY_MAP, nothing).metrics() == {}
     assert evaluate(prediction(truth, [(5, 100)], {5: ("chair", 1.0)}), nothing).metrics() == {}
-    assert evaluate(empty, truth, transfer=Transfer.TO_MAP).metrics()["instances.ap50"] == 0.0
 
 
 def test_evaluate_inconsistent_predictions_raise():
     truth = scene([(1, 100)], {1: "chair"})
-    with pytest.raises(DataError, match="expected labels in `ids`, got 6"):
+    with pytest.raises(DataError, match="expected 0 or a value of `ids`, got 6"):
         prediction(truth, [(6, 10)], {5: ("chair", 1.0)})
     with pytest.raises(DataError, match="expected finite values"):
         prediction(truth, [(5, 10)], {5: ("chair", float("nan"))})

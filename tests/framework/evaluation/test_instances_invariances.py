@@ -21,7 +21,7 @@ from framework.evaluation.instances import (
 )
 from tests.support.slow_evaluation import slow_metrics
 
-MIN_POINTS = 12  # of a true instance; the scenes are small
+MIN_POINTS = 12  # minimum number of points of an evaluated ground-truth instance; the scenes are small
 CLASSES = ("chair", "bed", "couch")
 CLEAR = 1e-5  # margin of nearest-neighbor distances, m; larger than rounding errors
 

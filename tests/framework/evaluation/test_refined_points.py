@@ -70,7 +70,7 @@ def test_true_fit_ignores_pixels_without_depth() -> None:
     np.testing.assert_array_equal(fit.iou, [1.0])
 
 
-def test_refinement_clusters_of_unknown_class_are_not_judged() -> None:
+def test_refinement_excludes_clusters_of_unknown_class() -> None:
     seen = frame(ids(rows(0, 4), rows(4, 8)), {10: None, 20: "chair"})
     before = clusters(rows(0, 5), rows(3, 8))
     refined = Refinement(seen, before, clusters(rows(4, 5), rows(4, 8)), 1.0)
@@ -78,12 +78,11 @@ def test_refinement_clusters_of_unknown_class_are_not_judged() -> None:
     np.testing.assert_array_equal(refined.fit_before.unknown, [True, False])
     np.testing.assert_allclose(refined.fit_before.iou, [10 / 80, 40 / 50])  # with the chair
     np.testing.assert_array_equal(refined.judged_before, [False, True])
-    np.testing.assert_array_equal(
-        refined.judged_after, [False, True]
-    )  # the first is not judged, although it is now on the chair
+    # the first refined cluster is not evaluated, although it is on the chair
+    np.testing.assert_array_equal(refined.judged_after, [False, True])
 
 
-def test_refinement_without_truth_is_not_judged() -> None:
+def test_refinement_without_truth_is_not_evaluated() -> None:
     blind = Refinement(frame(), clusters(rows(0, 3)), clusters(rows(0, 2)), 1.0)
     assert blind.fit_before is None
     assert blind.fit_after is None

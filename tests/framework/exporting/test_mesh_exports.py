@@ -421,5 +421,5 @@ def test_export_up_option_replaces_missing_up_direction(tmp_path: Path, caplog: 
     export(run, [ExportFormat.PLY], tmp_path / "given", up=(0, 2, 0), floor=-1.25)
     assert not caplog.text
     assert read_mesh(tmp_path / "given" / "scene.ply").vertices[:, 2].min() == pytest.approx(0, abs=1e-5)
-    with pytest.raises(DataError, match="up: expected a direction of 3 numbers"):
+    with pytest.raises(DataError, match="up: expected a nonzero direction of 3 finite numbers"):
         read_room(run, up=(0, 0, 0))

@@ -43,7 +43,7 @@ def room(run: Path) -> UprightRoom:
 
 @pytest.fixture(scope="module")
 def low(room: UprightRoom) -> Plan:
-    """Return a plan for a robot that fits under the table."""
+    """Return a floor plan for a robot that fits under the table."""
     return plan(room, RESOLUTION, 0.5)
 
 
@@ -311,7 +311,7 @@ def test_scene_graph_matches_schema(run: Path, tmp_path: Path) -> None:
 
 
 def divided(door: float) -> list[Block]:
-    """Return a wall with a door of this width, m, which divides the floor into two rooms of 4 x 3 m."""
+    """Return a wall with a door `door` m wide, which divides the floor into two rooms of 4 x 3 m."""
     low, high = 1.5 - door / 2, 1.5 + door / 2
     return [(4.0, 0.0, 0.0, 4.1, low, 2.5), (4.0, high, 0.0, 4.1, 3.0, 2.5)]
 
@@ -344,7 +344,7 @@ def test_rooms_wide_opening_does_not_separate(tmp_path: Path) -> None:
 
 
 def by_hand(text: str) -> Plan:
-    """Return a plan with cells of 0.5 m from text: # = wall, . = free, o = occupied, space = unknown."""
+    """Return a floor plan with cells of 0.5 m from text: # = wall, . = free, o = occupied, space = unknown."""
     rows = np.array([list(row) for row in text.split("\n")])[::-1]
     free, wall, occupied = rows == ".", rows == "#", rows == "o"
     return Plan(0.5, np.zeros(2), occupied | wall, free, free, wall, np.zeros(rows.shape, np.int32))

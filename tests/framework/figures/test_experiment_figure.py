@@ -203,7 +203,7 @@ def test_stage_times_figure_averages_sequences(tmp_path: Path, caplog: pytest.Lo
     assert "tracking" not in found
     note = " ".join(found[0].split())
     assert "map integration: update and integration. Lines: mean over 2 sequences (011, 206) " in note
-    assert "Lines end with the shortest sequence." in note
+    assert "Lines end at the last frame of the shortest sequence." in note
     assert "annotation made up; 12 to 20 frames per run." in note
 
 
@@ -235,7 +235,7 @@ def test_write_figure_without_data_raises_one_line_error(tmp_path: Path) -> None
         with pytest.raises(DataError, match="expected a completed run, got none"):
             write_figure(root)
         (run(root, "whole", "011") / name).write_text("")
-        with pytest.raises(DataError, match=r"expected a readable .*, got none; the log lists the reasons"):
+        with pytest.raises(DataError, match=r"expected a readable .*, got none; see the log for the reasons"):
             write_figure(root)
         assert not list(root.glob("figure.*"))
 

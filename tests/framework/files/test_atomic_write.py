@@ -107,7 +107,7 @@ def test_reader_non_regular_file_raises_without_blocking(
 
 def test_read_labels_from_named_pipe_raises(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "labels.txt")
-    with pytest.raises(ConfigError, match=r"labels: expected one of .*, or a text file with one name per line"):
+    with pytest.raises(ConfigError, match=r"label_space: expected one of .*, or a text file with one name per line"):
         read_labels(str(tmp_path / "labels.txt"))
 
 
@@ -148,7 +148,7 @@ def test_atomic_write_failure_names_requested_file(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(Path, "unlink", refused)
     with (
-        pytest.raises(DataError, match=r"page\.html: expected a writable file, got Read-only"),
+        pytest.raises(DataError, match=r"page\.html: expected a writable file, got an error \(Read-only"),
         atomic_write(tmp_path / "page.html"),
     ):
         refused()

@@ -92,7 +92,7 @@ def test_directory_lock_unsupported_file_system_logs_warning(
     monkeypatch.setattr(fcntl, "flock", refuse)
     with locked(tmp_path):
         pass
-    assert "expected a file system with locks, got No locks available" in caplog.text
+    assert "expected a file system with locks, got an error (No locks available)" in caplog.text
 
 
 def test_directory_lock_named_pipe_as_holder_file_raises(tmp_path: Path) -> None:

@@ -42,16 +42,25 @@ def test_matrix_file_invalid_line_error_gives_line_number(tmp_path: Path, text: 
         read_matrix_lines(tmp_path / "traj.txt")
 
 
-def test_matrix_file_missing_raises_and_empty_has_no_matrix(tmp_path: Path) -> None:
+def test_matrix_file_missing_raises(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"missing.txt: expected a text file, got no such file"):
         read_matrix(tmp_path / "missing.txt")
+
+
+def test_matrix_file_empty_has_no_matrix(tmp_path: Path) -> None:
     (tmp_path / "empty.txt").touch()
     assert read_matrix_lines(tmp_path / "empty.txt") == []
 
 
-def test_intrinsics_matrix_gives_pinhole_camera_or_raises() -> None:
-    K = np.array([[585.0, 0, 320, 0], [0, 580, 240, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    assert PrintedMatrix("here", K).camera(640, 480) == Camera(640, 480, 585, 580, 320, 240)
+KINECT_MATRIX = np.array([[585.0, 0, 320, 0], [0, 580, 240, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+def test_intrinsics_matrix_gives_pinhole_camera() -> None:
+    assert PrintedMatrix("here", KINECT_MATRIX).camera(640, 480) == Camera(640, 480, 585, 580, 320, 240)
+
+
+def test_intrinsics_matrix_invalid_raises() -> None:
+    K = KINECT_MATRIX.copy()
     for row, column, value in ((0, 1, 0.1), (2, 0, 1), (2, 2, 2), (0, 0, np.nan), (3, 3, 0)):
         wrong = K.copy()
         wrong[row, column] = value

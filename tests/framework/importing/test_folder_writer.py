@@ -87,7 +87,7 @@ def test_folder_writer_interrupted_import_has_no_camera_json(tmp_path: Path) -> 
         ({"depth": np.zeros((1, 16), np.float32)}, "expected depth of at least 2x2 px, got 16x1 px"),
         (
             {"confidence": np.zeros((12, 15), np.uint8)},
-            r"expected confidence of shape \(12, 16\), as for depth, got \(12, 15\)",
+            r"expected confidence of shape \(12, 16\) as for depth, got \(12, 15\)",
         ),
     ],
 )

@@ -78,7 +78,7 @@ def test_drawing_thread_draws_all_frames_and_final_map(room: CornerRoom) -> None
     assert book.closed
 
 
-def test_drawing_thread_does_not_block_and_draws_newest_image(room: CornerRoom) -> None:
+def test_drawing_thread_after_delay_draws_newest_image(room: CornerRoom) -> None:
     going_on, book = threading.Event(), RecordedDrawing()
     book.waits_for = going_on
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)

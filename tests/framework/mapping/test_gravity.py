@@ -1,4 +1,7 @@
-"""Tests of the up direction: within 0.1 degrees on exact surfaces, within 2 degrees with noise and clutter."""
+"""Tests of the up direction, the floor height and upright boxes.
+
+The error of the up direction is below 0.1 degrees on exact surfaces, and below 2 degrees with noise and clutter.
+"""
 
 from __future__ import annotations
 
@@ -45,11 +48,14 @@ def room() -> tuple[Float32, Int32]:
 
 
 def held(turned: Float64, downwards: float = 0.5) -> GravityEstimator:
-    """Return the estimator of a hand-held camera that looks `downwards` rad down, in a world rotated by `turned`."""
+    """Return the estimator of a hand-held camera that is pitched down by `downwards` rad.
+
+    `turned` (3, 3) is the rotation of the world frame.
+    """
     gravity = GravityEstimator()
     for k in range(8):
         heading = Rotation.from_euler("z", k / 8 * 3)
-        # camera axes: x right, y down, z forward; at heading 0, forward is the world's y
+        # camera axes: x right, y down, z forward; at heading 0, forward is the y axis of the world
         looking = Rotation.from_matrix(np.stack([X, -Z, Y], axis=1)) * Rotation.from_euler("x", -downwards)
         T = np.eye(4)
         T[:3, :3] = turned @ (heading * looking).as_matrix()
@@ -112,7 +118,7 @@ def test_floor_height_of_unseen_floor_is_none() -> None:
     assert floor_height(*rectangle(np.zeros(3), Y, Z), Z) is None
 
 
-def test_gravity_faces_have_triangle_normals_and_areas() -> None:
+def test_faces_have_normals_areas_and_centers_of_triangles() -> None:
     vertices = np.float32([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 0]])
     normals, areas, centers = faces(vertices, np.int32([[0, 1, 2], [0, 3, 1]]))  # the second triangle has no area
     np.testing.assert_allclose(normals, [[0, 0, 1]])
@@ -162,7 +168,7 @@ def test_gravity_sensor_noise_and_bias_average_out(seed: int) -> None:
 
 
 def test_gravity_contradictory_sensor_is_ignored(caplog: pytest.LogCaptureFixture) -> None:
-    """Measurements contradict each other if the sensor's axes differ from the camera's."""
+    """Measurements contradict each other if the axes of the sensor differ from the axes of the camera."""
     vertices, triangles = room()
     gravity = held(np.eye(3))
     for k in range(8):
@@ -174,10 +180,14 @@ def test_gravity_contradictory_sensor_is_ignored(caplog: pytest.LogCaptureFixtur
     assert caplog.text.count("sensor gravity: expected one direction in the world frame, got several") == 1
 
 
-def test_gravity_round_trips_and_invalid_values_raise() -> None:
+def test_gravity_saved_state_round_trip_is_exact() -> None:
     saved = sensing(np.eye(3)).saved()
     read = GravityEstimator.of(MapHeader(json.loads(json.dumps(saved))))
     assert read.saved() == saved
+
+
+def test_gravity_saved_state_with_invalid_values_raises() -> None:
+    saved = sensing(np.eye(3)).saved()
     for wrong in ([], [1, 2], ["a", 0, 0], [float("nan"), 0, 0], [True, None, 0], [1e200, 0, 0]):
         for key in ("camera_up", "sensed_up"):
             with pytest.raises(DataError, match=key):

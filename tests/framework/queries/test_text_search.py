@@ -119,7 +119,7 @@ def test_query_command_prints_method_and_matches(
     status, out, _ = asked(monkeypatch, capsys, str(run_without), "chair")
     assert status == 0
     lines = out.splitlines()
-    assert lines[0].startswith("by class names and colors, because this run has no embeddings; map it again with ")
+    assert lines[0].startswith("by class names and colors, because this run has no embeddings; run it again with ")
     assert lines[1].split() == ["id", "class", "match", "confidence", "color", "position", "size"]
     assert lines[2].split()[:2] == ["1", "chair"]
     _, out, _ = asked(monkeypatch, capsys, str(run_without), "chair", "--by", "names", "--json", "--top", "1")

@@ -48,7 +48,7 @@ def circle(radius: float) -> np.ndarray:
     return np.stack([radius * np.cos(angles), radius * np.sin(angles), 0.3 * angles], axis=1)
 
 
-def test_top_view_keeps_shapes_and_marks_lost_poses() -> None:
+def test_top_view_projects_paths_and_lost_poses() -> None:
     picture, share = top_view([PlottedPath(circle(2.0), [5])], [circle(2.2)], [], UP)
     [mine], [true] = paths(picture, "chart-path"), paths(picture, "chart-true")
     assert np.ptp(mine, axis=0) == pytest.approx(np.full(2, np.ptp(mine[:, 1])), rel=0.03), (

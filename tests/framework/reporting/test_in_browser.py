@@ -134,7 +134,7 @@ def test_report_view_buttons_change_map_colors(pages: list[Path], opened: Any) -
     assert page.locator("#legend button").count() > 0
 
 
-def test_report_time_slider_grows_map(pages: list[Path], opened: Any) -> None:
+def test_report_time_slider_limits_visible_map(pages: list[Path], opened: Any) -> None:
     page = opened(pages[0])
     page.locator("#path").uncheck()
     void = np.array(Image.new("RGB", (1, 1), "#e5e8ec"))[0, 0]

@@ -28,7 +28,8 @@ def folder(tmp_path: Path) -> Path:
     chosen = {"choice.dataset": "scenenn", "choice.fuser": "bayes", "git_commit": "abc", "git_dirty": False}
     first = {"seed": 0, "threads": 2, "dataset": {"scene": "011"}, "fuser": {"voxel_size": 1, "sides": [1, 2]}}
     second = {"row": "b", "seed": 1, "dataset": {"scene": "016"}, "fuser": {"voxel_size": 0.02, "split": True}}
-    write_run(tmp_path / "a", first, **chosen, seed=9, frames=8, fps=20.0, **{"instances.ap50": None})
+    code = {"code.fuser": "plugins.fusers.bayes 3f2a9c41d0b7"}  # not in runs of older versions
+    write_run(tmp_path / "a", first, **chosen, **code, seed=9, frames=8, fps=20.0, **{"instances.ap50": None})
     write_run(tmp_path / "in" / "b", second, **chosen, frames=4, fps=21.5, **{"instances.ap50": 1 / 3})
     (tmp_path / "failed").mkdir()
     (tmp_path / "failed" / "metrics.partial.json").write_text('{"partial": "the map is full"}')
@@ -42,13 +43,14 @@ def test_load_runs_returns_typed_columns(folder: Path) -> None:
         **{"run": "string", "row": "string", "seed": "Int64", "threads": "Int64", "frames": "Int64"},
         **{"dataset": "string", "dataset.scene": "string", "fuser": "string", "fuser.sides": "string"},
         **{"fuser.voxel_size": "float64", "fuser.split": "boolean", "git_dirty": "boolean", "git_commit": "string"},
-        **{"fps": "float64", "instances.ap50": "float64", "config_hash": "string"},
+        **{"fps": "float64", "instances.ap50": "float64", "code.fuser": "string", "config_hash": "string"},
     }
     assert {key: str(kind) for key, kind in runs.dtypes.items()} == types
     assert list(runs["dataset.scene"]) == ["011", "016"]
     assert list(runs["seed"]) == [0, 1], "expected the seed of the config"
     assert list(runs["fuser.sides"].fillna("")) == ["[1, 2]", ""]
     assert list(runs["row"].isna()) == [True, False]
+    assert list(runs["code.fuser"].fillna("none")) == ["plugins.fusers.bayes 3f2a9c41d0b7", "none"]
     assert runs["instances.ap50"].isna()[0]
     assert runs["instances.ap50"][1] == 1 / 3
 

@@ -83,8 +83,8 @@ def test_class_probabilities_are_written_with_float32_digits(tmp_path: Path) -> 
         ("", "expected valid JSON"),
         ("[", "expected valid JSON"),
         ("[" * 100_000, "expected JSON with at most 50 nested lists"),
-        ("{}", "expected a list of instances, got dict"),
-        ("[7]", "entry 1: expected an object"),
+        ("{}", "expected a JSON array of instances, got {}"),
+        ("[7]", "entry 1: expected a JSON object"),
         ([ENTRY, ENTRY | {"id": 0}], r"entry 2: id: expected an integer in \[1, 2147483647\], got 0"),
         ([ENTRY | {"id": 2**31}], "entry 1: id"),
         ([ENTRY | {"id": True}], "entry 1: id"),
@@ -99,10 +99,10 @@ def test_class_probabilities_are_written_with_float32_digits(tmp_path: Path) -> 
         ([ENTRY | {"confidence": float("nan")}], "entry 1: confidence"),
         ([ENTRY | {"confidence": 10**400}], "expected integers of at most 63 bits, got 10{19}... of 401 digits"),
         ([ENTRY | {"confidence": "high"}], "entry 1: confidence"),
-        ([{"id": 3}], "entry 1: expected mappings in obb and class_probabilities, got None and None"),
+        ([{"id": 3}], "entry 1: expected JSON objects in obb and class_probabilities, got None and None"),
         (
             [ENTRY | {"obb": [1, 2, 3]}],
-            r"entry 1: expected mappings in obb and class_probabilities, got \[1, 2, 3\] and",
+            r"entry 1: expected JSON objects in obb and class_probabilities, got \[1, 2, 3\] and",
         ),
         (
             [ENTRY | {"class_probabilities": {"chair": 0.5, "couch": -1}}],

@@ -41,13 +41,13 @@ def test_read_mesh_foreign_ply_raises_one_line_error(tmp_path: Path) -> None:
     shades = dict.fromkeys(("red", "green", "blue"), mesh.colors[:, 0])
     labels = {"instance": mesh.instance_ids, "class": mesh.class_ids}
     for properties, comments, message in [
-        (shades, ("classes chair",), "expected int32 for the vertex property 'instance', got no such property"),
+        (shades, ("classes chair",), "expected int32 for the vertex property 'instance', got none"),
         (
             shades | labels | {"class": mesh.class_ids.astype(np.float32)},
             ("classes chair",),
             "expected int32 for the vertex property 'class', got float32",
         ),
-        (labels, ("classes chair",), "expected uint8 for the vertex property 'red', got no such property"),
+        (labels, ("classes chair",), "expected uint8 for the vertex property 'red', got none"),
         (shades | labels, (), "expected one line 'comment classes ...', got 0"),
         (shades | labels, ("classes chair", "classes bed"), "got 2"),
     ]:

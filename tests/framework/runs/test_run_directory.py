@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import platform
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from framework.files.tum_trajectory import read_tum
 from framework.pipeline import Pipeline
 from framework.runs import provenance, run_directory
 from framework.runs.instances_file import write_instances
+from framework.runs.manifest import Manifest, RunStatus
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import instance_metrics, run_metrics, trajectory_metrics
 from framework.runs.run_directory import RunRecord, headline
@@ -67,7 +69,10 @@ def test_run_directory_contains_all_documented_files(record: RunRecord, room: Co
     record.write(room, mapped(room))
     assert sorted(path.name for path in record.directory.iterdir()) == [
         "config.yaml",
+        "digests.csv",
+        "environment.txt",
         "instances.json",
+        "manifest.json",
         "map.npz",
         "mesh.ply",
         "metrics.json",
@@ -75,6 +80,33 @@ def test_run_directory_contains_all_documented_files(record: RunRecord, room: Co
         "timings.csv",
         "trajectory.txt",
     ]
+
+
+def test_manifest_lists_all_result_files(record: RunRecord, room: CornerRoom) -> None:
+    record.write(room, mapped(room))
+    manifest = Manifest.read(record.directory)
+    assert manifest.status is RunStatus.COMPLETE
+    assert set(manifest.files) == {path.name for path in record.directory.iterdir()} - {"manifest.json"}
+    assert manifest.changed_files(record.directory) == []
+
+
+def test_digests_list_each_stage_of_each_frame(record: RunRecord, room: CornerRoom) -> None:
+    record.write(room, mapped(room))
+    rows = list(csv.DictReader((record.directory / "digests.csv").open()))
+    assert [(row["frame"], row["stage"]) for row in rows[:5]] == [
+        ("0", stage) for stage in ("tracking", "detection", "lifting", "refinement", "fusion")
+    ]
+    assert len(rows) == 6 * 5
+    first = (record.directory / "digests.csv").read_bytes()
+    record.write(room, mapped(room))
+    assert (record.directory / "digests.csv").read_bytes() == first
+
+
+def test_environment_lists_installed_packages(record: RunRecord, room: CornerRoom) -> None:
+    record.write(room, mapped(room))
+    lines = (record.directory / "environment.txt").read_text().splitlines()
+    assert lines[0] == f"# Python {platform.python_version()}"
+    assert f"numpy=={np.__version__}" in lines
 
 
 def test_metrics_contain_all_documented_keys(record: RunRecord, room: CornerRoom) -> None:
@@ -152,7 +184,8 @@ def test_run_directory_with_unusable_truth_keeps_map_files(record: RunRecord, ro
     room.scene_truth = far_off  # type: ignore[method-assign]
     assert str(record.write(room, result)) == "ground truth: a point lies far off"
     left = {path.name for path in record.directory.iterdir()}
-    assert left == {"config.yaml", "metrics.partial.json", *MAPPED}
+    assert left == {"config.yaml", "digests.csv", "environment.txt", "manifest.json", "metrics.partial.json", *MAPPED}
+    assert Manifest.read(record.directory).status is RunStatus.PARTIAL
     metrics = metrics_of(record, "metrics.partial.json")
     assert metrics["partial"] == "ground truth: a point lies far off"
     assert (metrics["frames"], metrics["instances.count"], "instances.ap50" in metrics) == (6, 2, False)

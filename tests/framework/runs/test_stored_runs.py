@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from framework.errors import DataError
 from framework.runs import stored_runs
 from framework.runs.inputs import inputs_sha256
+from framework.runs.plugin_code import plugin_code
 from framework.runs.provenance import config_hash
 from framework.runs.stored_runs import MAPPED, find_records, is_recorded, read_record
 
@@ -55,7 +56,7 @@ def test_read_record_returns_config_and_metrics(directory: Path) -> None:
         ("metrics.json", '{"seed": 0', "metrics.json: expected"),
         ("metrics.json", "[" * 100_000, "metrics.json: expected"),
         ("metrics.json", "\xff", "metrics.json: expected"),
-        ("metrics.json", "[1, 2]", r"metrics\.json: expected an object, got list"),
+        ("metrics.json", "[1, 2]", r"metrics\.json: expected a JSON object, got \[1, 2\]"),
         ("metrics.json", '{"fps": [1]}', r"metrics\.json: expected flat values, got nested values below 'fps'"),
         ("metrics.json", '{"instances.ap50": "best"}', r"instances\.ap50: expected a number or null, got 'best'"),
         (
@@ -129,6 +130,18 @@ def test_find_records_ignores_other_files(directory: Path) -> None:
     found, others = find_records(directory.parent)
     assert [record.directory for record in found] == [directory]
     assert others == []
+
+
+def test_is_recorded_changed_plugin_code_is_false(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    refiner = {"_target_": "plugins.refiners.identity.Identity"}
+    config = CONFIG | {"refiner": refiner}
+    metrics = json.loads((directory / "metrics.json").read_text()) | {"config_hash": config_hash(config)}
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(config))
+    for code, is_complete in ((plugin_code(config), True), ({"code.refiner": "mean 0.1 3f"}, False)):
+        (directory / "metrics.json").write_text(json.dumps(metrics | code))
+        assert is_recorded(directory, OmegaConf.create(config)) is is_complete
+    assert f"repeating the run: the code changed since the run in {directory}: refiner: mean 0.1 3f ->" in caplog.text
 
 
 def test_is_recorded_same_config_is_true(directory: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -25,7 +25,7 @@ def test_sweep_rows_resolves_interpolations() -> None:
     assert sweep_rows(config | {"sequences": {"in_progress": 80}}) == {"third": ["dataset.stop=80"], "whole": []}
     assert sweep_rows(config) == config["rows"], "expected unchanged unresolved values"
     assert sweep_rows({}) == {}
-    with pytest.raises(ConfigError, match="rows: expected names with overrides"):
+    with pytest.raises(ConfigError, match="rows: expected a mapping of names to overrides"):
         sweep_rows({"rows": ["a"]})
 
 

@@ -158,7 +158,7 @@ def test_book_row_places_upright_books_side_by_side() -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_strew_places_objects_in_contact_and_keeps_walkway(seed: int) -> None:
+def test_strew_places_objects_in_contact_with_furniture(seed: int) -> None:
     rng = np.random.default_rng(seed)
     layout = arrange([cluttered_couch_group(rng), chair_row(rng, 3), single("bag", backpack(rng))], 4.8, 4.2, rng)
     strewn = strew(layout, some(rng, ON_FLOORS, 9), rng)

@@ -108,13 +108,16 @@ def test_depth_noise_deviation_scales_with_noise_parameter():
     assert half == pytest.approx(0.6 * full, rel=0.2)
 
 
-def test_normal_quantiles_and_random_bits_are_unbiased():
+def test_normal_quantiles_match_normal_distribution():
     quantiles = normal_quantiles().astype(float)
     assert quantiles.mean() == pytest.approx(0, abs=1e-6)
     assert quantiles.std() == pytest.approx(1, abs=1e-6)
     assert (quantiles**4).mean() == pytest.approx(3, abs=0.02)
     for sigmas, share in ((1, 0.6827), (2, 0.9545), (3, 0.9973)):
         assert (np.abs(quantiles) < sigmas).mean() == pytest.approx(share, abs=5e-4)
+
+
+def test_random_bits_are_unbiased_and_seeded():
     bits = random_bits((100, 101, 3), np.random.default_rng(0))
     assert bits.shape == (100, 101, 3)
     for k in range(16):

@@ -69,7 +69,7 @@ def test_scenenn_scene_files_have_scenenn_names(scene: SceneNNScene) -> None:
     assert len(lines) == RECORDING.frames
 
 
-def test_scenenn_scene_poses_are_rigid_and_world_is_y_up(scene: SceneNNScene) -> None:
+def test_scenenn_scene_poses_are_rigid_in_y_up_world(scene: SceneNNScene) -> None:
     found = poses(scene)
     assert list(found) == list(range(RECORDING.frames))
     for index, T_world_camera in found.items():

@@ -27,7 +27,7 @@ from framework.tables.table_choice import TableChoice
         ),
         (
             {"columns_by": "dataset.scene", "columns": ["fps", "frames"]},
-            r"table\.columns: expected one metric with table\.columns_by, got 2; set table\.group_by=",
+            r"table\.columns: expected one metric with table\.columns_by, got 2; set table\.columns_by=null and",
         ),
         ({"published": "table4", "columns": ["fps"]}, r"table\.published: expected null or one"),
         (

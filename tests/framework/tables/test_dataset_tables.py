@@ -86,7 +86,7 @@ def test_sweep_differences_are_within_dataset(sweep: Path) -> None:
         "| dataset=rooms, refiner=identity | 2 | -0.200 | +0.00 |",
         "| dataset=scan, refiner=identity | 2 | – | +0.00 |",
     ]
-    assert "Rows without a matching row" not in text
+    assert "Rows without a matching base row" not in text
 
 
 def test_sweep_of_single_rows_per_dataset_has_no_differences(sweep: Path) -> None:
@@ -167,7 +167,7 @@ def test_table_pairs_by_seed_have_same_datasets(sweep: Path) -> None:
     text = write_tables(sweep)
     _, second = grids(text)
     assert [line.split(" | ")[:2] for line in second[2:]] == [["| refiner=identity", "2"]]
-    assert "- Rows without a matching row of refiner=chain: refiner=other." in text
+    assert "- Rows without a matching base row (refiner=chain): refiner=other." in text
 
 
 def test_table_groups_have_digits_and_best_value_of_each_column(sweep: Path) -> None:

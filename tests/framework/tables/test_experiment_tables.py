@@ -127,6 +127,14 @@ def test_table_code_note_names_later_evaluation_commit(sweep: Path) -> None:
     assert expected in write_tables(sweep).splitlines()
 
 
+def test_table_notes_name_rows_of_mixed_plugin_code(sweep: Path) -> None:
+    for seed, code in enumerate(("mean 0.1 3f", "mean 0.1 9c", "mean 0.1 9c")):
+        run(sweep, "mean", seed, 0.5, 1.0, **{"code.refiner": code, "code.fuser": "tsdf 1.0 aa"})
+    assert "- Mixed plugin code in mean: refiner mean 0.1 9c (2 runs), mean 0.1 3f (1 run); repeat its runs with" in (
+        write_tables(sweep)
+    )
+
+
 def test_table_notes_replace_line_breaks(sweep: Path) -> None:
     (sweep / "row=chain,seed=1" / "metrics.json").unlink()
     partial = {"partial": "the map\nis\r\nfull"}
@@ -171,7 +179,7 @@ RUN_TIMES = {
 
 
 def of_dataset(sweep: Path, dataset: str, annotation: str | None = None, only: str = "") -> None:
-    """Set the dataset of all runs, or of those of one row."""
+    """Set the dataset of all runs, or only of the runs of one row."""
     for path in sweep.glob(f"row={only}*/metrics.json"):
         expected = {"choice.dataset": dataset, "annotation_release": annotation}
         path.write_text(json.dumps(json.loads(path.read_text()) | expected))
@@ -287,7 +295,7 @@ def test_table_without_experiment_has_column_for_single_value(tmp_path: Path) ->
 def test_table_without_metrics_has_all_columns(tmp_path: Path) -> None:
     run(tmp_path, "a", 0, None, 1.0, **{"stage_ms.refinement.median": None})
     text = write_tables(tmp_path)
-    assert text.splitlines()[2].count("|") == 18  # row, runs, poses, and all 14 figures
+    assert text.splitlines()[2].count("|") == 18  # row, runs, poses, and all 14 metrics
     assert "Omitted" not in text
 
 

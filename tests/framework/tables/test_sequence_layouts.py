@@ -89,10 +89,10 @@ GOLDEN = """\
 | other                     | ground truth | made up    | +0.500 | +0.400 | +0.450 ± 0.050 |     2 |
 
 - Cells: mean ± sample standard deviation over seed, without ± for equal values. mean: average over \
-dataset.scene with equal weights; its deviation is over the runs with all values of dataset.scene. Bold: highest AP50 \
-for the same poses and number of runs, unless several rows have it. missing: no complete run.
+dataset.scene with equal weights; its standard deviation is over the runs with all values of dataset.scene. Bold: \
+highest AP50 for the same poses and number of runs, unless several rows have it. missing: no complete run.
 - Differences are paired by seed, dataset.scene: mean ± standard error over dataset.scene, after averaging the runs of \
-each. pairs: number of values of dataset.scene in both rows. *: the 95% interval of Student's t excludes 0.
+each. pairs: number of values of dataset.scene in both rows. *: the 95% confidence interval (Student's t) excludes 0.
 - Identical runs: the results do not depend on seed in other.
 - ours compared with Prior (re-implementation), ground truth: higher in 1 of 2 sequences, lower in 1: 016.
 - ours compared with other, ground truth: higher in 2 of 2 sequences, lower in 0.
@@ -171,7 +171,7 @@ def test_table_tracked_row_needs_tracked_baseline(sweep: Path) -> None:
     text = write_tables(sweep)
     _, second = grids(text)
     assert len(second) == 3
-    assert "- Rows without a matching row of ours: other, tracker=icp." in text
+    assert "- Rows without a matching base row (ours): other, tracker=icp." in text
 
 
 @pytest.mark.parametrize(

@@ -194,7 +194,7 @@ def test_distance_gate_beyond_range_increases_with_depth() -> None:
     assert enlarged(1, backward, DEPTH).matched == 0
 
 
-def test_equations_sum_terms_and_separate_color() -> None:
+def test_equations_are_sums_of_separate_terms() -> None:
     offset = np.array([0.004, -0.003, 0.002, 0.002, 0.001, -0.002])
     both, depth, color = (
         enlarged(1, offset, weights) for weights in (BOTH, DEPTH, COLOR._replace(color_weight=np.float32(0.1)))

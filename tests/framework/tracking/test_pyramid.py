@@ -58,7 +58,7 @@ def slope(step: float, nearest: float) -> np.ndarray:
 @pytest.mark.parametrize("nearest", [0.6, 1.0, 2.0])
 def test_is_coarse_detects_eight_bit_depth(nearest: float) -> None:
     assert is_coarse(slope(0.0392, nearest), otherwise=False)
-    disparity = 8 * 580 * 0.075 / slope(0, nearest)  # of a Kinect, px / 8
+    disparity = 8 * 580 * 0.075 / slope(0, nearest)  # of a Kinect, in quantization steps of 1/8 px
     kinect = (8 * 580 * 0.075 / np.rint(disparity)).astype(np.float32)
     for fine in (slope(0.001, nearest), slope(0, nearest), kinect):
         assert not is_coarse(fine, otherwise=True)

@@ -111,9 +111,9 @@ def test_to_coco_unknown_labels_raise_with_full_list():
 
 
 def test_to_coco_without_object_class_raises():
-    with pytest.raises(ConfigError, match="labels: expected an object class of COCO, got none in 2 labels"):
+    with pytest.raises(ConfigError, match="expected at least one object class of COCO, got none in 2 labels"):
         to_coco(["wall", "floor"])
-    with pytest.raises(ConfigError, match="labels: expected an object class of COCO, got none in 0 labels"):
+    with pytest.raises(ConfigError, match="expected at least one object class of COCO, got none in 0 labels"):
         to_coco([])
 
 

@@ -31,9 +31,12 @@ def test_ground_truth_masks_of_known_classes_are_exact():
     assert detections.class_probabilities[1, COCO.index("tv")] == 1
 
 
-def test_ground_truth_empty_frame_is_valid_and_missing_raises():
+def test_ground_truth_frame_without_instances_has_no_detections():
     empty = FrameTruth(np.zeros((30, 40), np.int32), {})
     assert len(GroundTruthDetector().detect(frame_with(empty))) == 0
+
+
+def test_ground_truth_missing_in_frame_raises():
     with pytest.raises(DataError, match="expected instance ground truth"):
         GroundTruthDetector().detect(frame_with(None))
 

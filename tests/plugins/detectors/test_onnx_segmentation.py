@@ -136,7 +136,7 @@ def test_onnx_segmentation_different_class_names_are_logged(tmp_path, caplog):
         ),
         (
             {"output1": np.zeros((1, 40, 40))},
-            r"expected two outputs, \(1, 4 \+ classes \+ M, K\) or .*, got output0",
+            r"expected two outputs, a table \(1, 4 \+ classes \+ M, K\), or .*, got output0",
         ),
         ({"more": np.zeros((1, 2))}, r"got output0 \(1, 9, 4\), output1 \(1, 2, 40, 40\), more \(1, 2\)"),
     ],

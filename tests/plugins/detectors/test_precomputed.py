@@ -244,7 +244,7 @@ def test_precomputed_mask_folder_with_duplicate_frame_raises(tmp_path: Path) -> 
 def test_precomputed_mask_image_with_wrong_size_or_type_raises(
     tmp_path: Path, ids: np.ndarray, error: type[DataError]
 ) -> None:
-    with pytest.raises(error, match=r"000003\.(png|json).*(8x6 px \(as the frame\), got 9x6 px|uint8)"):
+    with pytest.raises(error, match=r"000003\.(png|json).*(size, 8x6 px, got 9x6 px|uint8)"):
         Precomputed(write_folder(tmp_path, ids)).detect(frame(3))
 
 
@@ -273,7 +273,7 @@ def test_precomputed_mask_image_with_wrong_size_or_type_raises(
         ({"segmentation": {"size": [6], "counts": PACKED}}, "size"),
         ({"segmentation": {"size": [6, 8], "counts": [3, 4]}}, "run lengths: expected"),
         ({"segmentation": [[1, 2, 3, 4]]}, "at least 3 points, got [1, 2, 3, 4]"),
-        ({"segmentation": []}, "segmentation: expected a polygon, got none"),
+        ({"segmentation": []}, "segmentation: expected at least one polygon, got an empty list"),
         ({"bbox": [1, 2, 3]}, "bbox: expected [x, y, width, height] px, at most"),
         ({"class_probabilities": [0.5, 0.5]}, "class_probabilities: expected 80 values, one for each label, got 2"),
         ({"class_probabilities": {"chair": 0.5}}, "class_probabilities: expected a sum of 1, got 0.5"),
@@ -317,7 +317,7 @@ def test_precomputed_result_file_with_two_sequences_raises(tmp_path: Path) -> No
 
 def test_precomputed_mask_with_wrong_frame_size_raises(tmp_path: Path) -> None:
     detector = Precomputed(write(tmp_path, entry()))
-    with pytest.raises(DataError, match=r"entry 0: frame 0: mask: expected 16x12 px \(as the frame\), got 8x6 px"):
+    with pytest.raises(DataError, match=r"entry 0: frame 0: mask: expected the frame's size, 16x12 px, got 8x6 px"):
         detector.detect(frame(camera=CAMERA.scaled(2)))
     detector = Precomputed(write(tmp_path, entry(segmentation=[[0, 0, 12, 0, 12, 6]])))
     with pytest.raises(
@@ -360,8 +360,8 @@ def test_precomputed_invalid_parameter_raises(tmp_path: Path) -> None:
 
 
 def test_precomputed_unusable_or_duplicate_label_raises(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="expected detections of COCO's classes, got none of 1"):
+    with pytest.raises(DataError, match="expected detections of COCO classes, got none in 1 detections"):
         Precomputed(write(tmp_path, entry(category_name="wall")), label_space="nyu40")
     (tmp_path / "labels.txt").write_text("chair\nchair\n")
-    with pytest.raises(ConfigError, match=r"detector\.label_space: expected unique names, got duplicates in"):
+    with pytest.raises(ConfigError, match=r"detector\.label_space: expected unique names, got 'chair' twice"):
         Precomputed(write(tmp_path, entry()), label_space=str(tmp_path / "labels.txt"))

@@ -23,7 +23,7 @@ from plugins.detectors.simulated import (
 PERFECT = SimulatedDetector(
     merge_rate=0,
     miss_rate=0,
-    small_side=0,
+    miss_size_scale=0,
     truncated_miss_rate=0,
     split_rate=0,
     shift=0,
@@ -101,7 +101,7 @@ def test_simulated_error_types_have_independent_random_streams():
 def test_simulated_miss_rates_match_parameters():
     chair, cup, bed = IDS == 5, IDS == 9, IDS == 12
     assert count_of(replace(PERFECT, miss_rate=0.3), chair) == pytest.approx(400 * 0.7, abs=30)  # 3 sigma
-    smaller = replace(PERFECT, small_side=20.0)
+    smaller = replace(PERFECT, miss_size_scale=20.0)
     assert count_of(smaller, cup) == pytest.approx(400 * (1 - np.exp(-1)), abs=30)
     assert count_of(smaller, chair) == pytest.approx(400 * (1 - np.exp(-2)), abs=22)
     truncated = replace(PERFECT, truncated_miss_rate=0.4)
@@ -178,7 +178,7 @@ def test_simulated_coarse_mask_grid_keeps_square_and_blurs_comb():
     assert np.mean(mask != (comb == 5)) > 0.2
 
 
-def test_confusion_kernel_is_normalized_and_favors_lookalikes():
+def test_confusion_kernel_is_normalized_and_favors_similar_classes():
     kernel = confusion_kernel(COCO, 0.25)
     np.testing.assert_allclose(kernel.sum(axis=1), 1)
     np.testing.assert_allclose(np.diag(kernel), 0.75)
@@ -349,9 +349,12 @@ def test_simulated_ellipse_matches_reference(place):
             np.testing.assert_array_equal(ellipse(x, y, a, b, field), expected)
 
 
-def test_simulated_missing_truth_raises_and_empty_gives_none():
+def test_simulated_missing_truth_raises():
     with pytest.raises(DataError, match="expected instance ground truth"):
         SimulatedDetector().detect(replace(frame(), truth=None))
+
+
+def test_simulated_frame_without_instances_has_no_detections():
     assert len(PERFECT.detect(replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {})))) == 0
 
 
@@ -361,7 +364,7 @@ def test_simulated_missing_truth_raises_and_empty_gives_none():
         {"seed": -1},
         {"min_pixels": 0},
         {"miss_rate": 1.1},
-        {"small_side": -1.0},
+        {"miss_size_scale": -1.0},
         {"bleed": float("nan")},
         {"boundary_scale": 1.0},
         {"mask_grid": 3},

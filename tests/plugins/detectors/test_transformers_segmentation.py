@@ -146,7 +146,7 @@ def test_transformers_decoding_agrees_with_mask2former(folders):
         assert np.mean(mask == found.masks[k]) > 0.99
 
 
-def test_transformers_decoding_agrees_with_eomt(folders):
+def test_transformers_decoding_matches_eomt_processor(folders):
     from transformers import EomtImageProcessorPil
 
     image = frame(3, CAMERA)  # 48 rows are padded to 64 at the bottom
@@ -370,12 +370,12 @@ def copy(folders, tmp_path):
         (
             "preprocessor_config.json",
             {"size": {"height": 3}},
-            "size: expected height and width, or shortest_edge and longest_edge",
+            "size: expected height and width, max_height and max_width, or shortest_edge and longest_edge",
         ),
         (
             "preprocessor_config.json",
             {"size": None},
-            "size: expected height and width, or shortest_edge and longest_edge",
+            "size: expected height and width, max_height and max_width, or shortest_edge and longest_edge",
         ),
         ("preprocessor_config.json", {"pad_size": FIXED}, "pad_size"),
         ("preprocessor_config.json", {"resample": 1}, "resample"),

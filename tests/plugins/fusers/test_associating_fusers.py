@@ -61,7 +61,7 @@ def test_fuser_weak_detection_creates_no_instance(new_fuser: NewFuser, frames: l
         ({"min_class_agreement": 1.0}, False),  # the class floor prevents complete agreement
     ],
 )
-def test_fuser_overlap_rule_and_class_agreement_limit_matches(
+def test_fuser_match_requires_overlap_and_class_agreement(
     new_fuser: NewFuser, frames: list[Frame], parameters: dict[str, Any], updates: bool
 ) -> None:
     fuser = new_fuser(**parameters)
@@ -96,7 +96,7 @@ def test_fuser_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frame
 def test_fuser_merges_instances_covered_by_one_cluster(
     fuser_class: type[MapFuser], merge_frames: int, frames: list[Frame]
 ) -> None:
-    """The detections of the whole are weak and would relabel the voxels of the other half only slowly."""
+    """The detections of the whole object have low scores and would relabel the voxels of the other half slowly."""
     fuser = assemble(fuser_class, voxel_size=0.02, max_depth=4.0, merge_overlap=0.5, merge_frames=merge_frames)
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
@@ -147,7 +147,7 @@ def test_fuser_merges_supported_object_only_if_classes_agree(
     assert len(fuser.scene.table.records) == (1 if merged else 2)
 
 
-def test_fuser_separate_objects_stay_apart_under_shared_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
+def test_fuser_separate_objects_are_not_merged_by_shared_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
     fuser = new_fuser()
     first, second, _ = masks_of(frames[0])
     for _ in range(5):
@@ -198,7 +198,7 @@ def test_fuser_empty_scene_leaves_map_unchanged(new_fuser: NewFuser) -> None:
 
 
 def test_fuser_instance_with_few_visible_pixels_is_not_counted(new_fuser: NewFuser, frames: list[Frame]) -> None:
-    """Otherwise frames that show only a small part of an instance would decrease its confidence."""
+    """Frames that show only a small part of an instance do not decrease its confidence."""
     fuser = new_fuser(create_points=50)
     mask = masks_of(frames[0])[0]
     fuse_masks(fuser, frames[0], [mask], [0.9])

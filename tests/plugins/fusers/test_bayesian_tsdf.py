@@ -23,7 +23,7 @@ def frames() -> list[Frame]:
     return [room().frame(T, k) for k, T in enumerate(walk(10))]
 
 
-def test_bayesian_tsdf_full_map_raises_and_keeps_content(frames: list[Frame]) -> None:
+def test_bayesian_tsdf_full_map_error_keeps_content(frames: list[Frame]) -> None:
     fuser = new_fuser(max_blocks=300)
     with pytest.raises(MapFullError, match="300 blocks"):
         fuse_masks(fuser, frames[0], [], [])

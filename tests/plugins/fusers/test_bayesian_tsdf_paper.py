@@ -218,7 +218,7 @@ def roll_classes(scene: InstanceMap, shift: int) -> None:
 
 
 @pytest.mark.parametrize(("source", "changes"), [("VOXELS", True), ("DETECTIONS", False)])
-def test_paper_fuser_voxel_evidence_decides_instance_class(frames: list[Frame], source: str, changes: bool) -> None:
+def test_paper_fuser_voxel_evidence_sets_instance_class(frames: list[Frame], source: str, changes: bool) -> None:
     fuser = paper_fuser(f"fuser.instance_class={source}")
     for frame in frames:
         fuse_masks(fuser, frame, masks_of(frame), SCORES, PROBABILITIES)
@@ -261,7 +261,7 @@ def test_paper_fuser_unmatched_masks_update_classes_only_if_set(frames: list[Fra
 
 
 def test_paper_fuser_pixels_of_all_masks_are_listed(frames: list[Frame]) -> None:
-    """In the paper every mask is a separate update, so overlapping masks all count."""
+    """In the paper, every mask is a separate update, so all overlapping masks count."""
     fuser = paper_fuser()
     whole, small = masks_of(frames[0])[0], masks_of(frames[0])[0].copy()
     small[:, : int(np.median(np.nonzero(whole)[1]))] = False

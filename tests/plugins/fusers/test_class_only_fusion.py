@@ -65,7 +65,7 @@ def mapped(frames: list[Frame]) -> SemanticMap:
 # Components
 
 
-def test_class_only_separate_boxes_of_one_class_are_two() -> None:
+def test_class_only_separate_boxes_are_two_instances() -> None:
     instances = mapped_boxes([LEFT, RIGHT], [0, 0]).instances()
     assert list(instances) == [1, 2]
     for instance, box in zip(sorted(instances.values(), key=lambda i: i.aabb.center[0]), [LEFT, RIGHT], strict=True):
@@ -73,12 +73,12 @@ def test_class_only_separate_boxes_of_one_class_are_two() -> None:
         assert instance.class_probabilities.argmax() == 0
 
 
-def test_class_only_touching_boxes_of_one_class_are_one() -> None:
+def test_class_only_touching_boxes_are_one_instance() -> None:
     [instance] = mapped_boxes([LEFT, TOUCHING], [0, 0]).instances().values()
     assert instance.aabb.extent[0] == pytest.approx(1.0, abs=0.1)
 
 
-def test_class_only_touching_boxes_of_two_classes_are_two() -> None:
+def test_class_only_touching_classes_are_two_instances() -> None:
     scene = mapped_boxes([LEFT, TOUCHING], [0, 1])
     instances = scene.instances()
     assert sorted(i.class_probabilities.argmax() for i in instances.values()) == [0, 1]
@@ -123,7 +123,7 @@ def test_class_only_instance_below_min_area_is_excluded(frames: list[Frame]) -> 
 
 
 def test_class_only_voxel_evidence_matches_reference(mapped: SemanticMap, frames: list[Frame]) -> None:
-    """The reference is eq. [7] over classes and background, with the voxel projected into each frame."""
+    """The reference is eq. (7) over the classes and the background, with the voxel projected into each frame."""
     grid, evidence, fuser = mapped.volume.voxels.grid, mapped.labels.evidence, new_fuser()
     rows = np.flatnonzero(grid.label_row[: mapped.volume.voxels.block_count] >= 0)
     rng = np.random.default_rng(0)
@@ -269,7 +269,7 @@ def test_class_only_different_label_space_raises(frames: list[Frame]) -> None:
     fuse_masks(fuser, frames[0], [], [])
     assert fuser.scene.classes == CLASSES
     clusters = lift(Detections.none(CAMERA.shape, ("chair",)), frames[1], Pose(np.eye(4)))
-    with pytest.raises(DataError, match=r"the 2 classes of the map, got 1 different"):
+    with pytest.raises(DataError, match=r"label space of the map \(length 2\), got a different .* \(length 1\)"):
         fuser.fuse(frames[1], Pose(np.eye(4)), clusters)
 
 
@@ -321,7 +321,7 @@ def slowly_smoothed(scene: SemanticMap, smoothness: float) -> Int32:
 
 
 @pytest.mark.parametrize("smoothness", [0.5, 3.0])
-def test_class_only_smoothness_equals_icm_reference(mapped: SemanticMap, smoothness: float, tmp_path: Path) -> None:
+def test_class_only_smoothness_matches_icm_reference(mapped: SemanticMap, smoothness: float, tmp_path: Path) -> None:
     plain = with_smoothness(mapped, tmp_path, 0.0)
     expected = slowly_smoothed(plain, smoothness)
     smooth = with_smoothness(mapped, tmp_path, smoothness).mesh().class_ids

@@ -81,7 +81,7 @@ def test_object_volumes_each_box_is_one_instance(mapped: ObjectVolumes) -> None:
 
 
 def test_object_volumes_label_whole_object_surface(mapped: ObjectVolumes) -> None:
-    """Otherwise the nearest vertex of half of the true points would be in the background."""
+    """Without labels on the background, the vertex nearest to half of the true points would be unlabeled."""
     mesh = mapped.scene.mesh()
     owners = BOXES.owners(mesh.vertices.astype(np.float64), VOXEL / 4)
     for key in (1, 2):
@@ -276,7 +276,7 @@ def test_object_volumes_incremental_mesh_equals_loaded_mesh(frames: list[Frame],
 
 
 def test_object_volumes_keep_surfaces_of_overlapping_objects(frames: list[Frame]) -> None:
-    """The first detection is of the whole, the second of a small part, which the IoU rule does not match."""
+    """The first mask covers the whole object, and the second mask a small part, which the IoU rule does not match."""
     fuser = new_fuser(min_observations=1)
     whole = masks_of(frames[0])[0]
     for k, mask in enumerate([whole, part_of(whole, 0.15)]):
@@ -318,7 +318,7 @@ def test_object_volumes_full_map_raises(frames: list[Frame]) -> None:
         fuse(new_fuser(max_blocks=background), frames[0], masks_of(frames[0]))
 
 
-def test_object_volumes_pixel_outside_or_other_classes_raise(frames: list[Frame]) -> None:
+def test_object_volumes_pixel_outside_image_raises(frames: list[Frame]) -> None:
     frame = frames[0]
     clusters = clusters_of(frame, masks_of(frame))
     fuser = fuse(new_fuser(), frame, [])
@@ -326,7 +326,13 @@ def test_object_volumes_pixel_outside_or_other_classes_raise(frames: list[Frame]
         DataError, match=r"clusters: expected pixels in the image of .*x.*, got u in \[.*, .*\], v in \[.*, .*\]"
     ):
         fuser.fuse(frame, Pose(np.eye(4)), replace(clusters, pixels=clusters.pixels + 200))
-    with pytest.raises(DataError, match="got 3 different"):
+
+
+def test_object_volumes_different_label_space_raises(frames: list[Frame]) -> None:
+    frame = frames[0]
+    clusters = clusters_of(frame, masks_of(frame))
+    fuser = fuse(new_fuser(), frame, [])
+    with pytest.raises(DataError, match=r"got a different label space \(length 3\)"):
         fuser.fuse(frame, Pose(np.eye(4)), replace(clusters, classes=("a", "b", "c")))
 
 

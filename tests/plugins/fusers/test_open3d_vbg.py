@@ -119,7 +119,7 @@ def test_open3d_vbg_only_voxels_in_band_under_mask_vote(frames: list[Frame]) -> 
 
 
 @pytest.mark.parametrize(("scores", "winner"), [([0.9, 0.6], 1), ([0.6, 0.9], 2)])
-def test_open3d_vbg_shared_pixels_go_to_higher_score(frames: list[Frame], scores: list[float], winner: int) -> None:
+def test_open3d_vbg_shared_pixels_vote_for_higher_score(frames: list[Frame], scores: list[float], winner: int) -> None:
     first, second, _ = masks_of(frames[0])
     v = np.arange(CAMERA.height)[:, None]
     shared = first & (v > np.quantile(np.nonzero(first)[0], 0.7))
@@ -288,7 +288,7 @@ def test_open3d_vbg_grid_growth_keeps_content(frames: list[Frame], monkeypatch: 
         assert np.array_equal(getattr(small.mesh(), name), getattr(large.mesh(), name))
 
 
-def test_open3d_vbg_full_map_raises_and_keeps_content(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open3d_vbg_full_map_error_keeps_content(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("framework.baselines.open3d_grid.FIRST_BLOCKS", 16)
     first = new_fuser()
     fuse_masks(first, frames[0], [], [])
@@ -358,7 +358,7 @@ def test_open3d_vbg_empty_map_round_trip_is_exact(tmp_path: Path) -> None:
 
 
 def test_open3d_vbg_single_depth_reading_is_mapped(frames: list[Frame]) -> None:
-    """The pixel is between those that Open3D samples; without a sample Open3D would raise an error."""
+    """The pixel is between the pixels that Open3D samples; without a sample, Open3D would raise an error."""
     depth = np.zeros_like(frames[0].depth)
     depth[61, 83] = 1.5
     fuser = new_fuser()

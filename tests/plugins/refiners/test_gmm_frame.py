@@ -108,7 +108,7 @@ def split(node: Gaussian, points: Float64, refiner: GmmFrame) -> list[Gaussian]:
 
 
 def slow_masks(refiner: GmmFrame, points: Float32, masks: Int32, count: int) -> Int32:
-    """Return the mask (S,) of the root of each point's most probable leaf."""
+    """Return the index (S,) of the mask whose tree contains the most probable leaf of each point."""
     x = points.astype(np.float64)
     first = m_step(x, np.eye(count)[masks], list(range(count)), refiner.std_floor**2)
     leaves = em(x, first, refiner)

@@ -114,7 +114,7 @@ def test_gmm_tree_cluster_with_too_few_points_is_unchanged():
     assert len(GmmTree().refine(box, lonely).pixels) == (ids > 0).sum(), "expected no change for a ring without depth"
     sparse = frame_of(np.where((np.indices(depth.shape).sum(axis=0) % 40) == 0, depth, 0).astype(np.float32))
     few = lifted(bleeding(ids > 0, 8)[None], sparse)
-    assert len(GmmTree(min_node=10**6).refine(few, sparse).pixels) == len(few.pixels), (
+    assert len(GmmTree(min_split_points=10**6).refine(few, sparse).pixels) == len(few.pixels), (
         "expected no change for a tree without nodes"
     )
 
@@ -133,7 +133,7 @@ def test_gmm_tree_does_not_depend_on_thread_count():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(np.stack([bleeding(ids > 0, 8), ids > 0]), frame)
-    refiner = GmmTree(levels=3, min_node=16)
+    refiner = GmmTree(levels=3, min_split_points=16)
     np.testing.assert_array_equal(*by_one_thread_and_two(lambda: refiner.refine(before, frame).pixels))
 
 

@@ -146,7 +146,7 @@ def test_plane_removal_cluster_fraction_counts_all_parts(share, unchanged):
     np.testing.assert_array_equal(left, mask & (post | unchanged))
 
 
-def test_plane_removal_keeps_screen_and_removes_wall_behind():
+def test_plane_removal_keeps_screen_in_front_of_wall():
     """The screen of 1.2 m x 0.7 m is 8 cm in front of the wall, without and with depth noise."""
     screen = (-0.6, -0.4, 3.85), (0.6, 0.3, 3.92)
     for noise, kept, dropped in ((0.0, 1.0, 1.0), (0.001, 0.99, 0.99)):

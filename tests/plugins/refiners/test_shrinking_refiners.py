@@ -91,7 +91,7 @@ def test_gmm_em_removes_mask_bleed(px):
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_shrinking_refiner_only_shrinks_and_keeps_point_data(make):
+def test_shrinking_refiner_points_are_subset_of_input(make):
     depth, ids = room()
     depth[100:110, 150:160] = 0
     frame = frame_of(depth)

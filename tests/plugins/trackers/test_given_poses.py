@@ -69,7 +69,7 @@ def test_given_poses_skip_frames_without_pose_with_one_warning(
 
 
 @TRACKERS
-def test_given_poses_missing_do_not_hide_unreadable_frames(
+def test_given_poses_unreadable_frame_is_logged_separately(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Unreadable frames are logged one by one up to a limit; frames without poses do not count toward it."""

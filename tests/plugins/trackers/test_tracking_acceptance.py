@@ -188,7 +188,7 @@ def there_and_back(frames: list[Frame], begin: int, bad: list[Frame], end: int) 
         (garbage, 5),
     ],
 )
-def test_tracking_of_bad_frames_is_lost_and_keeps_map_accurate(
+def test_tracking_of_bad_frames_keeps_map_accurate(
     spoilt, count: int, frames: list[Frame], surface, clean_error
 ) -> None:
     shown = there_and_back(frames, 25, [spoilt(f) for f in frames[25 : 25 + count]], 25 + count)
@@ -197,7 +197,7 @@ def test_tracking_of_bad_frames_is_lost_and_keeps_map_accurate(
     assert_robust(poses, shown, surface.error(scene), clean_error)
 
 
-def test_tracking_after_cut_to_other_room_is_lost_and_keeps_map(
+def test_tracking_after_cut_to_other_room_keeps_map_accurate(
     frames: list[Frame], elsewhere, surface, clean_error
 ) -> None:
     bad = [dataclasses.replace(f, depth=e.depth, color=e.color) for f, e in zip(frames[25:28], elsewhere, strict=True)]

@@ -1,4 +1,4 @@
-"""Real recordings with one convention that differs from the format."""
+"""Copies of real recordings in which one convention differs from the dataset format."""
 
 from __future__ import annotations
 
@@ -25,7 +25,17 @@ def write_damaged(
     poses_late: int = 0,
     frames: int = 10_000,
 ) -> Path:
-    """Write an RGB-D folder with links to the images of `sound` and damaged poses, depth scale or delays."""
+    """Write an RGB-D folder with the images of the valid recording `sound`, and wrong poses, depth scale or delays.
+
+    Args:
+        place: Folder to write.
+        sound: Valid recording; the written images are links to its files.
+        pose: Function that converts each stored pose (4, 4).
+        scale: Factor of the depth scale.
+        depth_late: Delay of the depth images, in frames.
+        poses_late: Delay of the poses, in frames.
+        frames: Maximum number of frames.
+    """
     recorded = sound.contents.frames[:frames]
     usable = range(max(depth_late, poses_late, 0), len(recorded) + min(depth_late, poses_late, 0))
     for name in ("color", "depth"):

@@ -25,7 +25,10 @@ def jpeg(image):
 
 
 def with_table(image):
-    """Return the 16zT encoding of OpenNI without short forms: values, first index, then 0xff and each other index."""
+    """Return an image in OpenNI's 16zT encoding, without its short forms.
+
+    The content is the table of values, the index of the first pixel, and then 0xff and the index for each other pixel.
+    """
     values, places = np.unique(image, return_inverse=True)
     table = struct.pack("<H", len(values)) + values.astype("<u2").tobytes()
     first, *others = places.ravel()
@@ -44,13 +47,15 @@ class Node:
     times: list[int]  # time of each image, us
     codec: bytes = b"NONE"
     pixel_format: int | None = None  # pixel format of OpenNI 2; None = omitted, as by OpenNI 1
-    positions: list[int] = field(default_factory=list)
+    positions: list[int] = field(default_factory=list)  # byte offset of each image record, set by OniFile.write
 
 
 @dataclass
 class OniFile:
+    """Content of a recording."""
+
     nodes: list[Node]
-    wide: bool = True  # 64-bit positions since version 1.0.1.0; otherwise 1.0.0.5 without seek tables
+    wide: bool = True  # True = version 1.0.1.0, with 64-bit positions; False = 1.0.0.5, without seek tables
     end_node: int = 0  # node in the end record; OpenNI 1 writes OPENNI_1_END_NODE
 
     def write(self, path: Path) -> Path:

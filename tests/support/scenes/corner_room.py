@@ -51,9 +51,9 @@ class CornerRoom(RGBDSequence):
     unposed: tuple[int, ...] = ()  # indices of the frames without a ground-truth pose
     slow_s: float = 0.0  # time to read a frame, s
     scene: str = ""  # sequence name; all names give the same room
-    start: int = 0  # first frame
-    stop: int = -1  # one past the last frame; -1 = all frames
-    stride: int = 1  # step between frames
+    start: int = 0  # index of the first frame
+    stop: int = -1  # index after the last frame; -1 = all frames
+    stride: int = 1  # step between frames; 1 = every frame
 
     def __post_init__(self) -> None:
         self.camera, self.name = CAMERA, "corner_room"
@@ -138,8 +138,8 @@ class GivenPose(PoseTracker):
     """Tracker that returns the ground-truth pose; the frames in [lost_from, lost_to) are lost."""
 
     pose_source = "ground_truth"
-    lost_from: int = 0  # first lost frame
-    lost_to: int = 0  # one past the last lost frame
+    lost_from: int = 0  # index of the first lost frame
+    lost_to: int = 0  # index after the last lost frame
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         if frame.T_world_camera is None:

@@ -32,7 +32,7 @@ PICTURE: list[Block] = [(2.8, 2.95, 1.2, 3.3, 3.0, 1.6)]
 
 
 def faces(block: Block, inward: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices (V, 3), m, and triangles (T, 3) of a box with subdivided faces, oriented out or in."""
+    """Return the vertices (V, 3), m, and outward triangles (T, 3) of a box; `inward` reverses their orientation."""
     low, high = np.array(block[:3]), np.array(block[3:])
     vertices, triangles, count = [], [], 0
     for axis in range(3):

@@ -48,7 +48,7 @@ def test_convert_weights_torchvision_keeps_classes_and_eps(tmp_path, monkeypatch
     [
         ("absent.pkl", "out.safetensors", "expected a file or one of"),
         ("broken.pkl", "out.safetensors", "broken.pkl: expected a pickle of numpy arrays"),
-        ("broken.pkl", "out.pth", "out.pth: expected the suffix .safetensors, got .pth"),
+        ("broken.pkl", "out.pth", "OUT: expected a file name with the suffix .safetensors, got out.pth"),
     ],
 )
 def test_convert_weights_errors_are_one_line(tmp_path, monkeypatch, capsys, source, target, fault):

@@ -51,7 +51,7 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
     [
         (("out=2024",), "out: expected a path"),
         (("out=check.jpg",), "out: expected a name with the suffix"),
-        (("out=nowhere/check.png",), "out: expected a file in an existing folder, got"),
+        (("out=nowhere/check.png",), "out: expected an existing parent folder, got none"),
         (("dataset=rgbd_folder", "dataset.root=nowhere"), "dataset.root: expected an existing folder, got nowhere"),
         (("dataset=rgbd_folder", "dataset.root=.", "dataset.camera_axes=UNITY"), "camera_axes"),
     ],

@@ -91,7 +91,7 @@ def test_evaluate_unchanged_run_keeps_exact_metrics(stored: Path, command) -> No
     assert metrics_of(stored) == after
 
 
-def test_evaluate_old_metrics_are_replaced_and_others_kept(stored: Path, command) -> None:
+def test_evaluate_replaces_only_evaluation_metrics(stored: Path, command) -> None:
     true = metrics_of(stored)
     old = {key: value for key, value in true.items() if not key.startswith("instances.to_map.")}
     old |= {"instances.ap50": 0.125, "instances.ap50.sofa": 0.5, "annotation_release": "first", "fps": 3.0}
@@ -198,14 +198,12 @@ def _truncated_mesh(directory: Path) -> None:
         (lambda directory: (directory / "instances.json").unlink(), "instances.json: expected a readable file"),
         (
             lambda directory: _with_dataset(directory, truth=False),
-            "expected a dataset with instances (as in its metrics), got a dataset without instances",
+            "expected ground-truth instances of the dataset (as in metrics.json), got none",
         ),
         (lambda directory: _with_dataset(directory, colour=1), "got 'colour'"),
     ],
 )
-def test_evaluate_refuses_unusable_run_and_evaluates_others(
-    stored: Path, command, spoil: Callable[[Path], None], message: str
-) -> None:
+def test_evaluate_refuses_only_unusable_run(stored: Path, command, spoil: Callable[[Path], None], message: str) -> None:
     spoilt = Path(shutil.copytree(stored, stored.parent / "a spoilt one"))
     spoil(spoilt)
     before = {path.name: path.read_bytes() for path in spoilt.iterdir()}
@@ -317,5 +315,5 @@ def test_evaluate_stored_config_cannot_read_environment(stored: Path, command, m
     _with_dataset(stored, scene="${oc.env:SECRET}")
     status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert "config of the run: expected resolved values, got dataset.scene=${oc.env:SECRET}" in err
+    assert "dataset.scene: expected a resolved value in the run's config.yaml, got ${oc.env:SECRET}" in err
     assert "hunter2" not in err

@@ -30,7 +30,7 @@ FRAMES = 6
 
 
 def write_folder(root: Path) -> None:
-    """Write the corner of the room as an RGB-D folder without poses or annotation."""
+    """Write the corner room as an RGB-D folder without poses or annotation."""
     for name in ("color", "depth"):
         (root / name).mkdir(parents=True)
     camera = {key: getattr(CAMERA, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
@@ -53,7 +53,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def mapped(directory: Path, root: Path, **changes: Any) -> dict[str, Any]:
-    """Map a recording; return the metrics."""
+    """Map the recording in `root` into the run directory `directory`; return the metrics."""
     dataset = {"_target_": "framework.datasets.rgbd_folder.RgbdFolder", "root": str(root)}
     config = reported_run.CONFIG | {
         "dataset": dataset | changes.pop("dataset", {}),

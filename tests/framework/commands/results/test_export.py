@@ -82,7 +82,7 @@ def test_export_invalid_arguments_exit_with_status_2(
         (("--to", "floorplan", "--resolution", "0"), "resolution"),
         (("--to", "floorplan", "--robot-height", "nan"), "robot_height"),
         (("--to", "glb", "--min-confidence", "2"), "min_confidence"),
-        (("--to", "glb", "--up", "0", "nan", "1"), "up: expected a direction of 3 numbers"),
+        (("--to", "glb", "--up", "0", "nan", "1"), "up: expected a nonzero direction of 3 finite numbers"),
         (("--to", "glb", "--floor", "nan"), "expected a floor height in [-10000, 10000] m, got nan"),
         (("--to", "glb", "--out", "/dev/null"), "/dev/null"),
         (("--to", "floorplan", "--floor=-1e300"), "expected a floor height in [-10000, 10000] m"),

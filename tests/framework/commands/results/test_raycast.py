@@ -106,7 +106,7 @@ def test_raycast_without_sequence_uses_kinect_camera(
 ) -> None:
     monkeypatch.setattr(RunSource, "of", classmethod(lambda cls, contents: cls(contents, None, "its folder is gone")))
     assert command(stored)[0] == 0
-    assert "the camera of the run is unknown (its folder is gone); rendering with the camera of a Kinect" in caplog.text
+    assert "camera of the run unknown (its folder is gone); rendering with the intrinsics of a Kinect" in caplog.text
     assert views[0][0].camera == NOT_CAMERA
 
 
@@ -117,11 +117,15 @@ FAR = ("--pose", 0, 0, -50, 0, 1, 0, 0)
     ("arguments", "message"),
     [
         (["--frame", 2], "--frame: expected a mapped frame, got 2 (a lost frame); use the nearest one, --frame 1"),
-        (["--frame", 6], "--frame: expected a number from 0 to 5, got 6"),
-        (["--frame", -1], "--frame: expected a number from 0 to 5, got -1"),
+        (["--frame", 6], "--frame: expected a frame number from 0 to 5, got 6"),
+        (["--frame", -1], "--frame: expected a frame number from 0 to 5, got -1"),
         (["--pose", 0, 0, 0, 0, 0, 0, 2], "--pose: expected a quaternion qx qy qz qw of length 1, got 2"),
         (["--pose", "nan", 0, 0, 0, 0, 0, 1], "--pose: expected a finite pose, got nan 0 0 0 0 0 1"),
-        (FAR, "raycast: expected a pose with the map in view, got pose 0 0 -50 0 1 0 0; set another --frame or --pose"),
+        (
+            FAR,
+            "raycast: expected a pose with the map in view, got an empty view from pose 0 0 -50 0 1 0 0; set another "
+            "--frame or --pose",
+        ),
         (["--out", "view.jpg"], "--out: expected a name with the suffix .png, got view.jpg"),
     ],
 )
@@ -141,4 +145,4 @@ def test_raycast_without_mapped_frames_is_one_line_error(stored: Path, command: 
     (stored / "trajectory.txt").write_text("")
     status, _, err = command(stored)
     assert status == 1
-    assert err == f"error: {stored}: expected mapped frames, got none; set --pose\n"
+    assert err == f"error: {stored}: expected at least one mapped frame, got none; set --pose\n"

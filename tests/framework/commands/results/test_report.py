@@ -169,7 +169,7 @@ def test_report_of_empty_run_is_written(stored: Path, command) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("instances.json", "{}", "instances.json: expected a list of instances"),
+        ("instances.json", "{}", "instances.json: expected a JSON array of instances"),
         ("instances.json", '[{"id": 1}]', "entry 1"),
         ("instances.json", '[{"id": 1, "class": "cup", "confidence": NaN}]', "entry 1"),
         ("mesh.ply", "ply\n", "mesh.ply"),
@@ -200,7 +200,7 @@ def test_report_invalid_output_path_fails_before_reading(
     stored: Path, command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(RunReport, "of", pytest.fail)
-    assert "expected a file in an existing folder" in command(stored, "--out", stored / "missing" / "page.html")[2]
+    assert "expected an existing parent folder" in command(stored, "--out", stored / "missing" / "page.html")[2]
     assert ": expected a regular file, got a folder" in command(stored, "--out", stored)[2]
 
 
@@ -212,7 +212,7 @@ def test_report_url_is_percent_encoded(stored: Path, command) -> None:
 
 def test_report_invalid_or_repeated_run_is_refused(stored: Path, command, tmp_path: Path) -> None:
     assert "expected a run directory with metrics.json or" in command(tmp_path)[2]
-    assert "expected each run once" in command(stored, stored.parent / "." / "first")[2]
+    assert "expected distinct runs" in command(stored, stored.parent / "." / "first")[2]
 
 
 def test_report_of_several_runs_writes_comparison(mapped: Path, stored: Path, command) -> None:

@@ -35,7 +35,7 @@ def test_detect_output_is_read_by_precomputed(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["found.json", "found.labels.txt"]
     assert "frame skipped: frame 1" in done.stderr
     assert "10 detections in 5 frames of corner_room" in done.stderr
-    assert "mask AP50 1.00, AP 1.00: mean of 2 classes, 10 ground-truth objects of at least" in done.stderr
+    assert "mask AP50 1.00, mask AP 1.00 (mean of 2 classes, 10 ground-truth objects of at least" in done.stderr
     message = dict(re.findall(r"INFO +(.*?)  +(\S+)$", done.stderr, re.MULTILINE))
     assert (message["found"], message["mask IoU"], message["correct class"], message["false detections per image"]) == (
         *("1.00", "1.00", "1.00", "0.00"),
@@ -69,7 +69,7 @@ def test_detect_output_is_read_by_pycocotools(tmp_path: Path) -> None:
     ("overrides", "message"),
     [
         ([], "out: expected a file name, got none; set out=detections.json"),
-        (["out=absent/found.json"], "out: expected a file in an existing folder, got"),
+        (["out=absent/found.json"], "out: expected an existing parent folder, got none"),
         (["out=2024"], "out: expected a path (in quotes if it looks like a number), got 2024"),
         (["out=[a,b]"], "out: expected a path (in quotes if it looks like a number), got ['a', 'b']"),
     ],

@@ -222,7 +222,7 @@ def test_experiment_on_synthetic_scenes_simulates_detector(experiment: str) -> N
 
 @pytest.mark.parametrize(("sequences", "stop"), [("benchmark", 40), ("scenenn", 1000)])
 def test_figure4_progress_stop_frame_depends_on_sequences(sequences: str, stop: int) -> None:
-    config, _ = composed(["experiment=figure4_progress", f"sequences={sequences}", "row=third"])
+    config, _ = composed(["experiment=figure4_progress", f"sequences={sequences}", "row=in_progress"])
     assert config.dataset.stop == stop
 
 
@@ -247,7 +247,7 @@ def test_experiment_is_overridden_by_command_line() -> None:
 
 def test_experiment_unknown_figure_kind_raises_before_runs() -> None:
     with pytest.raises(ConfigError, match=r"figure\.kind: expected one"):
-        composed(["experiment=figure4_progress", "row=whole", "figure.kind=pie"])
+        composed(["experiment=figure4_progress", "row=final", "figure.kind=pie"])
 
 
 def test_experiment_unknown_row_raises() -> None:

@@ -141,8 +141,13 @@ def test_resume_from_missing_map_raises(tmp_path: Path) -> None:
         Mapper(*GIVEN, "resume_from=7")
 
 
-def test_keyframes_file_round_trip_is_exact_and_damage_raises(tmp_path: Path) -> None:
-    desk, _ = mapped([DESK[k] for k in range(0, 30, 5)], *TRACKED)
+@pytest.fixture(scope="module")
+def desk() -> Mapper:
+    """Return a mapper that has tracked six frames of the desk."""
+    return mapped([DESK[k] for k in range(0, 30, 5)], *TRACKED)[0]
+
+
+def test_keyframes_file_round_trip_is_exact(desk: Mapper, tmp_path: Path) -> None:
     keyframes = desk.pipeline.tracker.keyframes()
     path = tmp_path / "keyframes.npz"
     assert read_keyframes(path) == {}
@@ -156,6 +161,10 @@ def test_keyframes_file_round_trip_is_exact_and_damage_raises(tmp_path: Path) ->
     again.load_keyframes(back, desk.scene)
     for name, array in again.keyframes().items():
         np.testing.assert_array_equal(array, keyframes[name])
+
+
+def test_keyframes_invalid_arrays_or_file_raise(desk: Mapper, tmp_path: Path) -> None:
+    keyframes = desk.pipeline.tracker.keyframes()
     scaled = np.array(keyframes["poses"]) * 2
     for damage in (
         {"counts": keyframes["counts"][:-1]},
@@ -168,6 +177,8 @@ def test_keyframes_file_round_trip_is_exact_and_damage_raises(tmp_path: Path) ->
             Mapper(*TRACKED).pipeline.tracker.load_keyframes({**keyframes, **damage}, desk.scene)
     with pytest.raises(DataError, match="keyframes: expected"):
         Mapper(*TRACKED).pipeline.tracker.load_keyframes({"poses": keyframes["poses"]}, desk.scene)
+    path = tmp_path / "keyframes.npz"
+    write_keyframes(path, keyframes)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(DataError, match=r"keyframes\.npz"):
         read_keyframes(path)

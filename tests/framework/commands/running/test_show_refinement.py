@@ -35,7 +35,7 @@ def test_show_refinement_draws_one_frame(tmp_path: Path) -> None:
 def test_show_refinement_without_detections_draws_frame(tmp_path: Path) -> None:
     done = start(tmp_path, "refiner=gmm_em", "detector=none", "out=refinement.png")
     assert done.returncode == 0, done.stderr
-    assert "no detections, nothing to refine" in done.stderr
+    assert "no detections to refine" in done.stderr
     assert (tmp_path / "refinement.png").exists()
 
 
@@ -43,7 +43,7 @@ def test_show_refinement_without_detections_draws_frame(tmp_path: Path) -> None:
     ("overrides", "message"),
     [
         ([], "out: expected a file name, got none; set out=refinement.png"),
-        (["out=absent/refinement.png"], "out: expected a file in an existing folder, got"),
+        (["out=absent/refinement.png"], "out: expected an existing parent folder, got none"),
         (["out=refinement.jpg"], "out: expected a name with the suffix .png, got refinement.jpg"),
         (["out=r.png", "frame=6"], "frame: expected a position in [0, 5] among the selected frames of"),
         (["out=r.png", "frame=1", "dataset.unreadable=1"], "frame 1: depth/000001.png is truncated"),
@@ -83,7 +83,7 @@ def test_show_refinement_skips_unusable_frames() -> None:
     assert position == 1
     with pytest.raises(FrameError, match="truncated"):
         detected(CornerRoom(unreadable=0), SphereDetector(), 0)
-    with pytest.raises(DataError, match="expected a usable frame, got none of 1 tried frames"):
+    with pytest.raises(DataError, match="expected a usable frame, got none of 1 candidates"):
         detected(CornerRoom(frames=1, unreadable=0), SphereDetector(), None)
 
 
@@ -105,7 +105,7 @@ def test_show_refinement_tries_few_frames_of_long_video() -> None:
     assert Counted.calls == CANDIDATES
 
 
-def test_show_refinement_called_returns_refiner_overrides() -> None:
+def test_called_returns_refiner_overrides() -> None:
     overrides = ["refiner=chain", "refiner.links.gmm_em=null", "refiner@refiner.links.x=kmeans", "frame=3", "seed=1"]
     assert called("chain", overrides) == "refiner=chain refiner.links.gmm_em=null refiner@refiner.links.x=kmeans"
     added = "+refiner@refiner.links.last=largest_component"

@@ -74,12 +74,12 @@ def wait_until(condition: Callable[[], object], process: subprocess.Popen[str]) 
 
 
 def recorded(directory: Path) -> dict[str, int]:
-    """Return the completion time of each completed run by directory name."""
+    """Return the completion time, ns since the epoch, of each completed run by directory name."""
     return {path.parent.name: path.stat().st_mtime_ns for path in (directory / PLACE).glob("*/metrics.json")}
 
 
 def begun(directory: Path) -> dict[str, int]:
-    """Return the start time of each active run by directory name."""
+    """Return the start time, ns since the epoch, of each active run by directory name."""
     began = {path.parent.name: path.stat().st_mtime_ns for path in (directory / PLACE).glob("*/config.yaml")}
     return {name: began[name] for name in set(began) - set(recorded(directory))}
 

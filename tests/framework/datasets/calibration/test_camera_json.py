@@ -20,7 +20,7 @@ def test_camera_json_keys_map_to_camera_fields() -> None:
 
 
 def test_camera_json_missing_or_invalid_raises(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"c\.json: expected a readable file, got No such file"):
+    with pytest.raises(DataError, match=r"c\.json: expected a readable file, got an error \(No such file"):
         read_json_object(tmp_path / "c.json")
     (tmp_path / "c.json").write_bytes(b"\xff")
     with pytest.raises(DataError, match="expected valid JSON"):

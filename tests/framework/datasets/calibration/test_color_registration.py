@@ -25,7 +25,7 @@ def test_color_registration_matches_viewing_direction() -> None:
     found, negative = registration.apply(image), registration.apply(255 - image)
     assert (
         np.abs(found[2:-2, 2:-2] - ramp(DEPTH)[2:-2, 2:-2]).max() < 1.2
-    )  # of 255; a shift of one pixel changes colors by 2.8
+    )  # gray levels; a shift of one pixel changes colors by 2.8
     both = (found + (255.0 - negative)) / 2  # OpenCV rounds halves up, which cancels here
     assert np.abs((both - ramp(DEPTH))[2:-2, 2:-2].mean(axis=(0, 1))).max() < 0.02
 

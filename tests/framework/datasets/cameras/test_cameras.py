@@ -107,14 +107,14 @@ def test_camera_images_are_undistorted_for_supported_model_only(
     device.coeffs = (0.1, -0.05, 0.01, 0.02, 0.001)
     [as_it_is] = sent(brand.video(), 1)
     np.testing.assert_array_equal(as_it_is.color, CornerRoom()[0].color)
-    expected = f"{brand.name}: expected Brown-Conrady lens distortion, got inverse; images are not undistorted"
-    assert caplog.messages == [expected]
+    expected = f"{brand.name}: expected Brown-Conrady lens distortion (k1, k2, p1, p2, k3), got inverse with the "
+    assert [message.startswith(expected) for message in caplog.messages] == [True]
     device.model = "brown"
     [undone] = sent(brand.video(), 1)
     lens = Undistortion(CAMERA, Distortion(*device.coeffs))
     np.testing.assert_array_equal(undone.color, lens.smooth(CornerRoom()[0].color))
     np.testing.assert_allclose(undone.depth, lens.exact(CornerRoom()[0].depth), atol=UNIT)
-    assert caplog.messages == [expected]
+    assert len(caplog.messages) == 1
 
 
 def test_camera_missing_package_raises_one_line_error(brand: Brand, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,7 +145,7 @@ def test_camera_unsupported_request_raises_one_line_error(
     assert not device.running
 
 
-def test_camera_disconnected_device_raises_and_stops(
+def test_camera_disconnected_device_error_stops_stream(
     brand: Brand, device: FakeCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device.unplugged_at = 2

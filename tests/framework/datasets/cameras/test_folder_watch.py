@@ -167,7 +167,7 @@ def test_folder_watch_continues_after_files_are_removed(folder: Path) -> None:
     first, second = watched.readers()
     assert outcome(first) == 0
     (folder / "color/000001.jpg").unlink()
-    assert "color/000001.jpg: expected a readable file, got No such file" in str(outcome(second))
+    assert "color/000001.jpg: expected a readable file, got an error (No such file" in str(outcome(second))
     for path in (folder / "depth").iterdir():
         path.unlink()
     write(folder, 2)

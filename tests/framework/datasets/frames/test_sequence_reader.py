@@ -44,8 +44,11 @@ def test_frame_fraction_sampling_is_uniform():
     assert max(counts) < 580
 
 
-def test_frame_fraction_one_keeps_all_and_minimum_keeps_one():
+def test_frame_fraction_one_keeps_all_frames():
     assert list(choose_frames(7, 1, -1, 2, frame_fraction=1.0, seed=9)) == [1, 3, 5]
+
+
+def test_frame_fraction_minimum_keeps_one_frame():
     assert len(choose_frames(7, 0, -1, 1, frame_fraction=1e-9)) == 1
 
 

@@ -43,7 +43,7 @@ def label_at(x: np.ndarray) -> np.ndarray:
 
 
 def write_wall(path: Path, T: np.ndarray | None = None, **properties: np.ndarray) -> None:
-    """Write the mesh of a wall of 4 x 4 m, transformed by T. By default, it has labels."""
+    """Write the mesh of a wall of 4 x 4 m, transformed by T (4, 4). `properties` replace its instance labels."""
     side = np.arange(-2.0, 2.0 + CELL / 2, CELL)
     x, y = np.meshgrid(side, side)
     vertices = np.stack([x, y, np.full_like(x, WALL)], axis=-1).reshape(-1, 3).astype(np.float32)
@@ -213,10 +213,14 @@ def test_named_truth_run_with_given_poses_is_not_aligned(folder: Path, tracked_r
         (
             lambda mesh: mesh.unlink(),
             ConfigError,
-            r"^dataset\.ground_truth: expected a labeled mesh .*, got nonexistent .*\.ply$",
+            r"^dataset\.ground_truth: expected a labeled mesh .*, got the nonexistent path .*\.ply$",
         ),
-        (lambda mesh: write_wall(mesh, label=np.ones(6561, np.int32)), DataError, "'instance' of integers, got label"),
-        (lambda mesh: write_wall(mesh, instance=np.ones(6561, np.float32)), DataError, "'instance' of integers"),
+        (
+            lambda mesh: write_wall(mesh, label=np.ones(6561, np.int32)),
+            DataError,
+            "'instance', got only .* x, y, z, label;",
+        ),
+        (lambda mesh: write_wall(mesh, instance=np.ones(6561, np.float32)), DataError, "'instance', got float32;"),
         (lambda mesh: write_wall(mesh, instance=np.zeros(6561, np.int32)), DataError, "got only instance 0"),
         (lambda mesh: write_wall(mesh, instance=np.full(6561, -1, np.int32)), DataError, "instance: expected values"),
         (lambda mesh: write_wall(mesh, instance=np.full(6561, 9, np.int32)), DataError, "got none for instance 9"),
@@ -226,7 +230,7 @@ def test_named_truth_run_with_given_poses_is_not_aligned(folder: Path, tracked_r
         (
             lambda mesh: (mesh.parent / "instances.json").write_text('[{"id": "a"}]'),
             DataError,
-            "entry 1: expected an id",
+            "entry 1: expected a JSON object with an id",
         ),
         (lambda mesh: (mesh.parent / "instances.json").write_text("[]"), DataError, "got only instance 0"),
         (

@@ -69,7 +69,7 @@ def test_scene_truth_wall_gives_one_point_per_voxel():
     assert (truth.instance_ids == 5).all()
 
 
-def test_scene_truth_uses_majority_and_smaller_id_on_tie():
+def test_scene_truth_majority_tie_uses_smaller_id():
     depth = np.zeros(CAMERA.shape)
     depth[2, 2] = 1.0
     frames = [view(depth, np.full(CAMERA.shape, i)) for i in (3, 2, 3, 2, 9)]
@@ -93,5 +93,5 @@ def test_scene_truth_empty_depth_gives_no_points():
 
 
 def test_scene_truth_point_outside_grid_raises():
-    with pytest.raises(DataError, match=r"expected points within \d+ m of the origin"):
+    with pytest.raises(DataError, match=r"expected all points within \d+ m of the world origin"):
         fuse_scene_truth([view(np.full(CAMERA.shape, 3e6), np.ones(CAMERA.shape))], {}, 0.02)

@@ -267,7 +267,7 @@ def test_scannet_first_release_names_use_first_release_table(tmp_path: Path) -> 
     table.write_text("id\traw_category\tnyu40class\n1\twall\twall\n")
     with pytest.raises(
         DataError,
-        match=r"expected names of the label table, got 'folding chair'.* or put scannet-labels\.combined\.tsv",
+        match=r"expected labels from scannetv2-labels\.combined\.tsv, got 'folding chair'.* or put scannet-labels",
     ):
         ScanNet(tmp_path, SCENE)
     (tmp_path / "scannet-labels.combined.tsv").write_text(
@@ -279,7 +279,7 @@ def test_scannet_first_release_names_use_first_release_table(tmp_path: Path) -> 
     assert truth.class_names == of_both.class_names
 
 
-def test_scannet_incomplete_truth_files_give_no_truth_and_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_scannet_incomplete_truth_files_give_no_truth(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     as_sens(tmp_path / SCENE, shots(1))
     write_labels(tmp_path / SCENE)
     (tmp_path / SCENE / f"{SCENE}.aggregation.json").unlink()

@@ -112,7 +112,7 @@ def test_oni_records_missing_largest_node_is_repaired(tmp_path):
             struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2),
             "expected depth and color images, got no depth and no color before the truncation or damage at byte 24",
         ),
-        (None, "expected a readable file, got No such file"),
+        (None, "expected a readable file, got an error (No such file"),
     ],
 )
 def test_oni_records_invalid_file_raises_one_line_error(tmp_path, content, fault):

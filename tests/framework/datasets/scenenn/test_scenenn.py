@@ -209,7 +209,7 @@ def test_scenenn_missing_annotation_gives_no_truth(root: Path) -> None:
 def test_scenenn_mesh_without_labels_raises(root: Path) -> None:
     vertices, triangles, _ = striped_wall()
     write_ply(root / "016" / "016.ply", vertices, triangles, {"red": np.zeros(len(vertices), np.uint8)})
-    with pytest.raises(DataError, match=r"016\.ply: expected a vertex property 'label'"):
+    with pytest.raises(DataError, match=r"016\.ply: expected an integer vertex property 'label', got"):
         SceneNN(root, "016")
 
 

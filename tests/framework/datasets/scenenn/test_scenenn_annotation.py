@@ -119,10 +119,10 @@ def test_scenenn_annotation_invalid_oriented_box_is_none(path, text):
         ('<label id="-1"/>', "line 3: .* got '-1'"),
         ('<label id="1.0"/>', "line 3: .* got '1.0'"),
         ('<label id="2147483648"/>', "line 3: .* got '2147483648'"),
-        ('<label id="5" text="a"/>', "line 3: label 5: expected text=None as in line 2, got 'a'"),
-        ("<label id=5/>", r"line 3: expected valid XML, got not well-formed \(invalid token\)"),
-        ('<label id="6">', "line 4: expected valid XML, got mismatched tag"),
-        ('<label id="&a;"/>', "line 3: expected valid XML, got undefined entity"),
+        ('<label id="5" text="a"/>', "line 3: label 5: expected text=None as on line 2, got 'a'"),
+        ("<label id=5/>", r"line 3: expected valid XML, got an error \(not well-formed \(invalid token\)\)"),
+        ('<label id="6">', r"line 4: expected valid XML, got an error \(mismatched tag\)"),
+        ('<label id="&a;"/>', r"line 3: expected valid XML, got an error \(undefined entity\)"),
     ],
 )
 def test_scenenn_annotation_malformed_error_gives_line(path, label, message):
@@ -173,7 +173,7 @@ def test_scenenn_annotation_nested_xml_needs_no_recursion(path):
 
 
 def test_scenenn_annotation_missing_or_oversized_raises(path, monkeypatch):
-    with pytest.raises(DataError, match=r"011.xml: expected a readable file, got No such file"):
+    with pytest.raises(DataError, match=r"011.xml: expected a readable file, got an error \(No such file"):
         read_annotation(path)
     monkeypatch.setattr(scenenn_annotation, "LARGEST_FILE", 100)
     path.write_text("<a><label id='1'/>" + " " * 78 + "</a>")

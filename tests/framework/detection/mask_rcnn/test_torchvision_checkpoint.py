@@ -88,7 +88,7 @@ def test_torchvision_invalid_checkpoints_raise():
     state = tiny_network().state_dict()
     with pytest.raises(DataError, match=r"^here: expected COCO's 91 labels, got 4; set the classes with --classes$"):
         from_torchvision(state, "here")
-    with pytest.raises(DataError, match=r"^here: expected 3 classes, got 2$"):
+    with pytest.raises(DataError, match=r"^here: expected 3 classes, got 2; set them with --classes$"):
         from_torchvision(state, "here", ("chair", "couch"))
     with pytest.raises(DataError, match=r"^here: expected the weights roi_heads.box_predictor.cls_score.bias"):
         from_torchvision({k: v for k, v in state.items() if "roi_heads" not in k}, "here", TINY.classes)

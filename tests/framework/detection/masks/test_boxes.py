@@ -34,10 +34,15 @@ def test_box_decode_matches_formula(extent):
     np.testing.assert_allclose(decode(boxes, deltas, extent), expected, rtol=1e-4, atol=1e-3)
 
 
-def test_box_decode_is_identity_at_zero_and_finite_if_huge():
-    box = np.array([[10, 20, 29, 59]], np.float32)
-    np.testing.assert_allclose(decode(box, np.zeros((1, 4), np.float32)), box)
-    huge = decode(box, np.full((1, 4), 1000, np.float32))
+ANCHOR = np.array([[10, 20, 29, 59]], np.float32)
+
+
+def test_box_decode_zero_deltas_give_anchor():
+    np.testing.assert_allclose(decode(ANCHOR, np.zeros((1, 4), np.float32)), ANCHOR)
+
+
+def test_box_decode_huge_deltas_stay_finite():
+    huge = decode(ANCHOR, np.full((1, 4), 1000, np.float32))
     assert np.isfinite(huge).all()
     assert huge[0, 2] - huge[0, 0] + 1 == pytest.approx(20 * 1000 / 16, rel=1e-4)
 

@@ -107,7 +107,7 @@ def test_cache_entry_without_detections_round_trips() -> None:
     assert_same(before, unpack(pack(before), COCO))
 
 
-def test_cache_entry_embeddings_are_optional_and_round_trip() -> None:
+def test_cache_entry_optional_embeddings_round_trip() -> None:
     before = random_detections(1, (37, 53))
     embedded = replace(before, embeddings=np.eye(7, 5, dtype=np.float32), embedding_space="words@1 \N{SNOWMAN}")
     after = unpack(pack(embedded), COCO)
@@ -284,7 +284,7 @@ def test_detectors_read_only_declared_frame_fields(
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "flipped", "another frame's"])
-def test_cache_damaged_entry_misses_and_is_replaced(
+def test_cache_damaged_entry_is_replaced(
     room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
     expected = CachedDetector(Noise(), tmp_path).detect(room[0])
@@ -311,7 +311,7 @@ def test_cache_damaged_entry_misses_and_is_replaced(
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("nothing")])
-def test_cache_non_regular_entry_warns_and_detects_again(
+def test_cache_non_regular_entry_is_ignored_with_warning(
     room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, make: Callable[[Path], None]
 ) -> None:
     expected = CachedDetector(Noise(), tmp_path).detect(room[0])

@@ -68,7 +68,7 @@ def test_content_hash_covers_folder_files_and_names(tmp_path: Path) -> None:
     assert len(set(seen)) == 4
 
 
-def test_content_hash_resolves_path_in_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_content_hash_resolves_path_in_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "weights").write_bytes(b"1")
     monkeypatch.chdir(tmp_path)
     assert content_hash(Path("weights")) == content_hash(tmp_path / "weights")
@@ -107,7 +107,7 @@ def test_fingerprint_covers_all_detection_modules(monkeypatch: pytest.MonkeyPatc
 
 def test_fingerprint_without_source_file_raises() -> None:
     notebook = type("Mine", (), {"__module__": "a_notebook"})
-    with pytest.raises(ConfigError, match="Mine: expected a class in a source file, got none"):
+    with pytest.raises(ConfigError, match="Mine: expected a class defined in a source file, got one without"):
         fingerprint(dataclass(notebook)())
 
 

@@ -294,7 +294,7 @@ def two_cameras() -> BagWriter:
         ({"depth": "/left/depth/image"}, r"expected one color topic, got .*; set --color"),
         (
             {"depth": "/left/depth/image", "color": "/left/color/image"},
-            r"expected one topic with poses, got /left/pose, /right/pose; set --poses",
+            r"expected one topic with poses, got /left/pose, /right/pose; set --poses to one",
         ),
         (
             {"depth": "/left/depth/image", "color": "/left/color/image", "poses": "/left/color/image"},

@@ -137,7 +137,7 @@ def test_record3d_damaged_exr_image_skips_one_frame(export: Path, tmp_path: Path
 
 def test_record3d_depth_size_mismatch_raises(export: Path, tmp_path: Path) -> None:
     changed(export, lambda m: m.update(dw=1000))
-    with pytest.raises(DataError, match=r"depth/0\.exr: expected 1000x60 px of R, got 80x60 px of R"):
+    with pytest.raises(DataError, match=r"depth/0\.exr: expected 1000x60 px with the channel R, got 80x60 px with R"):
         write_folder(open_source(export), tmp_path / "out", Writing())
 
 

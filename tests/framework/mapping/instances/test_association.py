@@ -139,7 +139,7 @@ def test_match_does_not_assign_table_to_book_on_top() -> None:
     seen[:, 2] = 2  # the book
     overlaps = overlaps_of(clusters_of([columns(0, 4), columns(2, 3)], [1, 1]), seen)
     smaller = overlaps.over_smaller(min_pixels=1)
-    assert smaller[0].argmax() != 0, "by the overlap over the smaller area, the table matches the book best"
+    assert smaller[0].argmax() != 0, "expected the table to match the book by the overlap over the smaller area"
     assert match_one_to_one(smaller > 0.35, overlaps.over_union(min_pixels=1)).tolist() == [0, 1]
 
 

@@ -11,7 +11,7 @@ frames = st.lists(st.integers(0, 40))
 
 
 @given(frames, frames)
-def test_frame_set_behaves_like_set(ours: list[int], theirs: list[int]) -> None:
+def test_frame_set_matches_python_set(ours: list[int], theirs: list[int]) -> None:
     """Frames may be added in any order."""
     a, b = FrameSet(), FrameSet()
     for found, expected in ((a, ours), (b, theirs)):

@@ -26,7 +26,7 @@ def mapped(frames: list[Frame], detections: list[Detections], refiner: str = "ch
 
 
 def shares(scene: BoxScene, fuser: MapFuser) -> np.ndarray:
-    """Return the fraction (objects + 1, instances + 1) of each object's vertices that belong to each instance.
+    """Return the fractions (O + 1, I + 1) of the vertices of O objects that belong to each of I instances.
 
     Row 0 is the room, and column 0 is "no instance".
     """

@@ -23,7 +23,7 @@ X, Y = np.float32([1, 0, 0]), np.float32([0, 1, 0])
 WITH_TABLES = ("bayesian_tsdf", "last_write", "object_volumes", "open3d_vbg")
 
 
-def test_embedding_mean_is_unit_and_spread_is_one_minus_length() -> None:
+def test_object_embedding_mean_and_spread_match_definition() -> None:
     once = ObjectEmbedding.of(X, 0.7)
     np.testing.assert_allclose(once.mean, X, atol=1e-6)
     assert once.spread == pytest.approx(0, abs=1e-6)
@@ -100,7 +100,7 @@ def embeddings_of(scene: SceneMap) -> list[list[float] | None]:
 
 
 @pytest.mark.parametrize("name", WITH_TABLES)
-def test_embeddings_are_kept_in_map_and_file(name: str, tmp_path: Path) -> None:
+def test_embeddings_map_file_round_trip_is_exact(name: str, tmp_path: Path) -> None:
     scene = mapped(name, embeddings=EMBEDDINGS).scene
     assert embeddings_of(scene) == [[1, 0], [0, 1], None]
     assert scene.embedding_space == "words@1"
@@ -135,12 +135,12 @@ def test_resumed_map_accumulates_embeddings(tmp_path: Path) -> None:
     assert turned.embedding_spread == pytest.approx(1 - np.sqrt(17) / 5)
 
 
-def test_embeddings_of_other_space_raise() -> None:
+def test_embeddings_of_other_space_or_length_raise() -> None:
     fuser = mapped("bayesian_tsdf", embeddings=EMBEDDINGS)
     frame = room().frame(walk(4)[0], 9)
     with pytest.raises(DataError, match=r"detector: expected embeddings from words@1 \(as in the map\)"):
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=EMBEDDINGS, space="words@2")
-    with pytest.raises(DataError, match="embeddings: expected equal lengths, got 2 and 3;"):
+    with pytest.raises(DataError, match="detector: expected embeddings of equal length, got 2 and 3 numbers;"):
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=np.eye(3))
 
 
@@ -162,7 +162,9 @@ def test_embeddings_of_other_space_raise() -> None:
         ("embedding_counts", None, "expected the arrays embedding_counts for the embedding space"),
     ],
 )
-def test_embeddings_damaged_in_file_raise(tmp_path: Path, array: str, value: np.ndarray | None, fault: str) -> None:
+def test_map_file_with_invalid_embeddings_raises(
+    tmp_path: Path, array: str, value: np.ndarray | None, fault: str
+) -> None:
     path = tmp_path / "map.npz"
     mapped("bayesian_tsdf", embeddings=EMBEDDINGS).scene.save(path)
     with np.load(path) as file:

@@ -64,7 +64,7 @@ def test_class_slots_exact_storage_handles_80_classes() -> None:
     np.testing.assert_array_equal(scores, np.arange(80) ** 2 + 3)
 
 
-def test_class_slots_may_be_unaligned() -> None:
+def test_add_scores_unaligned_slots_matches_reference() -> None:
     """The slots of all voxels are in one structured array, between other fields."""
     record = np.dtype([("flag", np.uint8), ("classes", np.uint8, (CLASS_SLOTS,)), ("scores", np.int16, (CLASS_SLOTS,))])
     records = np.zeros(3, record)

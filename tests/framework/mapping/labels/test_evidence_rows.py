@@ -76,14 +76,14 @@ def test_evidence_rows_with_256_classes_raise() -> None:
 
 
 def at_pixel(block: int, *voxels: int) -> SeenBlocks:
-    """Return the seen blocks of a frame whose only pixel sees these voxels of one block."""
+    """Return the seen blocks of a frame in which these voxels of one block project to the only pixel."""
     pixel = np.full((1, 512), -1, np.int32)
     pixel[0, voxels] = 0
     return seen_at(np.array([block], np.int32), pixel)
 
 
 def seen_at(blocks: Int32, pixels: Int32) -> SeenBlocks:
-    """Return the seen blocks of a frame; `pixels` (A, 512) are those that see the voxels, -1 = far from the surface."""
+    """Return the seen blocks of a frame; `pixels` (A, 512) are the pixels of the voxels, -1 = far from the surface."""
     block, voxel = np.nonzero(pixels >= 0)
     count = np.bincount(block, minlength=len(blocks))
     return SeenBlocks(

@@ -22,7 +22,7 @@ from tests.support.one_pixel import BARE, COVERED, FLOOR, SCORE_SCALE, blank, di
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10_000), labels=st.integers(1, INSTANCE_SLOTS))
 def test_label_update_matches_full_recursion_if_labels_fit(seed: int, labels: int) -> None:
-    """With no more labels than slots, no label is evicted and posteriors are exact: eqs. [7] and [8]."""
+    """With no more labels than slots, no label is evicted and posteriors equal those of eqs. (7) and (8)."""
     rng = np.random.default_rng(seed)
     classes = labels  # every class is named
     evidence = blank()
@@ -80,14 +80,14 @@ def test_label_update_of_voxel_under_two_masks_applies_both() -> None:
     assert found[2] == np.float32(np.log(0.5 / FLOOR))
 
 
-def test_label_update_absence_counts_only_if_detected() -> None:
+def test_label_update_absence_lowers_only_matched_instance() -> None:
     evidence = blank()
     one = np.full((1, 3), 1 / 3)
     update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), COVERED)
     before = float(evidence.instance_value[0, 0])
-    update_voxel(evidence, 0, measured([2], [0.9], one, 0.5, 2), BARE)  # instance 2 is detected elsewhere
+    update_voxel(evidence, 0, measured([2], [0.9], one, 0.5, 2), BARE)  # instance 2 is matched at other pixels
     assert float(evidence.instance_value[0, 0]) == before
-    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)  # instance 1 is detected elsewhere
+    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)  # instance 1 is matched at other pixels
     assert float(evidence.instance_value[0, 0]) == np.float32(before + np.log(0.5))
     for _ in range(10):
         update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)
@@ -185,7 +185,7 @@ def test_compact_scores_saturate_without_wrapping() -> None:
 
 @pytest.mark.parametrize(("classes", "best"), [(2, 0.7), (3, 0.6), (9, 0.8), (80, 0.5)])
 def test_most_likely_class_is_stable_over_repetition(classes: int, best: float) -> None:
-    """A distribution whose last class is the most likely, and the first the second most likely, is fused 1000 times."""
+    """The last class is the most likely, and the first class the second most likely; 1000 updates are fused."""
     p = np.full((1, classes), 0.1 * (1 - best) / max(classes - 2, 1))
     p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
     relative, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)

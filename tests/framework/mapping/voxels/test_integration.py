@@ -163,7 +163,7 @@ def test_integration_outside_sensor_range_allocates_no_blocks(depth: float) -> N
             {"voxel_size": 1e-4, "truncation": 50.0},
             0.0,
             MapFullError,
-            r"the map is full: expected at most .* blocks, got [0-9]+ or more for one frame",
+            r"fuser\.max_blocks: expected at most .* blocks in the map, got at least [0-9]+ for one frame",
         ),
         (
             {"voxel_size": 1e-3},

@@ -77,7 +77,7 @@ def test_raycast_spheres_have_accurate_depth_without_holes() -> None:
     assert (view.class_ids == -1).all()
 
 
-def test_raycast_from_outside_or_of_empty_map_is_empty() -> None:
+def test_raycast_without_front_face_in_view_is_empty() -> None:
     voxels = mapped(room(), [pose()])
     evidence = EvidenceRows(voxels).evidence
     away = render(voxels, evidence, SENSOR, CAMERA, pose(rotvec=(0, np.pi, 0)))
@@ -90,7 +90,7 @@ def test_raycast_from_outside_or_of_empty_map_is_empty() -> None:
 
 
 @pytest.mark.parametrize("d", [0.0, -0.0, 1e-20, -1e-20])
-def test_leave_cell_axis_parallel_ray_exits_other_side(d: float) -> None:
+def test_leave_cell_axis_parallel_ray_exits_opposite_side(d: float) -> None:
     """A ray on a block face must not advance in steps of a thousandth of a voxel.
 
     The middle column of a camera with cx at a pixel center has such rays.
@@ -120,7 +120,7 @@ def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
     depth, _ = cast_view(voxels, SENSOR, camera, T)
     exhaustive = every_ray(voxels, T, camera)
     assert (exhaustive > 0).mean() > 0.1
-    # at ragged borders of the map, tiny gaps depend on where a step starts
+    # at ragged borders of the map, small gaps depend on the start of a step
     assert ((depth == 0) & (exhaustive > 0)).mean() < 4e-3
     assert ((depth > 0) & (exhaustive == 0)).mean() < 15e-3
     both = (depth > 0) & (exhaustive > 0)

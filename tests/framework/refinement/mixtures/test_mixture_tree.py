@@ -170,8 +170,8 @@ def test_mixture_tree_assigns_points_to_best_child():
     odds = np.array([0.0, 0.0, 0.0, 1.5], np.float32)
     shares = np.array([0.9, 0.25], np.float32)
     tree, starts = MixtureTree((level,)), np.array([0, 4])
-    child, share = tree.shared(0, points, starts, shares, np.array([0.6], np.float32), odds)
-    assert child.tolist() == tree.passed(0, points, starts).tolist() == [0, 1, -1, 0]
+    child, share = tree.best_nodes_with_posteriors(0, points, starts, shares, np.array([0.6], np.float32), odds)
+    assert child.tolist() == tree.best_nodes(0, points, starts).tolist() == [0, 1, -1, 0]
     densities = gaussian_densities(points.astype(np.float64), level.weights, level.means, level.covariances)
     ours = (densities @ shares + 0.6 * 0.2 / 1000) * np.exp(odds)
     theirs = densities @ (1 - shares) + 0.4 * 0.2 / 1000

@@ -79,7 +79,7 @@ def test_segments_separate_boxes_adjacent_in_image(cell, noise):
 
 @pytest.mark.parametrize("cell", [1, 2])
 @pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_segments_separate_box_from_table_and_keep_box_whole(cell, noise):
+def test_segments_separate_box_from_table(cell, noise):
     """The camera looks down from the side and sees the front, the top and the left face of the box."""
     camera = Camera(160, 120, 90.0, 90.0, 79.5, 59.5).scaled(cell)
     boxes = np.array([[0.35, 0.3, 0.9, 0.65, 0.6, 1.3]])

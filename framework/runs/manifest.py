@@ -1,0 +1,85 @@
+"""manifest.json: status, input files and the SHA-256 of all result files of a run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from framework.errors import DataError
+from framework.files.hashing import path_hash
+from framework.files.json_file import read_json, write_json
+
+MANIFEST = "manifest.json"
+
+
+class RunStatus(Enum):
+    """RunStatus of a run directory."""
+
+    COMPLETE = "all frames are mapped and all files are written"
+    PARTIAL = "the run ended early"
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Contents of manifest.json."""
+
+    status: RunStatus
+    files: Mapping[str, tuple[int, str]]  # size, bytes, and SHA-256 (hex) by file name
+    inputs: Mapping[str, str]  # SHA-256 (hex) of the input files, by config key
+
+    @classmethod
+    def of(cls, directory: Path, names: list[str], status: RunStatus, inputs: Mapping[str, str]) -> Manifest:
+        """Return the manifest of the existing files with these names in a run directory.
+
+        Raises DataError if a file cannot be read.
+        """
+        paths = [directory / name for name in names if (directory / name).exists()]
+        return cls(status, {path.name: (path.stat().st_size, path_hash(path)) for path in paths}, inputs)
+
+    @classmethod
+    def read(cls, directory: Path) -> Manifest:
+        """Read the manifest of a run directory. Raises DataError for another digest or wrong types."""
+        path = directory / MANIFEST
+        content = read_json(path)
+        if not isinstance(content, dict):
+            raise DataError(f"{path}: expected a JSON object, got {type(content).__name__}")
+        digest = content.pop("digest", None)
+        if digest != _digest(content):
+            raise DataError(f"{path}: expected the digest {_digest(content)[:12]}, got {digest!s:.12}; repeat the run")
+        try:
+            files = {str(name): (int(one["bytes"]), str(one["sha256"])) for name, one in content["files"].items()}
+            return cls(RunStatus[content["status"]], files, {key: str(one) for key, one in content["inputs"].items()})
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise DataError(f"{path}: expected status, files and inputs, got an error ({error!r})") from error
+
+    def write(self, directory: Path) -> None:
+        """Write the manifest atomically. Raises DataError if writing fails."""
+        content: dict[str, Any] = {
+            "status": self.status.name,
+            "files": {name: {"bytes": size, "sha256": sha256} for name, (size, sha256) in self.files.items()},
+            "inputs": dict(self.inputs),
+        }
+        write_json(directory / MANIFEST, content | {"digest": _digest(content)})
+
+    def changed_files(self, directory: Path, optional: Collection[str] = ()) -> list[str]:
+        """Return one message for each changed or missing file; files in `optional` may be missing."""
+        found = []
+        for name, (size, sha256) in self.files.items():
+            path = directory / name
+            if name in optional and not path.exists():
+                continue
+            if not path.is_file():
+                found.append(f"{path}: expected a file of {size} bytes, got none")
+            elif path.stat().st_size != size or path_hash(path) != sha256:
+                found.append(f"{path}: expected the SHA-256 {sha256[:12]} of {MANIFEST}, got {path_hash(path)[:12]}")
+        return found
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 (hex) of the canonical JSON: sorted keys, no spaces."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

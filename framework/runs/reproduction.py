@@ -1,0 +1,145 @@
+"""Comparison of a repeated run with the stored run: possible causes of differences, and the first difference."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from framework.errors import DataError
+from framework.files.atomic_write import read_text
+from framework.runs.inputs import ROOT, input_hashes
+from framework.runs.manifest import Manifest
+from framework.runs.plugin_code import changed_code, plugin_code
+from framework.runs.provenance import code_version, leaves, relevant
+from framework.runs.stored_runs import (
+    CONFIG,
+    DIGESTS,
+    ENVIRONMENT,
+    INSTANCES,
+    KEYFRAMES,
+    MAP,
+    MESH,
+    TRAJECTORY,
+    Record,
+    commit_of,
+    read_yaml,
+)
+from framework.runtime.run_log import STAGES
+
+COMPARED = (TRAJECTORY, INSTANCES, MESH, MAP, KEYFRAMES)  # files without times
+COMPOSED = Path(".hydra/config.yaml")  # the config as composed by Hydra
+PACKAGES = ("numba", "numpy", "onnxruntime", "opencv-python-headless", "scipy", "torch", "transformers")
+"""Packages that may change the last digits of results."""
+
+LARGE = (MAP, MESH, KEYFRAMES)  # files that a bundle contains only on request; their hashes are in the manifest
+ORDER = (*STAGES, "fusion")  # order of the stages within a frame
+
+
+def causes(record: Record) -> list[str]:
+    """Return what has changed since a run and may change its results, one line each; empty = nothing known.
+
+    These are result files that differ from manifest.json, parameters, input files, plugin code, the commit and the
+    versions of numerical packages. Raises DataError if the manifest is missing or damaged.
+    """
+    manifest = Manifest.read(record.directory)
+    return [
+        *manifest.changed_files(record.directory, optional=LARGE),
+        *_changed_parameters(record),
+        *_changed_inputs(manifest.inputs, input_hashes(record.config), record.config),
+        *(f"plugin code of {change}" for change in changed_code(record.metrics, plugin_code(record.config))),
+        *_changed_commit(record),
+        *_changed_packages(record.directory / ENVIRONMENT),
+    ]
+
+
+def _changed_parameters(record: Record) -> Iterator[str]:
+    """Yield the parameters in config.yaml that differ from the config as composed by Hydra."""
+    if not (record.directory / COMPOSED).exists():
+        return
+    composed = dict(leaves(relevant(read_yaml(record.directory / COMPOSED))))
+    for key, value in leaves(relevant(record.config)):
+        before = composed.get(key, value)
+        if before != value and "${" not in str(before):
+            yield f"{record.directory / CONFIG}: {key}: expected {before} (as composed by Hydra), got {value}"
+
+
+def _changed_inputs(before: Mapping[str, str], now: Mapping[str, str], config: Mapping[str, Any]) -> Iterator[str]:
+    values = dict(leaves(config))
+    for key, sha256 in before.items():
+        if now.get(key) == sha256:
+            continue
+        if key == ROOT:
+            yield f"{key}: expected the names, sizes and modification times of the run's recording, got others"
+        else:
+            found = f"the SHA-256 {now[key][:12]}" if key in now else "no file"
+            yield f"{key}: expected the file with the SHA-256 {sha256[:12]}, got {found} in {values.get(key)}"
+
+
+def _changed_commit(record: Record) -> Iterator[str]:
+    now = commit_of(code_version())
+    if record.commit != now:
+        yield f"git_commit: expected {record.commit}, got {now}"
+
+
+def _changed_packages(path: Path) -> Iterator[str]:
+    """Yield the numerical packages whose version differs from that in environment.txt."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    if not path.exists():
+        return
+    before = dict(line.split("==", 1) for line in read_text(path).splitlines() if "==" in line)
+    for package in PACKAGES:
+        try:
+            now = version(package)
+        except PackageNotFoundError:
+            now = "none"
+        if package in before and before[package] != now:
+            yield f"{package}: expected version {before[package]}, got {now}; install with the constraints in {path}"
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """Differences between a stored run and its repetition."""
+
+    files: tuple[str, ...]  # names of the different files; empty = byte-identical
+    frame: int | None = None  # first frame with a different result; None = unknown or no difference
+    stage: str = ""  # first different stage of this frame
+
+    @classmethod
+    def of(cls, before: Path, after: Path) -> Reproduction:
+        """Compare the run directories of a run and its repetition.
+
+        Raises DataError if a manifest or a file of digests is invalid.
+        """
+        old, new = Manifest.read(before).files, Manifest.read(after).files
+        names = [name for name in COMPARED if name in old or name in new]
+        different = tuple(name for name in names if old.get(name) != new.get(name))
+        first = _first_difference(before / DIGESTS, after / DIGESTS)
+        return cls(different, *first) if first else cls(different)
+
+    def __str__(self) -> str:
+        if not self.files and self.frame is None:
+            return "byte-identical"
+        where = f"first difference: frame {self.frame}, {self.stage}; " if self.frame is not None else ""
+        return f"{where}different files: {', '.join(self.files) or 'none'}"
+
+
+def _first_difference(before: Path, after: Path) -> tuple[int, str] | None:
+    """Return the first frame and its first stage with different digests; None = no difference or no digests."""
+    if not (before.exists() and after.exists()):
+        return None
+    old, new = _digests(before), _digests(after)
+    different = [key for key in dict.fromkeys([*old, *new]) if old.get(key) != new.get(key)]
+    return min(different, key=lambda key: (key[0], ORDER.index(key[1])), default=None)
+
+
+def _digests(path: Path) -> dict[tuple[int, str], str]:
+    """Return the digests by frame and stage. Raises DataError if the file cannot be read or is invalid."""
+    try:
+        rows = list(csv.DictReader(read_text(path).splitlines()))
+        return {(int(row["frame"]), row["stage"]): row["digest"] for row in rows if row["stage"] in ORDER}
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}: expected the columns frame, stage and digest, got an error ({error!r})") from error
