@@ -40,18 +40,6 @@ class Mean:
         """Return the standard error of the mean."""
         return self.deviation / math.sqrt(self.count) if self.count > 1 else math.nan
 
-    @property
-    def is_not_zero(self) -> bool:
-        """Return True if 0 is outside of the confidence interval of the mean, by Student's t.
-
-        Equal values, such as counts, have no confidence interval.
-        """
-        if self.count < 2 or self.deviation <= 1e-9 * abs(self.value):
-            return False
-        from scipy.stats import t
-
-        return abs(self.value) > self.error * float(t.ppf((1 + CONFIDENCE) / 2, self.count - 1))
-
 
 @dataclass(frozen=True)
 class RunRow:

@@ -24,6 +24,7 @@ from framework.tables.published import (
     PublishedRow,
     read_published,
 )
+from framework.tables.statistics import TableStatistics
 
 PLAIN = (
     *("instances.ap50", "instances.ap50_agnostic", "instances.ap25", "instances.ap", "instances.mean_iou"),
@@ -167,6 +168,17 @@ class ComparisonTable:
         """Pairs of a row and its baseline."""
         pairs = ((row, self.base_of(row)) for row in self.rows)
         return [(row, base) for row, base in pairs if base is not None]
+
+    @cached_property
+    def statistics(self) -> TableStatistics:
+        """Statistics of each compared row and column: row minus baseline; with columns_by, baseline minus row."""
+        pairs = {}
+        for row, base in self.compared:
+            first, second = (base, row) if self.choice.columns_by else (row, base)
+            for key in self.choice.columns:
+                values, others = first.values(key), second.values(key)
+                pairs[row.name, key] = {run: (values[run], others[run]) for run in values if run in others}
+        return TableStatistics.of(pairs, self.choice.split_key or self.choice.average_over[-1])
 
     @property
     def records(self) -> list[Record]:

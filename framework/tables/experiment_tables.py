@@ -11,7 +11,14 @@ from pathlib import Path
 from framework.files.atomic_write import atomic_write
 from framework.tables.comparison import ComparisonTable, mean_difference
 from framework.tables.grid import TextTable, latex_grid, markdown_grid
-from framework.tables.layouts import across_grid, by_grid, difference_across_grid, difference_grid, row_grid
+from framework.tables.layouts import (
+    across_grid,
+    by_grid,
+    difference_across_grid,
+    difference_grid,
+    row_grid,
+    statistics_grid,
+)
 from framework.tables.table_notes import counted, digest, notes
 
 
@@ -46,6 +53,8 @@ def _grids(comparison: ComparisonTable) -> Iterator[TextTable]:
     yield figures(comparison)
     if comparison.compared:
         yield differences(comparison)
+    if comparison.statistics.tested:
+        yield statistics_grid(comparison)
 
 
 def comma_separated_rows(comparison: ComparisonTable) -> str:

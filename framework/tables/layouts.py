@@ -79,7 +79,11 @@ def difference_grid(comparison: ComparisonTable) -> TextTable:
     for k, (row, base) in enumerate(compared):
         pairs = set(row.records) & set(base.records)
         expected = len({run[-1] for run in pairs})
-        cells = [_of(_difference(means[key][k], digits[key]), means[key][k].count, expected) for key in keys]
+        texts = [
+            _difference(means[key][k], digits[key], comparison.statistics.results[row.name, key].is_significant)
+            for key in keys
+        ]
+        cells = [_of(text, means[key][k].count, expected) for text, key in zip(texts, keys, strict=True)]
         body.append([comparison.called(row), str(len(pairs)), *cells])
     return TextTable([f"minus {comparison.base_called}", "pairs", *map(head, keys)], body)
 
@@ -186,11 +190,24 @@ def difference_across_grid(comparison: ComparisonTable) -> TextTable:
         for row in rows:
             means, mean = mean_by_sequence(differences[row.name]), mean_difference(differences[row.name])
             texts = [figure(means[s].value, math.nan, digits, True) if s in means else MISSING for s in sequences]
-            texts += [_difference(mean, digits) if mean.count else MISSING, str(len(differences[row.name]))]
+            significant = comparison.statistics.results[row.name, key].is_significant
+            texts.append(_difference(mean, digits, significant) if mean.count else MISSING)
+            texts.append(str(len(differences[row.name])))
             section.append(_row_line(comparison, row, [(text, math.nan) for text in texts]))
         sections.append(section)
     heads = [*_labels(comparison, f"{comparison.base_called} minus"), *sequences, "mean", "pairs"]
     return _grid(heads, sections, digits)
+
+
+def statistics_grid(comparison: ComparisonTable) -> TextTable:
+    """Return a table with the statistics of each row and column."""
+    base = comparison.base_called
+    rows = {row.name: comparison.called(row) for row, _ in comparison.compared}
+    return comparison.statistics.grid(
+        f"{base} minus" if comparison.choice.columns_by else f"minus {base}",
+        rows,
+        {key: head(key) for key in comparison.choice.columns},
+    )
 
 
 def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], digits: int) -> TextTable:
@@ -260,10 +277,10 @@ def _mean_cell(mean: Mean, digits: int, expected: int) -> str:
     return _of(figure(mean.value, mean.deviation, digits), mean.count, expected)
 
 
-def _difference(mean: Mean, digits: int) -> str:
+def _difference(mean: Mean, digits: int, significant: bool) -> str:
     """Return the signed mean ± standard error; * = significantly different from 0."""
     text = figure(mean.value, mean.error, digits, signed=True)
-    return f"{text} *" if mean.is_not_zero else text
+    return f"{text} *" if significant else text
 
 
 def _of(text: str, count: int, expected: int) -> str:

@@ -9,10 +9,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from framework.evaluation.instances import MAX_DISTANCE
 from framework.registry import STAGES
 from framework.runs.metrics import is_evaluation
-from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, following
+from framework.runs.run_rows import CHOICE, Run, following
 from framework.runs.stored_runs import Record, is_number
 from framework.tables.comparison import ComparisonTable, mean_by_sequence
 from framework.tables.layouts import head
+from framework.tables.statistics import ALPHA
 
 
 def notes(comparison: ComparisonTable) -> Iterator[str]:
@@ -23,6 +24,7 @@ def notes(comparison: ComparisonTable) -> Iterator[str]:
 
 def _notes(comparison: ComparisonTable) -> Iterator[str]:
     yield from _averaging(comparison)
+    yield from comparison.statistics.notes()
     yield from _winners(comparison)
     if comparison.left_out:
         yield f"Omitted columns without values: {_with_needs(comparison.left_out)}."
@@ -63,7 +65,7 @@ def _averaging(comparison: ComparisonTable) -> Iterator[str]:
             error += f" over {kinds}, after averaging the runs of each"
         yield (
             f"Differences are paired by {', '.join(keys)}: {error}. "
-            f"*: the {CONFIDENCE:.0%} interval of Student's t excludes 0."
+            f"*: p < {ALPHA:.2g} in a paired t-test with Holm's correction."
         )
         bases = [base for _, base in comparison.compared]
         if alone := [row.name for row in comparison.rows if not (comparison.base_of(row) or row in bases)]:

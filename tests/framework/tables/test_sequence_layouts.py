@@ -96,7 +96,9 @@ GOLDEN = """\
 weights; its deviation is over the runs with all sequences. Bold: highest value for the same poses and number of runs. \
 missing: no complete run.
 - Differences are paired by seed, dataset.scene: mean ± standard error over the sequences, after averaging the runs of \
-each. *: the 95% interval of Student's t excludes 0.
+each. *: p < 0.05 in a paired t-test with Holm's correction.
+- No statistics: they require at least 3 values of dataset.scene in a row and its baseline, and differences that are \
+not all equal.
 - ours compared with Prior (re-implementation), ground truth: higher in 1 of 2 sequences, lower in 1: 016.
 - ours compared with other, ground truth: higher in 2 of 2 sequences, lower in 0.
 - Overrides of each row: ours: none; prior: refiner=geometric; other: refiner=identity.
