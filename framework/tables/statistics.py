@@ -134,8 +134,8 @@ class TableStatistics:
             of_metric = {row: self.tested[row, metric] for row in rows if (row, metric) in self.tested}
             digits = decimals(result.mean for result in of_metric.values())
             body += [[head, rows[row], *_cells(result, digits)] for row, result in of_metric.items()]
-        columns = ["n", "difference", f"{CONFIDENCE:.0%} interval", "p (t)", "Holm (t)", "p (Wilcoxon)"]
-        columns += ["Holm (Wilcoxon)", f"n for {POWER:.0%} power"]
+        columns = ["units", "difference", f"{CONFIDENCE:.0%} interval", "p (t)", "Holm (t)", "p (Wilcoxon)"]
+        columns += ["Holm (Wilcoxon)", f"units for {POWER:.0%} power"]
         return TextTable(["metric", title, *columns], body, 2, groups=frozenset(groups - {0, len(body)}))
 
     def notes(self) -> Iterator[str]:
@@ -149,16 +149,16 @@ class TableStatistics:
                 )
             return
         yield (
-            f"Statistics: n is the number of {units} in a row and its baseline; the runs of each value are averaged "
-            f"first. {CONFIDENCE:.0%} interval: BCa bootstrap of the mean difference over the {units}, {RESAMPLES} "
+            f"Statistics: units are {units} in both a row and its baseline; the runs of each unit are averaged "
+            f"first. {CONFIDENCE:.0%} interval: BCa bootstrap of the mean difference over the units, {RESAMPLES} "
             f"samples, seed {SEED}. p: two-sided paired t-test and Wilcoxon's signed-rank test. Holm: p corrected for "
             f"all rows of the metric (at most {self.comparisons}); a claim over several metrics requires another "
-            f"correction. Comparisons with fewer than {MIN_TESTED} {units} or with equal differences are omitted."
+            f"correction. Comparisons with fewer than {MIN_TESTED} units or with equal differences are omitted."
         )
         yield (
-            f"n for {POWER:.0%} power: number of {units} for p < {ALPHA:.2g} in a paired t-test without Holm's "
+            f"units for {POWER:.0%} power: number of units for p < {ALPHA:.2g} in a paired t-test without Holm's "
             "correction. It assumes normal, independent differences whose true mean and deviation are the observed "
-            "ones; for few values it is only an order of magnitude."
+            "ones; with few units it is only an order of magnitude."
         )
         yield from self._limits(units)
 
@@ -176,7 +176,7 @@ class TableStatistics:
             omitted = f" and omitted below {MIN_UNITS}" if fewest < MIN_UNITS else ""
             yield (
                 f"Below {FEW_UNITS} {units}, bootstrap intervals are too narrow{omitted}, and the t-test relies on "
-                "normal differences, which so few values cannot confirm. A missing * is no evidence of equal rows."
+                "normal differences, which so few units cannot confirm. A missing * is no evidence of equal rows."
             )
         if self.unit == "seed":
             yield (

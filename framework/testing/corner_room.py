@@ -27,6 +27,7 @@ from framework.data import (
     UInt8,
     View,
 )
+from framework.detection.masks.binary_masks import tight_boxes
 from framework.errors import DataError
 from framework.geometry import exp_se3
 from framework.interfaces import MapStatistics, SceneMap
@@ -101,11 +102,8 @@ def spheres_in(frame: Frame) -> Detections:
     if frame.truth is None:
         raise DataError(f"frame {frame.index}: expected ground-truth instances, got none; choose another detector")
     masks = frame.truth.instance_ids == np.array([1, 2], np.int32)[:, None, None]
-    boxes = [
-        [u.min(), v.min(), u.max() + 1, v.max() + 1] if len(u) else [0, 0, 0, 0] for v, u in map(np.nonzero, masks)
-    ]
     sure = np.array([[0.9, 0.1], [0.2, 0.8]], np.float32)
-    return Detections(masks, np.array(boxes, np.float32), sure.max(1), sure, CLASSES)
+    return Detections(masks, tight_boxes(masks), sure.max(1), sure, CLASSES)
 
 
 def exact_clusters(frame: Frame) -> PointClusters:

@@ -98,8 +98,7 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
     end all workers.
     """
     own = config.hydra
-    swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
-    overrides = [*swept, *own.overrides.task]
+    overrides = overrides_of(own)
     runs = checked_sweep(overrides, checked_rows(config.get("rows")))
     _name_by(own, swept_keys(overrides))
     workers = 0
@@ -109,6 +108,12 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
             own.launcher.n_jobs = workers
     directory = place_of("hydra.sweep.dir", own.sweep.dir)
     return sweep_in(directory, with_table, config.get("figure") is not None, workers > 1)
+
+
+def overrides_of(own: DictConfig) -> list[str]:
+    """Return the overrides of a sweep: those of the experiment, then those of the command line."""
+    swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
+    return [*swept, *own.overrides.task]
 
 
 def _name_by(own: DictConfig, keys: Collection[str]) -> None:

@@ -199,7 +199,7 @@ def test_statistics_grid_has_line_per_tested_comparison() -> None:
     grid = TableStatistics.of(comparisons, "dataset.scene").grid(
         "minus a", {"b": "B", "c": "C"}, {"ap": "AP", "none": "x", "fps": "Hz"}
     )
-    assert grid.heads[:5] == ["metric", "minus a", "n", "difference", "95% interval"]
+    assert grid.heads[:5] == ["metric", "minus a", "units", "difference", "95% interval"]
     [first, second] = grid.body
     assert first[:4] == ["AP", "B", "10", "-1.580"]
     assert first[5:] == ["0.003", "0.003", "0.004", "0.004", "7"]
