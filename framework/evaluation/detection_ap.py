@@ -77,7 +77,8 @@ def detection_ap(
         without_class = masks[[name is None for name in names]]
         for label in sorted(detected):  # in other classes there is no detection to ignore
             if len(without_class):  # a mask may cover several objects; the box around all of them would be too large
-                unknown["segm"].append(_annotation(k, label, without_class.any(axis=0)) | {"iscrowd": 1})
+                covered: Bool = np.asarray(without_class.any(axis=0))
+                unknown["segm"].append(_annotation(k, label, covered) | {"iscrowd": 1})
             unknown["bbox"] += [_annotation(k, label, mask) | {"iscrowd": 1} for mask in without_class]
     counted = [truth["category_id"] for truth in known if not truth["iscrowd"]]
 

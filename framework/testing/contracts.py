@@ -196,7 +196,9 @@ class TrackerContract:
             frame = frame_at(k) if k == 0 else misleading(frame_at(k))
             pose = misled.track(frame, scene)
             if misled.pose_source == "ground_truth":
-                assert pose.lost or np.array_equal(pose.T_world_camera, frame.T_world_camera)
+                given = frame.T_world_camera
+                assert given is not None
+                assert pose.lost or np.array_equal(pose.T_world_camera, given)
             else:
                 expected = tracker.track(frame_at(k), scene)
                 np.testing.assert_allclose(

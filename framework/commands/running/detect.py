@@ -9,6 +9,8 @@ from __future__ import annotations
 import logging
 import math
 import os
+import re
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,9 +51,8 @@ def job(config: DictConfig) -> None:
         raise ConfigError("out: expected a file name, got none; set out=detections.json")
     hydra_config = HydraConfig.get()
     of_sweep = is_of_sweep(hydra_config)
-    out = (
-        file_of_job(config.out, Path(hydra_config.runtime.output_dir)) if of_sweep else checked_file("out", config.out)
-    )
+    folder = Path(hydra_config.runtime.output_dir)
+    out = file_of_job(config.out, folder) if of_sweep else checked_file("out", config.out)
 
     from framework.detection.stored.cache import with_cache
     from framework.registry import build  # local: config errors are reported before heavy imports
@@ -68,10 +69,18 @@ def job(config: DictConfig) -> None:
         from framework.tables.detection_table import write_metrics
 
         write_metrics(out.parent, list(hydra_config.overrides.task), metrics)
-    how = f"detector=precomputed detector.path={out}"
+    how = ["detector=precomputed", as_argument("detector.path", out)]
     if detector.classes != COCO:
-        how += f" detector.label_space={write_labels(out, detector.classes)}"
-    log.info("use it with: %s", how)
+        how.append(as_argument("detector.label_space", write_labels(out, detector.classes)))
+    log.info("use it with: %s", " ".join(how))
+
+
+def as_argument(key: str, path: Path) -> str:
+    """Return an override for the shell; a path with other characters, such as those of a job's folder, is quoted."""
+    if re.fullmatch(r"[\w./-]+", str(path)):
+        return f"{key}={path}"
+    escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
+    return shlex.quote(f'{key}="{escaped}"')
 
 
 def file_of_job(out: object, folder: Path) -> Path:

@@ -129,10 +129,10 @@ def test_bootstrap_interval_covers_true_mean() -> None:
     rng = np.random.default_rng(0)
 
     def coverage(units: int) -> float:
-        intervals = [bootstrap_interval(rng.normal(0.3, 1, units)) for _ in range(300)]
+        intervals = [bootstrap_interval(rng.normal(0.3, 1, units)) for _ in range(150)]
         return float(np.mean([low < 0.3 < high for low, high in intervals]))
 
-    assert 0.90 < coverage(20) < 0.98
+    assert 0.88 < coverage(20) < 0.99
     assert 0.78 < coverage(6) < 0.91
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shlex
 import subprocess
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from framework.commands.running.detect import file_of_job, write_detections
 from framework.data import Frame
@@ -87,6 +89,11 @@ def test_detect_sweep_writes_file_per_job_and_table(tmp_path: Path) -> None:
         fake, none = csv.DictReader(file)
     assert fake["overrides"] == "dataset=fake detector=fake out=found.json"
     assert (fake["mask_ap50.couch"], none["correct class"]) == ("1.0", "")
+    [how] = [line for line in done.stderr.splitlines() if "use it with: " in line and "label_space" in line]
+    arguments = OverridesParser.create().parse_overrides(shlex.split(how.partition("use it with: ")[2]))
+    values = {argument.key_or_group: argument.value() for argument in arguments}
+    assert values["detector.path"] == str(jobs[0] / "found.json")
+    assert values["detector.label_space"] == str(jobs[0] / "found.labels.txt")
 
 
 @pytest.mark.parametrize("out", ["sub/found.json", "/tmp/found.json", "../found.json"])
