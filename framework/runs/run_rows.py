@@ -45,18 +45,6 @@ class Mean:
         """Return the standard error of the mean."""
         return self.deviation / math.sqrt(self.count) if self.count > 1 else math.nan
 
-    @property
-    def is_not_zero(self) -> bool:
-        """Return True if 0 is outside of the confidence interval of the mean (level CONFIDENCE, Student's t).
-
-        Return False for fewer than two values and for equal values, whose deviation of 0 is no estimate of the spread.
-        """
-        if self.count < 2 or self.deviation <= 1e-9 * abs(self.value):
-            return False
-        from scipy.stats import t
-
-        return abs(self.value) > self.error * float(t.ppf((1 + CONFIDENCE) / 2, self.count - 1))
-
 
 @dataclass(frozen=True)
 class RunRow:
@@ -99,14 +87,6 @@ class RunRow:
 
     def mean(self, column: str) -> Mean:
         return Mean.of(self.values(column).values())
-
-    def differences(self, base: RunRow, column: str) -> dict[Run, float]:
-        """Return the difference of the metric `column` from the row `base`, for each run in both rows.
-
-        Runs with the same seed have the same scene and detections, so most of the variation cancels.
-        """
-        own, others = self.values(column), base.values(column)
-        return {run: own[run] - others[run] for run in own if run in others}
 
     def shares_data(self, other: RunRow) -> bool:
         """Return True if every run in both rows has the same data, and there is such a run."""

@@ -1,4 +1,4 @@
-"""Contents of a table: the run directories below a folder as rows, their baseline and the columns."""
+"""Contents of a table: the run directories below a folder as rows, their base row and the columns."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, S
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from framework.errors import DataError
 from framework.runs.metrics import is_evaluation
@@ -22,20 +22,10 @@ from framework.tables.published import (
     PublishedRow,
     read_published,
 )
+from framework.tables.statistics import PairedValues, TableStatistics
 from framework.tables.table_choice import TableChoice
 
 FIRST = "the first row with the same data"  # name of the base if groups of rows have different bases
-
-
-class PairedValues(NamedTuple):
-    """The mean values of a row and of its base in one unit, such as a scene."""
-
-    value: float
-    base: float
-
-    @property
-    def difference(self) -> float:
-        return self.value - self.base
 
 
 @dataclass(frozen=True)
@@ -169,16 +159,27 @@ class ComparisonTable:
 
         Each value is a mean over the runs of the unit. Without table.pair_by, only runs in both rows are used.
         """
-        own, others = row.values(column), base.values(column)
-        if not self.choice.pair_by:
-            common = own.keys() & others.keys()
-            own, others = ({run: value for run, value in one.items() if run in common} for one in (own, others))
-        means, of_base = self._by_unit(own), self._by_unit(others)
-        return {unit: PairedValues(means[unit], of_base[unit]) for unit in means if unit in of_base}
+        own, others = (_grouped(values, self._unit) for values in self._compared_values(row, base, column))
+        return {unit: PairedValues(own[unit].value, others[unit].value) for unit in own if unit in others}
 
     def difference(self, row: RunRow, base: RunRow, column: str) -> Mean:
         """Return the mean over units of the differences between a row and its base."""
         return Mean.of(pair.difference for pair in self.pairs(row, base, column).values())
+
+    def difference_by_sequence(self, row: RunRow, base: RunRow, column: str) -> dict[str, float]:
+        """Return the difference of a metric between two rows in each sequence of both rows."""
+        own, others = map(mean_by_sequence, self._compared_values(row, base, column))
+        return {sequence: own[sequence].value - others[sequence].value for sequence in own if sequence in others}
+
+    @cached_property
+    def statistics(self) -> TableStatistics:
+        """Statistics of each compared row and column: row minus base; with columns_by, base minus row."""
+        pairs = {}
+        for row, base in self.compared:
+            first, second = (base, row) if self.choice.columns_by else (row, base)
+            for column in self.choice.columns:
+                pairs[row.name, column] = self.pairs(first, second, column)
+        return TableStatistics.of(pairs, self.choice.units)
 
     def common_units(self, row: RunRow, base: RunRow) -> set[Run]:
         """Return the units in which both rows have runs."""
@@ -186,8 +187,16 @@ class ComparisonTable:
             return set(map(self._unit, row.records.keys() & base.records.keys()))
         return set(map(self._unit, row.records)) & set(map(self._unit, base.records))
 
-    def _by_unit(self, values: Mapping[Run, float]) -> dict[Run, float]:
-        return {unit: mean.value for unit, mean in _grouped(values, self._unit).items()}
+    def _compared_values(self, row: RunRow, base: RunRow, column: str) -> tuple[dict[Run, float], dict[Run, float]]:
+        """Return the values of a metric in two rows by run; without table.pair_by, only of runs in both rows.
+
+        Runs with the same seed have the same scene and detections, so most of the variation cancels.
+        """
+        own, others = row.values(column), base.values(column)
+        if self.choice.pair_by:
+            return own, others
+        common = [run for run in own if run in others]
+        return {run: own[run] for run in common}, {run: others[run] for run in common}
 
     def _unit(self, run: Run) -> Run:
         return tuple(run[self.choice.averaged.index(key)] for key in self.choice.units)

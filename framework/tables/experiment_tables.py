@@ -9,7 +9,14 @@ from framework.files.atomic_write import atomic_write
 from framework.runs.data_frame import data_frame
 from framework.tables.comparison import ComparisonTable
 from framework.tables.grid import TextTable, latex_grid, markdown_grid
-from framework.tables.layouts import across_grid, by_grid, difference_across_grid, difference_grid, row_grid
+from framework.tables.layouts import (
+    across_grid,
+    by_grid,
+    difference_across_grid,
+    difference_grid,
+    row_grid,
+    statistics_grid,
+)
 from framework.tables.table_notes import notes
 
 
@@ -46,3 +53,5 @@ def _grids(comparison: ComparisonTable) -> Iterator[TextTable]:
     yield figures(comparison)
     if comparison.compared:
         yield differences(comparison)
+    if comparison.statistics.tested:
+        yield statistics_grid(comparison)

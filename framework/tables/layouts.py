@@ -46,7 +46,10 @@ def difference_grid(comparison: ComparisonTable) -> TextTable:
     body = []
     for k, (row, base) in enumerate(compared):
         pairs = len(comparison.common_units(row, base))
-        cells = [_of(_difference(means[key][k], digits[key]), means[key][k].count, pairs) for key in keys]
+        cells = []
+        for key in keys:
+            significant = comparison.statistics.results[row.name, key].is_significant
+            cells.append(_of(_difference(means[key][k], digits[key], significant), means[key][k].count, pairs))
         body.append([comparison.called(row), str(pairs), *cells])
     return TextTable([f"minus {comparison.base_called}", "pairs", *map(head, keys)], body)
 
@@ -156,21 +159,32 @@ def difference_across_grid(comparison: ComparisonTable) -> TextTable:
     """Return a table of the base minus each other row, by sequence, and their mean with its standard error."""
     [key] = comparison.choice.columns
     bases = {row.name: base for row, base in comparison.compared}
-    differences = {row.name: base.differences(row, key) for row, base in comparison.compared}
-    paired = {run[-1] for runs in differences.values() for run in runs}
-    sequences = [sequence for sequence in comparison.sequences if sequence in paired]
-    digits = decimals(value for runs in differences.values() for value in runs.values())
+    differences = {row.name: comparison.difference_by_sequence(base, row, key) for row, base in comparison.compared}
+    sequences = [sequence for sequence in comparison.sequences if any(sequence in one for one in differences.values())]
+    digits = decimals(value for of_row in differences.values() for value in of_row.values())
     sections = []
     for rows in _by_peers([row for row, _ in comparison.compared]):
         section = []
         for row in rows:
-            means, mean = mean_by_sequence(differences[row.name]), comparison.difference(bases[row.name], row, key)
-            texts = [figure(means[s].value, math.nan, digits, True) if s in means else MISSING for s in sequences]
-            texts += [_difference(mean, digits) if mean.count else MISSING, str(mean.count)]
+            of_row, mean = differences[row.name], comparison.difference(bases[row.name], row, key)
+            texts = [figure(of_row[s], math.nan, digits, True) if s in of_row else MISSING for s in sequences]
+            significant = comparison.statistics.results[row.name, key].is_significant
+            texts += [_difference(mean, digits, significant) if mean.count else MISSING, str(mean.count)]
             section.append(_row_line(comparison, row, [(text, math.nan) for text in texts]))
         sections.append(section)
     heads = [*_labels(comparison, f"{comparison.base_called} minus"), *sequences, "mean", "pairs"]
     return _grid(heads, sections)
+
+
+def statistics_grid(comparison: ComparisonTable) -> TextTable:
+    """Return a table with the statistics of each row and column."""
+    base = comparison.base_called
+    rows = {row.name: comparison.called(row) for row, _ in comparison.compared}
+    return comparison.statistics.grid(
+        f"{base} minus" if comparison.choice.columns_by else f"minus {base}",
+        rows,
+        {key: head(key) for key in comparison.choice.columns},
+    )
 
 
 def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], columns: Sequence[_SequenceFigures] = ()) -> TextTable:
@@ -244,10 +258,10 @@ def _mean_cell(mean: Mean, digits: int, expected: int) -> str:
     return _of(figure(mean.value, mean.deviation or math.nan, digits), mean.count, expected)
 
 
-def _difference(mean: Mean, digits: int) -> str:
+def _difference(mean: Mean, digits: int, significant: bool) -> str:
     """Return the signed mean ± standard error; * = significantly different from 0."""
     text = figure(mean.value, mean.error or math.nan, digits, signed=True)
-    return f"{text} *" if mean.is_not_zero else text
+    return f"{text} *" if significant else text
 
 
 def _of(text: str, count: int, expected: int) -> str:

@@ -11,10 +11,11 @@ from framework.evaluation.instances import MAX_DISTANCE
 from framework.registry import STAGES
 from framework.runs.metrics import is_evaluation
 from framework.runs.plugin_code import CODE
-from framework.runs.run_rows import CONFIDENCE, DATA, Run, RunRow, dependent_keys
+from framework.runs.run_rows import DATA, Run, RunRow, dependent_keys
 from framework.runs.stored_runs import Record, is_number
-from framework.tables.comparison import ComparisonTable, as_text, mean_by_sequence
+from framework.tables.comparison import ComparisonTable, as_text
 from framework.tables.metric_columns import Direction, direction, head
+from framework.tables.statistics import ALPHA
 
 OF_RESULTS = ("instances.", "trajectory.", "map.", "frames")  # prefixes of metrics that do not depend on the machine
 MOST_NAMES = 12  # maximum number of sequences that a note names
@@ -29,6 +30,7 @@ def notes(comparison: ComparisonTable) -> Iterator[str]:
 def _notes(comparison: ComparisonTable) -> Iterator[str]:
     yield from _averaging(comparison)
     yield from _comparing(comparison)
+    yield from comparison.statistics.notes()
     yield from _identical(comparison)
     yield from _winners(comparison)
     if comparison.left_out:
@@ -94,7 +96,7 @@ def _comparing(comparison: ComparisonTable) -> Iterator[str]:
             error += f" over {units}, after averaging the runs of each"
         yield (
             f"Differences are paired by {keys}: {error}. pairs: number of values of {units} in both rows. "
-            f"*: the {CONFIDENCE:.0%} confidence interval (Student's t) excludes 0."
+            f"*: p < {ALPHA:.2g} in a paired t-test with Holm's correction."
         )
         paired = {one.name for pair in comparison.compared for one in pair}
         if alone := [row.name for row in comparison.rows if row.name not in paired]:
@@ -141,12 +143,12 @@ def _winners(comparison: ComparisonTable) -> Iterator[str]:
         return
     [key] = comparison.choice.columns
     for row, base in comparison.compared:
-        means = mean_by_sequence(base.differences(row, key))
-        lost = [sequence for sequence in comparison.sequences if sequence in means and means[sequence].value < 0]
-        won = sum(mean.value > 0 for mean in means.values())
+        found = comparison.difference_by_sequence(base, row, key)
+        lost = [sequence for sequence in comparison.sequences if found.get(sequence, 0) < 0]
+        won = sum(difference > 0 for difference in found.values())
         yield (
             f"{comparison.base_called} compared with {comparison.called(row, without='tracker')}, {row.poses}: "
-            f"higher in {won} of {len(means)} sequences, lower in {len(lost)}{': ' + ', '.join(lost) if lost else ''}."
+            f"higher in {won} of {len(found)} sequences, lower in {len(lost)}{': ' + ', '.join(lost) if lost else ''}."
         )
 
 

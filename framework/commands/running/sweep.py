@@ -99,9 +99,7 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
     would then end all workers.
     """
     own = config.hydra
-    swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
-    overrides = [*swept, *own.overrides.task]
-    rows = checked_rows(config.get("rows"))
+    overrides, rows = overrides_of(own), checked_rows(config.get("rows"))
     runs = checked_sweep(overrides, rows)
     if with_table:
         check_table(config, overrides, rows)
@@ -113,6 +111,12 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
             own.launcher.n_jobs = workers
     directory = directory_of("hydra.sweep.dir", own.sweep.dir)
     return sweep_in(directory, with_table, config.get("figure") is not None, workers > 1)
+
+
+def overrides_of(own: DictConfig) -> list[str]:
+    """Return the overrides of a sweep: first those of the experiment, then those of the command line."""
+    swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
+    return [*swept, *own.overrides.task]
 
 
 def _name_by(own: DictConfig, swept: Collection[str], of_outputs: Collection[str]) -> None:

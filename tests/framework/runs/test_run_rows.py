@@ -7,9 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from scipy import stats
 
 from framework.runs.run_rows import Mean, RunRow, dependent_keys, rows_of
 from framework.runs.stored_runs import Record
@@ -41,45 +39,12 @@ def test_mean_of_fewer_than_two_values_has_nan_deviation() -> None:
     one, none = Mean.of([4.0]), Mean.of([])
     assert (one.value, one.count, none.count) == (4.0, 1, 0)
     assert all(map(math.isnan, (one.deviation, one.error, none.value, none.deviation, none.error)))
-    assert not one.is_not_zero
-    assert not none.is_not_zero
-
-
-def test_row_differences_are_paired() -> None:
-    """Rooms differ by 0.5 and rows by 0.1, so only paired differences are significant."""
-    base, other = row("a", seed0=0.1, seed1=0.6, seed2=0.9), row("b", seed0=0.2, seed1=0.7, seed3=0.0)
-    difference = Mean.of(other.differences(base, AP).values())
-    assert difference.count == 2
-    assert difference.value == pytest.approx(0.1)
-    assert difference.error == pytest.approx(0, abs=1e-12)
-    assert other.mean(AP).value == pytest.approx(0.3)
 
 
 def test_row_values_skip_undefined_metrics() -> None:
     expected = row("a", seed0=0.4, seed1=None, seed2="many", seed3=True, seed4=math.nan, seed5=1, seed6=10**400)
     assert expected.values(AP) == {("0",): 0.4, ("5",): 1.0}
     assert expected.mean("no.such.key").count == 0
-    assert expected.differences(row("b", seed0=None), AP) == {}
-
-
-def test_is_not_zero_matches_paired_t_test() -> None:
-    rng = np.random.default_rng(0)
-    stars = []
-    for _ in range(40):
-        a = rng.normal(0, 1, 5)
-        b = a + rng.normal(0.6, 0.5, 5)
-        mean = Mean.of(b - a)
-        assert mean.is_not_zero == (stats.ttest_rel(b, a).pvalue < 0.05)
-        stars.append(mean.is_not_zero)
-    assert 5 < sum(stars) < 35
-
-
-def test_is_not_zero_is_false_for_equal_differences() -> None:
-    """Equal differences have no spread, so their significance is undefined."""
-    assert not Mean.of([2.0, 2.0]).is_not_zero
-    assert not Mean.of([0.7 - 0.6, 0.2 - 0.1]).is_not_zero, (
-        "expected no significance: the differences are equal except for rounding"
-    )
 
 
 def test_rows_keep_experiment_order_and_sort_seeds() -> None:

@@ -9,12 +9,14 @@ from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
+from scipy.stats import ttest_1samp
 
 from framework.errors import ConfigError, DataError
 from framework.runs.data_frame import load_runs
 from framework.runs.provenance import config_hash
-from framework.tables.comparison import ComparisonTable, PairedValues
+from framework.tables.comparison import ComparisonTable
 from framework.tables.experiment_tables import write_tables
+from framework.tables.statistics import PairedValues
 from tests.support.table_text import grids
 
 pytestmark = pytest.mark.integration
@@ -156,7 +158,28 @@ def test_table_pairs_by_key_without_common_seeds(sweep: Path) -> None:
         ("rooms",): pytest.approx((0.45, 0.8)),
     }
     _, second = grids(write_tables(sweep))
-    assert second[2:] == ["| refiner=identity | 2 | -0.175 ± 0.025 |", "| refiner=other | 2 | -0.325 ± 0.025 * |"]
+    assert second[2:] == ["| refiner=identity | 2 | -0.175 ± 0.025 |", "| refiner=other | 2 | -0.325 ± 0.025 |"]
+
+
+def test_table_statistics_have_units_of_pairs(sweep: Path) -> None:
+    """Rows with other seeds have columns, differences and tests by dataset."""
+    run(sweep, "hall", "chain", 0, 0.7)
+    for dataset, ap in (("desk", 0.2), ("rooms", 0.4), ("hall", 0.3)):
+        for seed in (5, 6):
+            run(sweep, dataset, "other", seed, ap + 0.1 * (seed - 5))
+    choice = {"columns_by": "dataset", "columns": [AP50], "base": "refiner=chain"}
+    choice |= {"where": {"dataset": ["desk", "rooms", "hall"]}}
+    table(sweep, **choice)
+    assert len(grids(write_tables(sweep))) == 2
+    table(sweep, **choice, pair_by=["dataset"])
+    text = write_tables(sweep)
+    _, second, third = grids(text)
+    # chain: 0.55, 0.7, 0.8; other: 0.25, 0.35, 0.45
+    assert second[0] == "| refiner=chain minus | poses | annotation | desk | hall | rooms | mean | pairs |"
+    assert second[3] == "| refiner=other | ground truth | – | +0.300 | +0.350 | +0.350 | +0.333 ± 0.017 * | 3 |"
+    p = ttest_1samp([0.3, 0.35, 0.35], 0).pvalue
+    assert third[2].startswith(f"| AP50 | refiner=other | 3 | +0.333 | – | {p:.3f} | {p:.3f} | 0.250 |")
+    assert "refiner=chain compared with refiner=other, ground truth: higher in 3 of 3 sequences, lower in 0." in text
 
 
 def test_table_pairs_by_seed_have_same_datasets(sweep: Path) -> None:
@@ -176,7 +199,7 @@ def test_table_groups_have_digits_and_best_value_of_each_column(sweep: Path) -> 
         path.write_text(json.dumps(json.loads(path.read_text()) | {"map.bytes": 5e6}))
     table(sweep, group_by="dataset", columns=[AP50, TIME, "map.bytes"])
     text = write_tables(sweep)
-    first, _ = grids(text)
+    first, *_ = grids(text)
     assert first[0] == "| dataset | system | poses | annotation | AP50 | fusion (ms) | map (bytes) |"
     assert [line.split(" | ")[4:] for line in first[2:]] == [
         ["**0.550 ± 0.071**", "**9.00**", "5000000 |"],

@@ -62,6 +62,10 @@ def test_write_tables_values_match_manual_result(sweep: Path) -> None:
     # -0.3, -0.2, -0.4: mean -0.3, standard error 0.1 / sqrt(3) = 0.0577; t = 5.2 > 4.3
     assert "| identity | 3 | -0.300 ± 0.058 * | -151.0 ± 0.6 * |" in lines
     assert "| minus chain | pairs | AP50 | refinement (ms) |" in lines
+    # scipy.stats.ttest_1samp([-0.3, -0.2, -0.4], 0).pvalue is 0.035; three negative values: 2 of 2^3 sign patterns
+    assert "| AP50 | identity | 3 | -0.300 | – | 0.035 | 0.035 | 0.250 | 0.250 | 4 |" in lines
+    assert "| refinement (ms) | identity | 3 | -151.0 | – | < 0.001 | < 0.001 | 0.250 | 0.250 | 2 |" in lines
+    assert "with fewer than 6 values of seed; its smallest p with 3 is 0.250." in text
     assert (sweep / "table.md").read_text() == text
     assert "- Overrides of each row: identity: refiner=identity; chain: none; none_yet: refiner=none_yet." in lines
     assert "- Rows without a complete run: none_yet." in lines

@@ -92,7 +92,9 @@ GOLDEN = """\
 dataset.scene with equal weights; its standard deviation is over the runs with all values of dataset.scene. Bold: \
 highest AP50 for the same poses and number of runs, unless several rows have it. missing: no complete run.
 - Differences are paired by seed, dataset.scene: mean ± standard error over dataset.scene, after averaging the runs of \
-each. pairs: number of values of dataset.scene in both rows. *: the 95% confidence interval (Student's t) excludes 0.
+each. pairs: number of values of dataset.scene in both rows. *: p < 0.05 in a paired t-test with Holm's correction.
+- No statistics: they require at least 3 values of dataset.scene in a row and its base, and differences that are not \
+all equal.
 - Identical runs: the results do not depend on seed in other.
 - ours compared with Prior (re-implementation), ground truth: higher in 1 of 2 sequences, lower in 1: 016.
 - ours compared with other, ground truth: higher in 2 of 2 sequences, lower in 0.
