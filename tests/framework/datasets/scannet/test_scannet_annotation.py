@@ -113,7 +113,7 @@ def test_scannet_label_table_missing_names_are_listed(tmp_path: Path) -> None:
     objects = [
         group(k, label, 3) for k, label in enumerate(("zimzum", "laptop", "Gizmo", "unknown", "whatnot", "zimzum"))
     ]
-    message = r"s\.aggregation\.json: expected names .*, got 'whatnot', 'zimzum'; add a line to scannetv2-labels\.comb"
+    message = r"s\.aggregation\.json: expected labels from scannetv2-labels.*, got 'whatnot', 'zimzum'; add a line"
     with pytest.raises(DataError, match=message) as caught:
         read(tmp_path, objects, table=TABLE)
     assert "\n" not in str(caught.value)
