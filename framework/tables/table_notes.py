@@ -197,11 +197,15 @@ def _missing(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _mixed_code(comparison: ComparisonTable) -> Iterator[str]:
-    """Yield a note for each row whose runs have different plugin code."""
+    """Yield a note for each row whose runs have different code of the same option."""
     for row in comparison.rows:
-        keys = sorted({key for record in row.records.values() for key in record.metrics if key.startswith(CODE)})
-        codes = {key: counted(str(record.metrics.get(key)) for record in row.records.values()) for key in keys}
-        if mixed := [f"{key.removeprefix(CODE)} {code}" for key, code in codes.items() if "(" in code]:
+        records = row.records.values()
+        codes: dict[tuple[str, str | None], list[str]] = {}  # by stage and its option
+        for key in sorted({key for record in records for key in record.metrics if key.startswith(CODE)}):
+            stage = key.removeprefix(CODE)
+            for record in records:
+                codes.setdefault((stage, record.choices.get(stage)), []).append(str(record.metrics.get(key)))
+        if mixed := [f"{stage} {counted(found)}" for (stage, _), found in codes.items() if len(set(found)) > 1]:
             yield f"Mixed plugin code in {row.name}: {'; '.join(mixed)}; repeat its runs with skip_completed=true."
 
 

@@ -285,6 +285,19 @@ def test_table_notes_report_identical_runs_and_rows(sweep: Path) -> None:
     )
 
 
+def test_table_notes_report_mixed_code_of_same_dataset(sweep: Path) -> None:
+    """Averaged options have different code; only different code of one option is mixed."""
+    for path in sweep.glob("*/metrics.json"):
+        metrics = json.loads(path.read_text())
+        path.write_text(json.dumps(metrics | {"code.dataset": f"reader of {metrics['choice.dataset']} 3f"}))
+    table(sweep, average_over=["seed", "dataset"])
+    assert "Mixed" not in write_tables(sweep)
+    [changed] = sweep.glob("dataset=desk,*refiner=chain,seed=1/metrics.json")
+    changed.write_text(changed.read_text().replace("reader of desk 3f", "reader of desk 9c"))
+    expected = "Mixed plugin code in refiner=chain: dataset reader of desk 3f (1 run), reader of desk 9c (1 run);"
+    assert expected in write_tables(sweep)
+
+
 def test_table_notes_name_command_line_and_data(sweep: Path) -> None:
     table(sweep, [*TASK, "dataset.stride=3", "skip_completed=true", "+table.columns=[fps]"], columns=[AP50])
     text = write_tables(sweep)
