@@ -202,6 +202,8 @@ FAULTY = {
     "show-refinement": ["dataset=synthetic", "detector=simulated"],
     "compile": ["nothing"],
     "plugins": ["detector", "nothing"],
+    "bundle": ["nowhere"],
+    "reproduce": ["nowhere"],
     "new-plugin": ["refiner", "gmm_em"],
     "synthesize": ["new", "--scenes=999"],
     "train-detector": ["device=tpu"],

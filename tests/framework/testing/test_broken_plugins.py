@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import threading
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import FrozenInstanceError, dataclass, replace
 from functools import partial
@@ -48,14 +47,15 @@ class Forgetful(SphereDetector):
 
 
 class Sharing(SphereDetector):
-    """Detector that declares concurrent detection, but shares one frame between all calls."""
+    """Detector that declares concurrent detection, but shares the first frame between the calls of other threads."""
 
     concurrent = True
+    shared: Frame | None = None
 
     def detect(self, frame: Frame) -> Detections:
-        self.frame = frame
-        time.sleep(0.1)  # long enough for the other threads to begin
-        return super().detect(self.frame)
+        if threading.current_thread() is not threading.main_thread():
+            self.shared = frame = self.shared or frame
+        return super().detect(frame)
 
 
 class Peeking(SphereDetector):

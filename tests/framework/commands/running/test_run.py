@@ -143,7 +143,7 @@ def test_run_on_full_disk_writes_small_files(tmp_path: Path) -> None:
     assert not list(place.glob(".*partial*"))
     fault = str(figures(place)["partial"])
     assert fault.startswith(f"{place / 'mesh.ply'}: expected a writable file, got ")
-    assert fault.endswith("the disk may be full")
+    assert fault.endswith("the disk may be full)")
     assert figures(place)["instances.ap50"] == 1.0
 
 
