@@ -22,7 +22,7 @@
     view = scene.view(camera, T_world_camera)  # rendered depth, normals, color and instances
 
 `export("outputs/demo", "glb", "usd")` writes files in standard formats. `query("outputs/demo", "a red chair").objects`
-lists the matching objects, best match first.
+lists the matching objects, best match first. `load_runs("multirun/sweep")` returns the runs of a sweep as a data frame.
 
 A Mapper is thread-safe; queries wait until the current frame is mapped.
 

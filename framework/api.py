@@ -48,6 +48,7 @@ from framework.pipeline import Pipeline
 from framework.queries.map_queries import Map
 from framework.queries.text_search import Match, QueryResult, TextQuery, search
 from framework.registry import build
+from framework.runs.data_frame import load_runs
 from framework.runs.stored_runs import KEYFRAMES, MAP
 from framework.runtime.cpu_budget import limited_threads
 from framework.runtime.process_settings import Settings, configure_process
@@ -90,6 +91,7 @@ __all__ = [
     "configure_process",
     "export",
     "load_map",
+    "load_runs",
     "open_dataset",
     "query",
     "untimed",

@@ -273,7 +273,7 @@ class Detections:
     """The N objects detected in one image, best first. Masks may overlap; N may be 0."""
 
     masks: Bool  # (N, H, W)
-    boxes: Float32  # (N, 4) x1 y1 x2 y2, px
+    boxes: Float32  # (N, 4) x1 y1 x2 y2, px; the first and the last pixels inside
     scores: Float32  # (N,) in [0, 1]
     class_probabilities: Float32  # (N, C), each row a distribution over `classes`
     classes: tuple[str, ...]  # names of the C columns

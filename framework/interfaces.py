@@ -138,7 +138,10 @@ class Detector(ABC):
 
     @abstractmethod
     def detect(self, frame: Frame) -> Detections:
-        """Return the objects in `frame`. The result depends on the frame alone, not on the order of frames."""
+        """Return the objects in `frame`. The result depends on the frame alone, not on the order of frames.
+
+        A detector that reads the ground truth of the frame raises DataError for a frame without it.
+        """
 
 
 class PoseTracker(ABC):
@@ -151,7 +154,8 @@ class PoseTracker(ABC):
         """Return the pose of `frame`. Called once per frame, in order. `scene` is read-only.
 
         Set `Pose.lost` if the pose cannot be estimated; the frame is then not integrated. The first frame defines the
-        world frame: its ground-truth pose if known, otherwise the identity.
+        world frame: its ground-truth pose if known, otherwise the identity. If the result depends on the ground truth
+        of later frames, return their ground-truth poses and set `pose_source` to `ground_truth`.
 
         Raises:
             NoPoseError: The tracker requires the poses of the sequence, but this frame has none. The frame is skipped.

@@ -25,7 +25,8 @@ from framework.files.atomic_write import atomic_write
 from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, RunRow
 from framework.tables.comparison import ComparisonTable, mean_by_sequence
 from framework.tables.grid import TextTable, decimals, figure, markdown_grid
-from framework.tables.layouts import NOTHING, head
+from framework.tables.layouts import NOTHING
+from framework.tables.metric_columns import head
 from framework.tables.table_notes import counted, digest
 
 FEWEST = 3  # minimum rows; two rows have the same order by chance with probability 0.5

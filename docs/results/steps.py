@@ -23,7 +23,8 @@ from framework.figures.figure_page import FAINT_INK, INK, MARGIN_MM, PAGE_MM, SM
 from framework.runs.run_rows import CHOICE, CONFIDENCE, RunRow
 from framework.tables.comparison import ComparisonTable
 from framework.tables.grid import TextTable, figure, markdown_grid
-from framework.tables.layouts import NOTHING, head
+from framework.tables.layouts import NOTHING
+from framework.tables.metric_columns import head
 from framework.tables.table_notes import counted, digest
 
 SAMPLES = 10000  # number of bootstrap samples

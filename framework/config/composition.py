@@ -233,6 +233,9 @@ def _known_keys(error: OmegaConfBaseException) -> str:
     path = str(error.full_key or error.key)
     if hint := rename_hint(path):
         return f"{path}: expected a known key, got {error.key}; {hint}"
+    if path == "table" or path.startswith("table.where."):  # new keys of a sweep
+        key = f"+{path}.KEY" if path == "table" else f"+{path}"
+        return f"{path}: expected a prefix + for a new key, got none; set {key}=VALUE"
     if close:
         return f"{path}: expected a known key, got {error.key}; did you mean {path[: -len(str(error.key))]}{close[0]}?"
     return f"{path}: expected one of {', '.join(keys) or 'none'}, got {error.key}"

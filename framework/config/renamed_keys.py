@@ -50,7 +50,7 @@ RENAMED = {
     "refiner.whole_segments": "refiner.grow_to_segments",
     "refiner.window": "refiner.window_radius",
     "table.across": "table.columns_by",
-    "table.base": "table.baseline",
+    "table.baseline": "table.base",
     "table.by": "table.group_by",
     "table.over": "table.average_over",
     "tracker.finest": "tracker.finest_scale",

@@ -11,6 +11,7 @@ from typing import Any, get_args, get_type_hints
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from framework.config.renamed_keys import rename_hint
 from framework.errors import ConfigError
 
 MAX_DETECTIONS = 1000  # maximum number of detections per image; each has a mask of the image size; COCO evaluates 100
@@ -24,6 +25,7 @@ PHRASES: Mapping[Any, str] = {
     Path: "a path",
     NoneType: "null",
     list[str]: "a list of strings",
+    dict[str, Any]: "a mapping from keys to values",
     dict[str, str]: "a mapping from names to strings",
 }
 """Valid values by type, for error messages."""
@@ -115,6 +117,8 @@ def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:
     block, types = OmegaConf.structured(kind), get_type_hints(kind)
     for key in map(str, node):
         if key not in types:
+            if hint := rename_hint(f"{name}.{key}"):
+                raise ConfigError(f"{name}.{key}: expected a known key, got {key}; {hint}")
             raise ConfigError(f"{name}: expected one of {', '.join(types)}, got {key!r}")
         try:
             block = OmegaConf.merge(block, OmegaConf.create({key: node[key]}))

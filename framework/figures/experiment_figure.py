@@ -21,8 +21,8 @@ from framework.figures.stage_times import COLUMNS, WINDOW, MeanTimes, stage_time
 from framework.runs.reevaluation import Truth
 from framework.runs.run_rows import Run, RunRow, natural, rows_of
 from framework.runs.stored_map import StoredMap
-from framework.runs.stored_runs import Incomplete, Record, find_records, read_yaml
-from framework.runs.sweep_file import SWEEP
+from framework.runs.stored_runs import Incomplete, Record, completed_runs, read_yaml
+from framework.runs.sweep_file import SWEEP, asked_keys, command_line
 from framework.runs.timings_file import StageTimes, read_timings
 from framework.tables.table_notes import counted, data, machine
 
@@ -51,6 +51,7 @@ class Pictured:
     choice: FigureChoice
     rows: Mapping[str, RunRow | None]  # by display name; None = no complete run
     incomplete: Sequence[Incomplete]
+    command_line: Sequence[str] = ()  # overrides of the sweep on the command line
 
     @classmethod
     def below(cls, directory: Path) -> Pictured:
@@ -73,16 +74,13 @@ class Pictured:
             )
         choice = FigureChoice.of(sweep[NAME])
         overrides = checked_rows(sweep.get("rows"))
-        records, incomplete = find_records(directory)
-        if not records:
-            why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
-            raise DataError(f"{directory}: expected a completed run, got none{f' ({why})' if why else ''}")
-        found = rows_of(records, choice.over, overrides)
+        records, incomplete = completed_runs(directory)
+        found = rows_of(records, choice.over, overrides, asked_keys(sweep))
         rows: dict[str, RunRow | None] = {}
         for system in dict.fromkeys([*overrides, *(row.system for row in found)]):
             of_system: dict[str, RunRow | None] = {choice.called(row): row for row in found if row.system == system}
             rows |= of_system or {choice.names.get(system, system): None}
-        return cls(choice, rows, incomplete)
+        return cls(choice, rows, incomplete, command_line(sweep))
 
     @property
     def runs(self) -> list[Run]:
@@ -93,6 +91,14 @@ class Pictured:
     @property
     def records(self) -> list[Record]:
         return [record for row in self.rows.values() if row for record in row.records.values()]
+
+    @property
+    def origin(self) -> str:
+        """Return the data, the overrides on the command line, the machine and the code of the runs."""
+        chosen = f" Command line: {' '.join(self.command_line)}." if self.command_line else ""
+        runs = self.records
+        code = counted(record.commit for record in runs)
+        return f"Data: {data(runs)}.{chosen} {counted(map(machine, runs))}; code {code}."
 
     def called(self, run: Run) -> str:
         """Return the name of the run's sequence, with the seed if the runs have several seeds."""
@@ -124,7 +130,7 @@ def _stage_times(pictured: Pictured) -> Page:
     )
     if any(one.longest > one.frames[-1] for one in shown):
         note += " Lines end at the last frame of the shortest sequence."
-    return stage_times_figure(means, f"{note} Data: {data(pictured.records)}. {_origin(pictured.records)}")
+    return stage_times_figure(means, f"{note} {pictured.origin}")
 
 
 def _times_of(row: RunRow | None) -> dict[Run, StageTimes]:
@@ -159,9 +165,7 @@ def _maps(pictured: Pictured) -> Page:
         "An object has the same color in all images of a row. Dark: no match with a ground-truth object. "
         "Beige: ground-truth object of unknown class, not evaluated."
     )
-    if any(record.annotation for record in pictured.records):
-        note += f" Annotation: {counted(record.annotation or 'unknown' for record in pictured.records)}."
-    return map_figure(heads, lines, f"{note} {_origin(pictured.records)}")
+    return map_figure(heads, lines, f"{note} {pictured.origin}")
 
 
 DRAWN: Mapping[str, Callable[[Pictured], Page]] = {"stage_times": _stage_times, "maps": _maps}
@@ -192,7 +196,3 @@ def _if_readable(read: Callable[[Record], Read], record: Record) -> Read | None:
     except InstanceMapError as error:
         log.warning("omitted from the figure: %s", error)
         return None
-
-
-def _origin(records: Sequence[Record]) -> str:
-    return f"{counted(map(machine, records))}; code {counted(record.commit for record in records)}."

@@ -22,7 +22,6 @@ from framework.files.atomic_write import atomic_write, remove_left_over
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import RGBDVideo
-from framework.registry import STAGES
 from framework.rendering.overview import write_overview
 from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import write_instances
@@ -32,9 +31,11 @@ from framework.runs.metrics import Metrics, class_name, instance_metrics, room_m
 from framework.runs.plugin_code import plugin_code
 from framework.runs.provenance import code_version, config_hash, environment, frozen_environment
 from framework.runs.stored_runs import (
+    CHOICE,
     CONFIG,
     DIGESTS,
     ENVIRONMENT,
+    GROUPS,
     INSTANCES,
     KEYFRAMES,
     MAP,
@@ -147,7 +148,7 @@ class RunRecord:
     def _metrics(self, video: RGBDVideo, figures: Metrics) -> Metrics:
         return {
             "sequence": video.name,
-            **{f"choice.{group}": self.choices.get(group) for group in STAGES},
+            **{f"{CHOICE}{group}": self.choices.get(group) for group in GROUPS},
             **figures,
             "peak_rss_bytes": peak_memory(),
             "seed": self.config.get("seed"),

@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from framework.runs.provenance import leaves, relevant
-from framework.runs.stored_runs import Record, is_number
+from framework.registry import STAGES
+from framework.runs.metrics import TRUTH
+from framework.runs.stored_runs import CHOICE, Record, is_number
 
-CHOICE = "choice."  # prefix of the chosen options in metrics.json
 DATA = "dataset.root"  # config key of the dataset folder
+ANNOTATION = "annotation"  # key of the release of the ground truth in the differences between rows
 CONFIDENCE = 0.95
 PRESET_STAGES = ("tracker", "refiner", "fuser")  # stages set by preset=NAME
+
+ABSENT = "–"  # value of a key that a run does not have
 
 Run = tuple[str, ...]  # values of the keys that are averaged over, e.g. ("3",) for seed 3
 
@@ -25,32 +28,22 @@ class Mean:
     """A mean over runs. NaN = undefined, such as the mean of no run or the deviation of a single run."""
 
     value: float
-    deviation: float  # sample standard deviation, with the divisor n - 1
+    deviation: float  # sample standard deviation, with the divisor n - 1; 0 = equal values
     count: int
 
     @classmethod
     def of(cls, values: Iterable[float]) -> Mean:
         sample = np.array(list(values), np.float64)
-        value = float(sample.mean()) if len(sample) else math.nan
-        deviation = float(sample.std(ddof=1)) if len(sample) > 1 else math.nan
-        return cls(value, deviation, len(sample))
+        if not len(sample):
+            return cls(math.nan, math.nan, 0)
+        if np.ptp(sample) == 0:  # without rounding errors
+            return cls(float(sample[0]), 0.0 if len(sample) > 1 else math.nan, len(sample))
+        return cls(float(sample.mean()), float(sample.std(ddof=1)), len(sample))
 
     @property
     def error(self) -> float:
         """Return the standard error of the mean."""
         return self.deviation / math.sqrt(self.count) if self.count > 1 else math.nan
-
-    @property
-    def is_not_zero(self) -> bool:
-        """Return True if 0 is outside of the confidence interval of the mean (level CONFIDENCE, Student's t).
-
-        Return False for fewer than two values and for equal values, whose deviation of 0 is no estimate of the spread.
-        """
-        if self.count < 2 or self.deviation <= 1e-9 * abs(self.value):
-            return False
-        from scipy.stats import t
-
-        return abs(self.value) > self.error * float(t.ppf((1 + CONFIDENCE) / 2, self.count - 1))
 
 
 @dataclass(frozen=True)
@@ -80,6 +73,13 @@ class RunRow:
     def _distinct(self, key: str) -> str:
         return "/".join(sorted({str(record.metrics.get(key)) for record in self.records.values()}))
 
+    @property
+    def peers(self) -> tuple[str, ...]:
+        """Return the key of comparable rows: the variant in an experiment, otherwise the source of poses and data."""
+        if self.system:
+            return self.variant
+        return (self.pose_source, *(part for part in self.variant if is_of_data(part)))
+
     def values(self, column: str) -> dict[Run, float]:
         """Return the metric `column` of each run; runs with an undefined value are omitted."""
         found = {run: record.metrics.get(column) for run, record in self.records.items()}
@@ -88,44 +88,73 @@ class RunRow:
     def mean(self, column: str) -> Mean:
         return Mean.of(self.values(column).values())
 
-    def differences(self, base: RunRow, column: str) -> dict[Run, float]:
-        """Return the difference of the metric `column` from the row `base`, for each run in both rows.
+    def shares_data(self, other: RunRow) -> bool:
+        """Return True if every run in both rows has the same data, and there is such a run."""
+        runs = self.records.keys() & other.records.keys()
+        return bool(runs) and all(data_of(self.records[run]) == data_of(other.records[run]) for run in runs)
 
-        Runs with the same seed have the same scene and detections, so most of the variation cancels.
-        """
-        own, others = self.values(column), base.values(column)
-        return {run: own[run] - others[run] for run in own if run in others}
+
+def data_of(record: Record) -> tuple[Any, ...]:
+    """Return the identity of the data of a run: its dataset, sequence and ground truth."""
+    keys = ("sequence", "annotation_release", TRUTH)
+    parameters = (record.parameters.get(key) for key in (DATA, "dataset.scene"))
+    return (record.choices.get("dataset"), *parameters, *(record.metrics.get(key) for key in keys))
+
+
+def is_of_data(part: str) -> bool:
+    """Return True if a part of a row's variant, such as dataset=desk, describes its data."""
+    return is_below(part.partition("=")[0], ("dataset", ANNOTATION, "seed"))
+
+
+def value_of(record: Record, key: str) -> str:
+    """Return an option or parameter of a run as text; ABSENT = the run does not have the key."""
+    return str(record.settings[key]) if key in record.settings else ABSENT
 
 
 def rows_of(
-    records: Sequence[Record], over: Sequence[str], overrides: Mapping[str, Sequence[str]] | None = None
+    records: Sequence[Record],
+    over: Sequence[str],
+    overrides: Mapping[str, Sequence[str]] | None = None,
+    asked: Collection[str] | None = None,
 ) -> list[RunRow]:
     """Group `records` into rows: first the rows in `overrides`, then other rows by name.
 
     Records of an experiment are grouped by their config key `row`. Other records are grouped by their differing options
-    and parameters, except for the averaged keys `over` and keys that always have the same value as one of them, such as
-    dataset.seed and seed. `overrides` contains the overrides of each row by name.
+    and parameters, except for the averaged keys `over` and the keys that depend on them (`dependent_keys`).
 
     A row of an experiment is split by differences within it, by data folder and by annotation. It is also split by
     differences between rows that no override causes, such as the pose source or the number of frames. The later of two
     records of the same run is used.
+
+    Args:
+        records: The runs.
+        over: The averaged keys: options and parameters.
+        overrides: The overrides of each row of an experiment by name.
+        asked: The keys in the overrides of the sweep; None = unknown.
+
+    Returns:
+        The rows, each with at least one run.
     """
     overrides = overrides or {}
     variants = [_Variant.of(record, over) for record in sorted(records, key=lambda record: record.written)]
-    own = _following(variants, over)
     changed = {key for changes in overrides.values() for override in changes for key in _changed(override)}
+    own = _dependent(variants, over, None if asked is None else {*_all_changed(asked), *changed})
     stages = _differing(
         [(one.row, one.choices) for one in variants]
         + [("", {key: value for key, value in one.choices.items() if key not in changed}) for one in variants]
     )
+
+    def dataset_of(one: _Variant) -> Any:  # rows of several datasets are named by their dataset, not by its folder
+        return one.choices.get("dataset") if "dataset" in stages else ""
+
     parameters = _differing(
         [((one.row, *map(one.choices.get, stages)), one.parameters) for one in variants]
-        + [("", {DATA: one.parameters[DATA]}) for one in variants if DATA in one.parameters]
+        + [(dataset_of(one), {DATA: one.parameters[DATA]}) for one in variants if DATA in one.parameters]
         + [kept for one in variants if not one.row or one.row in overrides for kept in _kept(one, changed)]
     )
     rows: dict[tuple[str, tuple[str, ...]], dict[Run, Record]] = {}
     for one in variants:
-        variant = [f"{key}={one.choices[key]}" for key in stages if key in one.choices]
+        variant = [f"{key}={one.choices[key]}" for key in stages if key in one.choices and key not in own]
         variant += [f"{key}={one.parameters[key]}" for key in parameters if key in one.parameters and key not in own]
         rows.setdefault((one.row, tuple(variant)), {})[one.run] = one.record
     place = {name: k for k, name in enumerate(overrides)}
@@ -145,15 +174,21 @@ def _changed(override: str) -> tuple[str, ...]:
     return PRESET_STAGES if group == "preset" else (package or group.replace("/", "."),)
 
 
+def _all_changed(keys: Iterable[str]) -> Iterator[str]:
+    """Yield the keys changed by overrides of these keys and groups."""
+    for key in keys:
+        yield from _changed(key)
+
+
 def _kept(one: _Variant, changed: Collection[str]) -> Iterator[tuple[Any, Mapping[str, Any]]]:
     """Yield the parameters that no row changes, with their stage and its option."""
     for key, value in one.parameters.items():
-        if not _is_below(key, changed):
+        if not is_below(key, changed):
             stage = key.partition(".")[0]
             yield (stage, one.choices.get(stage)), {key: value}
 
 
-def _is_below(key: str, others: Collection[str]) -> bool:
+def is_below(key: str, others: Collection[str]) -> bool:
     """Return True if a dotted key is in `others` or below one of them."""
     parts = key.split(".")
     return any(".".join(parts[:k]) in others for k in range(1, len(parts) + 1))
@@ -171,31 +206,55 @@ class _Variant:
 
     @classmethod
     def of(cls, record: Record, over: Sequence[str]) -> _Variant:
-        parameters = dict(leaves(relevant(record.config)))
-        choices = {k.removeprefix(CHOICE): v for k, v in record.metrics.items() if k.startswith(CHOICE)}
-        choices["annotation"] = record.annotation or "unknown"
-        run = tuple(str(parameters.get(key)) for key in over)
-        row = record.config.get("row")
-        return cls(record, "" if row is None else str(row), run, choices, parameters)
+        choices = {stage: option for stage, option in record.choices.items() if stage in STAGES}
+        choices[ANNOTATION] = record.annotation or "unknown"
+        return cls(record, record.row, tuple(value_of(record, key) for key in over), choices, record.parameters)
+
+    @property
+    def values(self) -> Mapping[str, Any]:
+        """Return the chosen options, the annotation and the parameters."""
+        return {**self.parameters, **self.choices}
 
 
-def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:
-    """Return the keys whose value equals that of a key in `over` in every record, even by chance.
+def dependent_keys(records: Sequence[Record], over: Sequence[str], asked: Collection[str] | None = None) -> list[str]:
+    """Return the differing keys that are averaged because they depend on a key in `over`, for a note.
 
-    Keys with the same last part as a key in `over`, such as dataset.seed for seed, are omitted.
+    These keys have the same value as a key in `over` in every record, even by chance, or are set by an averaged option.
+    Keys with the same last part as a key in `over`, such as dataset.seed for seed, and the parameters of averaged and
+    returned options are omitted.
     """
     variants = [_Variant.of(record, over) for record in records]
     names = {key.rpartition(".")[2] for key in over}
-    differing = set(_differing([("", one.parameters) for one in variants]))
-    return sorted(key for key in differing & _following(variants, over) if key.rpartition(".")[2] not in names)
+    differing = set(_differing([("", one.values) for one in variants]))
+    found = differing & _dependent(variants, over, None if asked is None else set(_all_changed(asked)))
+    return sorted(
+        key for key in found if key.rpartition(".")[2] not in names and not is_below(key, {*over, *found} - {key})
+    )
 
 
-def _following(variants: Sequence[_Variant], over: Sequence[str]) -> set[str]:
-    """Return the keys `over`, and the keys whose value equals that of one of them in every record."""
+def _dependent(variants: Sequence[_Variant], over: Sequence[str], asked: Collection[str] | None) -> set[str]:
+    """Return the keys `over` and the keys that depend on them.
+
+    A key depends on `over` if its value equals that of a key in `over` in every record. The parameters and the
+    annotation of an averaged option also depend on it, and all keys that are not in `asked`, if each option has one
+    value of the key.
+    """
     found = set(over)
+    keys = {key for one in variants for key in one.values}
     for key in {key for one in variants for key in one.parameters}:
         for k in range(len(over)):
             if all(str(one.parameters[key]) == one.run[k] for one in variants if key in one.parameters):
+                found.add(key)
+    options = [k for k, key in enumerate(over) if key in STAGES]
+    if not options:
+        return found
+    for key in keys - found:
+        of_option = is_below(key, over) or (key == ANNOTATION and "dataset" in over)
+        if of_option or (asked is not None and not is_below(key, asked)):
+            values: dict[Run, set[str]] = {}
+            for one in variants:
+                values.setdefault(tuple(one.run[k] for k in options), set()).add(repr(one.values.get(key)))
+            if all(len(of_run) == 1 for of_run in values.values()):
                 found.add(key)
     return found
 

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -18,9 +19,19 @@ from framework.errors import DataError, first_line
 from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
 from framework.files.json_file import read_json
 from framework.files.yaml_file import load_yaml
+from framework.registry import STAGES
 from framework.runs.inputs import INPUTS, inputs_sha256
 from framework.runs.plugin_code import changed_code, plugin_code
-from framework.runs.provenance import code_version, config_hash, environment, shows_speed, speed_settings
+from framework.runs.provenance import (
+    OF_SPEED,
+    code_version,
+    config_hash,
+    environment,
+    leaves,
+    relevant,
+    shows_speed,
+    speed_settings,
+)
 from framework.runs.timings_file import current_key
 
 CONFIG = "config.yaml"
@@ -44,6 +55,8 @@ RESULT_FILES = (CONFIG, *MAPPED, KEYFRAMES, DIGESTS, ENVIRONMENT)
 EVALUATION = "evaluation."  # prefix of the keys with the code version of the last re-evaluation
 GROUND_TRUTH = EVALUATION + "ground_truth"  # key of the `dataset.ground_truth` of the last re-evaluation, if it was set
 
+CHOICE = "choice."  # prefix of the chosen options in metrics.json
+GROUPS = (*STAGES, "preset", "sequences")  # config groups whose chosen option is stored
 FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # prefixes of numeric metrics
 
 _LOG_LINE = re.compile(r"\S+ (?P<level>DEBUG|INFO|WARNING|ERROR|CRITICAL) +(?P<message>.*)")
@@ -82,6 +95,35 @@ class Record:
     def annotation(self) -> str:
         """Return the release of the ground truth; "" = unknown."""
         return str(self.metrics.get("annotation_release") or "")
+
+    @property
+    def row(self) -> str:
+        """Return the row of an experiment; "" = no experiment."""
+        row = self.config.get("row")
+        return "" if row is None else str(row)
+
+    @cached_property
+    def choices(self) -> dict[str, str]:
+        """Return the chosen option of each config group."""
+        chosen = {key.removeprefix(CHOICE): value for key, value in self.metrics.items() if key.startswith(CHOICE)}
+        return {group: str(option) for group, option in chosen.items() if option is not None}
+
+    @cached_property
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters that change results by dotted key."""
+        return dict(leaves(relevant(self.config)))
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """Return the row, the chosen options, the parameters, and the settings that change times, by key."""
+        row = {"row": self.row} if self.row else {}
+        speed = {key: self.config[key] for key in OF_SPEED if key in self.config}
+        return (
+            row
+            | self.choices
+            | {key: self.parameters[key] for key in self.parameters if key not in self.choices}
+            | speed
+        )
 
 
 @dataclass(frozen=True)

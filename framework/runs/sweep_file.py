@@ -15,10 +15,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.config.validation import checked_rows
+from framework.runs.provenance import OF_SPEED, WITHOUT_EFFECT
 
 _OF_ITSELF = re.compile(
     r"\$\{[\w.]+\}|\$\{all_of:\$\{[\w.]+\}\}"
 )  # references to keys of the same config, as in the included experiments
+
+WITHOUT_CHANGES = {"experiment", "launcher", *WITHOUT_EFFECT} - {*OF_SPEED, "sequences"}
+"""Keys and groups that do not change the results or times of an experiment's runs."""
 
 SWEEP = "multirun.yaml"  # written by Hydra's sweeper
 MAX_VALUES = 1000  # maximum number of values of a key; a range may have more
@@ -36,6 +40,22 @@ def requested_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[
         return []
     plain = not any("${" in value for column in values for value in column)
     return list(itertools.islice(itertools.product(*values), MAX_RUNS)) if plain else []
+
+
+def asked_keys(sweep: Mapping[str, Any]) -> set[str] | None:
+    """Return the keys and groups that the overrides of a sweep set; None without a sweep."""
+    return {override.key_or_group for override in _overrides(sweep)} if sweep else None
+
+
+def command_line(sweep: Mapping[str, Any]) -> list[str]:
+    """Return the overrides on the command line of a sweep that change results or times, in order."""
+    found = []
+    for text in _below(sweep, "overrides", "task", list):
+        with suppress(HydraException):
+            key = OverridesParser.create().parse_override(str(text)).key_or_group
+            if key.partition(".")[0] not in WITHOUT_CHANGES:
+                found.append(str(text))
+    return found
 
 
 def sweep_rows(sweep: Mapping[str, Any]) -> dict[str, list[str]]:

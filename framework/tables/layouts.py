@@ -1,7 +1,7 @@
 """Layouts of a comparison: one line per row, one column per sequence, or one group of lines per sequence.
 
-In the layouts with sequences, rows with the same pose source are adjacent, and the highest mean among them is bold.
-Means over fewer runs than the others are not compared.
+In the layouts with sequences, rows with the same pose source are adjacent, and the best mean among them is bold unless
+several rows have it. Means over fewer runs than the others are not compared.
 """
 
 from __future__ import annotations
@@ -11,45 +11,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from framework.runs.run_rows import Mean, RunRow
-from framework.tables.comparison import ComparisonTable, mean_by_sequence, mean_difference, mean_over_sequences
+from framework.tables.comparison import ComparisonTable, mean_by_sequence, mean_over_sequences
 from framework.tables.grid import TextTable, decimals, figure
+from framework.tables.metric_columns import Direction, direction, head
 from framework.tables.published import NOT_KNOWN, Key, PublishedRow
-from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 NOTHING = "–"  # undefined value, such as the AP of a class without objects
 MISSING = "missing"  # value without a complete run
-
-HEADS = {
-    "instances.ap": "AP",
-    "instances.ap25": "AP25",
-    "instances.ap50": "AP50",
-    "instances.ap25_agnostic": "AP25 agnostic",
-    "instances.ap50_agnostic": "AP50 agnostic",
-    "instances.mean_iou": "mean IoU",
-    "instances.count": "instances",
-    **{
-        f"instances.to_map.{key}": f"{name} to map"
-        for key, name in (("ap50", "AP50"), ("ap25", "AP25"), ("ap", "AP"), ("mean_iou", "mean IoU"))
-    },
-    "instances.to_map.ap50_agnostic": "AP50 agnostic, to map",
-    "fps": "Hz",
-    "fps_median": "Hz (median)",
-    "frames_lost": "frames lost",
-    "trajectory.ate_rmse_m": "ATE (m)",
-    "trajectory.rpe_rmse_m": "RPE (m)",
-    "map.bytes": "map (bytes)",
-    "peak_rss_bytes": "peak memory (bytes)",
-    **{f"instances.ap50.{coco}": name for name, coco in SCENENN_TO_COCO.items()},
-}
-"""Column headings by key; all other columns have their key as the heading."""
-
-
-def head(key: str) -> str:
-    """Return the heading of a metric's column, with its unit."""
-    parts = key.split(".")
-    if parts[0] == "stage_ms" and len(parts) == 3:
-        return f"{parts[1]} (ms{'' if parts[2] == 'median' else f', {parts[2]}'})"
-    return HEADS.get(key, key)
 
 
 def row_grid(comparison: ComparisonTable) -> TextTable:
@@ -71,16 +39,18 @@ def row_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def difference_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a table with each row's mean difference from the baseline and its standard error."""
+    """Return a table with each row's mean difference from its base and its standard error."""
     keys, compared = comparison.choice.columns, comparison.compared
-    means = {key: [mean_difference(row.differences(base, key)) for row, base in compared] for key in keys}
+    means = {key: [comparison.difference(row, base, key) for row, base in compared] for key in keys}
     digits = {key: decimals(mean.value for mean in of_key) for key, of_key in means.items()}
     body = []
     for k, (row, base) in enumerate(compared):
-        pairs = set(row.records) & set(base.records)
-        expected = len({run[-1] for run in pairs})
-        cells = [_of(_difference(means[key][k], digits[key]), means[key][k].count, expected) for key in keys]
-        body.append([comparison.called(row), str(len(pairs)), *cells])
+        pairs = len(comparison.common_units(row, base))
+        cells = []
+        for key in keys:
+            significant = comparison.statistics.results[row.name, key].is_significant
+            cells.append(_of(_difference(means[key][k], digits[key], significant), means[key][k].count, pairs))
+        body.append([comparison.called(row), str(pairs), *cells])
     return TextTable([f"minus {comparison.base_called}", "pairs", *map(head, keys)], body)
 
 
@@ -93,7 +63,7 @@ class _Line:
 
     labels: list[str]
     cells: list[_Cell]
-    variant: tuple[str, ...] = ()  # lines with the same variant are compared
+    peers: tuple[str, ...] = ()  # RunRow.peers; lines with the same value are compared
 
 
 class _SequenceFigures:
@@ -101,16 +71,18 @@ class _SequenceFigures:
 
     def __init__(self, comparison: ComparisonTable, key: str) -> None:
         self._rows = comparison.rows
-        self._seeds = len({run[:-1] for row in self._rows for run in row.records})  # expected runs of a sequence
+        self.direction = direction(key)
         self.means = {row.name: mean_by_sequence(row.values(key)) for row in self._rows}
         self._overall = {row.name: mean_over_sequences(row.values(key)) for row in self._rows}
+        self._expected = {sequence: comparison.expected(sequence) for sequence in self.sequences}
+        self.digits = decimals(mean.value for of_row in self.means.values() for mean in of_row.values())
 
     @property
     def sequences(self) -> set[str]:
         """Sequences with a value in at least one row."""
         return {sequence for of_row in self.means.values() for sequence in of_row}
 
-    def cell(self, row: RunRow, sequence: str, digits: int) -> _Cell:
+    def cell(self, row: RunRow, sequence: str) -> _Cell:
         """Return the mean ± standard deviation over the seeds of one sequence.
 
         The number of seeds is appended if values are missing.
@@ -118,21 +90,25 @@ class _SequenceFigures:
         if not any(run[-1] == sequence for run in row.records):
             return MISSING, math.nan
         mean = self.means[row.name].get(sequence, Mean.of(()))
-        found = [self.means[other.name] for other in self._rows if other.variant == row.variant]
+        found = [self.means[other.name] for other in self._rows if other.peers == row.peers]
         most = max((of_row[sequence].count for of_row in found if sequence in of_row), default=0)
-        return _mean_cell(mean, digits, self._seeds), mean.value if mean.count == most else math.nan
+        text = _mean_cell(mean, self.digits, self._expected.get(sequence, 0))
+        return text, mean.value if mean.count == most else math.nan
 
-    def mean_cell(self, row: RunRow, expected: int, digits: int) -> _Cell:
+    def mean_cell(self, row: RunRow, sequences: int) -> _Cell:
         """Return the mean over sequences ± standard deviation over seeds.
 
-        The number of sequences or runs is appended if some of the `expected` sequences or of their runs are missing.
+        The number of sequences or runs is appended if some of the expected `sequences` or of their runs are missing.
         """
         mean = self._overall[row.name]
-        others = [self._overall[other.name] for other in self._rows if other.variant == row.variant]
+        others = [self._overall[other.name] for other in self._rows if other.peers == row.peers]
         competes = (mean.count, mean.runs) == max((other.count, other.runs) for other in others)
-        text = _of(figure(mean.value, mean.deviation, digits), mean.count, expected)
-        if 0 < mean.count == expected and mean.runs < expected * self._seeds:
-            text += f" ({mean.runs} of {expected * self._seeds} runs)"
+        equal_runs = all(of_sequence.deviation == 0 for of_sequence in self.means[row.name].values())
+        spread = math.nan if equal_runs else mean.deviation
+        text = _of(figure(mean.value, spread, self.digits), mean.count, sequences)
+        runs = sum(self._expected.values())
+        if 0 < mean.count == sequences and mean.runs < runs:
+            text += f" ({mean.runs} of {runs} runs)"
         return text, mean.value if competes else math.nan
 
 
@@ -140,99 +116,110 @@ def across_grid(comparison: ComparisonTable) -> TextTable:
     """Return a table of the means of each row over seeds, with one column per sequence and a column with their mean."""
     [key] = comparison.choice.columns
     figures, sequences = _SequenceFigures(comparison, key), comparison.sequences
-    digits = _decimals([figures])
     sections = []
-    for rows in _by_variant(comparison.rows):
+    for rows in _by_peers(comparison.rows):
         section = []
         for row in rows:
-            cells = [figures.cell(row, sequence, digits) for sequence in sequences]
-            cells.append(figures.mean_cell(row, len(sequences), digits))
+            cells = [figures.cell(row, sequence) for sequence in sequences]
+            cells.append(figures.mean_cell(row, len(sequences)))
             section.append(_row_line(comparison, row, cells))
         sections.append(section)
     keys = [(sequence,) for sequence in (*sequences, "mean")]
-    sections.append([_published_line(comparison, one, keys, digits) for one in comparison.published_rows])
-    return _grid([*_labels(comparison, "system"), *sequences, "mean"], sections, digits)
+    columns = [figures] * len(keys)
+    sections.append([_published_line(comparison, one, keys, columns) for one in comparison.published_rows])
+    return _grid([*_labels(comparison, "system"), *sequences, "mean"], sections, columns)
 
 
 def by_grid(comparison: ComparisonTable) -> TextTable:
     """Return a table with one group of lines per sequence, and one line per row. The last group contains the means."""
     keys = comparison.choice.columns
-    rows = [row for rows in _by_variant(comparison.rows) for row in rows]
+    rows = [row for rows in _by_peers(comparison.rows) for row in rows]
     figures = [_SequenceFigures(comparison, key) for key in keys]
-    digits = _decimals(figures)
     begun = {run[-1] for row in rows for run in row.records}
 
     sections: dict[str, list[_Line]] = {}
     for sequence in comparison.sequences:
         known = [one for one in comparison.published_rows if one.has_any((sequence, key) for key in keys)]
         sections[sequence] = [
-            _row_line(comparison, row, [of_key.cell(row, sequence, digits) for of_key in figures])
+            _row_line(comparison, row, [of_key.cell(row, sequence) for of_key in figures])
             for row in rows
             if sequence in begun
-        ] + [_published_line(comparison, one, [(sequence, key) for key in keys], digits) for one in known]
+        ] + [_published_line(comparison, one, [(sequence, key) for key in keys], figures) for one in known]
     sections["mean"] = [
-        _row_line(comparison, row, [of_key.mean_cell(row, len(of_key.sequences), digits) for of_key in figures])
-        for row in rows
+        _row_line(comparison, row, [of_key.mean_cell(row, len(of_key.sequences)) for of_key in figures]) for row in rows
     ]
     titled = [
         [replace(line, labels=[title if k == 0 else "", *line.labels]) for k, line in enumerate(section)]
         for title, section in sections.items()
     ]
-    return _grid([comparison.noun, *_labels(comparison, "system"), *map(head, keys)], titled, digits)
+    return _grid([comparison.noun, *_labels(comparison, "system"), *map(head, keys)], titled, figures)
 
 
 def difference_across_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a table of the baseline minus each other row, by sequence, and their mean with its standard error."""
+    """Return a table of the base minus each other row, by sequence, and their mean with its standard error."""
     [key] = comparison.choice.columns
-    differences = {row.name: base.differences(row, key) for row, base in comparison.compared}
-    paired = {run[-1] for runs in differences.values() for run in runs}
-    sequences = [sequence for sequence in comparison.sequences if sequence in paired]
-    digits = decimals(value for runs in differences.values() for value in runs.values())
+    bases = {row.name: base for row, base in comparison.compared}
+    differences = {row.name: comparison.difference_by_sequence(base, row, key) for row, base in comparison.compared}
+    sequences = [sequence for sequence in comparison.sequences if any(sequence in one for one in differences.values())]
+    digits = decimals(value for of_row in differences.values() for value in of_row.values())
     sections = []
-    for rows in _by_variant([row for row, _ in comparison.compared]):
+    for rows in _by_peers([row for row, _ in comparison.compared]):
         section = []
         for row in rows:
-            means, mean = mean_by_sequence(differences[row.name]), mean_difference(differences[row.name])
-            texts = [figure(means[s].value, math.nan, digits, True) if s in means else MISSING for s in sequences]
-            texts += [_difference(mean, digits) if mean.count else MISSING, str(len(differences[row.name]))]
+            of_row, mean = differences[row.name], comparison.difference(bases[row.name], row, key)
+            texts = [figure(of_row[s], math.nan, digits, True) if s in of_row else MISSING for s in sequences]
+            significant = comparison.statistics.results[row.name, key].is_significant
+            texts += [_difference(mean, digits, significant) if mean.count else MISSING, str(mean.count)]
             section.append(_row_line(comparison, row, [(text, math.nan) for text in texts]))
         sections.append(section)
     heads = [*_labels(comparison, f"{comparison.base_called} minus"), *sequences, "mean", "pairs"]
-    return _grid(heads, sections, digits)
+    return _grid(heads, sections)
 
 
-def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], digits: int) -> TextTable:
+def statistics_grid(comparison: ComparisonTable) -> TextTable:
+    """Return a table with the statistics of each row and column."""
+    base = comparison.base_called
+    rows = {row.name: comparison.called(row) for row, _ in comparison.compared}
+    return comparison.statistics.grid(
+        f"{base} minus" if comparison.choice.columns_by else f"minus {base}",
+        rows,
+        {key: head(key) for key in comparison.choice.columns},
+    )
+
+
+def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], columns: Sequence[_SequenceFigures] = ()) -> TextTable:
+    """Return the sections as a table. The best values of `columns` are bold."""
     lines: list[_Line] = []
     bold: set[tuple[int, int]] = set()
     groups: set[int] = set()
     for section in sections:
         if lines:
             groups.add(len(lines))
-        bold |= {(len(lines) + k, len(section[k].labels) + column) for k, column in _highest(section, digits)}
+        for column, figures in enumerate(columns):
+            best = _best(section, column, figures.direction, figures.digits)
+            bold |= {(len(lines) + k, len(section[k].labels) + column) for k in best}
         lines += section
     body = [[*line.labels, *(text for text, _ in line.cells)] for line in lines]
     return TextTable(heads, body, len(lines[0].labels), frozenset(bold), frozenset(groups))
 
 
-def _highest(section: Sequence[_Line], digits: int) -> Iterator[tuple[int, int]]:
-    """Yield the (line, column) of each highest printed value among the lines of a variant."""
+def _best(section: Sequence[_Line], column: int, better: Direction, digits: int) -> Iterator[int]:
+    """Yield the line of the best printed value of a column among comparable lines, unless it is a tie."""
+    if better is Direction.NONE:
+        return
     for k, line in enumerate(section):
-        competing = [other.cells for other in section if other.variant == line.variant]
-        for column, (_, value) in enumerate(line.cells):
-            values = [round(cells[column][1], digits) for cells in competing if not math.isnan(cells[column][1])]
-            if len(values) > 1 and round(value, digits) == max(values):
-                yield k, column
+        competing = [other.cells[column][1] for other in section if other.peers == line.peers]
+        values = [round(better * value, digits) for value in competing if not math.isnan(value)]
+        own = round(better * line.cells[column][1], digits)
+        if len(values) > 1 and own == max(values) and values.count(own) == 1:
+            yield k
 
 
-def _decimals(figures: Iterable[_SequenceFigures]) -> int:
-    return decimals(mean.value for f in figures for of_row in f.means.values() for mean in of_row.values())
-
-
-def _by_variant(rows: Sequence[RunRow]) -> list[list[RunRow]]:
+def _by_peers(rows: Sequence[RunRow]) -> list[list[RunRow]]:
     """Return groups of comparable rows, in the order of the first row of each group."""
     groups: dict[tuple[str, ...], list[RunRow]] = {}
     for row in rows:
-        groups.setdefault(row.variant, []).append(row)
+        groups.setdefault(row.peers, []).append(row)
     return list(groups.values())
 
 
@@ -243,12 +230,15 @@ def _labels(comparison: ComparisonTable, name: str, poses: str = "poses", annota
 
 def _row_line(comparison: ComparisonTable, row: RunRow, cells: list[_Cell]) -> _Line:
     name = comparison.called(row, without="tracker")
-    return _Line(_labels(comparison, name, row.poses, row.annotation or NOTHING), cells, row.variant)
+    return _Line(_labels(comparison, name, row.poses, row.annotation or NOTHING), cells, row.peers)
 
 
-def _published_line(comparison: ComparisonTable, one: PublishedRow, keys: Iterable[Key], digits: int) -> _Line:
+def _published_line(
+    comparison: ComparisonTable, one: PublishedRow, keys: Iterable[Key], columns: Iterable[_SequenceFigures]
+) -> _Line:
     labels = _labels(comparison, published_name(one), one.poses, one.annotation)
-    return _Line(labels, [(published_cell(one, key, digits), math.nan) for key in keys])
+    cells = [published_cell(one, key, of_key.digits) for key, of_key in zip(keys, columns, strict=True)]
+    return _Line(labels, [(cell, math.nan) for cell in cells])
 
 
 def published_name(published: PublishedRow) -> str:
@@ -265,13 +255,13 @@ def published_cell(published: PublishedRow, key: Key, digits: int) -> str:
 
 
 def _mean_cell(mean: Mean, digits: int, expected: int) -> str:
-    return _of(figure(mean.value, mean.deviation, digits), mean.count, expected)
+    return _of(figure(mean.value, mean.deviation or math.nan, digits), mean.count, expected)
 
 
-def _difference(mean: Mean, digits: int) -> str:
+def _difference(mean: Mean, digits: int, significant: bool) -> str:
     """Return the signed mean ± standard error; * = significantly different from 0."""
-    text = figure(mean.value, mean.error, digits, signed=True)
-    return f"{text} *" if mean.is_not_zero else text
+    text = figure(mean.value, mean.error or math.nan, digits, signed=True)
+    return f"{text} *" if significant else text
 
 
 def _of(text: str, count: int, expected: int) -> str:

@@ -5,15 +5,20 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 from framework.evaluation.instances import MAX_DISTANCE
 from framework.registry import STAGES
 from framework.runs.metrics import is_evaluation
 from framework.runs.plugin_code import CODE
-from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, following
+from framework.runs.run_rows import DATA, Run, RunRow, dependent_keys
 from framework.runs.stored_runs import Record, is_number
-from framework.tables.comparison import ComparisonTable, mean_by_sequence
-from framework.tables.layouts import head
+from framework.tables.comparison import ComparisonTable, as_text
+from framework.tables.metric_columns import Direction, direction, head
+from framework.tables.statistics import ALPHA
+
+OF_RESULTS = ("instances.", "trajectory.", "map.", "frames")  # prefixes of metrics that do not depend on the machine
+MOST_NAMES = 12  # maximum number of sequences that a note names
 
 
 def notes(comparison: ComparisonTable) -> Iterator[str]:
@@ -24,12 +29,17 @@ def notes(comparison: ComparisonTable) -> Iterator[str]:
 
 def _notes(comparison: ComparisonTable) -> Iterator[str]:
     yield from _averaging(comparison)
+    yield from _comparing(comparison)
+    yield from comparison.statistics.notes()
+    yield from _identical(comparison)
     yield from _winners(comparison)
     if comparison.left_out:
         yield f"Omitted columns without values: {_with_needs(comparison.left_out)}."
     if comparison.overrides:
         changes = (f"{name}: {' '.join(changes) or 'none'}" for name, changes in comparison.overrides.items())
         yield f"Overrides of each row: {'; '.join(changes)}."
+    if comparison.command_line:
+        yield f"Command line: {' '.join(comparison.command_line)}."
     if fixed := _same(comparison.records):
         yield f"Common to all runs: {fixed}."
     yield from _protocol(comparison)
@@ -43,33 +53,79 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _averaging(comparison: ComparisonTable) -> Iterator[str]:
-    """Yield notes about the means and the comparison of rows."""
+    """Yield notes about the runs in the table and their means."""
     choice, over = comparison.choice, ", ".join(comparison.choice.average_over)
-    if others := following(comparison.records, choice.average_over):
-        yield f"Also averaged over keys with the same value as {over} in every run: {', '.join(others)}."
-    if choice.split_key:
-        yield (
-            f"Cells: mean ± sample standard deviation over {over}. mean: average of the sequences "
-            f"({choice.split_key}) with equal weights; its standard deviation is computed over the {over} values with "
-            "all sequences. Bold: highest value for the same poses and number of runs. missing: no complete run."
-        )
-    else:
-        yield f"Cells: mean ± sample standard deviation over {over}. runs: number of complete runs."
+    if choice.conditions:
+        yield f"Only runs with {as_text(choice.conditions)}."
+    if others := dependent_keys(comparison.records, choice.averaged, comparison.asked):
+        yield f"Also averaged over keys that depend on {', '.join(choice.averaged)}: {', '.join(others)}."
+    spread = f"mean ± sample standard deviation over {over}, without ± for equal values"
+    if not choice.split_key:
+        yield f"Cells: {spread}. runs: number of complete runs."
+        return
+    yield (
+        f"Cells: {spread}. mean: average over {choice.split_key} with equal weights; its standard deviation is over "
+        f"the runs with all values of {choice.split_key}. {_bold(choice.columns)} missing: no complete run."
+    )
+
+
+def _bold(columns: Sequence[str]) -> str:
+    """Return the meaning of bold cells."""
+    of = {better: [head(key) for key in columns if direction(key) is better] for better in Direction}
+    parts = [f"{word} {', '.join(of[better])}" for better, word in _BEST if of[better]]
+    if not parts:
+        return ""
+    return f"Bold: {'; '.join(parts)} for the same poses and number of runs, unless several rows have it."
+
+
+_BEST = ((Direction.HIGHER, "highest"), (Direction.LOWER, "lowest"))
+
+
+def _comparing(comparison: ComparisonTable) -> Iterator[str]:
+    """Yield notes about the differences between rows."""
+    choice = comparison.choice
     if not comparison.has_base:
-        yield f"No differences: the baseline {comparison.base_name} has no complete run; set table.baseline=ROW."
-    elif len(comparison.rows) > 1:
-        keys = [*choice.average_over, *filter(None, [choice.split_key])]
-        error = "mean ± standard error"
-        if len(keys) > 1:
-            kinds = "the sequences" if choice.split_key else f"the values of {keys[-1]}"
-            error += f" over {kinds}, after averaging the runs of each"
+        yield f"No differences: the base {comparison.base_name} has no complete run; set table.base=ROW."
+    elif not comparison.compared:
+        if len(comparison.rows) > 1:
+            yield "No differences: no two rows have the same data."
+    else:
+        error, units = "mean ± standard error", ", ".join(choice.units)
+        keys = ", ".join(choice.pair_by or choice.averaged)
+        if choice.units != choice.averaged:
+            error += f" over {units}, after averaging the runs of each"
         yield (
-            f"Differences are paired by {', '.join(keys)}: {error}. "
-            f"*: the {CONFIDENCE:.0%} confidence interval (Student's t) excludes 0."
+            f"Differences are paired by {keys}: {error}. pairs: number of values of {units} in both rows. "
+            f"*: p < {ALPHA:.2g} in a paired t-test with Holm's correction."
         )
-        bases = [base for _, base in comparison.compared]
-        if alone := [row.name for row in comparison.rows if not (comparison.base_of(row) or row in bases)]:
-            yield f"Rows without a matching baseline row ({comparison.base_name}): {'; '.join(alone)}."
+        paired = {one.name for pair in comparison.compared for one in pair}
+        if alone := [row.name for row in comparison.rows if row.name not in paired]:
+            yield f"Rows without a matching base row ({comparison.base_called}): {'; '.join(alone)}."
+
+
+def _identical(comparison: ComparisonTable) -> Iterator[str]:
+    """Yield notes about averaged keys and rows without an effect on the results."""
+    for k, key in enumerate(comparison.choice.averaged):
+        if rows := [comparison.called(row) for row in comparison.rows if _has_no_effect(row, k)]:
+            yield f"Identical runs: the results do not depend on {key} in {'; '.join(rows)}."
+    for row, base in comparison.compared:
+        runs = row.records.keys() & base.records.keys()
+        if runs and all(_results(row.records[run]) == _results(base.records[run]) for run in runs):
+            yield f"Identical rows: the results of {comparison.called(row)} equal those of {base.name}."
+
+
+def _has_no_effect(row: RunRow, place: int) -> bool:
+    """Return True if runs that differ only in one averaged key have equal results, and there are such runs."""
+    groups: dict[Run, list[dict[str, Any]]] = {}
+    for run, record in row.records.items():
+        groups.setdefault((*run[:place], *run[place + 1 :]), []).append(_results(record))
+    several = [results for results in groups.values() if len(results) > 1]
+    return bool(several) and all(one == results[0] for results in several for one in results)
+
+
+def _results(record: Record) -> dict[str, Any]:
+    """Return the metrics that do not depend on the machine."""
+    return {key: value for key, value in record.metrics.items() if key.startswith(OF_RESULTS)}
 
 
 def _with_needs(columns: Sequence[str]) -> str:
@@ -82,17 +138,17 @@ def _with_needs(columns: Sequence[str]) -> str:
 
 
 def _winners(comparison: ComparisonTable) -> Iterator[str]:
-    """Yield, for each row, the numbers of sequences in which the baseline has a higher and a lower value."""
+    """Yield, for each row, the numbers of sequences in which the base has a higher and a lower value."""
     if not comparison.choice.columns_by:
         return
     [key] = comparison.choice.columns
     for row, base in comparison.compared:
-        means = mean_by_sequence(base.differences(row, key))
-        lost = [sequence for sequence in comparison.sequences if sequence in means and means[sequence].value < 0]
-        won = sum(mean.value > 0 for mean in means.values())
+        found = comparison.difference_by_sequence(base, row, key)
+        lost = [sequence for sequence in comparison.sequences if found.get(sequence, 0) < 0]
+        won = sum(difference > 0 for difference in found.values())
         yield (
             f"{comparison.base_called} compared with {comparison.called(row, without='tracker')}, {row.poses}: "
-            f"higher in {won} of {len(means)} sequences, lower in {len(lost)}{': ' + ', '.join(lost) if lost else ''}."
+            f"higher in {won} of {len(found)} sequences, lower in {len(lost)}{': ' + ', '.join(lost) if lost else ''}."
         )
 
 
@@ -131,7 +187,7 @@ def _missing(comparison: ComparisonTable) -> Iterator[str]:
     run_of = {run[-1] for row in comparison.rows for run in row.records}
     if absent := [sequence for sequence in comparison.sequences if sequence not in run_of]:
         yield f"Sequences without a complete run: {comparison.choice.split_key}={','.join(absent)}."
-    keys = [*comparison.choice.average_over, *filter(None, [comparison.choice.split_key])]
+    keys = comparison.choice.averaged
     for row, missing in comparison.missing():
         yield f"Missing in {row.name}: {_as_overrides(keys, missing)}."
     if comparison.superseded:
@@ -143,13 +199,13 @@ def _missing(comparison: ComparisonTable) -> Iterator[str]:
 def _mixed_code(comparison: ComparisonTable) -> Iterator[str]:
     """Yield a note for each row whose runs have different code of the same option."""
     for row in comparison.rows:
-        codes: dict[tuple[str, str], list[str]] = {}  # by stage and its option
-        for record in row.records.values():
-            for key in filter(lambda key: key.startswith(CODE), record.metrics):
-                stage = key.removeprefix(CODE)
-                option = str(record.metrics.get(f"{CHOICE}{stage}"))
-                codes.setdefault((stage, option), []).append(str(record.metrics[key]))
-        if mixed := [f"{stage} {counted(found)}" for (stage, _), found in sorted(codes.items()) if len(set(found)) > 1]:
+        records = row.records.values()
+        codes: dict[tuple[str, str | None], list[str]] = {}  # by stage and its option
+        for key in sorted({key for record in records for key in record.metrics if key.startswith(CODE)}):
+            stage = key.removeprefix(CODE)
+            for record in records:
+                codes.setdefault((stage, record.choices.get(stage)), []).append(str(record.metrics.get(key)))
+        if mixed := [f"{stage} {counted(found)}" for (stage, _), found in codes.items() if len(set(found)) > 1]:
             yield f"Mixed plugin code in {row.name}: {'; '.join(mixed)}; repeat its runs with skip_completed=true."
 
 
@@ -164,20 +220,27 @@ def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
 
 def _same(records: Sequence[Record]) -> str:
     """Return the config options that all runs have in common, as stage=option."""
-    chosen = {stage: {record.metrics.get(f"{CHOICE}{stage}") for record in records} for stage in STAGES}
+    chosen = {stage: {record.choices.get(stage) for record in records} for stage in STAGES}
     agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}
     return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
 
 
 def data(records: Sequence[Record]) -> str:
-    """Return the datasets with their annotation releases, and the range of frame counts."""
+    """Return the datasets with their folders and annotation releases, the sequences, and the range of frame counts."""
     names = (
-        f"{record.metrics.get(f'{CHOICE}dataset')}{record.annotation and f', annotation {record.annotation}'}"
+        record.choices.get("dataset", "unknown")
+        + (f" in {root}" if (root := record.parameters.get(DATA)) else "")
+        + (f", annotation {record.annotation}" if record.annotation else "")
         for record in records
     )
+    parts = [f"dataset={counted(names)}"]
+    sequences = dict.fromkeys(str(record.metrics["sequence"]) for record in records if "sequence" in record.metrics)
+    if sequences:
+        shown = ", ".join(list(sequences)[:MOST_NAMES])
+        parts.append(f"sequences {shown}" + (f" and {more} more" if (more := len(sequences) - MOST_NAMES) > 0 else ""))
     frames = sorted(number for record in records if is_number(number := record.metrics.get("frames")))
     lengths = dict.fromkeys(f"{number:g}" for number in frames[:1] + frames[-1:])
-    return f"dataset={counted(names)}" + (f"; {' to '.join(lengths)} frames per run" if frames else "")
+    return "; ".join(parts + ([f"{' to '.join(lengths)} frames per run"] if frames else []))
 
 
 def machine(record: Record) -> str:

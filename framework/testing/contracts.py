@@ -29,6 +29,7 @@ from framework.testing.corner_room import (
     bleeding_clusters,
     exact_clusters,
     frame_at,
+    misleading,
     pose_at,
     spheres_in,
 )
@@ -110,6 +111,14 @@ class DetectorContract:
         detector = self.plugin()
         frame = frame_at(0)
         assert_valid(detector.detect(frame), detector, frame)
+        assert same(frame, frame_at(0)), "the frame was changed"
+
+    def test_detector_uses_ground_truth_only_if_required(self) -> None:
+        """A detector that depends on ground truth is unusable without it, so that it is not mistaken for a real one."""
+        detector = self.plugin()
+        frame = frame_at(0)
+        if not same(detector.detect(frame), detector.detect(misleading(frame))):
+            assert_data_error(lambda: detector.detect(frame_at(0, truth=False)), "truth")
 
     def test_detector_does_not_depend_on_frame_order(self) -> None:
         detector = self.plugin()
@@ -176,9 +185,32 @@ class TrackerContract:
         tracker = self.plugin()
         scene = RoomMap()
         for k in range(6):
-            pose = tracker.track(frame_at(k), scene)
+            frame = frame_at(k)
+            pose = tracker.track(frame, scene)
             assert isinstance(pose, Pose)  # a Pose is always rigid
             assert not pose.lost or pose.reason
+            assert same(frame, frame_at(k)), "the frame was changed"
+
+    def test_tracker_pose_source_is_correct(self) -> None:
+        """With the pose source `ground_truth`, poses are those of the frames. Other trackers use only the first one."""
+        tracker, misled = self.plugin(), self.plugin()
+        scene = RoomMap()
+        for k in range(4):
+            frame = frame_at(k) if k == 0 else misleading(frame_at(k))
+            pose = misled.track(frame, scene)
+            if misled.pose_source == "ground_truth":
+                given = frame.T_world_camera
+                assert given is not None
+                assert pose.lost or np.array_equal(pose.T_world_camera, given)
+            else:
+                expected = tracker.track(frame_at(k), scene)
+                np.testing.assert_allclose(
+                    pose.T_world_camera,
+                    expected.T_world_camera,
+                    atol=1e-6,  # m; sums in several threads differ by about 1e-8
+                    err_msg="the pose depends on the ground truth; set pose_source = 'ground_truth'",
+                )
+                assert pose.lost == expected.lost
 
     def test_tracker_first_pose_equals_ground_truth(self) -> None:
         pose = self.plugin().track(frame_at(4), RoomMap())
@@ -223,7 +255,14 @@ class RefinerContract:
         assert len(np.unique(of_one, axis=0)) == len(of_one), "duplicate pixel in a cluster"
         assert refined.classes == clusters.classes
         assert all(np.array_equal(before[name], value) for name, value in vars(clusters).items()), "input was changed"
+        assert same(frame, frame_at(1)), "the frame was changed"
         assert (refined.cluster >= 0).any(), "all points of two complete spheres were removed"
+
+    def test_refiner_does_not_depend_on_ground_truth(self) -> None:
+        refiner = self.plugin()
+        frame = frame_at(1)
+        clusters = bleeding_clusters(frame)
+        assert same(refiner.refine(clusters, frame), refiner.refine(clusters, misleading(frame)))
 
     def test_refiner_is_repeatable(self) -> None:
         refiner = self.plugin()
@@ -302,6 +341,15 @@ class FuserContract:
         length = np.linalg.norm(view.normals_world[view.depth > 0], axis=1)
         np.testing.assert_allclose(length, 1, atol=1e-3)
         assert not view.normals_world[view.depth == 0].any()
+
+    def test_fuser_does_not_depend_on_ground_truth(self) -> None:
+        fuser, misled = self.plugin(), self.plugin()
+        for k in range(3):
+            frame = frame_at(k)
+            fuser.fuse(frame, Pose(pose_at(k)), exact_clusters(frame))
+            misled.fuse(misleading(frame), Pose(pose_at(k)), exact_clusters(frame))
+            assert same(frame, frame_at(k)), "the frame was changed"
+        assert same(fuser.scene.mesh(), misled.scene.mesh())
 
     def test_fuser_instances_match_mesh(self) -> None:
         scene = fused(self.plugin()).scene

@@ -27,6 +27,7 @@ from framework.data import (
     UInt8,
     View,
 )
+from framework.detection.masks.binary_masks import tight_boxes
 from framework.errors import DataError
 from framework.geometry import exp_se3
 from framework.interfaces import MapStatistics, SceneMap
@@ -85,16 +86,27 @@ def frame_at(k: int, truth: bool = True) -> Frame:
     return Frame(k, k / RATE, color, depth, CAMERA, pose_at(k), FrameTruth(ids, dict(enumerate(CLASSES, start=1))))
 
 
+def misleading(frame: Frame) -> Frame:
+    """Return the frame with a wrong ground-truth pose, 10 cm and 6 degrees off, and exchanged instances.
+
+    A plugin that must not depend on the ground truth has the same result for both frames. Raises DataError for a frame
+    without ground truth.
+    """
+    if frame.T_world_camera is None or frame.truth is None:
+        raise DataError(f"frame {frame.index}: expected ground truth, got none; pass frame_at(k, truth=True)")
+    wrong = exp_se3(np.array([0.1, 0.0, 0.0, 0.0, 0.1, 0.0])) @ frame.T_world_camera
+    ids = frame.truth.instance_ids
+    exchanged = FrameTruth(np.where(ids > 0, len(CLASSES) + 1 - ids, 0).astype(np.int32), frame.truth.class_names)
+    return replace(frame, T_world_camera=wrong, truth=exchanged)
+
+
 def spheres_in(frame: Frame) -> Detections:
     """Return the ground-truth masks of both spheres. Raises DataError for a frame without ground-truth instances."""
     if frame.truth is None:
         raise DataError(f"frame {frame.index}: expected ground-truth instances, got none; choose another detector")
     masks = frame.truth.instance_ids == np.array([1, 2], np.int32)[:, None, None]
-    boxes = [
-        [u.min(), v.min(), u.max() + 1, v.max() + 1] if len(u) else [0, 0, 0, 0] for v, u in map(np.nonzero, masks)
-    ]
     sure = np.array([[0.9, 0.1], [0.2, 0.8]], np.float32)
-    return Detections(masks, np.array(boxes, np.float32), sure.max(1), sure, CLASSES)
+    return Detections(masks, tight_boxes(masks), sure.max(1), sure, CLASSES)
 
 
 def exact_clusters(frame: Frame) -> PointClusters:

@@ -136,19 +136,26 @@ def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detect
     """Show the frames, with their detections, as a run does. Frame LOST is lost, and frame SKIPPED is skipped."""
     with scene.call():
         viewer.begin(scene, "a room", directory)
-    for k, (frame, found) in enumerate(frames):
+    shown = [shown_with(k) for k in range(len(frames))]
+    for k, ((frame, found), (pose, stage_ms)) in enumerate(zip(frames, shown, strict=True)):
         with scene.call():
             if k == SKIPPED:
                 viewer.skip(f"frame {k} cannot be read")
-            elif k == LOST:
-                lost = Pose(pose_at(k), lost=True, reason="too dark")
-                viewer.show(
-                    frame, found, lost, {stage: STAGE_MS[stage] for stage in ("reading", "detection", "tracking")}
-                )
             else:
-                viewer.show(frame, found, Pose(pose_at(k)), STAGE_MS)
+                viewer.show(frame, found, pose, stage_ms)
     with scene.call():
         viewer.end()
+    for k, (pose, stage_ms) in enumerate(shown):
+        assert same(pose, shown_with(k)[0]), "the pose was changed"
+        assert stage_ms == shown_with(k)[1], "the stage times were changed"
+
+
+def shown_with(k: int) -> tuple[Pose, dict[str, float]]:
+    """Return the pose and the stage times of frame k."""
+    if k == LOST:
+        timed = ("reading", "detection", "tracking")
+        return Pose(pose_at(k), lost=True, reason="too dark"), {stage: STAGE_MS[stage] for stage in timed}
+    return Pose(pose_at(k)), dict(STAGE_MS)
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:

@@ -28,7 +28,7 @@ from framework.detection.mask_rcnn.network_file import Fact, load_network, save_
 from framework.detection.mask_rcnn.resnet import DEPTHS, ResNetShape
 from framework.detection.runtimes.device import torch_device
 from framework.errors import ConfigError
-from framework.evaluation.mask_ap import MaskAp, mask_ap
+from framework.evaluation.detection_ap import AveragePrecision, detection_ap
 from framework.files.atomic_write import atomic_write
 from framework.interfaces import Detector
 from framework.registry import build
@@ -45,7 +45,7 @@ HELD_OUT = 1_000_000  # number of the first held-out room
 NETWORK, PRECISION = "network.safetensors", "average_precision.json"
 
 
-def train(config: DictConfig, folder: Path) -> MaskAp:
+def train(config: DictConfig, folder: Path) -> AveragePrecision:
     """Render missing rooms, run the remaining training steps, and return the mask AP on the held-out rooms.
 
     `folder`: output folder; training resumes from its checkpoint, if any.
@@ -79,9 +79,9 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
     save_network(trainer.trained(), weights, card, half=True)
     node = {"_target_": DETECTOR, "weights": str(weights.absolute()), "device": device}
     detector = build(Detector, OmegaConf.create(node))
-    precision = mask_ap(
+    precision = detection_ap(
         _detected(detector, RoomPictures(rooms, HELD_OUT, wanted.held_out)), detector.classes, MIN_PIXELS
-    )
+    ).masks
     card |= _known({"held_out_rooms": wanted.held_out, "mask_ap50": precision.ap50, "mask_ap": precision.ap})
     save_network(trainer.trained(), weights, card, half=True)
     with atomic_write(folder / PRECISION) as path:

@@ -24,7 +24,7 @@ from framework.registry import (
     plugin_fields,
 )
 from framework.runs.provenance import WITHOUT_EFFECT
-from framework.tables.comparison import TableChoice
+from framework.tables.table_choice import TableChoice
 from framework.training.trainer import Schedule
 from tests.support import registered
 
@@ -137,6 +137,6 @@ def test_sweep_run_names_exclude_keys_without_effect() -> None:
     for name, choice in (("table", TableChoice), ("figure", FigureChoice)):
         shown |= {f"{name}.{field.name}" for field in dataclasses.fields(choice)}
     assert shown - {"viewer._target_"} == {key for key in left_out if "." in key}
-    tells_runs_apart, no_key_of_the_config = {"hydra", "row", "rows", "sequences"}, {"experiment", "launcher"}
+    tells_runs_apart, no_key_of_the_config = {"hydra", "row", "rows", "sequences"}, {"experiment", "launcher", "out"}
     whole = {key for key in left_out if "." not in key}
     assert set(WITHOUT_EFFECT) - tells_runs_apart == whole - no_key_of_the_config

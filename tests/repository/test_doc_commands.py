@@ -19,7 +19,12 @@ from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
 
 pytestmark = pytest.mark.integration
 
-EXECUTED = ["for frame in sequence", "for frame in frames:", "class ColorBlobs"]  # executed in test_readme.py
+EXECUTED = [
+    "for frame in sequence",
+    "for frame in frames:",
+    "class ColorBlobs",
+    "load_runs(",
+]  # executed in test_readme.py
 CONTRACT = block("python", "class TestMyRefiner")
 PARSED = [line for line in LINES if line.startswith("python -m framework ") and line.split()[3] in main.COMMANDS]
 

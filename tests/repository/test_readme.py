@@ -25,6 +25,7 @@ from framework.pipeline import Pipeline
 from framework.refinement.lifting import lift
 from framework.registry import STAGES, build
 from framework.runs.mesh_file import read_mesh
+from tests.support import stored_experiments
 from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
 from tests.support.recordings.phone_exports import room_frames, write_stray_scanner
 from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
@@ -55,6 +56,17 @@ def test_documented_python_example_maps_frames(tmp_path: Path, monkeypatch: pyte
     scene = names["scene"]
     assert isinstance(scene, Map)
     assert len(scene.mesh().vertices) > 1000
+
+
+def test_documented_data_frame_has_means_of_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stored_experiments.experiment(tmp_path / "outputs" / "ablation_refiner", {"chain": [0.5, 0.7], "identity": [0.25]})
+    monkeypatch.chdir(tmp_path)
+    exec(block("python", "load_runs("), {})
+    chain, identity = capsys.readouterr().out.splitlines()[-2:]
+    assert chain.split()[:3] == ["chain", "0.60", "0.141421"]
+    assert identity.split()[:2] == ["identity", "0.25"]
 
 
 def test_contributing_paths_exist() -> None:

@@ -17,7 +17,7 @@ from framework.evaluation.instances import Transfer
 from framework.runs.metrics import MAIN_FIGURES
 from framework.runs.reevaluation import Reevaluation, Truth, dataset_of
 from framework.runs.stored_runs import Record, find_records
-from framework.tables.layouts import head
+from framework.tables.metric_columns import head
 
 REFUSED = "refused: "  # prefix of an error
 

@@ -17,7 +17,6 @@ from framework.commands.command_line import EXIT_FAILED, KNOWN_ERRORS, arguments
 from framework.errors import ConfigError, DataError
 from framework.runs.reproduction import Reproduction, causes
 from framework.runs.run_bundle import opened_bundle
-from framework.runs.run_rows import CHOICE
 from framework.runs.stored_runs import METRICS, Record, find_records, no_run_error, read_record
 
 
@@ -118,5 +117,4 @@ def _run_again(record: Record, overrides: Sequence[str], directory: Path) -> Non
             config.merge_with_dotlist([override])
         except OmegaConfBaseException as error:
             raise ConfigError(f"{override}: expected KEY=VALUE with a key of the run's config, got another") from error
-    choices = {key.removeprefix(CHOICE): value for key, value in record.metrics.items() if key.startswith(CHOICE)}
-    run(config, directory, choices)
+    run(config, directory, record.choices)

@@ -6,7 +6,8 @@ experiment therefore sweeps over the key `row`, and each job adds the overrides 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from math import prod
 
@@ -20,6 +21,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from framework.config.composition import config_loader
 from framework.config.validation import checked_rows
 from framework.errors import ConfigError
+from framework.runs.provenance import OF_SPEED, leaves, relevant
+from framework.runs.stored_runs import GROUPS
 
 GLOB_COUNT = 1_000_000  # assumed upper bound on the number of values of a glob(), which Hydra resolves later
 COUNTED = (ValueType.SIMPLE_CHOICE_SWEEP, ValueType.CHOICE_SWEEP, ValueType.RANGE_SWEEP)
@@ -40,7 +43,7 @@ def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, C
     if not rows:
         return config, choices
     from framework.figures.figure_choice import FigureChoice
-    from framework.tables.comparison import TableChoice
+    from framework.tables.table_choice import TableChoice
 
     TableChoice.of(config.table)
     if config.get("figure") is not None:
@@ -71,10 +74,53 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
     return prod(runs.values())
 
 
+def check_table(config: DictConfig, overrides: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
+    """Raise ConfigError for an invalid `table` of a sweep, such as an unknown key.
+
+    A key may exist only with one of the swept options or rows. These are composed if the key is not found otherwise.
+    """
+    table = config.get("table")
+    if table is None:
+        return
+    from framework.tables.table_choice import TableChoice
+
+    choice = TableChoice.of_sweep(OmegaConf.to_container(table) if OmegaConf.is_config(table) else table)
+    choice.check_base(rows)
+    known = {*_keys_of(config), *swept_keys(overrides), *GROUPS, *(["row"] if rows else [])}
+    for alternative in _alternatives(overrides, rows):
+        if not choice.unknown(known):
+            break
+        with suppress(HydraException), config_loader() as loader:  # its job reports the error
+            known |= _keys_of(loader.compose([*single_run(overrides), *alternative]))
+    choice.check_keys(known)
+
+
+def _keys_of(config: DictConfig) -> set[str]:
+    """Return the keys of a config that describe a run."""
+    content = OmegaConf.to_container(config)
+    assert isinstance(content, dict)
+    plain = {str(key): value for key, value in content.items()}
+    return {*dict(leaves(relevant(plain))), *OF_SPEED}
+
+
+def _alternatives(overrides: Sequence[str], rows: Mapping[str, Sequence[str]]) -> Iterator[list[str]]:
+    """Yield the overrides of each row, and of each option of a swept group."""
+    yield from map(list, rows.values())
+    for override in _parsed(overrides):
+        if override.is_sweep_override() and "." not in override.key_or_group:
+            yield from ([f"{override.get_key_element()}={value}"] for value in _values(override))
+
+
 def swept_keys(overrides: Sequence[str]) -> set[str]:
     """Return the swept keys and config groups. The last override of a key takes precedence."""
     last = {override.key_or_group: override for override in _parsed(overrides)}
     return {key for key, override in last.items() if override.is_sweep_override()}
+
+
+def of_tables(overrides: Sequence[str]) -> list[str]:
+    """Return the keys of overrides of the table and figure, such as table.where.dataset."""
+    keys = [override.key_or_group for override in _parsed(overrides)]
+    return [key for key in keys if key.startswith(("table.", "figure."))]
 
 
 def check_row(chosen: Sequence[str], rows: Collection[str]) -> None:

@@ -19,7 +19,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.commands.running.choices import checked_sweep, swept_keys
+from framework.commands.running.choices import check_table, checked_sweep, of_tables, swept_keys
 from framework.config.composition import one_line
 from framework.config.validation import checked_rows
 from framework.errors import ConfigError, InstanceMapError
@@ -99,10 +99,11 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
     would then end all workers.
     """
     own = config.hydra
-    swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
-    overrides = [*swept, *own.overrides.task]
-    runs = checked_sweep(overrides, checked_rows(config.get("rows")))
-    _name_by(own, swept_keys(overrides))
+    overrides, rows = overrides_of(own), checked_rows(config.get("rows"))
+    runs = checked_sweep(overrides, rows)
+    if with_table:
+        check_table(config, overrides, rows)
+    _name_by(own, swept_keys(overrides), of_tables(overrides))
     workers = 0
     if by_joblib(own):
         workers = min(joblib_workers(own.launcher.n_jobs), runs)
@@ -112,14 +113,20 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
     return sweep_in(directory, with_table, config.get("figure") is not None, workers > 1)
 
 
-def _name_by(own: DictConfig, keys: Collection[str]) -> None:
-    """Include swept keys in the names of job directories, even if they do not affect results.
+def overrides_of(own: DictConfig) -> list[str]:
+    """Return the overrides of a sweep: first those of the experiment, then those of the command line."""
+    swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
+    return [*swept, *own.overrides.task]
+
+
+def _name_by(own: DictConfig, swept: Collection[str], of_outputs: Collection[str]) -> None:
+    """Include swept keys in the names of job directories, even if they do not affect results, and omit `of_outputs`.
 
     Otherwise, jobs that differ only in such keys would share a directory. The function extends Hydra's overrides,
     because workers compose each job again from them.
     """
     left_out = [*own.job.config.override_dirname.exclude_keys]
-    still = [key for key in left_out if key not in keys]
+    still = [*(key for key in left_out if key not in swept), *(key for key in of_outputs if key not in left_out)]
     if still != left_out:
         with flag_override(own, ["readonly", "struct"], [False, False]):
             own.overrides.hydra.append(f"hydra.job.config.override_dirname.exclude_keys=[{','.join(still)}]")

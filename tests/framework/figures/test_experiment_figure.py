@@ -125,8 +125,17 @@ def test_map_figure_has_sequences_as_lines_and_rows_as_columns(maps: Path) -> No
     assert found.count("2 instances") == 2
     assert found.count("incomplete") == 1
     [note] = [text for text in found if text.startswith("An object")]
-    for message in ("Annotation: made up.", "2 cores of Z80", "code 1234567."):
+    for message in ("Data: dataset=unknown, annotation made up", "2 cores of Z80", "code 1234567."):
         assert message in " ".join(note.split())
+
+
+def test_figure_note_names_overrides_and_data(maps: Path) -> None:
+    sweep = OmegaConf.load(maps / "multirun.yaml")
+    task = ["experiment=figure4_progress", "dataset.stride=3", "figure.zoom=true", "launcher=joblib", "seed=0"]
+    (maps / "multirun.yaml").write_text(OmegaConf.to_yaml({**sweep, "hydra": {"overrides": {"task": task}}}))
+    [note] = [text for text in texts(maps) if text.startswith("An object")]
+    expected = "annotation made up; 8 to 20 frames per run. Command line: dataset.stride=3 seed=0. 2 cores"
+    assert expected in " ".join(note.split())
 
 
 def test_map_figure_omits_damaged_maps_and_missing_truth(maps: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from scipy import stats
 
-from framework.runs.run_rows import Mean, RunRow, following, rows_of
+from framework.runs.run_rows import Mean, RunRow, dependent_keys, rows_of
 from framework.runs.stored_runs import Record
 
 AP = "instances.ap50"
@@ -40,45 +39,12 @@ def test_mean_of_fewer_than_two_values_has_nan_deviation() -> None:
     one, none = Mean.of([4.0]), Mean.of([])
     assert (one.value, one.count, none.count) == (4.0, 1, 0)
     assert all(map(math.isnan, (one.deviation, one.error, none.value, none.deviation, none.error)))
-    assert not one.is_not_zero
-    assert not none.is_not_zero
-
-
-def test_row_differences_are_paired() -> None:
-    """Rooms differ by 0.5 and rows by 0.1, so only paired differences are significant."""
-    base, other = row("a", seed0=0.1, seed1=0.6, seed2=0.9), row("b", seed0=0.2, seed1=0.7, seed3=0.0)
-    difference = Mean.of(other.differences(base, AP).values())
-    assert difference.count == 2
-    assert difference.value == pytest.approx(0.1)
-    assert difference.error == pytest.approx(0, abs=1e-12)
-    assert other.mean(AP).value == pytest.approx(0.3)
 
 
 def test_row_values_skip_undefined_metrics() -> None:
     expected = row("a", seed0=0.4, seed1=None, seed2="many", seed3=True, seed4=math.nan, seed5=1, seed6=10**400)
     assert expected.values(AP) == {("0",): 0.4, ("5",): 1.0}
     assert expected.mean("no.such.key").count == 0
-    assert expected.differences(row("b", seed0=None), AP) == {}
-
-
-def test_is_not_zero_matches_paired_t_test() -> None:
-    rng = np.random.default_rng(0)
-    stars = []
-    for _ in range(40):
-        a = rng.normal(0, 1, 5)
-        b = a + rng.normal(0.6, 0.5, 5)
-        mean = Mean.of(b - a)
-        assert mean.is_not_zero == (stats.ttest_rel(b, a).pvalue < 0.05)
-        stars.append(mean.is_not_zero)
-    assert 5 < sum(stars) < 35
-
-
-def test_is_not_zero_is_false_for_equal_differences() -> None:
-    """Equal differences have no spread, so their significance is undefined."""
-    assert not Mean.of([2.0, 2.0]).is_not_zero
-    assert not Mean.of([0.7 - 0.6, 0.2 - 0.1]).is_not_zero, (
-        "expected no significance: the differences are equal except for rounding"
-    )
 
 
 def test_rows_keep_experiment_order_and_sort_seeds() -> None:
@@ -164,18 +130,25 @@ def test_rows_accept_numeric_names() -> None:
     assert list(names(records, "0", "20")) == ["0", "20"]
 
 
-def test_following_lists_parameters_that_vary_with_seed() -> None:
+def test_dependent_keys_list_parameters_that_vary_with_seed() -> None:
     records = [
         record({"seed": seed, "dataset": {"seed": seed, "stride": seed, "start": 1}, "fuser": {"voxel": 1}})
         for seed in (1, 2)
     ]
-    assert following(records, ["seed"]) == ["dataset.stride"]
-    assert following(records[:1], ["seed"]) == []
+    assert dependent_keys(records, ["seed"]) == ["dataset.stride"]
+    assert dependent_keys(records[:1], ["seed"]) == []
 
 
 def test_row_names_include_dataset_root_differences() -> None:
     records = [record({"row": row, "seed": 0, "dataset": {"root": f"/{row}", "stride": 1}}) for row in "ab"]
     changes = {"a": [], "b": ["dataset.stride=2"]}
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.root=/a", "b, dataset.root=/b"]
+
+
+def test_row_names_include_folder_of_datasets_that_rows_override() -> None:
+    """Rows on other data have no common variant, so that they are not compared."""
+    records = [record({"row": row, "seed": 0, "dataset": {"root": f"/{row}"}}, dataset=row) for row in "ab"]
+    changes = {"a": [], "b": ["dataset=b"]}
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.root=/a", "b, dataset.root=/b"]
 
 
@@ -212,3 +185,56 @@ def test_rows_of_presets_have_distinct_names() -> None:
     ]
     changes = {"default": ["preset=default"], "paper": ["preset=paper"]}
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["default", "paper"]
+
+
+def of_two_datasets() -> list[Record]:
+    """Return runs of two rows on two datasets, each with its own detector and annotation."""
+    data = (("desk", {"root": "/d", "scene": "a"}, "net"), ("rooms", {"kind": "STUDIO"}, "simulated"))
+    found = [
+        record({"seed": 0, "dataset": node, "detector": {"name": net}}, dataset=name, detector=net, refiner=refiner)
+        for refiner in ("chain", "identity")
+        for name, node, net in data
+    ]
+    return [replace(one, metrics={**one.metrics, "annotation_release": one.choices["dataset"]}) for one in found]
+
+
+def test_rows_average_over_datasets() -> None:
+    """The parameters of a dataset and the detector that it sets depend on it."""
+    records = of_two_datasets()
+    asked = {"dataset", "refiner"}
+    rows = rows_of(records, ["seed", "dataset"], asked=asked)
+    runs = [("0", "desk"), ("0", "rooms")]
+    assert {row.name: list(row.records) for row in rows} == {"refiner=chain": runs, "refiner=identity": runs}
+    assert dependent_keys(records, ["seed", "dataset"], asked) == ["annotation", "detector"]
+
+
+@pytest.mark.parametrize("asked", [None, {"dataset", "refiner", "detector"}])
+def test_rows_split_by_detector_unless_dataset_sets_it(asked: set[str] | None) -> None:
+    rows = rows_of(of_two_datasets(), ["seed", "dataset"], asked=asked)
+    assert [list(row.records) for row in rows] == [[("0", "desk")]] * 2 + [[("0", "rooms")]] * 2
+
+
+def test_rows_average_over_annotations_of_datasets() -> None:
+    records = [
+        Record(Path(), {"choice.dataset": name, "annotation_release": name}, {"seed": 0}, 0.0) for name in ("a", "b")
+    ]
+    assert len(rows_of(records, ["dataset"])) == 1
+    assert len(rows_of(records, ["seed"])) == 2
+
+
+def test_rows_split_by_parameter_that_varies_within_dataset() -> None:
+    records = [record({"seed": 0, "dataset": {"stride": stride}}, dataset=name) for name in "ab" for stride in (1, 2)]
+    found = names(records, over=("dataset",))
+    assert found == {"dataset.stride=1": [("a",), ("b",)], "dataset.stride=2": [("a",), ("b",)]}
+
+
+def test_rows_share_data_of_equal_sequence_and_ground_truth() -> None:
+    def of(scene: str, truth: str = "t", stride: int = 1) -> RunRow:
+        config = {"dataset": {"scene": scene, "stride": stride}}
+        one = record(config, dataset="scenenn")
+        return RunRow("", {("0",): Record(one.directory, {**one.metrics, "truth_sha256": truth}, config, 0.0)})
+
+    assert of("011").shares_data(of("011", stride=4))
+    assert not of("011").shares_data(of("016"))
+    assert not of("011").shares_data(of("011", truth="u"))
+    assert not of("011").shares_data(RunRow("", {("1",): record({})}))

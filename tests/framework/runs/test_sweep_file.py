@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from framework.errors import ConfigError
-from framework.runs.sweep_file import requested_runs, sweep_rows
+from framework.runs.sweep_file import asked_keys, command_line, requested_runs, sweep_rows
 
 
 def sweep(params: Any, task: Any) -> dict[str, Any]:
@@ -77,3 +77,23 @@ def test_requested_runs_limits_large_ranges() -> None:
 )
 def test_requested_runs_unresolvable_sweep_is_empty(config: dict[str, Any]) -> None:
     assert requested_runs(config, ["seed"]) == []
+
+
+def test_command_line_omits_settings_without_effect() -> None:
+    chosen = [
+        "experiment=x",
+        "row=a,b",
+        "table.columns=[fps]",
+        "+table.where.dataset=desk",
+        "viewer=rerun",
+        "debug=true",
+    ]
+    kept = ["dataset.stride=3", "seed=0,1", "threads=1", "sequences=replica", "~preset"]
+    assert command_line(sweep({"seed": "0"}, [*chosen, *kept])) == kept
+    assert command_line({}) == []
+
+
+def test_asked_keys_are_those_of_sweeper_and_command_line() -> None:
+    asked = sweep({"row": "a,b", "dataset.scene": "011"}, ["refiner=x,y", "+fuser.new=1", "seed=0"])
+    assert asked_keys(asked) == {"row", "dataset.scene", "refiner", "fuser.new", "seed"}
+    assert asked_keys({}) is None

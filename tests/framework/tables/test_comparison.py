@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from framework.errors import ConfigError
-from framework.tables.comparison import TableChoice
+from framework.tables.table_choice import TableChoice
 
 
 @pytest.mark.parametrize(

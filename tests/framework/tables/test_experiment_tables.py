@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
 
+import pandas
 import pytest
 from omegaconf import OmegaConf
 
 from framework.errors import DataError
+from framework.runs.data_frame import load_runs
 from framework.runs.provenance import config_hash
 from framework.synthetic.scenenn_scene import BenchmarkSettings
 from framework.tables.experiment_tables import write_tables
-from framework.tables.layouts import head
 from tests.support.forked_commands import completed
 
 pytestmark = pytest.mark.integration
 
+AP50 = "instances.ap50"
 CHECKOUT = Path(__file__).resolve().parents[3]
-TABLE = {"average_over": ["seed"], "baseline": "chain", "columns": ["instances.ap50", "stage_ms.refinement.median"]}
+TABLE = {"average_over": ["seed"], "base": "chain", "columns": ["instances.ap50", "stage_ms.refinement.median"]}
 FUSER_HEADS = "association (ms), update (ms), integration (ms), fusion (ms)"
 ROWS = {"identity": ["refiner=identity"], "chain": [], "none_yet": ["refiner=none_yet"]}
 
@@ -56,11 +57,15 @@ def test_write_tables_values_match_manual_result(sweep: Path) -> None:
     assert lines[0] == "# ablation_x"
     assert lines[2] == "| row | runs | AP50 | refinement (ms) | poses |"
     # 0.2, 0.4, 0.6: mean 0.4, sd 0.2; 0.5, 0.6, 1.0: mean 0.7, sd sqrt(0.14 / 2) = 0.2646
-    assert "| identity | 3 | 0.400 ± 0.200 | 0.0 ± 0.0 | ground_truth |" in lines
+    assert "| identity | 3 | 0.400 ± 0.200 | 0.0 | ground_truth |" in lines
     assert "| chain | 3 | 0.700 ± 0.265 | 151.0 ± 1.0 | ground_truth |" in lines
     # -0.3, -0.2, -0.4: mean -0.3, standard error 0.1 / sqrt(3) = 0.0577; t = 5.2 > 4.3
     assert "| identity | 3 | -0.300 ± 0.058 * | -151.0 ± 0.6 * |" in lines
     assert "| minus chain | pairs | AP50 | refinement (ms) |" in lines
+    # scipy.stats.ttest_1samp([-0.3, -0.2, -0.4], 0).pvalue is 0.035; three negative values: 2 of 2^3 sign patterns
+    assert "| AP50 | identity | 3 | -0.300 | – | 0.035 | 0.035 | 0.250 | 0.250 | 4 |" in lines
+    assert "| refinement (ms) | identity | 3 | -151.0 | – | < 0.001 | < 0.001 | 0.250 | 0.250 | 2 |" in lines
+    assert "with fewer than 6 values of seed; its smallest p with 3 is 0.250." in text
     assert (sweep / "table.md").read_text() == text
     assert "- Overrides of each row: identity: refiner=identity; chain: none; none_yet: refiner=none_yet." in lines
     assert "- Rows without a complete run: none_yet." in lines
@@ -68,14 +73,14 @@ def test_write_tables_values_match_manual_result(sweep: Path) -> None:
     assert "- Code: 1234567." in lines
     assert "- Machine: 2 cores of Z80." in lines
     assert "Missing" not in text
-    with (sweep / "table.csv").open() as file:
-        first, second = csv.DictReader(file)
-    assert (first["row"], first["runs"], second["row"]) == ("identity", "3", "chain")
-    assert float(first["instances.ap50.mean"]) == pytest.approx(0.4)
-    assert float(first["instances.ap50.sd"]) == pytest.approx(0.2)
-    assert float(first["instances.ap50.difference"]) == pytest.approx(-0.3)
-    assert float(first["instances.ap50.se"]) == pytest.approx(0.1 / 3**0.5)
-    assert first["instances.ap50.pairs"] == "3"
+
+
+def test_table_csv_is_data_frame_of_its_runs(sweep: Path) -> None:
+    write_tables(sweep)
+    runs = load_runs(sweep)
+    assert runs[AP50].tolist() == [0.5, 0.6, 1.0, 0.2, 0.4, 0.6]
+    read = pandas.read_csv(sweep / "table.csv", dtype=dict(runs.dtypes))
+    pandas.testing.assert_frame_equal(read, runs.replace("", pandas.NA))  # CSV has no empty strings
 
 
 def test_table_difference_error_is_over_scenes(tmp_path: Path) -> None:
@@ -88,12 +93,8 @@ def test_table_difference_error_is_over_scenes(tmp_path: Path) -> None:
             run(tmp_path, row, seed, ap, 1.0, scene=scene)
     text = write_tables(tmp_path)
     lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert "| other | 6 | +0.200 ± 0.100 |" in lines  # an error over six runs would be 0.045
-    assert "paired by seed, scene: mean ± standard error over the values of scene, after averaging" in text
-    with (tmp_path / "table.csv").open() as file:
-        _, other = csv.DictReader(file)
-    assert float(other["instances.ap50.se"]) == pytest.approx(0.1)
-    assert other["instances.ap50.pairs"] == "6"
+    assert "| other | 2 | +0.200 ± 0.100 |" in lines  # an error over six runs would be 0.045
+    assert "paired by seed, scene: mean ± standard error over scene, after averaging" in text
 
 
 def test_table_notes_list_missing_runs(sweep: Path) -> None:
@@ -160,16 +161,16 @@ def test_table_notes_list_parameters_equal_to_seed(tmp_path: Path) -> None:
         (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
         metrics = json.loads((directory / "metrics.json").read_text()) | {"config_hash": config_hash(config)}
         (directory / "metrics.json").write_text(json.dumps(metrics))
-    expected = "- Also averaged over keys with the same value as seed in every run: dataset.stride."
+    expected = "- Also averaged over keys that depend on seed: dataset.stride."
     assert expected in write_tables(tmp_path)
 
 
-def test_table_without_baseline_has_no_differences(sweep: Path) -> None:
+def test_table_without_base_has_no_differences(sweep: Path) -> None:
     for path in sweep.glob("row=chain*/metrics.json"):
         path.unlink()
     text = write_tables(sweep)
     assert "minus chain" not in text
-    assert "- No differences: the baseline chain has no complete run; set table.baseline=ROW." in text
+    assert "- No differences: the base chain has no complete run; set table.base=ROW." in text
     assert text.count("| identity ") == 1
 
 
@@ -288,7 +289,6 @@ def test_table_without_experiment_has_available_columns(tmp_path: Path) -> None:
     )
     assert [line for line in lines if "Omitted" in line] == [absent + f"instances, {FUSER_HEADS}."]
     assert "transfer" not in text, "expected no note on the transfer without ground-truth instances"
-    assert "ap50" not in (tmp_path / "table.csv").read_text()
 
 
 def test_table_without_experiment_has_column_for_single_value(tmp_path: Path) -> None:
@@ -375,11 +375,6 @@ def test_table_notes_name_data_without_evaluation(tmp_path: Path) -> None:
     for seed, frames in enumerate((600, 90)):
         run(tmp_path, "a", seed, None, 1.0, frames=frames, **{"choice.dataset": "desk"})
     assert "- Data: dataset=desk; 90 to 600 frames per run.\n" in write_tables(tmp_path)
-
-
-def test_table_headers_have_units() -> None:
-    keys = ("instances.ap50_agnostic", "stage_ms.update.median", "stage_ms.update.p95", "trajectory.ate_rmse_m", "x.y")
-    assert [head(key) for key in keys] == ["AP50 agnostic", "update (ms)", "update (ms, p95)", "ATE (m)", "x.y"]
 
 
 def test_tables_command_prints_table_or_error(sweep: Path) -> None:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
 
+import pandas
 import pytest
 from omegaconf import OmegaConf
 
+from framework.runs.data_frame import load_runs
 from framework.runs.provenance import config_hash
 from framework.tables.experiment_tables import write_tables
+from tests.support.table_text import grids
 
 AP50 = "instances.ap50"
 ROWS = {"ours": [], "prior": ["refiner=geometric"], "other": ["refiner=identity"]}
@@ -72,37 +74,34 @@ def sweep(tmp_path: Path) -> Path:
     return root
 
 
-def grids(text: str) -> list[list[str]]:
-    """Return the lines of each table of a text, without padding."""
-    blocks = [block.splitlines() for block in text.split("\n\n") if block.startswith("|")]
-    return [[" ".join(line.split()) for line in block] for block in blocks]
-
-
 GOLDEN = """\
 # table3
 
 | system                    | poses        | annotation |               011 |               016 |                mean |
 | ------------------------- | ------------ | ---------- | ----------------: | ----------------: | ------------------: |
-| ours                      | ground truth | made up    | **0.700 ± 0.141** |     0.400 ± 0.141 |   **0.550 ± 0.000** |
-| Prior (re-implementation) | ground truth | made up    |     0.600 ± 0.141 | **0.500 ± 0.141** |   **0.550 ± 0.000** |
-| other                     | ground truth | made up    |     0.200 ± 0.000 |    0.100 (1 of 2) | 0.150 (3 of 4 runs) |
+| ours                      | ground truth | made up    | **0.700 ± 0.141** |     0.400 ± 0.141 |       0.550 ± 0.000 |
+| Prior (re-implementation) | ground truth | made up    |     0.600 ± 0.141 | **0.500 ± 0.141** |       0.550 ± 0.000 |
+| other                     | ground truth | made up    |             0.200 |    0.100 (1 of 2) | 0.150 (3 of 4 runs) |
 
 | ours minus                | poses        | annotation |    011 |    016 |           mean | pairs |
 | ------------------------- | ------------ | ---------- | -----: | -----: | -------------: | ----: |
-| Prior (re-implementation) | ground truth | made up    | +0.100 | -0.100 | +0.000 ± 0.100 |     4 |
-| other                     | ground truth | made up    | +0.500 | +0.400 | +0.450 ± 0.050 |     3 |
+| Prior (re-implementation) | ground truth | made up    | +0.100 | -0.100 | +0.000 ± 0.100 |     2 |
+| other                     | ground truth | made up    | +0.500 | +0.400 | +0.450 ± 0.050 |     2 |
 
-- Cells: mean ± sample standard deviation over seed. mean: average of the sequences (dataset.scene) with equal \
-weights; its standard deviation is computed over the seed values with all sequences. Bold: highest value for the same \
-poses and number of runs. missing: no complete run.
-- Differences are paired by seed, dataset.scene: mean ± standard error over the sequences, after averaging the runs of \
-each. *: the 95% confidence interval (Student's t) excludes 0.
+- Cells: mean ± sample standard deviation over seed, without ± for equal values. mean: average over \
+dataset.scene with equal weights; its standard deviation is over the runs with all values of dataset.scene. Bold: \
+highest AP50 for the same poses and number of runs, unless several rows have it. missing: no complete run.
+- Differences are paired by seed, dataset.scene: mean ± standard error over dataset.scene, after averaging the runs of \
+each. pairs: number of values of dataset.scene in both rows. *: p < 0.05 in a paired t-test with Holm's correction.
+- No statistics: they require at least 3 values of dataset.scene in a row and its base, and differences that are not \
+all equal.
+- Identical runs: the results do not depend on seed in other.
 - ours compared with Prior (re-implementation), ground truth: higher in 1 of 2 sequences, lower in 1: 016.
 - ours compared with other, ground truth: higher in 2 of 2 sequences, lower in 0.
 - Overrides of each row: ours: none; prior: refiner=geometric; other: refiner=identity.
 - Common to all runs: dataset=scenenn, tracker=ground_truth.
 - Label transfer: each ground-truth vertex gets the instance of the nearest map vertex within 5 cm. AP is in [0, 1].
-- Data: dataset=scenenn, annotation made up.
+- Data: dataset=scenenn in /data, annotation made up.
 - Code: 1234567.
 - Machine: 2 cores of Z80.
 - Config: config.yaml of each run; SHA-256 of all config hashes: DIGEST.
@@ -125,7 +124,7 @@ def test_sequence_columns_table_has_published_rows(sweep: Path) -> None:
         first[0] == "| system | poses | annotation | 011 | 016 | 030 | 061 | 078 | 086 | 096 | 206 | 223 | 255 | mean |"
     )
     found, missing = "**0.700 ± 0.141** | 0.400 ± 0.141 |", " ".join(["missing |"] * 8)
-    assert first[2] == f"| ours | ground truth | made up | {found} {missing} **0.550 ± 0.000 (2 of 10)** |"
+    assert first[2] == f"| ours | ground truth | made up | {found} {missing} 0.550 ± 0.000 (2 of 10) |"
     assert len(first) == 6, "expected no line for systems without published values"
     assert first[-1] == (
         "| Voxblox++ with Detectron2 panoptic (published) | ground truth | not known "
@@ -174,7 +173,7 @@ def test_table_tracked_row_needs_tracked_baseline(sweep: Path) -> None:
     text = write_tables(sweep)
     _, second = grids(text)
     assert len(second) == 3
-    assert "- Rows without a matching baseline row (ours): other, tracker=icp." in text
+    assert "- Rows without a matching base row (ours): other, tracker=icp." in text
 
 
 @pytest.mark.parametrize(
@@ -210,13 +209,12 @@ def test_table_separates_other_data_and_annotations(
 def test_table_csv_has_one_full_precision_line_per_run(sweep: Path) -> None:
     run(sweep, "ours", "078", 0, **{AP50: 1 / 3})
     write_tables(sweep)
-    with (sweep / "table.csv").open() as file:
-        lines = list(csv.DictReader(file))
-    assert len(lines) == 12
-    [line] = [line for line in lines if line["dataset.scene"] == "078"]
-    assert float(line["value"]) == 1 / 3
-    assert (line["system"], line["variant"], line["seed"], line["figure"]) == ("ours", "", "0", AP50)
-    assert (line["poses"], line["annotation"], line["code"]) == ("ground_truth", "made up", "1234567")
+    runs = load_runs(sweep)
+    assert len(runs) == 12
+    read = pandas.read_csv(sweep / "table.csv", dtype=dict(runs.dtypes))
+    pandas.testing.assert_frame_equal(read, runs)
+    [value] = read[read["dataset.scene"] == "078"][AP50]
+    assert value == 1 / 3
 
 
 def test_sequence_groups_table_has_expected_lines(sweep: Path) -> None:
@@ -227,9 +225,9 @@ def test_sequence_groups_table_has_expected_lines(sweep: Path) -> None:
     assert first[2] == f"| 011 | ours | ground truth | made up | {couch} |"
     assert first[5] == "| 016 | ours | ground truth | made up | 0.400 ± 0.141 | – | 0.400 ± 0.141 |"
     assert first[7] == "| | other | ground truth | made up | 0.100 (1 of 2) | – | 0.100 (1 of 2) |"
-    assert first[8] == "| mean | ours | ground truth | made up | **0.550 ± 0.000** | – | **0.550 ± 0.000** |"
+    assert first[8] == "| mean | ours | ground truth | made up | 0.550 ± 0.000 | – | 0.550 ± 0.000 |"
     assert second[0] == "| minus ours | pairs | sofa | television | AP50 |"
-    assert second[2] == "| Prior (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
+    assert second[2] == "| Prior (re-implementation) | 2 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
 
 
 def test_table_bold_mean_ignores_rows_with_fewer_sequences(sweep: Path) -> None:
@@ -242,12 +240,12 @@ def test_table_bold_mean_ignores_rows_with_fewer_sequences(sweep: Path) -> None:
         ("ours", "016", 0.2),
     ):
         run(sweep, row, scene, 0, tracker="icp", **{AP50: value})
-    run(sweep, "prior", "016", 0, tracker="icp", **{AP50: 0.1})
+    run(sweep, "prior", "016", 0, tracker="icp", **{AP50: 0.2})
     run(sweep, "ours", "078", 0, **{AP50: 0.9})
     first, _ = grids(write_tables(sweep))
     cells = {tuple(line.split(" | ")[1:3]): line.split(" | ")[-1] for line in first[-6:]}
-    assert cells["ours", "tracked (icp)"] == "**0.200 (2 of 3)** |"
-    assert cells["Prior (re-implementation)", "tracked (icp)"] == "**0.200 (2 of 3)** |"
+    assert cells["ours", "tracked (icp)"] == "0.200 (2 of 3) |"
+    assert cells["Prior (re-implementation)", "tracked (icp)"] == "**0.250 (2 of 3)** |"
     assert cells["other", "tracked (icp)"] == "0.900 (1 of 3) |"
 
 
@@ -262,7 +260,7 @@ def test_table_bold_mean_ignores_rows_with_fewer_runs(sweep: Path, table: dict[s
     lines, _ = grids(write_tables(sweep))
     assert "".join(lines).count("| 0.750 (1 of 2) ") == 2
     assert sum(line.endswith("| 0.750 (2 of 4 runs) |") for line in lines) == 1
-    assert sum(line.endswith("| **0.550 ± 0.000** |") for line in lines) == 2
+    assert sum(line.endswith("| 0.550 ± 0.000 |") for line in lines) == 2
     assert "**0.75" not in "".join(lines)
 
 

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from framework.runs.run_rows import Run
-from framework.tables.comparison import mean_by_sequence, mean_difference, mean_over_sequences
+from framework.tables.comparison import mean_by_sequence, mean_over_sequences
 
 FIGURES: dict[Run, float] = {("0", "a"): 0.2, ("1", "a"): 0.4, ("0", "b"): 0.9, ("1", "b"): 0.7}
 
@@ -34,12 +34,3 @@ def test_mean_over_sequences_weights_sequences_equally() -> None:
 def test_mean_over_sequences_without_values_is_nan() -> None:
     mean = mean_over_sequences({})
     assert (mean.count, math.isnan(mean.value), math.isnan(mean.deviation)) == (0, True, True)
-
-
-def test_mean_difference_error_is_over_sequences() -> None:
-    """The differences 0.3 and 0.8 have the mean 0.55 and the error 0.25, for any number of equal seeds."""
-    difference = mean_difference(FIGURES)
-    assert (difference.value, difference.count) == (pytest.approx(0.55), 2)
-    assert difference.error == pytest.approx(0.25)
-    more = {(str(seed), run[1]): FIGURES["0", run[1]] for seed in range(100) for run in FIGURES}
-    assert mean_difference(more).error == pytest.approx(0.35)

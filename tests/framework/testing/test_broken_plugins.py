@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import inspect
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import FrozenInstanceError, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 
 from framework.config import composition
 from framework.data import Detections, Frame, PointClusters, Pose
-from framework.interfaces import ClusterRefiner, PoseTracker, SceneMap, Viewer
+from framework.interfaces import ClusterRefiner, PoseTracker, SceneMap, StageTimer, Viewer, untimed
 from framework.testing.contracts import (
     DetectorContract,
     FuserContract,
@@ -23,6 +24,7 @@ from framework.testing.contracts import (
     SequenceContract,
     TrackerContract,
 )
+from framework.testing.corner_room import CAMERA
 from framework.testing.viewer import ViewerContract
 from tests.support.scenes.corner_room import CornerRoom, GridFuser, SphereDetector
 
@@ -56,6 +58,21 @@ class Sharing(SphereDetector):
         return super().detect(frame)
 
 
+class Peeking(SphereDetector):
+    """Detector that adds the ground truth if there is one, and otherwise finds nothing."""
+
+    def detect(self, frame: Frame) -> Detections:
+        return Detections.none(CAMERA.shape, self.classes) if frame.truth is None else super().detect(frame)
+
+
+class Whitening(SphereDetector):
+    """Detector that normalizes the color image in place."""
+
+    def detect(self, frame: Frame) -> Detections:
+        frame.color[:] = frame.color - frame.color.min()
+        return super().detect(frame)
+
+
 @dataclass
 class Shifting(ClusterRefiner):
     """Refiner that moves points."""
@@ -70,6 +87,49 @@ class Dropping(ClusterRefiner):
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return replace(clusters, cluster=np.full_like(clusters.cluster, -1))
+
+
+@dataclass
+class Selecting(ClusterRefiner):
+    """Refiner that keeps the points on ground-truth instances."""
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        assert frame.truth is not None
+        u, v = clusters.pixels.T
+        right = frame.truth.instance_ids[v, u] == clusters.cluster + 1
+        return replace(clusters, cluster=np.where(right, clusters.cluster, -1).astype(np.int32))
+
+
+@dataclass
+class Cheating(PoseTracker):
+    """Tracker that moves a fraction of the way from the first pose to the ground-truth pose."""
+
+    fraction: float = 1.0
+
+    def __post_init__(self) -> None:
+        self._first: Pose | None = None
+
+    def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        assert frame.T_world_camera is not None
+        self._first = self._first or Pose(frame.T_world_camera)
+        T_world_camera = self._first.T_world_camera.copy()
+        T_world_camera[:3, 3] += self.fraction * (frame.T_world_camera - T_world_camera)[:3, 3]
+        return Pose(T_world_camera)
+
+
+class Boasting(Cheating):
+    """Tracker that does not return the ground-truth poses that it declares."""
+
+    pose_source = "ground_truth"
+
+
+@dataclass
+class Erasing(PoseTracker):
+    """Tracker that removes far depth readings in place."""
+
+    def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        frame.depth[frame.depth > 2] = 0
+        return Pose(np.eye(4))
 
 
 @dataclass
@@ -88,6 +148,22 @@ class Careless(GridFuser):
     """Fuser whose map is rendered from any pose, even an invalid one."""
 
 
+class Relocating(GridFuser):
+    """Fuser that replaces the tracked pose by the ground-truth pose."""
+
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
+        assert frame.T_world_camera is not None
+        super().fuse(frame, Pose(frame.T_world_camera), clusters, timer)
+
+
+class Smoothing(GridFuser):
+    """Fuser that changes the depth image in place."""
+
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
+        frame.depth[1:-1] = (frame.depth[:-2] + frame.depth[2:]) / 2
+        super().fuse(frame, pose, clusters, timer)
+
+
 class Backwards(CornerRoom):
     """Dataset that returns its frames in reverse order."""
 
@@ -98,19 +174,28 @@ class Backwards(CornerRoom):
 @pytest.mark.parametrize(
     ("contract", "plugin", "test"),
     [
-        (DetectorContract, Forgetful(), "test_detector_does_not_depend_on_frame_order"),
-        (DetectorContract, Sharing(), "test_detector_does_not_depend_on_thread"),
-        (RefinerContract, Shifting(), "test_refiner_returns_only_measured_points"),
-        (RefinerContract, Dropping(), "test_refiner_returns_only_measured_points"),
-        (TrackerContract, Writing(writes=True), "test_tracker_returns_poses_without_changing_map"),
-        (TrackerContract, Writing(), "test_tracker_first_pose_equals_ground_truth"),
-        (FuserContract, Careless(), "test_fuser_map_rejects_invalid_poses"),
-        (SequenceContract, Backwards(), "test_dataset_frames_are_in_order"),
+        (DetectorContract, Forgetful, "test_detector_does_not_depend_on_frame_order"),
+        (DetectorContract, Sharing, "test_detector_does_not_depend_on_thread"),
+        (DetectorContract, Peeking, "test_detector_uses_ground_truth_only_if_required"),
+        (DetectorContract, Whitening, "test_detector_returns_valid_detections"),
+        (RefinerContract, Shifting, "test_refiner_returns_only_measured_points"),
+        (RefinerContract, Dropping, "test_refiner_returns_only_measured_points"),
+        (RefinerContract, Selecting, "test_refiner_does_not_depend_on_ground_truth"),
+        (TrackerContract, partial(Writing, writes=True), "test_tracker_returns_poses_without_changing_map"),
+        (TrackerContract, Writing, "test_tracker_first_pose_equals_ground_truth"),
+        (TrackerContract, Cheating, "test_tracker_pose_source_is_correct"),
+        (TrackerContract, partial(Cheating, fraction=1e-4), "test_tracker_pose_source_is_correct"),
+        (TrackerContract, partial(Boasting, fraction=0.5), "test_tracker_pose_source_is_correct"),
+        (TrackerContract, Erasing, "test_tracker_returns_poses_without_changing_map"),
+        (FuserContract, Careless, "test_fuser_map_rejects_invalid_poses"),
+        (FuserContract, Relocating, "test_fuser_does_not_depend_on_ground_truth"),
+        (FuserContract, Smoothing, "test_fuser_does_not_depend_on_ground_truth"),
+        (SequenceContract, Backwards, "test_dataset_frames_are_in_order"),
     ],
 )
-def test_contract_detects_broken_plugin(contract: type[Any], plugin: object, test: str) -> None:
+def test_contract_detects_broken_plugin(contract: type[Any], plugin: Callable[[], object], test: str) -> None:
     tests = contract()
-    tests.plugin = lambda: plugin
+    tests.plugin = plugin
     with pytest.raises((AssertionError, FrozenInstanceError)):
         getattr(tests, test)()
 
@@ -136,10 +221,26 @@ class Painting(Viewer):
         frame.color[0, 0] = 255 - frame.color[0, 0]
 
 
+class Leveling(Viewer):
+    """Viewer that changes the pose."""
+
+    def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
+        pose.T_world_camera[1, 3] = 0
+
+
+class Summing(Viewer):
+    """Viewer that adds the sum to the stage times."""
+
+    def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
+        stage_ms["total"] = sum(stage_ms.values())  # type: ignore[index]
+
+
 @pytest.mark.parametrize(
     ("viewer", "test"),
     [
         (Painting(), ViewerContract.test_viewer_shows_frames_without_changing_them),
+        (Leveling(), ViewerContract.test_viewer_shows_frames_without_changing_them),
+        (Summing(), ViewerContract.test_viewer_shows_frames_without_changing_them),
         (Late(), ViewerContract.test_viewer_reads_map_only_in_calls),
         (Late(), ViewerContract.test_viewer_writes_only_to_run_directory),
     ],

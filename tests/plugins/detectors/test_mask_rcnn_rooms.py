@@ -9,7 +9,7 @@ import pytest
 
 from framework.data import Camera, Frame
 from framework.detection.mask_rcnn.network_file import describe_network
-from framework.evaluation.mask_ap import mask_ap
+from framework.evaluation.detection_ap import detection_ap
 from framework.training.augmentation import MIN_PIXELS
 from framework.training.room_pictures import RoomPictures, render_rooms
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
@@ -50,6 +50,6 @@ def test_bundled_network_detects_objects_in_unseen_rooms(detector: MaskRCNNDetec
         camera = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
         frame = Frame(k, float(k), example.color, np.zeros((height, width), np.float32), camera)
         found.append((example.masks, example.class_names, detector.detect(frame)))
-    precision = mask_ap(found, detector.classes, MIN_PIXELS)
+    precision = detection_ap(found, detector.classes, MIN_PIXELS).masks
     assert precision.objects >= 30
     assert precision.ap50 >= 0.4

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import shutil
 import subprocess
 import sys
-import sysconfig
 import tomllib
-import venv
 from pathlib import Path
 
 import pytest
@@ -22,12 +18,12 @@ from framework.errors import ConfigError
 from framework.registry import GROUPS
 from tests.support import option_files
 from tests.support.doc_pages import blocks
+from tests.support.fresh_environment import create_environment, run_in
 
 pytestmark = pytest.mark.integration
 
 CHECKOUT = Path(__file__).resolve().parents[4]
 EXAMPLE = CHECKOUT / "examples" / "instancemap-depth-median"
-SITE = Path(sysconfig.get_paths()["purelib"])
 
 
 def test_new_plugin_output_matches_example_plugin() -> None:
@@ -108,53 +104,23 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     The plugins and InstanceMap are installed in `env` from wheels. The libraries are those of the current environment.
     """
     folder = tmp_path_factory.mktemp("stranger")
-    (folder / "wheels").mkdir()
     for stage in GROUPS.keys() - {"refiner"}:
         write_repository(stage, f"my_{stage}", folder)
     line = [sys.executable, "-m", "framework", "new-plugin", "refiner", "my_refiner", "--in", str(folder)]
     message = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=60).stdout
     assert len(message.splitlines()) == 3
-    for source in (CHECKOUT, *folder.glob("instancemap-my-*")):
-        build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder / "wheels")]
-        subprocess.run(build, cwd=source, check=True, capture_output=True, timeout=120)
-    venv.create(folder / "env", symlinks=True)
-    wheels = [str(path) for path in (folder / "wheels").iterdir()]
-    install = [sys.executable, "-m", "pip", "--python", str(folder / "env"), "install", "--quiet", "--no-deps"]
-    subprocess.run([*install, "--no-index", *wheels], check=True, timeout=120)
-    [site] = folder.glob("env/lib/python*/site-packages")
-    (site / "libraries.pth").write_text(f"{SITE}\n")
-    copy_kernels(site)
+    create_environment(folder, folder.glob("instancemap-my-*"))
     return folder
-
-
-def copy_kernels(site: Path) -> None:
-    """Copy the numba cache of the checkout to the installed files, with the modification times that numba checks."""
-    for path in (CHECKOUT / "framework").rglob("*.py"):
-        shutil.copystat(path, site / path.relative_to(CHECKOUT))
-    for path in (CHECKOUT / "framework").rglob("*.nb[ic]"):
-        copied = site / path.relative_to(CHECKOUT)
-        if copied.parents[1].is_dir():  # false for the outdated cache of a removed package
-            copied.parent.mkdir(exist_ok=True)
-            shutil.copy2(path, copied)
-
-
-def run(place: Path, *line: str) -> str:
-    """Run a program of the new environment; return its output."""
-    alone = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "HYDRA_FULL_ERROR")}
-    program = str(place / "env" / "bin" / line[0])
-    done = subprocess.run([program, *line[1:]], cwd=place, env=alone, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
-    return done.stdout
 
 
 @pytest.mark.acceptance
 def test_new_plugin_installed_plugins_pass_their_tests(place: Path) -> None:
-    where = run(place, "python", "-c", "import framework, instancemap_my_refiner; print(framework.__file__)")
+    where = run_in(place, "python", "-c", "import framework, instancemap_my_refiner; print(framework.__file__)")
     assert where.startswith(str(place))
     (place / "pytest.ini").touch()
     tests = [str(path) for path in place.glob("instancemap-my-*/tests/test_*.py")]
     assert len(tests) == len(GROUPS)
-    message = run(place, "python", "-m", "pytest", "--quiet", "-p", "no:dash", "--import-mode=importlib", *tests)
+    message = run_in(place, "python", "-m", "pytest", "--quiet", "-p", "no:dash", "--import-mode=importlib", *tests)
     assert " passed" in message
     assert "skipped" not in message
 
@@ -165,39 +131,39 @@ def test_new_plugin_and_builtin_option_share_sweep_table(place: Path) -> None:
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")
     chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"
     more = ("viewer=my_viewer", "hydra.sweep.dir=outputs/first_sweep")
-    message = run(place, "instancemap", "-m", "refiner=gmm_em,my_refiner", *chosen.split(), *more)
+    message = run_in(place, "instancemap", "-m", "refiner=gmm_em,my_refiner", *chosen.split(), *more)
     records = [json.loads(path.read_text()) for path in (place / "outputs" / "first_sweep").glob("*/metrics.json")]
     assert [record["frames"] for record in records] == [3, 3]
     assert all(record["instances.count"] > 0 for record in records)
     for job in ("refiner=gmm_em", "refiner=my_refiner"):
         [log] = (place / "outputs" / "first_sweep").glob(f"*{job}*/frames.jsonl")
         assert [json.loads(line)["frame"] for line in log.read_text().splitlines()] == [0, 1, 2]
-    assert run(place, "instancemap", "tables", "outputs/first_sweep").strip() in message
+    assert run_in(place, "instancemap", "tables", "outputs/first_sweep").strip() in message
     with (place / "outputs" / "first_sweep" / "table.csv").open() as table:
         rows = list(csv.DictReader(table))
-    assert [row["row"] for row in rows] == ["refiner=gmm_em", "refiner=my_refiner"]
+    assert [row["refiner"] for row in rows] == ["gmm_em", "my_refiner"]
     assert "refiner=my_refiner" in message
-    listed = run(place, "instancemap", "plugins", "refiner", "my_refiner")
+    listed = run_in(place, "instancemap", "plugins", "refiner", "my_refiner")
     assert "my_refiner  [from instancemap-my-refiner]" in listed
 
 
 @pytest.mark.acceptance
 def test_installed_package_runs_doctor_and_new_plugin(place: Path) -> None:
-    sections = json.loads(run(place, "instancemap", "doctor", "--json"))
+    sections = json.loads(run_in(place, "instancemap", "doctor", "--json"))
     found = {section["title"]: {check["name"]: check for check in section["checks"]} for section in sections}
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
     assert set(found["Libraries"]) == {Requirement(line).name for line in project["dependencies"]}
     assert set(found["Extras (optional)"]) == project["optional-dependencies"].keys()
     assert found["InstanceMap"]["commit"]["detail"] == "no checkout"
-    assert "written: instancemap-other" in run(place, "instancemap", "new-plugin", "tracker", "other")
+    assert "written: instancemap-other" in run_in(place, "instancemap", "new-plugin", "tracker", "other")
     assert (place / "instancemap-other" / "instancemap_other" / "other.py").exists()
 
 
 @pytest.mark.acceptance
 def test_installed_package_maps_desk(place: Path) -> None:
     """Run the command with its default dataset, and the Python example of the README, on a few frames each."""
-    assert run(place, "instancemap", "--version") == f"instancemap {framework.__version__}\n"
-    run(place, "instancemap", "dataset.stop=3", "hydra.run.dir=desk")
+    assert run_in(place, "instancemap", "--version") == f"instancemap {framework.__version__}\n"
+    run_in(place, "instancemap", "dataset.stop=3", "hydra.run.dir=desk")
     assert json.loads((place / "desk" / "metrics.json").read_text())["frames"] == 3
-    run(place, "python", "-c", blocks("python", "README.md")[0].replace("stop=14", "stop=3"))
+    run_in(place, "python", "-c", blocks("python", "README.md")[0].replace("stop=14", "stop=3"))
     assert (place / "desk.npz").exists()

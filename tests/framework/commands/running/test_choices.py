@@ -2,7 +2,9 @@
 
 import pytest
 
-from framework.commands.running.choices import GLOB_COUNT, checked_sweep, single_run
+from framework.commands.running.choices import GLOB_COUNT, check_table, checked_sweep, of_tables, single_run
+from framework.config.composition import composed
+from framework.config.validation import checked_rows
 from framework.errors import ConfigError
 
 pytestmark = pytest.mark.integration
@@ -47,3 +49,82 @@ def test_checked_sweep_without_rows_accepts_any_row() -> None:
 def test_single_run_takes_first_value_of_each_sweep() -> None:
     overrides = ["row=a,b", "+x@y=range(2,5)", "seed=3", "~tracker", "name='a,b'", "dataset=glob(*)"]
     assert single_run(overrides) == ["row=a", "+x@y=2", "seed=3", "~tracker", "name='a,b'", "dataset=glob(*)"]
+
+
+def check(*overrides: str, swept: tuple[str, ...] = ()) -> None:
+    """Check the table of a sweep as `instancemap -m` does."""
+    config = composed(*overrides)
+    check_table(config, [*overrides, *swept], checked_rows(config.get("rows")))
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        "+table.average_over=[seed,dataset]",
+        "+table.group_by=detector",
+        "+table.columns_by=fuser.voxel_size",
+        "+table.where.dataset.scene=[a,b]",
+        "+table={where:{threads:1},group_by:preset}",
+        "+table.base='refiner=identity, fuser.voxel_size=0.02'",
+    ],
+)
+def test_check_table_accepts_options_and_parameters(table: str) -> None:
+    check(table)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("+table.over=[seed]", "table.over: expected a known key, got over; set table.average_over (new name of "),
+        ("+table.baseline=x", "table.baseline: expected a known key, got baseline; set table.base (new name of "),
+        (
+            "+table.group_by=refner",
+            "table.group_by: expected a group of options or a parameter, got refner; did you mean",
+        ),
+        ("+table.average_over=[seed,dataset.scenes]", "table.average_over: expected a group of options or a parameter"),
+        ("+table.where.viewer=rerun", "table.where: expected a group of options or a parameter, got viewer"),
+        ("+table.pair_by=[dataset]", "table.pair_by: expected one of seed, got dataset"),
+        ("+table.base=identity", "table.base: expected KEY=VALUE, such as refiner=identity, got identity"),
+        ("+table.base='refner=identity'", "table.base: expected a group of options or a parameter, got refner"),
+        ("+table.colums=[fps]", "table: expected one of average_over, "),
+        ("+table=rows", "table: expected keys and values, got 'rows'"),
+    ],
+)
+def test_check_table_invalid_settings_raise(table: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        check(table)
+    assert str(caught.value).startswith(message)
+
+
+def test_check_table_finds_keys_of_swept_options_and_rows() -> None:
+    check("+table.group_by=dataset.kind", swept=("dataset=desk,synthetic",))
+    check("+table.group_by=detector.new", swept=("+detector.new=1,2",))
+    with pytest.raises(ConfigError, match=r"table\.group_by: .*, got dataset\.kind"):
+        check("+table.group_by=dataset.kind", swept=("dataset=desk,tum_rgbd",))
+    check("experiment=ablation_refiner", "+table.where.refiner.object_centers=2", swept=("row=kmeans,gmm_em",))
+
+
+def test_check_table_experiment_base_is_row() -> None:
+    check("experiment=ablation_refiner", "table.base=kmeans")
+    with pytest.raises(ConfigError, match=r"table\.base: expected one of chain, .*, got kmean"):
+        check("experiment=ablation_refiner", "table.base=kmean")
+
+
+def test_of_tables_lists_nested_keys() -> None:
+    overrides = ["+table.where.dataset=desk", "dataset=desk", "table.columns=[fps]", "figure.names.a=b", "tablet=1"]
+    assert of_tables(overrides) == ["table.where.dataset", "table.columns", "figure.names.a"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "fix"),
+    [
+        (["table.group_by=dataset"], "set +table.KEY=VALUE"),
+        (["experiment=ablation_refiner", "table.where.dataset=desk"], "set +table.where.dataset=VALUE"),
+        (["experiment=ablation_refiner", "table.baseline=chain"], "set table.base (new name of table.baseline)"),
+        (["experiment=ablation_refiner", "table.over=[seed]"], "set table.average_over (new name of table.over)"),
+    ],
+)
+def test_table_override_error_names_fix(overrides: list[str], fix: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        composed(*overrides)
+    assert str(caught.value).endswith(fix)

@@ -10,16 +10,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.framework.commands.running.test_sweep import CHECKOUT, PLACE, begin, begun, end, recorded, wait_until
+from tests.framework.commands.running.test_sweep import CHECKOUT, PLACE, begin, begun, end, recorded, tables, wait_until
 
 pytestmark = pytest.mark.acceptance
 
-THREE = ("row=half", "seed=1,2,3", "dataset.slow_s=0.7")  # three runs of four frames each
-TABLES = ("table.md", "table.tex", "table.csv")
-
-
-def tables(directory: Path) -> dict[str, bytes]:
-    return {name: (directory / PLACE / name).read_bytes() for name in TABLES}
+THREE = ("row=half", "seed=1,2,3", "dataset.slow_s=0.7", "threads=1")  # three runs of four frames each
 
 
 def mapping(directory: Path) -> dict[int, str]:
@@ -32,15 +27,15 @@ def mapping(directory: Path) -> dict[int, str]:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Return the tables of an uninterrupted sweep whose runs are executed one after another."""
     directory = tmp_path_factory.mktemp("undisturbed")
-    done = end(begin(directory, *THREE, "threads=1"))
+    done = end(begin(directory, *THREE))
     assert done.returncode == 0, done.stderr
     return tables(directory)
 
 
-def test_slurm_sweep_resumes_preempted_and_killed_jobs(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
+def test_slurm_sweep_resumes_preempted_and_killed_jobs(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     """Use submitit's local queue, the signal that SLURM sends before it preempts a job, and SIGKILL."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     arguments = ("launcher=submitit_local", *THREE)
@@ -78,7 +73,7 @@ def ray_cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
 
 
 def test_ray_sweep_restarts_run_of_removed_node(
-    tmp_path: Path, undisturbed: dict[str, bytes], ray_cluster: object
+    tmp_path: Path, undisturbed: dict[str, str], ray_cluster: object
 ) -> None:
     nodes = [ray_cluster.add_node(num_cpus=1) for _ in range(2)]
     sweep = begin(tmp_path, "launcher=ray", f"hydra.launcher.ray.init.address={ray_cluster.address}", *THREE)
@@ -94,7 +89,7 @@ def test_ray_sweep_restarts_run_of_removed_node(
     )
 
 
-def test_ray_sweep_restarted_after_failure_resumes(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
+def test_ray_sweep_restarted_after_failure_resumes(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     pytest.importorskip("hydra_plugins.hydra_ray_launcher")
     here = ("launcher=ray", "hydra.launcher.ray.init.num_cpus=1", *THREE)
     sweep = begin(tmp_path, *here, "hydra.launcher.ray.remote.max_retries=0")

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
+import shlex
 import subprocess
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from framework.commands.running.detect import write_detections
+from framework.commands.running.detect import file_of_job, write_detections
 from framework.data import Frame
 from framework.datasets.ground_truth.labeled_mesh import unseen
-from framework.errors import DataError
+from framework.errors import ConfigError, DataError
 from plugins.detectors.none import NoDetections
 from plugins.detectors.precomputed import Precomputed
 from tests.support.forked_commands import FAKE_CONF, completed
@@ -36,6 +39,7 @@ def test_detect_output_is_read_by_precomputed(tmp_path: Path) -> None:
     assert "frame skipped: frame 1" in done.stderr
     assert "10 detections in 5 frames of corner_room" in done.stderr
     assert "mask AP50 1.00, mask AP 1.00 (mean of 2 classes, 10 ground-truth objects of at least" in done.stderr
+    assert "box AP50 1.00, box AP 1.00" in done.stderr
     message = dict(re.findall(r"INFO +(.*?)  +(\S+)$", done.stderr, re.MULTILINE))
     assert (message["found"], message["mask IoU"], message["correct class"], message["false detections per image"]) == (
         *("1.00", "1.00", "1.00", "0.00"),
@@ -63,6 +67,40 @@ def test_detect_output_is_read_by_pycocotools(tmp_path: Path) -> None:
     assert len(results.anns) == 12
     masks = SphereDetector().detect(CornerRoom()[0]).masks
     assert results.annToMask(results.loadAnns(results.getAnnIds(imgIds=[0]))[1]).sum() == masks[1].sum()
+
+
+def test_detect_sweep_writes_file_per_job_and_table(tmp_path: Path) -> None:
+    detectors = ["dataset=fake", "detector=fake,none,faulty", "out=found.json"]
+    done = completed(tmp_path, "detect", "-m", "--config-dir", str(FAKE_CONF), *detectors, "hydra.sweep.dir=sweep")
+    assert done.returncode == 1, done.stderr
+    jobs = [tmp_path / "sweep" / f"dataset=fake,detector={name}" for name in ("fake", "none")]
+    assert [len(json.loads((job / "found.json").read_text())) for job in jobs] == [12, 0]
+    assert (jobs[0] / "found.labels.txt").read_text() == "chair\ncouch\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
+    text = (tmp_path / "sweep" / "table.md").read_text()
+    assert text in done.stdout
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    exact, empty = " | ".join(["1.000"] * 6), " | ".join(["0.000"] * 5)
+    assert f"| detector=fake | corner_room | 6 | 12 | 12 | 2 | {exact} | 0.000 |" in lines
+    assert f"| detector=none | corner_room | 6 | 0 | 12 | 2 | {empty} | – | 0.000 |" in lines
+    assert "- Jobs without result: dataset=fake,detector=faulty." in lines
+    assert "not comparable" not in text
+    with (tmp_path / "sweep" / "table.csv").open() as file:
+        fake, none = csv.DictReader(file)
+    assert fake["overrides"] == "dataset=fake detector=fake out=found.json"
+    assert (fake["mask_ap50.couch"], none["correct class"]) == ("1.0", "")
+    [how] = [line for line in done.stderr.splitlines() if "use it with: " in line and "label_space" in line]
+    arguments = OverridesParser.create().parse_overrides(shlex.split(how.partition("use it with: ")[2]))
+    values = {argument.key_or_group: argument.value() for argument in arguments}
+    assert values["detector.path"] == str(jobs[0] / "found.json")
+    assert values["detector.label_space"] == str(jobs[0] / "found.labels.txt")
+
+
+@pytest.mark.parametrize("out", ["sub/found.json", "/tmp/found.json", "../found.json"])
+def test_detect_sweep_rejects_file_outside_job_folder(tmp_path: Path, out: str) -> None:
+    with pytest.raises(ConfigError, match="out: expected a file name without a folder in a sweep, got "):
+        file_of_job(out, tmp_path / "job")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

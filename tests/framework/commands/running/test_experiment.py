@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import subprocess
 from pathlib import Path
 from typing import Any
 
+import pandas
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
@@ -18,6 +18,7 @@ from framework.errors import ConfigError, InstanceMapError
 from framework.files.search_paths import CONF
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker
 from framework.registry import build, stage_of
+from framework.runs.data_frame import load_runs
 from framework.runs.provenance import config_hash
 from framework.synthetic.benchmark import SCENES
 from framework.tables.published import read_published
@@ -37,13 +38,10 @@ def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def table(directory: Path) -> dict[str, dict[str, str]]:
-    with (directory / "table.csv").open() as file:
-        return {line["row"]: line for line in csv.DictReader(file)}
-
-
-def figures(line: dict[str, str], column: str) -> list[float | None]:
-    names = ("mean", "sd", "n", "difference", "se", "pairs")
-    return [float(line[f"{column}.{name}"]) if line[f"{column}.{name}"] else None for name in names]
+    """Return the cells of the rows in table.md by name and heading."""
+    lines = [line.strip("|").split("|") for line in (directory / "table.md").read_text().splitlines()[2:]]
+    heads, _, *rows = [[cell.strip() for cell in line] for line in lines[: lines.index([""])]]
+    return {row[0]: dict(zip(heads, row, strict=True)) for row in rows}
 
 
 def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
@@ -58,20 +56,17 @@ def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
 
     lines = table(out)
     assert list(lines) == ["all", "half"]
-    assert figures(lines["all"], "frames") == [8, 0, 2, 0, 0, 2]
-    assert figures(lines["all"], "frames_lost") == [2, pytest.approx(2**0.5), 2, 0, 0, 2]
-    assert figures(lines["half"], "frames_lost") == [
-        2,
-        pytest.approx(2**0.5),
-        2,
-        0,
-        0,
-        2,
-    ]  # the difference is 0 for each seed
-    assert figures(lines["half"], "frames") == [4, 0, 2, -4, 0, 2]
+    assert [line["frames"] for line in lines.values()] == ["8.00", "4.00"]
+    assert [line["frames lost"] for line in lines.values()] == ["2.00 ± 1.41", "2.00 ± 1.41"]
+    runs = load_runs(out)
+    assert list(runs["run"]) == sorted(metrics)
+    assert list(runs["dataset.frames"]) == [8, 8, 4, 4]
+    assert list(runs["frames_lost"]) == [1, 3, 1, 3]
+    read = pandas.read_csv(out / "table.csv", dtype=dict(runs.dtypes))
+    pandas.testing.assert_frame_equal(read, runs.replace("", pandas.NA))  # CSV has no empty strings
     text = (out / "table.md").read_text()
     assert text in first.stdout
-    assert "| half | 2 | 4.00 ± 0.00 |" in " ".join(text.split())
+    assert "| half | 2 | -4.00 | +0.000 |" in " ".join(text.split()), "expected equal differences"
     assert "Rows without a complete run: broken." in text
     assert "Incomplete: row=broken,seed=3: failed: dataset" in text
     assert "half: refiner=identity dataset.frames=4" in text
@@ -91,8 +86,7 @@ def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
     assert again.stderr.count("mapping corner_room") == 1
     kept = {name for name, path in metrics.items() if path.stat().st_mtime_ns == written[name]}
     assert kept == set(metrics) - {"row=half,seed=3"}
-    assert figures(table(out)["half"], "frames") == [4, 0, 2, -4, 0, 2]
-    assert "frames_lost.mean" not in table(out)["half"]
+    assert table(out)["half"] == {"row": "half", "runs": "2", "frames": "4.00", "poses": "ground_truth"}
 
 
 def test_experiment_table_has_one_column_per_sequence(tmp_path: Path) -> None:
@@ -101,8 +95,8 @@ def test_experiment_table_has_one_column_per_sequence(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     lines = [" ".join(line.split()) for line in done.stdout.splitlines()]
     assert "| system | poses | 011 | 078 | mean |" in lines
-    assert "| Prior | ground truth | **2.00** | **2.00** | **2.00** |" in lines
-    assert "| Prior | ground truth | -1.000 | -1.000 | -1.000 ± 0.000 | 2 |" in lines
+    assert "| ours | ground truth | **1.00** | **1.00** | **1.00** |" in lines
+    assert "| Prior | ground truth | -1.000 | -1.000 | -1.000 | 2 |" in lines
     out = tmp_path / "outputs" / "fake_scenes"
     assert (out / "dataset.scene=078,row=prior,seed=1,tracker=fake" / "metrics.json").exists()
 
