@@ -11,6 +11,7 @@ from multiprocessing import parent_process
 from pathlib import Path
 
 import hydra
+from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig
@@ -22,7 +23,8 @@ from framework.errors import PartialRunError
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.runs.stored_runs import is_recorded
-from framework.runtime.signals import ENDING, Interruption, raise_on_signals, received_from_sweep, signals_deferred
+from framework.runtime.signals import ENDING, Interruption, raise_on_signals, signals_deferred
+from framework.runtime.sweep_worker import job_of_worker
 
 log = logging.getLogger(__name__)
 jobs = Jobs()
@@ -33,8 +35,13 @@ jobs = Jobs()
 def job(config: DictConfig) -> None:
     """Build the stages of the config, map the sequence and write the outputs to Hydra's directory."""
     hydra_config = HydraConfig.get()
-    if is_of_sweep(hydra_config) and by_joblib(hydra_config) and parent_process() is not None:
-        received_from_sweep().check()
+    in_worker = is_of_sweep(hydra_config) and by_joblib(hydra_config) and parent_process() is not None
+    with job_of_worker() if in_worker else nullcontext():
+        run_job(config, hydra_config)
+
+
+def run_job(config: DictConfig, hydra_config: HydraConf) -> None:
+    """Execute a single run, or one job of a sweep."""
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
     # workers of a killed sweep may still write here; a single run has already locked its directory

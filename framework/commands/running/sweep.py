@@ -28,9 +28,14 @@ from framework.files.directory_lock import holder, holder_name, is_locked, locke
 from framework.runs.stored_runs import LOG
 from framework.runtime.process_settings import available_cores
 from framework.runtime.signals import signals_passed_on
+from framework.runtime.sweep_worker import end_with_parent
 
 ending = ExitStack()
 """Cleanup of this process after its run or sweep."""
+
+
+WORKER_START = f"{end_with_parent.__module__}.{end_with_parent.__name__}"
+"""Function that joblib calls in each new worker."""
 
 
 def cores_of(threads: int) -> int:
@@ -105,8 +110,9 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
     workers = 0
     if by_joblib(own):
         workers = min(joblib_workers(own.launcher.n_jobs), runs)
-        with flag_override(own, "readonly", False):
+        with flag_override(own.launcher, ["readonly", "struct"], [False, False]):
             own.launcher.n_jobs = workers
+            own.launcher.initializer = {"_target_": "hydra.utils.get_method", "path": WORKER_START}
     directory = place_of("hydra.sweep.dir", own.sweep.dir)
     return sweep_in(directory, with_table, config.get("figure") is not None, workers > 1)
 
