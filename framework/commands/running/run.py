@@ -22,6 +22,7 @@ from framework.commands.running.sweep import by_joblib, ending
 from framework.errors import PartialRunError
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
+from framework.runs.objective import objective_keys, objective_of
 from framework.runs.stored_runs import is_recorded
 from framework.runtime.signals import ENDING, Interruption, raise_on_signals, signals_deferred
 from framework.runtime.sweep_worker import job_of_worker
@@ -32,25 +33,29 @@ jobs = Jobs()
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 @jobs.reported
-def job(config: DictConfig) -> None:
-    """Build the stages of the config, map the sequence and write the outputs to Hydra's directory."""
+def job(config: DictConfig) -> float | list[float] | None:
+    """Build the stages of the config, map the sequence and write the outputs to Hydra's directory.
+
+    Returns the objective for Hydra's sweeper.
+    """
     hydra_config = HydraConfig.get()
     in_worker = is_of_sweep(hydra_config) and by_joblib(hydra_config) and parent_process() is not None
     with job_of_worker() if in_worker else nullcontext():
-        run_job(config, hydra_config)
+        return run_job(config, hydra_config)
 
 
-def run_job(config: DictConfig, hydra_config: HydraConf) -> None:
-    """Execute a single run, or one job of a sweep."""
+def run_job(config: DictConfig, hydra_config: HydraConf) -> float | list[float] | None:
+    """Execute a single run, or one job of a sweep. Returns its objective."""
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
+    objective_keys(config.objective)
     # workers of a killed sweep may still write here; a single run has already locked its directory
     with locked(directory, wait=True) if is_of_sweep(hydra_config) else nullcontext():
-        if config.skip_completed and is_recorded(directory, config):
-            return
-        interruption = run(config, directory, choices)
-    if is_of_sweep(hydra_config):  # a sweep would continue after this run
-        interruption.check()
+        if not (config.skip_completed and is_recorded(directory, config)):
+            interruption = run(config, directory, choices)
+            if is_of_sweep(hydra_config):  # a sweep would continue after this run
+                interruption.check()
+        return objective_of(directory, config.objective)
 
 
 def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) -> Interruption:

@@ -25,6 +25,7 @@ from framework.config.validation import checked_rows
 from framework.errors import ConfigError, InstanceMapError
 from framework.files.atomic_write import check_regular, remove_left_over
 from framework.files.directory_lock import holder, holder_name, is_locked, locked, new_directory
+from framework.runs.objective import objective_keys
 from framework.runs.stored_runs import LOG
 from framework.runtime.process_settings import available_cores
 from framework.runtime.signals import signals_passed_on
@@ -34,6 +35,7 @@ ending = ExitStack()
 """Cleanup of this process after its run or sweep."""
 
 
+WITH_OBJECTIVE = (".OptunaSweeper", ".AxSweeper", ".NevergradSweeper")  # class names of sweepers
 WORKER_START = f"{end_with_parent.__module__}.{end_with_parent.__name__}"
 """Function that joblib calls in each new worker."""
 
@@ -106,6 +108,10 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
     swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
     overrides = [*swept, *own.overrides.task]
     runs = checked_sweep(overrides, checked_rows(config.get("rows")))
+    if not objective_keys(config.objective) and str(own.sweeper._target_).endswith(WITH_OBJECTIVE):
+        raise ConfigError(
+            "objective: expected a metric to optimize, got none; set objective=instances.ap50, for example"
+        )
     _name_by(own, swept_keys(overrides))
     workers = 0
     if by_joblib(own):
