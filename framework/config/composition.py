@@ -19,7 +19,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
-from omegaconf import DictConfig, ListConfig, open_dict
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
 from framework.config import hydra_api
@@ -39,6 +39,13 @@ def composed(*overrides: str) -> DictConfig:
             return loader.compose([*overrides])
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra raises ValueError for some errors
         raise ConfigError(one_line(error)) from error
+
+
+def resolved(config: DictConfig) -> dict[str, Any]:
+    """Return the keys and values of a config, with interpolations resolved."""
+    plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
 
 
 _added: list[Path] = []

@@ -29,6 +29,8 @@ STAGE_MS = {  # stage times of a frame, ms
     "update": 3.0,
     "integration": 5.0,
 }
+CONFIG = {"seed": 0, "fuser": {"voxel_size": 0.01, "max_blocks": None}, "viewer": {}}  # config of a test run
+METRICS = {"sequence": "a room", "frames": FRAMES, "instances.ap50": 0.5, "instances.ap50.bed": None, "git_dirty": True}
 
 
 @dataclass(frozen=True)
@@ -96,10 +98,12 @@ class ViewerContract:
 
     def test_viewer_accepts_run_without_frames(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         scene, viewer = WatchedMap(), self.plugin()
+        viewer.begin_run(tmp_path, {})
         with scene.call():
             viewer.begin(scene, "a room", tmp_path)
             viewer.skip("frame 0 cannot be read")
             viewer.end()
+        viewer.end_run({}, "no frame was mapped")
         assert not warnings(caplog)
 
     def test_viewer_accepts_several_runs(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -131,6 +135,7 @@ def frame_with_found(k: int) -> tuple[Frame, Detections]:
 
 def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detections]], directory: Path) -> None:
     """Show the frames as a run does. One frame is lost, and one frame is skipped."""
+    viewer.begin_run(directory, CONFIG)
     with scene.call():
         viewer.begin(scene, "a room", directory)
     for k, (frame, found) in enumerate(frames):
@@ -146,6 +151,7 @@ def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detect
                 viewer.show(frame, found, Pose(pose_at(k)), STAGE_MS)
     with scene.call():
         viewer.end()
+    viewer.end_run(METRICS, "")
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:

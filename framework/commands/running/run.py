@@ -6,7 +6,7 @@ import gc
 import logging
 import sys
 from collections.abc import Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from multiprocessing import parent_process
 from pathlib import Path
 
@@ -19,11 +19,11 @@ from omegaconf import DictConfig
 from framework.commands.command_line import Jobs, is_of_sweep
 from framework.commands.running.choices import error_of_first_run, with_row
 from framework.commands.running.sweep import by_joblib, ending
-from framework.errors import PartialRunError
+from framework.errors import DataError, PartialRunError
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.runs.objective import objective_keys, objective_of
-from framework.runs.stored_runs import is_recorded
+from framework.runs.stored_runs import is_recorded, read_metrics
 from framework.runtime.signals import ENDING, Interruption, raise_on_signals, signals_deferred
 from framework.runtime.sweep_worker import job_of_worker
 
@@ -76,6 +76,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     from framework.datasets.frames.sequence_reader import Recording
     from framework.detection.stored.cache import cache_metrics
     from framework.interfaces import RGBDSequence, RGBDVideo
+    from framework.live_view.guarded_viewer import watched_run
     from framework.registry import STAGES, build
     from framework.runs.run_directory import RunRecord, reason
     from framework.runtime.process_settings import Settings, frozen_garbage_collector
@@ -95,16 +96,18 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
         from framework.checking.recording_check import warn_of_poses
 
         warn_of_poses(video)
-    with signals_deferred(*ENDING) as interruption:
+    with signals_deferred(*ENDING) as interruption, watched_run(pipeline.viewer, directory, record.config) as outcome:
         with frozen_garbage_collector():
             result = pipeline.run_to_any_end(video, directory)
         with interruption.second_ends_at_once("after the outputs are written"):
             error = record.write(video, result, cache_metrics(pipeline.detector))
-    if error is None:
-        return interruption
-    if isinstance(error, Exception):
-        raise PartialRunError(reason(error)) from error
-    raise error
+        with suppress(DataError):  # the disk may be full
+            outcome.metrics = read_metrics(directory)
+        if isinstance(error, Exception):
+            raise PartialRunError(reason(error)) from error
+        if error is not None:
+            raise error
+    return interruption
 
 
 def main() -> None:
