@@ -8,7 +8,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
+
+from filelock import FileLock
+from platformdirs import user_cache_path
 
 from framework.config.validation import check_package
 from framework.data import Detections, Frame, Pose
@@ -36,7 +40,9 @@ class MLflowViewer(Viewer):
 
         self._directory = directory
         self._pending: list[Any] = []  # operations of MLflow's thread
-        with self._named_errors():
+        # parallel runs of a sweep would create the tables of the database at the same time
+        lock = user_cache_path("instancemap", appauthor=False, ensure_exists=True) / "mlflow.lock"
+        with FileLock(lock), self._named_errors():
             self._client = MlflowClient(self.tracking_uri or None)
             self._run = self._client.create_run(self._experiment_id(), run_name=directory.absolute().name).info.run_id
             self._client.set_tag(self._run, "run_directory", str(directory.absolute()))
@@ -64,28 +70,17 @@ class MLflowViewer(Viewer):
 
     def _experiment_id(self) -> str:
         """Return the id of the experiment, which is created if it does not exist."""
-        from mlflow.exceptions import MlflowException
-
         found = self._client.get_experiment_by_name(self.experiment)
-        if found is None:
-            try:
-                return str(self._client.create_experiment(self.experiment))
-            except MlflowException:  # another run of the sweep has created it
-                found = self._client.get_experiment_by_name(self.experiment)
-                if found is None:
-                    raise
-        return str(found.experiment_id)
+        return str(found.experiment_id if found else self._client.create_experiment(self.experiment))
 
     @contextmanager
     def _named_errors(self) -> Iterator[None]:
-        from mlflow.exceptions import MlflowException
-
         try:
             yield
-        except MlflowException as error:
+        except Exception as error:  # of MLflow, SQLAlchemy or an HTTP client
             raise ConfigError(
                 f"viewer.tracking_uri: expected a database or server of MLflow, got {self.tracking_uri!r} "
-                f"({in_one_line(error)})"
+                f"({shorten(in_one_line(error), 200)})"
             ) from error
 
 

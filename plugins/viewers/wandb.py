@@ -16,7 +16,7 @@ from framework.interfaces import SceneMap, Viewer
 from framework.runs.logged_values import frame_values, parameter_values, run_values
 
 
-class Mode(Enum):
+class Destination(Enum):
     """Destination of the logs."""
 
     OFFLINE = "offline"
@@ -27,7 +27,7 @@ class Mode(Enum):
 class WandbViewer(Viewer):
     """Logger of parameters, stage times, map size, metrics and the overview image to Weights & Biases."""
 
-    mode: Mode = Mode.OFFLINE  # destination: OFFLINE (wandb folder in the run directory) or ONLINE (server of W&B)
+    mode: Destination = Destination.OFFLINE  # destination: OFFLINE (folder wandb in the run directory) or ONLINE (W&B)
     project: str = "instancemap"  # name of the project
 
     def __post_init__(self) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from framework.errors import ConfigError
 from plugins.viewers.mlflow import MLflowViewer
+from tests.framework.commands.running.test_sweep import BY_JOBLIB, FAKES, begin, end
 from tests.support.tracked_run import FRAMES, tracked_run
 
 mlflow = pytest.importorskip("mlflow", reason="requires mlflow-skinny (extra mlflow)")
@@ -42,3 +43,16 @@ def test_mlflow_invalid_database_raises_error(tmp_path: Path) -> None:
         ConfigError, match=r"viewer\.tracking_uri: expected a database or server of MLflow, got 'nope:x'"
     ):
         MLflowViewer(tracking_uri="nope:x").begin_run(tmp_path, {})
+
+
+@pytest.mark.acceptance
+def test_mlflow_stores_parallel_runs_of_sweep(tmp_path: Path) -> None:
+    """Each worker opens the database, which does not exist before the sweep."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    done = end(begin(tmp_path, *FAKES, *BY_JOBLIB, "viewer=mlflow", "seed=1,2,3", "hydra.sweep.dir=s", sweep="-m"))
+    assert done.returncode == 0, done.stderr
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    runs = client.search_runs([client.get_experiment_by_name("instancemap").experiment_id])
+    assert sorted((run.data.params["seed"], run.info.status) for run in runs) == [
+        (f"{k}", "FINISHED") for k in (1, 2, 3)
+    ]
