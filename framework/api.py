@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from weakref import finalize
@@ -11,7 +12,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig
 
 from framework.compilation.catalog import compile_for_run
-from framework.config.composition import composed
+from framework.config.composition import composed, resolved
 from framework.config.validation import checked_path
 from framework.data import (
     Camera,
@@ -44,7 +45,8 @@ from framework.interfaces import (
     Viewer,
     untimed,
 )
-from framework.pipeline import Pipeline
+from framework.live_view.guarded_viewer import watched_run
+from framework.pipeline import Pipeline, watched
 from framework.queries.map_queries import Map
 from framework.queries.text_search import Match, QueryResult, TextQuery, search
 from framework.registry import build
@@ -166,9 +168,10 @@ class Mapper(Map):
         warn_outside_domain(self.pipeline.detector, None)
         super().__init__(self.pipeline.fuser.scene)
         self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)
-        viewer = self.pipeline.viewer
-        viewer.begin(self.scene, "frames from Python", Path())
-        finalize(self, viewer.end)  # when the mapper is deleted, or at exit
+        with ExitStack() as viewing:
+            viewing.enter_context(watched_run(self.pipeline.viewer, Path(), resolved(config)))
+            viewing.enter_context(watched(self.pipeline.viewer, self.scene, "frames from Python", Path()))
+            finalize(self, viewing.pop_all().close)  # when the mapper is deleted, or at exit
         self._camera: Camera | None = None  # camera of the last frame
         self._sensor = SensorKind.KINECT_V1  # kind of depth sensor of the last frame
         self._T_world_color: Float64 | None = None  # (4, 4) pose of the color image of the last mapped frame

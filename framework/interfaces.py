@@ -20,7 +20,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from framework.data import (
     Array,
@@ -339,11 +339,24 @@ class SceneMap(ABC):
 
 
 class Viewer:
-    """Viewer of a run in progress. This class shows nothing; override the methods that a viewer needs.
+    """Viewer of a run in progress, or logger of runs to an experiment tracker.
 
-    The pipeline waits for each call, so do slow work in a thread (`framework.live_view.drawing_thread`). Read the map
-    only during a call. A viewer must not change results.
+    This class shows nothing; override the methods that a viewer needs. The order of the calls is `begin_run`, `begin`,
+    `show` or `skip` for each frame, `end`, `end_run`. The pipeline waits for each call, so do slow work in a thread
+    (`framework.live_view.drawing_thread`). Read the map only during a call, and not after `end`. A viewer must not
+    change results.
     """
+
+    def begin_run(self, directory: Path, config: Mapping[str, Any]) -> None:
+        """Start a run.
+
+        Args:
+            directory: The output folder.
+            config: The resolved config; empty if a program has built the stages without a config.
+
+        Raises:
+            ConfigError: The viewer cannot start.
+        """
 
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
         """Start showing the run of the video named `video`. `directory` is the folder for files.
@@ -358,4 +371,12 @@ class Viewer:
         """Show the reason for a skipped frame."""
 
     def end(self) -> None:
-        """Finish showing the run. Called once after `begin`, also after an error of the run."""
+        """Finish showing the video. Called once after `begin`, also after an error of the run."""
+
+    def end_run(self, metrics: Mapping[str, Any], error: str) -> None:
+        """Finish the run, whose outputs are written. Called once after `begin_run`, also after an error of the run.
+
+        Args:
+            metrics: The content of metrics.json, or metrics.partial.json; empty without outputs.
+            error: The reason for an early end; "" = the run is complete.
+        """

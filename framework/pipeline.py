@@ -14,7 +14,7 @@ from typing import cast
 
 from framework.data import Array, Detections, Float64, Frame, Pose
 from framework.detection.domain import warn_outside_domain
-from framework.errors import ConfigError, DataError, FrameError, MapFullError
+from framework.errors import ConfigError, DataError, FrameError, MapFullError, in_one_line
 from framework.interfaces import (
     ClusterRefiner,
     Detector,
@@ -26,7 +26,7 @@ from framework.interfaces import (
     SceneMap,
     Viewer,
 )
-from framework.live_view.guarded_viewer import GuardedViewer
+from framework.live_view.guarded_viewer import GuardedViewer, watched_run
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 from framework.runtime.cpu_budget import CpuBudget, parallel_kernels_are_thread_safe
@@ -85,10 +85,14 @@ class Pipeline:
         Raises:
             DataError: No frame was mapped.
         """
-        result = self.run_to_any_end(video)
-        if result.stopped_by is None or isinstance(result.stopped_by, KeyboardInterrupt | MapFullError):
-            return result
-        raise result.stopped_by
+        with watched_run(self.viewer, Path(), {}) as outcome:
+            result = self.run_to_any_end(video)
+            if result.stopped_by is None:
+                return result
+            outcome.error = in_one_line(result.stopped_by)
+            if isinstance(result.stopped_by, KeyboardInterrupt | MapFullError):
+                return result
+            raise result.stopped_by
 
     def run_to_any_end(self, video: RGBDVideo, directory: Path = Path()) -> RunResult:
         """Map `video`. An error of a stage after the first mapped frame is returned in `stopped_by`.

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import wraps
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
@@ -111,22 +112,23 @@ class Jobs:
 
     status: int = 0
 
-    def reported(self, job: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+    def reported(self, job: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
         """Return `job` with error logging: one line per error, with a traceback for unknown errors or `debug=true`."""
 
         @wraps(job)
-        def reported_job(config: DictConfig) -> None:
+        def reported_job(config: DictConfig) -> Any:
             try:
                 check_switches(config)
-                job(config)
+                return job(config)
             except Exception as error:
                 partial = isinstance(error, PartialRunError)
                 cause = error.__cause__ or error if partial else error
                 known = isinstance(cause, KNOWN_ERRORS)
                 _log_error(one_line(error), cause if config.get("debug") is True or not known else None)
-                if _in_worker():  # Hydra pickles the error for the process of the sweep
+                if _is_handled_by_sweep(config):
                     raise InstanceMapError(f"a run failed: {one_line(error)}") from None
                 self.status = EXIT_PARTIAL if partial and not is_of_sweep(HydraConfig.get()) else EXIT_FAILED
+                return None
 
         return reported_job
 
@@ -163,10 +165,15 @@ def _config_dirs(words: list[str]) -> list[Path]:
     return folders
 
 
-def _in_worker() -> bool:
-    """Return True in a worker process: in a job of a sweep with any launcher except Hydra's basic launcher."""
+def _is_handled_by_sweep(config: DictConfig) -> bool:
+    """Return True for a job whose error the sweep handles.
+
+    These are the jobs in worker processes (all launchers except Hydra's basic one), because the process of the sweep
+    receives only the error, and the jobs with an objective, because the sweeper limits the number of failed jobs.
+    """
     hydra_config = HydraConfig.get()
-    return is_of_sweep(hydra_config) and not str(hydra_config.launcher._target_).endswith(".BasicLauncher")
+    with_workers = not str(hydra_config.launcher._target_).endswith(".BasicLauncher")
+    return is_of_sweep(hydra_config) and (with_workers or config.get("objective") is not None)
 
 
 def _log_error(message: str, error: BaseException | None) -> None:

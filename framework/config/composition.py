@@ -19,7 +19,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
-from omegaconf import DictConfig, ListConfig, open_dict
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
 from framework.config import hydra_api
@@ -39,6 +39,13 @@ def composed(*overrides: str) -> DictConfig:
             return loader.compose([*overrides])
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra raises ValueError for some errors
         raise ConfigError(one_line(error)) from error
+
+
+def resolved(config: DictConfig) -> dict[str, Any]:
+    """Return the keys and values of a config, with interpolations resolved."""
+    plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
 
 
 _added: list[Path] = []
@@ -209,18 +216,31 @@ def _message_of(error: BaseException) -> str:
     return _joined(str(error)) or type(error).__name__
 
 
-_EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "ray": "ray"}
-"""Extra that installs each optional launcher of Hydra. InstanceMap's launchers have the names of the extras."""
+_EXTRAS = {
+    "hydra/launcher/joblib": ("launcher=joblib", "joblib"),
+    "hydra/launcher/submitit_slurm": ("launcher=slurm", "slurm"),
+    "hydra/launcher/ray": ("launcher=ray", "ray"),
+    "hydra/sweeper/optuna": ("hydra/sweeper=optuna", "sweepers"),
+}
+"""The override and the extra to install, by the missing config of Hydra."""
+
+_OLD_SWEEPERS = ("ax", "nevergrad")
+"""Sweepers whose latest release fails with Python 3.11: hydra-ax-sweeper 1.2 and hydra-nevergrad-sweeper 1.2."""
 
 
 def _no_such_option(error: MissingConfigException) -> str:
     group, _, name = str(error.missing_cfg_file).rpartition("/")
     if not group:
         return _joined(str(error))
-    if group == "hydra/launcher" and name in _EXTRAS:
-        extra = _EXTRAS[name]
-        return f"launcher: expected the installed extra {extra}, got none; run pip install instancemap[{extra}]"
+    if str(error.missing_cfg_file) in _EXTRAS:
+        override, extra = _EXTRAS[str(error.missing_cfg_file)]
+        return f"{override}: expected the installed extra {extra}, got none; run pip install instancemap[{extra}]"
     options = list(error.options or ())
+    if group == "hydra/sweeper" and name in _OLD_SWEEPERS:
+        return (
+            f"{group}: expected a sweeper for Python 3.11 and later, got {name}; set hydra/sweeper=optuna, which needs "
+            "pip install instancemap[sweepers]"
+        )
     close = get_close_matches(name, options, n=1)
     suggestion = f"; did you mean {close[0]}?" if close else ""
     return f"{group}: expected one of {', '.join(options) or 'none'}, got {name}{suggestion}"

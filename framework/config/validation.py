@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Mapping, Sequence
 from enum import Enum
 from pathlib import Path
@@ -59,6 +60,12 @@ def require(holds: bool, name: str, value: object, allowed: str) -> None:
     """Raise ConfigError with the message "NAME: expected ALLOWED, got VALUE" unless `holds`."""
     if not holds:
         raise ConfigError(f"{name}: expected {allowed}, got {value}")
+
+
+def check_package(key: str, package: str, extra: str) -> None:
+    """Raise ConfigError, with the command that installs the extra, if the optional `package` is missing."""
+    if importlib.util.find_spec(package) is None:
+        raise ConfigError(f"{key}: expected the package {package}, got none; run pip install instancemap[{extra}]")
 
 
 def checked_path(name: str, value: object) -> Path:

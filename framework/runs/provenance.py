@@ -18,7 +18,7 @@ from framework.runtime.process_settings import available_cores
 PACKAGES = ("torch", "numpy", "numba", "open3d")
 UNKNOWN = "unknown"
 WITHOUT_EFFECT = (
-    *("hydra", "debug", "skip_completed", "prefetch", "detection_cache", "detection_cache_dir", "viewer"),
+    *("hydra", "debug", "skip_completed", "prefetch", "detection_cache", "detection_cache_dir", "viewer", "objective"),
     "threads",  # changes only the last digits of network outputs
     *("row", "rows", "sequences", "table", "figure"),  # settings of an experiment
 )

@@ -15,7 +15,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from framework.config.composition import one_line
+from framework.config.composition import one_line, resolved
 from framework.data import Instance
 from framework.errors import InstanceMapError
 from framework.files.atomic_write import atomic_write, remove_left_over
@@ -71,9 +71,7 @@ class RunRecord:
     @classmethod
     def begin(cls, directory: Path, config: DictConfig, choices: Mapping[str, str | None]) -> RunRecord:
         """Start a run in `directory`: remove the metrics and report of an earlier run."""
-        resolved = OmegaConf.to_container(config, resolve=True)
-        assert isinstance(resolved, dict)
-        plain = {str(key): value for key, value in resolved.items()}
+        plain = resolved(config)
         inputs = input_hashes(plain)
         provenance: Metrics = {**code_version(), **plugin_code(plain), **environment()}
         directory.mkdir(parents=True, exist_ok=True)

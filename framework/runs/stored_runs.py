@@ -15,6 +15,7 @@ from typing import Any, TypeGuard
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from framework.config.composition import resolved
 from framework.errors import DataError, first_line
 from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
 from framework.files.json_file import read_json
@@ -222,9 +223,7 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
     except DataError as error:
         log.warning("repeating the run: %s", error)
         return False
-    resolved = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(resolved, dict)
-    plain = {str(key): value for key, value in resolved.items()}
+    plain = resolved(config)
     if record.metrics["config_hash"] != config_hash(plain):
         log.info("repeating the run: the config in %s differs", directory)
         return False

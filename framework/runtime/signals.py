@@ -136,6 +136,11 @@ def received_from_sweep() -> Interruption:
     return _deferring
 
 
+def signal_received() -> bool:
+    """Return True if a deferred signal was received."""
+    return _deferring is not None and _deferring.received is not None
+
+
 @contextmanager
 def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterator[None]:
     """Forward the first signal in the body to the busy workers, and raise Interrupted after they have finished.

@@ -29,6 +29,8 @@ STAGE_MS = {  # stage times of a frame, ms
     "update": 3.0,
     "integration": 5.0,
 }
+CONFIG = {"seed": 0, "fuser": {"voxel_size": 0.01, "max_blocks": None}, "viewer": {}}  # config of a test run
+METRICS = {"sequence": "a room", "frames": FRAMES, "instances.ap50": 0.5, "instances.ap50.bed": None, "git_dirty": True}
 
 
 @dataclass(frozen=True)
@@ -96,10 +98,12 @@ class ViewerContract:
 
     def test_viewer_accepts_run_without_frames(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         scene, viewer = WatchedMap(), self.plugin()
+        viewer.begin_run(tmp_path, {})
         with scene.call():
             viewer.begin(scene, "a room", tmp_path)
             viewer.skip("frame 0 cannot be read")
             viewer.end()
+        viewer.end_run({}, "no frame was mapped")
         assert not warnings(caplog)
 
     def test_viewer_accepts_several_runs(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -134,6 +138,7 @@ def frame_with_found(k: int) -> tuple[Frame, Detections]:
 
 def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detections]], directory: Path) -> None:
     """Show the frames, with their detections, as a run does. Frame LOST is lost, and frame SKIPPED is skipped."""
+    viewer.begin_run(directory, CONFIG)
     with scene.call():
         viewer.begin(scene, "a room", directory)
     shown = [shown_with(k) for k in range(len(frames))]
@@ -145,6 +150,7 @@ def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detect
                 viewer.show(frame, found, pose, stage_ms)
     with scene.call():
         viewer.end()
+    viewer.end_run(METRICS, "")
     for k, (pose, stage_ms) in enumerate(shown):
         assert same(pose, shown_with(k)[0]), "the pose was changed"
         assert stage_ms == shown_with(k)[1], "the stage times were changed"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import os
 import socket
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from framework.config.validation import check_bounds, require
+from framework.config.validation import check_bounds, check_package, require
 from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, in_one_line
 from framework.interfaces import SceneMap, Viewer
@@ -76,8 +75,7 @@ class RerunViewer(Viewer):
         limit = self.memory_limit.removesuffix("B").removesuffix("i").rstrip("kMGT%")
         require(limit.isdecimal(), "viewer.memory_limit", self.memory_limit, "a size such as 2GB or 25%")
         self._page: SealedPage | None = None
-        if importlib.util.find_spec("rerun") is None:
-            raise ConfigError("viewer: expected the package rerun, got none; run pip install instancemap[viewer]")
+        check_package("viewer", "rerun", extra="viewer")
 
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
         import rerun as rr

@@ -454,6 +454,9 @@ class Listener(Viewer):
     def end(self) -> None:
         self.calls.append("end")
 
+    def end_run(self, metrics: Mapping[str, object], error: str) -> None:
+        self.calls.append(f"end_run {error.partition(':')[0]}")
+
 
 @PREFETCH
 def test_viewer_receives_all_frames_in_order(prefetch: int, tmp_path: Path) -> None:
@@ -506,4 +509,11 @@ def test_viewer_end_is_called_after_unusable_sequence() -> None:
     listener = Listener()
     with pytest.raises(DataError):
         pipeline(viewer=listener).run(CornerRoom(frames=1, unreadable=0))
-    assert listener.calls[-1] == "end"
+    assert listener.calls[-2:] == ["end", "end_run corner_room"]
+
+
+def test_viewer_end_run_receives_reason_for_early_end(room: CornerRoom) -> None:
+    for fuser, reason in ((GridFuser(), ""), (GridFuser(capacity=2), "fuser.capacity")):
+        listener = Listener()
+        pipeline(viewer=listener, fuser=fuser).run(room)
+        assert listener.calls[-2:] == ["end", f"end_run {reason}"]

@@ -136,6 +136,10 @@ FAKES = {"dataset": "CornerRoom", "tracker": "GivenPose", "refiner": "KeepAll", 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_documented_command_composes(command: str) -> None:
     overrides = [word for word in shlex.split(command)[3:] if "=" in word]
+    if "hydra/sweeper=optuna" in overrides:
+        pytest.importorskip(
+            "hydra_plugins.hydra_optuna_sweeper", reason="requires hydra-optuna-sweeper (extra sweepers)"
+        )
     choices = [override.split("=")[1].split(",") for override in overrides if override.split("=")[0] in STAGES]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         for k in range(max(map(len, choices), default=1)):
@@ -262,5 +266,8 @@ def test_documented_benchmark_exists(command: str) -> None:
 
 
 def _kth(override: str, k: int) -> str:
-    values = override.split("=")[1].split(",")
+    value = override.split("=")[1]
+    if value.startswith("interval("):
+        return value.removeprefix("interval(").split(",")[0]
+    values = value.split(",")
     return values[k % len(values)]

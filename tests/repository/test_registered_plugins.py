@@ -67,8 +67,6 @@ class TestFusers(FuserContract):
 class TestViewers(ViewerContract):
     @pytest.fixture(autouse=True, params=registered.names("viewer"))
     def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
-        if request.param == "rerun":
-            pytest.importorskip("rerun", reason="requires rerun-sdk (extra viewer)")
         self.plugin = lambda: ready("viewer", request.param)
 
 

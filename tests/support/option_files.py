@@ -187,6 +187,26 @@ def _trajectory_file(folder: Path) -> list[str]:
     return [f"tracker.path={folder / 'poses.txt'}"]
 
 
+def _mlflow(folder: Path) -> list[str]:
+    pytest.importorskip("mlflow", reason="requires mlflow-skinny (extra mlflow)")
+    return [f"viewer.tracking_uri=sqlite:///{folder / 'mlflow.db'}"]
+
+
+def _rerun(_: Path) -> list[str]:
+    pytest.importorskip("rerun", reason="requires rerun-sdk (extra viewer)")
+    return []
+
+
+def _tensorboard(_: Path) -> list[str]:
+    pytest.importorskip("tensorboard", reason="requires tensorboard (extra tensorboard)")
+    return []
+
+
+def _wandb(_: Path) -> list[str]:
+    pytest.importorskip("wandb", reason="requires wandb (extra wandb)")
+    return []
+
+
 WRITERS: dict[tuple[str, str], Callable[[Path], list[str]]] = {
     ("dataset", "folder_watch"): _folder_watch,
     ("dataset", "orbbec"): _camera,
@@ -207,4 +227,8 @@ WRITERS: dict[tuple[str, str], Callable[[Path], list[str]]] = {
     ("detector", "transformers_segmentation"): _transformers_segmentation,
     ("detector", "with_embeddings"): _with_embeddings,
     ("tracker", "trajectory_file"): _trajectory_file,
+    ("viewer", "mlflow"): _mlflow,
+    ("viewer", "rerun"): _rerun,
+    ("viewer", "tensorboard"): _tensorboard,
+    ("viewer", "wandb"): _wandb,
 }

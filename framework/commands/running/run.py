@@ -6,11 +6,12 @@ import gc
 import logging
 import sys
 from collections.abc import Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from multiprocessing import parent_process
 from pathlib import Path
 
 import hydra
+from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig
@@ -18,11 +19,13 @@ from omegaconf import DictConfig
 from framework.commands.command_line import Jobs, is_of_sweep
 from framework.commands.running.choices import error_of_first_run, with_row
 from framework.commands.running.sweep import by_joblib, ending
-from framework.errors import PartialRunError
+from framework.errors import DataError, PartialRunError
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
-from framework.runs.stored_runs import is_recorded
-from framework.runtime.signals import ENDING, Interruption, raise_on_signals, received_from_sweep, signals_deferred
+from framework.runs.objective import objective_keys, objective_of
+from framework.runs.stored_runs import is_recorded, read_metrics
+from framework.runtime.signals import ENDING, Interruption, raise_on_signals, signals_deferred
+from framework.runtime.sweep_worker import job_of_worker
 
 log = logging.getLogger(__name__)
 jobs = Jobs()
@@ -30,20 +33,29 @@ jobs = Jobs()
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 @jobs.reported
-def job(config: DictConfig) -> None:
-    """Build the stages of the config, map the sequence and write the outputs to Hydra's directory."""
+def job(config: DictConfig) -> float | list[float] | None:
+    """Build the stages of the config, map the sequence and write the outputs to Hydra's directory.
+
+    Returns the objective for Hydra's sweeper.
+    """
     hydra_config = HydraConfig.get()
-    if is_of_sweep(hydra_config) and by_joblib(hydra_config) and parent_process() is not None:
-        received_from_sweep().check()
+    in_worker = is_of_sweep(hydra_config) and by_joblib(hydra_config) and parent_process() is not None
+    with job_of_worker() if in_worker else nullcontext():
+        return run_job(config, hydra_config)
+
+
+def run_job(config: DictConfig, hydra_config: HydraConf) -> float | list[float] | None:
+    """Execute a single run, or one job of a sweep. Returns its objective."""
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
+    objective_keys(config.objective)
     # workers of a killed sweep may still be writing here; a single run has already locked its directory
     with locked(directory, wait=True) if is_of_sweep(hydra_config) else nullcontext():
-        if config.skip_completed and is_recorded(directory, config):
-            return
-        interruption = run(config, directory, choices)
-    if is_of_sweep(hydra_config):  # a sweep would continue after this run
-        interruption.check()
+        if not (config.skip_completed and is_recorded(directory, config)):
+            interruption = run(config, directory, choices)
+            if is_of_sweep(hydra_config):  # a sweep would continue after this run
+                interruption.check()
+        return objective_of(directory, config.objective)
 
 
 def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) -> Interruption:
@@ -64,6 +76,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     from framework.datasets.frames.sequence_reader import Recording
     from framework.detection.stored.cache import cache_metrics
     from framework.interfaces import RGBDSequence, RGBDVideo
+    from framework.live_view.guarded_viewer import watched_run
     from framework.registry import STAGES, build
     from framework.runs.run_directory import RunRecord, reason
     from framework.runtime.process_settings import Settings, frozen_garbage_collector
@@ -83,16 +96,18 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
         from framework.checking.recording_check import warn_of_poses
 
         warn_of_poses(video)
-    with signals_deferred(*ENDING) as interruption:
+    with signals_deferred(*ENDING) as interruption, watched_run(pipeline.viewer, directory, record.config) as outcome:
         with frozen_garbage_collector():
             result = pipeline.run_to_any_end(video, directory)
         with interruption.second_ends_at_once("after the outputs are written"):
             error = record.write(video, result, cache_metrics(pipeline.detector))
-    if error is None:
-        return interruption
-    if isinstance(error, Exception):
-        raise PartialRunError(reason(error)) from error
-    raise error
+        with suppress(DataError):  # the disk may be full
+            outcome.metrics = read_metrics(directory)
+        if isinstance(error, Exception):
+            raise PartialRunError(reason(error)) from error
+        if error is not None:
+            raise error
+    return interruption
 
 
 def main() -> None:

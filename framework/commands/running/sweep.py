@@ -25,12 +25,19 @@ from framework.config.validation import checked_rows
 from framework.errors import ConfigError, InstanceMapError
 from framework.files.atomic_write import check_regular, remove_left_over
 from framework.files.directory_lock import holder, holder_name, is_locked, locked, new_directory
+from framework.runs.objective import objective_keys
 from framework.runs.stored_runs import LOG
 from framework.runtime.process_settings import available_cores
 from framework.runtime.signals import signals_passed_on
+from framework.runtime.sweep_worker import end_with_parent
 
 ending = ExitStack()
 """Stack of contexts that this process closes after its run or sweep."""
+
+
+WITH_OBJECTIVE = (".OptunaSweeper", ".AxSweeper", ".NevergradSweeper")  # class names of sweepers
+WORKER_START = f"{end_with_parent.__module__}.{end_with_parent.__name__}"
+"""Function that joblib calls in each new worker."""
 
 
 def cores_of(threads: int) -> int:
@@ -103,12 +110,17 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
     runs = checked_sweep(overrides, rows)
     if with_table:
         check_table(config, overrides, rows)
+    if not objective_keys(config.objective) and str(own.sweeper._target_).endswith(WITH_OBJECTIVE):
+        raise ConfigError(
+            "objective: expected a metric to optimize, got none; set objective=instances.ap50, for example"
+        )
     _name_by(own, swept_keys(overrides), of_tables(overrides))
     workers = 0
     if by_joblib(own):
         workers = min(joblib_workers(own.launcher.n_jobs), runs)
-        with flag_override(own, "readonly", False):
+        with flag_override(own.launcher, ["readonly", "struct"], [False, False]):
             own.launcher.n_jobs = workers
+            own.launcher.initializer = {"_target_": "hydra.utils.get_method", "path": WORKER_START}
     directory = directory_of("hydra.sweep.dir", own.sweep.dir)
     return sweep_in(directory, with_table, config.get("figure") is not None, workers > 1)
 

@@ -17,6 +17,7 @@ import pytest
 from framework.files.directory_lock import locked
 from framework.runs.stored_runs import MAPPED
 from tests.support.forked_commands import FAKE_CONF, ForkedCommand
+from tests.support.noted_calls import CALLS
 
 pytestmark = pytest.mark.integration
 
@@ -25,6 +26,7 @@ FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refine
 SMALL = ("trajectory.txt", "timings.csv", "instances.json")
 ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=100000", "fuser.note=note")
 PATIENCE_S = 120
+CAPACITY = "fuser.capacity: expected at most 1 frames, got more; increase fuser.capacity"
 
 
 def begin(directory: Path, *arguments: str, before: Callable[[], object] | None = None) -> ForkedCommand:
@@ -290,3 +292,28 @@ def test_run_removes_leftover_partial_files(tmp_path: Path) -> None:
     mine.touch()
     assert end(begin(tmp_path, f"hydra.run.dir={tmp_path}"))[0] == 0
     assert (torn.exists(), mine.exists()) == (False, True)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "status", "frames", "outcome"),
+    [
+        ([], 0, 6, [2, None, ""]),
+        (["fuser.capacity=1"], 3, 1, [2, CAPACITY, CAPACITY]),
+        (
+            ["dataset.frames=1", "dataset.unreadable=0"],
+            1,
+            0,
+            [None, None, "corner_room: expected usable frames, got none"],
+        ),
+    ],
+)
+def test_run_viewer_is_called_from_start_to_outputs(
+    tmp_path: Path, overrides: list[str], status: int, frames: int, outcome: list[object]
+) -> None:
+    process = begin(tmp_path, "viewer=noted", "seed=3", "hydra.run.dir=run", *overrides)
+    assert end(process)[0] == status
+    calls = [json.loads(line) for line in (tmp_path / "run" / CALLS).read_text().splitlines()]
+    shown = [["show", k] for k in range(frames)]
+    assert calls[:-1] == [["begin_run", 3, True], ["begin", "corner_room"], *shown, ["end"]]
+    assert calls[-1][:3] == ["end_run", *outcome[:2]]
+    assert calls[-1][3].startswith(str(outcome[2]))

@@ -287,9 +287,52 @@ def test_sweep_second_signal_ends_workers_immediately(tmp_path: Path) -> None:
     assert [each["frames"] > 0 for each in partial] == [True, True]
 
 
+def running_after(seconds: float, processes: list[psutil.Process]) -> list[psutil.Process]:
+    """Return the processes that have not ended after some seconds. Another process may read their status later."""
+    deadline = time.monotonic() + seconds
+    while left := [one for one in processes if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]:
+        if time.monotonic() > deadline:
+            return left
+        time.sleep(0.1)
+    return []
+
+
+@pytest.mark.parametrize("signaled", [False, True])
+def test_sweep_killed_leaves_partial_outputs_only(tmp_path: Path, signaled: bool) -> None:
+    """After `kill -9` of the main process, its workers write partial outputs and exit, also without a signal."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    process = begin(tmp_path, *BY_JOBLIB, "row=all", "seed=1,2,3", *ENDLESS, "fuser.note=${seed}.note")
+    wait_until(lambda: len(list(tmp_path.glob("*.note"))) == 2, process)
+    family = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    for worker in family if signaled else ():
+        worker.terminate()
+    assert not running_after(10, family)
+    process.communicate()
+    partial = [json.loads(path.read_text()) for path in (tmp_path / PLACE).glob("*/metrics.partial.json")]
+    assert [(each["partial"], each["frames"] > 0) for each in partial] == [("ended by SIGTERM", True)] * 2
+
+
+@pytest.mark.parametrize("state", ["starting", "writing"])
+@pytest.mark.acceptance
+def test_sweep_killed_leaves_no_processes(tmp_path: Path, state: str) -> None:
+    """Workers also exit if they are just being started, and if writing takes too long."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    process = begin(tmp_path, *BY_JOBLIB, "row=all", "seed=1,2", "fuser.slow_save_s=100", "fuser.capacity=100000")
+    root = psutil.Process(process.pid)
+    if state == "starting":
+        wait_until(lambda: any("LokyProcess" in " ".join(one.cmdline()) for one in root.children()), process)
+    else:
+        wait_until(lambda: len(list((tmp_path / PLACE).glob("*/mesh.ply"))) == 2, process)
+    family = root.children(recursive=True)
+    process.kill()
+    assert not running_after(10, family)
+    process.communicate()
+
+
 @pytest.mark.acceptance
 def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
-    """After `kill -9` of the main process, its workers finish their runs."""
+    """After `kill -9` of the main process, its workers still write partial outputs; the next sweep repeats the runs."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     arguments = (*BY_JOBLIB, "row=half", "dataset.slow_s=1")
     first = begin(tmp_path, *arguments)
@@ -304,13 +347,10 @@ def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
     for worker in workers:
         worker.resume()
     done = end(again)
-    for worker in workers:
-        worker.kill()  # otherwise, idle workers stay for some minutes
     first.communicate()
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("in use by process") == 2
-    assert done.stderr.count("skipped: the completed run in") == 2
-    assert "mapping" not in done.stderr
+    assert done.stderr.count("mapping") == len(recorded(tmp_path)) == 2
 
 
 def test_sweep_in_locked_folder_is_refused(tmp_path: Path) -> None:
