@@ -1,11 +1,11 @@
-"""manifest.json: status, input files and the SHA-256 of all result files of a run."""
+"""manifest.json: status, inputs and parameters of a run, and the SHA-256 of its result files."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -31,15 +31,15 @@ class Manifest:
     status: RunStatus
     files: Mapping[str, tuple[int, str]]  # size, bytes, and SHA-256 (hex) by file name
     inputs: Mapping[str, str]  # SHA-256 (hex) of the input files, by config key
+    parameters: Mapping[str, str]  # values of the parameters that change results, by dotted key
 
-    @classmethod
-    def of(cls, directory: Path, names: list[str], status: RunStatus, inputs: Mapping[str, str]) -> Manifest:
-        """Return the manifest of the existing files with these names in a run directory.
+    def with_files(self, directory: Path, names: Iterable[str]) -> Manifest:
+        """Return this manifest with the existing files of these names in a run directory.
 
         Raises DataError if a file cannot be read.
         """
         paths = [directory / name for name in names if (directory / name).exists()]
-        return cls(status, {path.name: (path.stat().st_size, path_hash(path)) for path in paths}, inputs)
+        return replace(self, files={path.name: (path.stat().st_size, path_hash(path)) for path in paths})
 
     @classmethod
     def read(cls, directory: Path) -> Manifest:
@@ -53,9 +53,12 @@ class Manifest:
             raise DataError(f"{path}: expected the digest {_digest(content)[:12]}, got {digest!s:.12}; repeat the run")
         try:
             files = {str(name): (int(one["bytes"]), str(one["sha256"])) for name, one in content["files"].items()}
-            return cls(RunStatus[content["status"]], files, {key: str(one) for key, one in content["inputs"].items()})
+            texts = [{key: str(one) for key, one in content[name].items()} for name in ("inputs", "parameters")]
+            return cls(RunStatus[content["status"]], files, *texts)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise DataError(f"{path}: expected status, files and inputs, got an error ({error!r})") from error
+            raise DataError(
+                f"{path}: expected status, files, inputs and parameters, got an error ({error!r})"
+            ) from error
 
     def write(self, directory: Path) -> None:
         """Write the manifest atomically. Raises DataError if writing fails."""
@@ -63,6 +66,7 @@ class Manifest:
             "status": self.status.name,
             "files": {name: {"bytes": size, "sha256": sha256} for name, (size, sha256) in self.files.items()},
             "inputs": dict(self.inputs),
+            "parameters": dict(self.parameters),
         }
         write_json(directory / MANIFEST, content | {"digest": _digest(content)})
 

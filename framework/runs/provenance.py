@@ -38,6 +38,11 @@ def relevant(config: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in config.items() if key not in WITHOUT_EFFECT}
 
 
+def parameters_of(config: Mapping[str, Any]) -> dict[str, str]:
+    """Return the values of the parameters that change results, as text by dotted key."""
+    return {key: str(value) for key, value in leaves(relevant(config))}
+
+
 def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the values of a config by dotted key; a list is one value."""
     for key, value in node.items():

@@ -124,8 +124,7 @@ class Reevaluation:
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
             if (self.record.directory / MANIFEST).exists():
                 stored = Manifest.read(self.record.directory)
-                names = list(stored.files)
-                Manifest.of(self.record.directory, names, stored.status, stored.inputs).write(self.record.directory)
+                stored.with_files(self.record.directory, stored.files).write(self.record.directory)
 
 
 def read_predictions(record: Record) -> PredictedInstances:

@@ -13,7 +13,7 @@ from framework.files.atomic_write import read_text
 from framework.runs.inputs import ROOT, input_hashes
 from framework.runs.manifest import Manifest
 from framework.runs.plugin_code import changed_code, plugin_code
-from framework.runs.provenance import code_version, leaves, package_version, relevant
+from framework.runs.provenance import code_version, leaves, package_version, parameters_of
 from framework.runs.stored_runs import (
     CONFIG,
     DIGESTS,
@@ -25,12 +25,10 @@ from framework.runs.stored_runs import (
     TRAJECTORY,
     Record,
     commit_of,
-    read_yaml,
 )
 from framework.runtime.run_log import FUSION, STAGES
 
 COMPARED = (TRAJECTORY, INSTANCES, MESH, MAP, KEYFRAMES)  # files without times
-COMPOSED = Path(".hydra/config.yaml")  # the config as composed by Hydra
 PACKAGES = ("numba", "numpy", "onnxruntime", "opencv-python-headless", "scipy", "torch", "transformers")
 """Packages that may change the last digits of results."""
 
@@ -47,7 +45,7 @@ def causes(record: Record) -> list[str]:
     manifest = Manifest.read(record.directory)
     return [
         *manifest.changed_files(record.directory, optional=LARGE),
-        *_changed_parameters(record),
+        *_changed_parameters(manifest.parameters, record),
         *_changed_inputs(manifest.inputs, input_hashes(record.config), record.config),
         *(f"plugin code of {change}" for change in changed_code(record.metrics, plugin_code(record.config))),
         *_changed_commit(record),
@@ -55,15 +53,13 @@ def causes(record: Record) -> list[str]:
     ]
 
 
-def _changed_parameters(record: Record) -> Iterator[str]:
-    """Yield the parameters in config.yaml that differ from the config as composed by Hydra."""
-    if not (record.directory / COMPOSED).exists():
-        return
-    composed = dict(leaves(relevant(read_yaml(record.directory / COMPOSED))))
-    for key, value in leaves(relevant(record.config)):
-        before = composed.get(key, value)
-        if before != value and "${" not in str(before):
-            yield f"{record.directory / CONFIG}: {key}: expected {before} (as composed by Hydra), got {value}"
+def _changed_parameters(before: Mapping[str, str], record: Record) -> Iterator[str]:
+    """Yield the parameters in config.yaml that differ from those of the run in manifest.json."""
+    now = parameters_of(record.config)
+    for key in dict.fromkeys([*before, *now]):
+        expected, got = (values.get(key, "no value") for values in (before, now))
+        if expected != got:
+            yield f"{record.directory / CONFIG}: {key}: expected {expected}, got {got}"
 
 
 def _changed_inputs(before: Mapping[str, str], now: Mapping[str, str], config: Mapping[str, Any]) -> Iterator[str]:

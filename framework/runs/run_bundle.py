@@ -14,11 +14,11 @@ from framework.errors import DataError
 from framework.files.atomic_write import atomic_write
 from framework.runs.manifest import MANIFEST, Manifest
 from framework.runs.plugin_code import plugin_files, targets_of
-from framework.runs.reproduction import COMPOSED, LARGE
+from framework.runs.reproduction import LARGE
 from framework.runs.stored_runs import completed_runs
 from framework.runs.sweep_file import SWEEP
 
-TABLES = (SWEEP, "table.md", "table.tex", "table.csv")
+SWEEP_FILES = (SWEEP, "table.md", "table.tex", "table.csv")
 PLUGINS = "plugins"  # folder with the sources of third-party plugins
 OPTIONS = "options"  # folder that registers these plugins, for the composition of configs
 MAX_SIZE = 2**36  # maximum total size of an extracted bundle, bytes
@@ -39,8 +39,8 @@ def write_bundle(folder: Path, path: Path, with_maps: bool = False) -> int:
                 raise DataError(f"{changed[0]}; repeat the run")
             names = [name for name in manifest.files if with_maps or name not in LARGE]
             of_run = record.directory.relative_to(folder) if record.directory != folder else record.directory.name
-            _add_files(archive, record.directory, [*names, MANIFEST, str(COMPOSED)], Path(of_run))
-        _add_files(archive, folder, TABLES, Path())
+            _add_files(archive, record.directory, [*names, MANIFEST], Path(of_run))
+        _add_files(archive, folder, SWEEP_FILES, Path())
         for name, file in sorted({pair for files in sources.values() for pair in files}):
             archive.write(file, f"{PLUGINS}/{name}")
         for k, (stage, target) in enumerate(sources):

@@ -29,7 +29,7 @@ from framework.runs.manifest import MANIFEST, Manifest, RunStatus
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
 from framework.runs.plugin_code import plugin_code
-from framework.runs.provenance import code_version, config_hash, environment, frozen_environment
+from framework.runs.provenance import code_version, config_hash, environment, frozen_environment, parameters_of
 from framework.runs.stored_runs import (
     CHOICE,
     CONFIG,
@@ -162,8 +162,8 @@ class RunRecord:
         write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
 
     def _write_manifest(self, status: RunStatus) -> None:
-        names = [*RESULT_FILES, METRICS, PARTIAL_METRICS]
-        Manifest.of(self.directory, names, status, self.inputs).write(self.directory)
+        manifest = Manifest(status, {}, self.inputs, parameters_of(self.config))
+        manifest.with_files(self.directory, [*RESULT_FILES, METRICS, PARTIAL_METRICS]).write(self.directory)
 
     def _announce(
         self, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics, error: BaseException | None

@@ -1,4 +1,4 @@
-"""`instancemap reproduce RUN|FOLDER|BUNDLE`: run stored runs again and compare the results."""
+"""`instancemap reproduce RUN|FOLDER|TABLE|BUNDLE`: run stored runs again and compare the results."""
 
 from __future__ import annotations
 
@@ -18,15 +18,18 @@ from framework.errors import ConfigError, DataError
 from framework.runs.reproduction import Reproduction, causes
 from framework.runs.run_bundle import opened_bundle
 from framework.runs.stored_runs import METRICS, Record, find_records, no_run_error, read_record
+from framework.tables.comparison import ComparisonTable
+from framework.tables.table_check import TABLE_FORMATS, changed_tables
 
 
 def main() -> None:
     """Run the command `instancemap reproduce`."""
     parser = argparse.ArgumentParser(
         description="Run stored runs again and compare the results: byte-identical, or the first stage and frame that "
-        "differ. Changes of files, parameters, inputs, code and packages since the runs are listed first."
+        "differ. Changes of tables, files, parameters, inputs, code and packages since the runs are listed first."
     )
-    parser.add_argument("source", metavar="SOURCE", type=Path, help="run directory, folder of runs, or bundle (.zip)")
+    kinds = "run directory, folder of runs, table in this folder (table.md, .tex or .csv), or bundle (.zip)"
+    parser.add_argument("source", metavar="SOURCE", type=Path, help=kinds)
     parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="overrides, e.g. dataset.root=DIR")
     parser.add_argument("--cell", metavar="ROW", help="reproduce only the runs of this row of the table; default: all")
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder of the repeated runs; default: temporary")
@@ -38,7 +41,9 @@ def main() -> None:
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors(), ExitStack() as stack:
         folder, out = parsed.source, parsed.out
-        if folder.suffix == ".zip":
+        if folder.suffix in TABLE_FORMATS:
+            folder = folder.parent
+        elif folder.suffix == ".zip":
             folder = stack.enter_context(opened_bundle(folder, parsed.trust_code))
         if out is None and not parsed.check_only:
             out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="instancemap_")))
@@ -48,24 +53,33 @@ def main() -> None:
 
 
 def reproduce_all(folder: Path, overrides: Sequence[str], row: str | None, out: Path | None) -> int:
-    """Print the changes and the comparison of each completed run, and return the number of different runs.
+    """Print the changes and the comparison of each completed run. Return the number of changed tables and runs.
 
-    A run whose config.yaml or metrics.json was edited is different, and is not run again. `row`: only the runs of this
-    row of an experiment; None = all runs. `out`: the folder of the repeated runs; None = only list the changes.
+    A run whose config.yaml or metrics.json was edited is different, and is not run again.
+
+    Args:
+        folder: The folder of the runs and their tables.
+        overrides: Overrides of the stored configs.
+        row: Only the runs in this row of the table; None = all runs.
+        out: The folder of the repeated runs; None = only list the changes.
     """
     records, incomplete = find_records(folder)
     edited = [one for one in incomplete if (one.directory / METRICS).exists()]
     if not records and not edited:
         raise no_run_error(folder, incomplete)
     if records and row is not None:
-        records = _of_row(records, row)
+        records = _of_row(folder, row)
+    different = len(edited)
+    if not edited:
+        for change in changed_tables(folder):
+            print(f"changed: {change}")
+            different += 1
     for one in edited:
         print_error(DataError(one.reason))
         try:
             _print_changes(read_record(one.directory, check_config=False))
         except KNOWN_ERRORS as error:
             print_error(error, f"error: {one.directory.name}: ")
-    different = len(edited)
     for number, record in enumerate(records):
         repeated = None if out is None else out / f"{number:03d}_{record.directory.name}"[:200]
         try:
@@ -98,12 +112,13 @@ def _print_changes(record: Record) -> bool:
     return bool(changes)
 
 
-def _of_row(records: Sequence[Record], row: str) -> list[Record]:
-    """Return the runs of a row of an experiment. Raises ConfigError if no run has this row."""
-    rows = [str(record.config.get("row")) for record in records]
+def _of_row(folder: Path, row: str) -> list[Record]:
+    """Return the runs in a row of the table. Raises ConfigError if the table has no row of this name."""
+    comparison = ComparisonTable.below(folder)
+    rows = {comparison.called(one): list(one.records.values()) for one in comparison.rows}
     if row not in rows:
-        raise ConfigError(f"--cell: expected one of {', '.join(sorted(set(rows)))}, got {row!r}")
-    return [record for record, of_record in zip(records, rows, strict=True) if of_record == row]
+        raise ConfigError(f"--cell: expected one of the rows {'; '.join(rows)}, got {row!r}")
+    return rows[row]
 
 
 def _run_again(record: Record, overrides: Sequence[str], directory: Path) -> None:

@@ -15,6 +15,7 @@ from framework.runs.data_frame import load_runs
 from framework.runs.provenance import config_hash
 from framework.synthetic.scenenn_scene import BenchmarkSettings
 from framework.tables.experiment_tables import write_tables
+from framework.tables.table_check import changed_tables
 from tests.support.forked_commands import completed
 
 pytestmark = pytest.mark.integration
@@ -73,6 +74,26 @@ def test_write_tables_values_match_manual_result(sweep: Path) -> None:
     assert "- Code: 1234567." in lines
     assert "- Machine: 2 cores of Z80." in lines
     assert "Missing" not in text
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after", "message"),
+    [
+        ("table.md", "0.700 ±", "0.900 ±", "chain: AP50: expected 0.700 ± 0.265 as in the runs, got 0.900 ± 0.265"),
+        ("table.tex", "0.700", "0.900", "chain: AP50: expected 0.700 $\\pm$ 0.265 as in the runs, got 0.900 $\\pm$"),
+        ("table.csv", ",0.6,", ",0.61,", "row=chain,seed=1: instances.ap50: expected 0.6 as in the runs, got 0.61"),
+        ("table.md", "| identity | 3 | -", "| x | 3 | -", "minus chain: expected identity as in the runs, got x"),
+        ("table.md", " poses ", " x | poses ", "expected the rows and columns of the runs' table, got others"),
+    ],
+)
+def test_changed_tables_name_edited_cell(sweep: Path, name: str, before: str, after: str, message: str) -> None:
+    write_tables(sweep)
+    assert list(changed_tables(sweep)) == []
+    content = (sweep / name).read_text()
+    content = "\n".join(" ".join(line.split()) for line in content.splitlines()) if name == "table.md" else content
+    assert before in content
+    (sweep / name).write_text(content.replace(before, after))
+    assert any(message in change for change in changed_tables(sweep)), list(changed_tables(sweep))
 
 
 def test_table_csv_is_data_frame_of_its_runs(sweep: Path) -> None:

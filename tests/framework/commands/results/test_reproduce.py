@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import shutil
@@ -77,7 +78,7 @@ def test_reproduce_changed_parameter_is_named(runs: Path, run: Path) -> None:
     config.write_text(config.read_text().replace("distance: 0.0", "distance: 0.5"))
     done = reproduce(runs, run)
     assert done.returncode == 1
-    assert "config.yaml: refiner.distance: expected 0.0 (as composed by Hydra), got 0.5" in done.stdout
+    assert "config.yaml: refiner.distance: expected 0.0, got 0.5" in done.stdout
 
 
 def test_reproduce_edited_metrics_are_named(runs: Path, run: Path) -> None:
@@ -86,6 +87,17 @@ def test_reproduce_edited_metrics_are_named(runs: Path, run: Path) -> None:
     done = reproduce(runs, run, "--check-only")
     assert done.returncode == 1
     assert "metrics.json: expected the SHA-256" in done.stdout
+
+
+def test_reproduce_edited_table_names_cell(runs: Path, run: Path) -> None:
+    assert command(run.parent.parent, "tables", "sweep").returncode == 0
+    table = run.parent / "table.csv"
+    lines = table.read_text().splitlines()
+    count = dict(zip(*csv.reader(lines), strict=True))["frames"]
+    table.write_text("\n".join([lines[0], lines[1].replace(f",{count},", ",97,")]) + "\n")
+    done = command(run.parent.parent, "reproduce", "sweep/table.csv", "--check-only")
+    assert done.returncode == 1
+    assert f"table.csv: run: frames: expected {count} as in the runs, got 97" in done.stdout
 
 
 def test_reproduce_changed_plugin_names_package_frame_and_stage(runs: Path, run: Path, tmp_path: Path) -> None:
@@ -108,7 +120,7 @@ def test_reproduce_override_of_unknown_key_raises(runs: Path, run: Path) -> None
 def test_reproduce_unknown_row_lists_rows(runs: Path, run: Path) -> None:
     done = reproduce(runs, run, "--cell", "nothing")
     assert done.returncode == 1
-    assert "error: --cell: expected one of " in done.stderr
+    assert "error: --cell: expected one of the rows all runs, got 'nothing'" in done.stderr
 
 
 def test_bundle_contains_plugin_and_is_reproduced_without_package(runs: Path, run: Path, tmp_path: Path) -> None:
