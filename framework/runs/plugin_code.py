@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from framework.config.composition import installed_config_dirs
+from framework.files.module_imports import required_modules
 from framework.registry import STAGES
 from framework.runs.provenance import leaves, package_version
 
@@ -23,10 +25,10 @@ DIGITS = 12  # number of digits of a shown hash
 def plugin_code(config: Mapping[str, Any]) -> dict[str, str]:
     """Return the package, version and hash of the plugins of each stage, by key of metrics.json.
 
-    A stage with plugins of several packages, such as a chain of refiners, lists them all. The hash covers the first
-    MAX_FILES files of a package in alphabetical order, or a single file. Files above MAX_HASHED bytes are represented
-    by size and modification time. For plugins of this project, only the plugin's own file is hashed, without comments
-    and docstrings.
+    A stage with several plugins, such as a chain of refiners, lists them all. The hash covers the modules that a plugin
+    imports from its package, and the package's other files except for config options. Files above MAX_HASHED bytes are
+    represented by size and modification time. For plugins of this project, only the plugin's own file is hashed,
+    without comments and docstrings.
 
     Args:
         config: The resolved config of a run.
@@ -74,7 +76,7 @@ def _described(target: str) -> str:
     module = target.rpartition(".")[0]
     package = module.partition(".")[0]
     own = package in OWN
-    files = _files_of(module if own else package)
+    files = _files_of(module) if own else _required_files(target)
     if not files:
         return f"{package} missing"
     digest = hashlib.sha256()
@@ -84,6 +86,25 @@ def _described(target: str) -> str:
         digest.update(content)
     known = None if own else package_version(package)
     return " ".join(filter(None, (module if own else package, known, digest.hexdigest()[:DIGITS])))
+
+
+def _required_files(target: str) -> list[tuple[str, Path]]:
+    """Return the relative names and the paths of the files of a package that a class depends on."""
+    files = _files_of(target.partition(".")[0])
+    modules = {_dotted(name): path for name, path in files if path.suffix == ".py"}
+    required = required_modules(target, modules)
+    others = [path for _, path in files if path.suffix != ".py" and not _is_option(path)]
+    return [(name, path) for name, path in files if _dotted(name) in required or path in others]
+
+
+def _is_option(path: Path) -> bool:
+    """Return True for a file in a config folder of an installed package. Its values are in the config of the run."""
+    return any(path.resolve().is_relative_to(folder) for folder in installed_config_dirs())
+
+
+def _dotted(name: str) -> str:
+    """Return the dotted module name of a relative file name."""
+    return name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
 
 
 def _files_of(name: str) -> list[tuple[str, Path]]:
