@@ -23,7 +23,7 @@ EXECUTED = [
     "for frame in sequence",
     "for frame in frames:",
     "class ColorBlobs",
-    "load_runs(",
+    'load_runs("outputs/ablation_refiner',
 ]  # executed in test_readme.py
 CONTRACT = block("python", "class TestMyRefiner")
 PARSED = [line for line in LINES if line.startswith("python -m framework ") and line.split()[3] in main.COMMANDS]
@@ -72,6 +72,7 @@ def test_documented_commands_and_scripts_are_all_tested() -> None:
         *OWN_DATA,
         *blocks("python", "README.md"),  # test_new_plugin.py
         *blocks("python", "docs/python.md"),
+        *blocks("python", "docs/tutorials/research_project.md"),  # test_research_workflow.py
         *(block("python", words) for words in EXECUTED),
     }
     assert not set(blocks("python")) - scripts

@@ -63,7 +63,7 @@ def test_documented_data_frame_has_means_of_rows(
 ) -> None:
     stored_experiments.experiment(tmp_path / "outputs" / "ablation_refiner", {"chain": [0.5, 0.7], "identity": [0.25]})
     monkeypatch.chdir(tmp_path)
-    exec(block("python", "load_runs("), {})
+    exec(block("python", 'load_runs("outputs/ablation_refiner'), {})
     chain, identity = capsys.readouterr().out.splitlines()[-2:]
     assert chain.split()[:3] == ["chain", "0.60", "0.141421"]
     assert identity.split()[:2] == ["identity", "0.25"]

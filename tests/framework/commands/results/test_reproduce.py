@@ -126,7 +126,7 @@ def test_reproduce_unknown_row_lists_rows(runs: Path, run: Path) -> None:
 def test_bundle_contains_plugin_and_is_reproduced_without_package(runs: Path, run: Path, tmp_path: Path) -> None:
     done = command(tmp_path, "bundle", "sweep", "--out", "experiment.zip", path=runs / "package")
     assert done.returncode == 0, done.stderr
-    assert "experiment.zip: 1 runs, " in done.stdout
+    assert "experiment.zip: 1 run, " in done.stdout
     names = zipfile.ZipFile(tmp_path / "experiment.zip").namelist()
     assert {"run/metrics.json", "run/manifest.json", "plugins/shift_refiner/__init__.py"} <= set(names)
     assert "run/map.npz" not in names
