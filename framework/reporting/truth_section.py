@@ -1,4 +1,7 @@
-"""Comparison of a run's objects with the ground truth: metrics, and galleries of missed, wrong and correct objects."""
+"""Report section that compares the objects of a run with the ground truth.
+
+The section contains metrics, and galleries of missed, wrong and correct objects.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +71,7 @@ class Gallery:
 
 @dataclass(frozen=True)
 class TruthCheck:
-    """The outcome of each object, and the missed ground-truth objects."""
+    """The outcomes of all objects, and the missed ground-truth objects."""
 
     match_results: Mapping[int, MatchResult]  # by object id
     missed: list[Card]
