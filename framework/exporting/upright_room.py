@@ -228,7 +228,7 @@ def upright(up: Float64, floor: float) -> Float64:
         floor: Floor height along `up`, m.
     """
     T = np.eye(4)
-    # smallest rotation from `up` to z, by Rodrigues' formula
+    # smallest rotation from `up` to z
     across, cosine = skew(np.cross(up, UP)), float(up @ UP)
     T[:3, :3] += across + across @ across / (1 + cosine) if cosine > -1 + 1e-9 else np.diag([0.0, -2.0, -2.0])
     T[2, 3] = -floor

@@ -1,6 +1,6 @@
 """Control of the rerun executable (rerun-sdk 0.41).
 
-It is bound to 127.0.0.1 instead of its default 0.0.0.0.
+The executable listens on 127.0.0.1 instead of its default 0.0.0.0.
 """
 
 from __future__ import annotations
