@@ -16,7 +16,7 @@ from framework.data import Bool, Float32, Float64, InstanceMesh, Int32, Int64
 
 OBJECTS_FRACTION = 0.5  # minimum fraction of the triangle limit that is reserved for objects
 MIN_TRIANGLES = 4  # minimum number of triangles of a closed surface
-QUADRIC_STEP = 2.5  # maximum reduction by quadric decimation alone, as a factor; its time is quadratic in the factor
+QUADRIC_STEP = 2.5  # maximum reduction factor of quadric decimation; its run time is quadratic in the factor
 LEFT_TO_QUADRIC = 1.8  # ratio of the triangles after clustering to the triangles after quadric decimation
 MIN_CLUSTERED = 20_000  # minimum number of triangles after clustering; with fewer, cells would be as large as objects
 RELIEF = 0.03  # m, offset of white vertices relative to black vertices along the normal

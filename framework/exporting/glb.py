@@ -75,7 +75,7 @@ def _node(part: Part, colors: UInt8) -> Node:
 
 
 def extras(part: Part) -> dict[str, Any]:
-    """Return the metadata of an object; empty for the rest of the room."""
+    """Return the metadata of an object. The rest of the room has no metadata."""
     one = part.object
     if one is None:
         return {}

@@ -86,7 +86,7 @@ def rest(room: UprightRoom) -> Part:
 
 
 def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
-    """Return the index (V,) of the object of each vertex, starting at 1; 0 = no object."""
+    """Return the index (V,) of the object of each vertex, starting at 1, or 0 for no object."""
     owner = np.zeros(len(mesh.vertices), np.int32)
     for number, one in enumerate(objects, start=1):
         owner[one.vertices] = number

@@ -149,7 +149,10 @@ def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
 
 
 def _highest(found: SurfacePoints, number: Int64, cells: int) -> Int32:
-    """Return the id (C,) of the highest object in each cell, given the cell (P,) of each point; 0 = none."""
+    """Return the id (C,) of the highest object in each cell, or 0 for a cell without objects.
+
+    `number` (P,) is the cell of each point.
+    """
     chosen = np.flatnonzero(found.owner > 0)
     rising = chosen[np.argsort(found.points[chosen, 2], kind="stable")]
     ids = np.zeros(cells, np.int32)

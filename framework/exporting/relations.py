@@ -107,7 +107,7 @@ class _Thing:
 
 
 def _standing(thing: _Thing, things: list[_Thing], plan: Plan | None) -> Relation | None:
-    """Return the relation of an object to its support, container or wall; None = unknown."""
+    """Return the relation of an object to its support, container or wall, or None if unknown."""
     others = [other for other in things if other.id != thing.id]
     holder = next((other for other in others if _is_in(thing, other)), None)
     if holder is not None:
@@ -127,7 +127,7 @@ def _standing(thing: _Thing, things: list[_Thing], plan: Plan | None) -> Relatio
 
 
 def _carries(below: _Thing, above: _Thing) -> float:
-    """Return a score, in [0, 1], for `below` as the support of `above`; 0 = no support."""
+    """Return a score in [0, 1] for `below` as the support of `above`, where 0 means no support."""
     if below.base >= above.base or below.tree.n < 1:
         return 0.0
     near = below.level & (np.abs(below.points[:, 2] - above.base) <= TOUCHING)
@@ -159,7 +159,7 @@ def _is_in(inner: _Thing, outer: _Thing) -> bool:
 
 
 def _gap(a: _Thing, b: _Thing) -> float:
-    """Return the distance between two objects, m; infinite if they are not neighbors."""
+    """Return the distance between two neighboring objects in m, or infinity for other objects."""
     if min(a.top, b.top) < max(a.base, b.base):  # no common height
         return float("inf")
     fewer, more = sorted((a, b), key=lambda thing: thing.tree.n)

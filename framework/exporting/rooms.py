@@ -52,7 +52,7 @@ class Rooms:
         return _place(self.plan, self.labels == room)
 
     def of(self, xy: Float64) -> int:
-        """Return the number of the room that is nearest to most of the points (P, 2), m; 0 = no rooms."""
+        """Return the number of the room nearest to most of the points (P, 2), m, or 0 without rooms."""
         if not self.count:
             return 0
         nearest = ndimage.distance_transform_edt(self.labels == 0, return_distances=False, return_indices=True)

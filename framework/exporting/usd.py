@@ -157,7 +157,7 @@ def _color(mesh: Any, colors: UInt8) -> None:
 
 
 def convex_hull(vertices: Float32) -> tuple[Float32, Int32] | None:
-    """Return the convex hull of points (M, 3), m; None if the hull has no volume.
+    """Return the convex hull of points (M, 3), m, or None if the hull has no volume.
 
     Returns:
         The vertices (H, 3), m, and the triangles (F, 3) with outward normals.
