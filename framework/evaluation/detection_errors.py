@@ -97,7 +97,7 @@ class DetectionErrors:
                 )
 
     def table(self) -> dict[str, float]:
-        """Return all statistics by name; NaN = no data."""
+        """Return all statistics by name. Statistics without data are NaN."""
         hits = [one for one in self.appearances if one.iou >= FOUND_IOU]
         scores = [one.score for one in hits]
         of_objects = _by_object(self.appearances)

@@ -143,12 +143,14 @@ class InstanceEvaluation:
     best_ids: Mapping[int, int]  # evaluated ground-truth instance -> prediction with the best IoU, 0 = none
 
     def ap(self, threshold: float) -> float:
-        """Return the AP at one IoU threshold, averaged over classes; NaN without ground truth."""
+        """Return the AP at one IoU threshold, averaged over classes, or NaN without ground truth."""
         scores = self.by_class.get(threshold, {})
         return float(np.mean([score.ap for score in scores.values()])) if scores else float("nan")
 
     def metrics(self) -> dict[str, float]:
-        """Return the metrics by their names in metrics.json; empty without evaluated ground-truth instances.
+        """Return the metrics by their names in metrics.json.
+
+        The result is empty without evaluated ground-truth instances.
 
         - `instances.ap50` and `ap25`: AP at IoU 0.5 and 0.25.
         - `ap`: mean AP over IOU_THRESHOLDS.

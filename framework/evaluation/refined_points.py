@@ -48,7 +48,7 @@ class Refinement:
 
     @cached_property
     def origin(self) -> Int32:
-        """Index (M,) of the original cluster of each refined cluster; -1 = none.
+        """Index (M,) of the original cluster of each refined cluster, or -1 for none.
 
         If the number of clusters does not change, refined cluster k comes from original cluster k. Otherwise, each
         refined cluster comes from the original cluster with the most common pixels.
@@ -61,7 +61,7 @@ class Refinement:
 
     @cached_property
     def main_part(self) -> Int32:
-        """Index (N,) of the largest refined cluster of each original cluster; -1 = none."""
+        """Index (N,) of the largest refined cluster of each original cluster, or -1 for none."""
         sizes = point_counts(self.after)
         largest_last = np.argsort(sizes, kind="stable")
         main = np.full(len(self.before), -1, np.int32)
@@ -83,17 +83,17 @@ class Refinement:
 
     @cached_property
     def fit_before(self) -> TrueFit | None:
-        """Fit of the original clusters; None without ground-truth instances."""
+        """Fit of the original clusters, or None without ground-truth instances."""
         return None if self.frame.truth is None else true_fit(self.before, self.frame, self.frame.truth)
 
     @cached_property
     def fit_after(self) -> TrueFit | None:
-        """Fit of the refined clusters; None without ground-truth instances."""
+        """Fit of the refined clusters, or None without ground-truth instances."""
         return None if self.frame.truth is None else true_fit(self.after, self.frame, self.frame.truth)
 
     @cached_property
     def judged_before(self) -> Bool:
-        """Mask (N,) of the evaluated original clusters; all False without ground truth.
+        """Mask (N,) of the evaluated original clusters, all False without ground truth.
 
         A cluster is not evaluated if an object of unknown class fits best.
         """
@@ -102,7 +102,7 @@ class Refinement:
 
     @cached_property
     def judged_after(self) -> Bool:
-        """Mask (M,) of the refined clusters with an evaluated original cluster; all False without ground truth."""
+        """Mask (M,) of the refined clusters with an evaluated original cluster, all False without ground truth."""
         fit = self.fit_after
         if fit is None:
             return np.zeros(len(self.after), np.bool_)
