@@ -181,7 +181,7 @@ def probability_gone(confidence: float, there: Bool, through: Bool, matched: boo
 
 
 def _nearest_labels(mesh: InstanceMesh, points: Float32) -> Int32:
-    """Return the object id (P,) of the vertex nearest to each point (P, 3), m; 0 = none nearby."""
+    """Return the object id (P,) of the vertex nearest to each point (P, 3), m, or 0 for none nearby."""
     if not len(mesh.vertices):
         return np.zeros(len(points), np.int32)
     distance, nearest = KDTree(mesh.vertices).query(points, distance_upper_bound=MAX_DISTANCE)
@@ -190,7 +190,7 @@ def _nearest_labels(mesh: InstanceMesh, points: Float32) -> Int32:
 
 
 def _match(labels: Int32) -> int | None:
-    """Return the most frequent nonzero label; None if it is too rare."""
+    """Return the most frequent nonzero label, or None if it is too rare."""
     ids, counts = np.unique(labels[labels > 0], return_counts=True)
     if not len(ids) or counts.max() < SAME_THING * len(labels):
         return None

@@ -36,7 +36,7 @@ class Map:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """The class names; empty before the first frame."""
+        """The class names, empty before the first frame."""
         return self.scene.classes
 
     def instances(self, class_: str | None = None) -> Mapping[int, Instance]:
@@ -59,7 +59,7 @@ class Map:
             return {key: instance for key, instance in found.items() if self.name(instance) == class_}
 
     def name(self, instance: Instance) -> str:
-        """Return the most likely class of an object; "object" in a map without classes."""
+        """Return the most likely class of an object, or "object" in a map without classes."""
         probabilities = instance.class_probabilities
         return self.classes[int(probabilities.argmax())] if len(probabilities) else "object"
 
@@ -128,7 +128,7 @@ class Map:
             return self.scene.instances().get(int(self.view(camera, T_world_camera).instance_ids[int(v), int(u)]))
 
     def up(self) -> Float64 | None:
-        """Return the up direction (3,), a unit vector in the world frame; None if unknown.
+        """Return the up direction (3,), a unit vector in the world frame, or None if unknown.
 
         If frames have `up`, the direction is measured by a sensor. Otherwise it is estimated from the floor, the walls
         and the camera orientation. The vertical axes of the boxes (`obb`) have this direction.
@@ -142,7 +142,7 @@ class Map:
             return self.scene.gravity().source
 
     def floor(self) -> float | None:
-        """Return the floor height along `up`, m; None if the floor was not observed.
+        """Return the floor height along `up` in m, or None if the floor was not observed.
 
         The height of a point above the floor is `point @ up - floor`.
         """
