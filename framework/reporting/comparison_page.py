@@ -22,7 +22,7 @@ from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
-MAX_MAPS = 6  # maximum number of maps in the page; their total size is limited to that of one map in a run's page
+MAX_MAPS = 6  # maximum number of maps in the page; their total size has the limit of a single map
 
 
 @dataclass(frozen=True)
@@ -239,5 +239,5 @@ def short_names(directories: Sequence[Path]) -> list[str]:
 
 
 def _target(node: Any) -> str:
-    """Return the class name of the plugin in a config node; "" = no plugin."""
+    """Return the class name of the plugin in a config node, or "" without a plugin."""
     return str(node.get("_target_")).rpartition(".")[2] if isinstance(node, dict) else ""

@@ -56,7 +56,7 @@ class MapScene:
 
     @classmethod
     def of(cls, contents: RunContents, footage: Footage, fraction: float = 1.0) -> MapScene | None:
-        """Return the map of a run; None for an empty map.
+        """Return the map of a run, or None for an empty map.
 
         The map is decimated to a fraction of MAX_TRIANGLES and MAX_BYTES.
 
@@ -87,7 +87,7 @@ class MapScene:
 
     @property
     def likely_labels(self) -> Int32:
-        """Index (V,) of the object of each vertex in `likely_ids`, starting at 1; 0 = no likely object."""
+        """Index (V,) of the object of each vertex in `likely_ids`, starting at 1, or 0 for no likely object."""
         likely = np.array([0, *likely_ids(self.contents)])
         indices = np.minimum(np.searchsorted(likely, self.mesh.instance_ids), len(likely) - 1)
         return np.where(likely[indices] == self.mesh.instance_ids, indices, 0).astype(np.int32)

@@ -100,7 +100,7 @@ def _size(one: StoredInstance, up: Float64 | None) -> str:
 
 
 def _height_above_floor(one: StoredInstance, contents: RunContents) -> float | None:
-    """Return the height of an object above the floor, m; None = unknown."""
+    """Return the height of an object above the floor in m, or None if unknown."""
     floor, up = contents.record.metrics.get("map.floor_m"), contents.up
     if not isinstance(floor, float) or up is None:
         return None

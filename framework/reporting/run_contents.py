@@ -78,7 +78,7 @@ class RunContents:
 
     @property
     def up(self) -> Float64 | None:
-        """Up direction (3,) in the world frame, a unit vector; None if unknown."""
+        """Up direction (3,), a unit vector in the world frame, or None if unknown."""
         values = [self.record.metrics.get(f"map.up.{axis}") for axis in "xyz"]
         up = np.array([value if is_number(value) else np.nan for value in values], np.float64)
         length = np.linalg.norm(up)

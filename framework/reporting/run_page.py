@@ -220,7 +220,7 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
 
 
 def overview_url(path: Path) -> str:
-    """Return a reduced overview.png as a `data:` URL; "" if it cannot be read."""
+    """Return a reduced overview.png as a `data:` URL, or "" if it cannot be read."""
     try:
         small = Image.fromarray(read_color(path))
     except FrameError:

@@ -53,7 +53,7 @@ class RunSource:
         return None if self.video is None else self.video.camera
 
     def frame(self, k: int) -> Frame | None:
-        """Return the frame of pose `k` of the trajectory; None if the frame cannot be read."""
+        """Return the frame of pose `k` of the trajectory, or None if the frame cannot be read."""
         numbers = self.contents.tracked_frames
         if self.video is None or not numbers or self.contents.times is None:
             return None
@@ -146,7 +146,7 @@ class TruePath:
 
     @classmethod
     def of(cls, poses: Float64, true_positions: Mapping[int, Float64]) -> TruePath | None:
-        """Return the aligned ground-truth path; None for fewer than three positions.
+        """Return the aligned ground-truth path, or None for fewer than three positions.
 
         Args:
             poses: Camera poses (P, 4, 4) of the trajectory.

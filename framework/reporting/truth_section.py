@@ -85,7 +85,7 @@ class TruthCheck:
         photographer: Photographer | None,
         footage: Footage,
     ) -> TruthCheck | None:
-        """Return the comparison of the objects with the ground truth; None for a run without a mesh."""
+        """Return the comparison of the objects with the ground truth, or None for a run without a mesh."""
         if contents.mesh is None:
             return None
         objects = contents.objects
@@ -128,7 +128,7 @@ class TruthCheck:
 def truth_section(
     check: TruthCheck | None, why_unchecked: str, contents: RunContents, pictures: Mapping[int, Picture]
 ) -> dict[str, Any] | None:
-    """Return the variables of the ground-truth section in run.html; None for a run without ground truth.
+    """Return the variables of the ground-truth section in run.html, or None without ground truth.
 
     Args:
         check: Comparison of the objects with the ground truth; None = not available.
