@@ -187,7 +187,7 @@ class DrawingThread:
                 self._drawing.draw_map(pending.snapshot)
 
     def _give_up(self, error: Exception) -> None:
-        """Disable the viewer; the run continues."""
+        """Disable the viewer without ending the run."""
         if not self._failed:
             log.warning("viewer: disabled after an error; the run continues: %s", in_one_line(error))
         with self._lock:

@@ -52,7 +52,7 @@ MIN_FRACTION = 0.3  # minimum fraction of the points in a mask that belong to it
 
 
 def seen_instances(masks: Bool, frame: Frame, T_world_camera: Float64, mesh: InstanceMesh) -> Int32:
-    """Return the id (N,) of the instance in each mask (N, H, W); 0 = no instance.
+    """Return the id (N,) of the instance in each mask (N, H, W), or 0 for no instance.
 
     Mesh vertices are projected into the frame and compared with its depth. The instance of a mask has the most vertices
     in the mask, and more than MIN_FRACTION of all vertices in the mask.
