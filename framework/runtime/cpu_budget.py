@@ -49,7 +49,7 @@ def kernel_threads(threads: int) -> Iterator[None]:
 
 @contextmanager
 def limited_threads(threads: int) -> Iterator[None]:
-    """Limit the threads of kernels and torch networks of the calling thread in the `with` body; 0 = no limit."""
+    """Limit the threads of kernels and torch networks in the `with` body. With 0, there is no limit."""
     if threads == 0:
         yield
         return

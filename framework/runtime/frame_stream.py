@@ -30,7 +30,7 @@ class FrameStream(AbstractContextManager["FrameStream"]):
 
     @abstractmethod
     def take(self) -> FrameReader | None:
-        """Return the reader of the next frame; None at the end."""
+        """Return the reader of the next frame, or None at the end."""
 
 
 def stream_of(video: RGBDVideo, ended: Callable[[], bool]) -> FrameStream:

@@ -114,7 +114,7 @@ def configure_process(threads: int = 0, seed: int | None = None) -> None:
 
 
 def available_cores() -> int:
-    """Return the number of cores that this process may use; all cores on macOS and Windows."""
+    """Return the number of cores that this process may use. On macOS and Windows, these are all cores."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

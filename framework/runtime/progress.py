@@ -39,7 +39,7 @@ class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
 
 
 def _columns() -> int:
-    """Return the width of the terminal; 0 = unknown."""
+    """Return the width of the terminal, or 0 if unknown."""
     try:
         return os.get_terminal_size(sys.stderr.fileno()).columns
     except (OSError, ValueError):
