@@ -193,7 +193,7 @@ def config_loader() -> Iterator[ConfigLoader]:
 
 
 def running_loader() -> Any | None:
-    """Return the config loader of the running Hydra application; None = no application.
+    """Return the config loader of the running Hydra application, or None without an application.
 
     The result is also None if the application does not search the configs of InstanceMap.
     """

@@ -58,7 +58,7 @@ def version_base(version: str) -> Iterator[None]:
 
 
 def running() -> Any | None:
-    """Return the Hydra application of this process; None = no application.
+    """Return the Hydra application of this process, or None without an application.
 
     Unlike GlobalHydra.instance(), this function does not create an application.
     """
