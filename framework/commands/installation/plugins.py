@@ -56,7 +56,7 @@ class Option:
 
 
 def registered(*stages: str, only: str | None = None) -> list[Option]:
-    """Return the options of config groups; with `only`, only the options of this name."""
+    """Return the options of config groups. With `only`, return only the options of this name."""
     with config_loader() as loader:
         files = CachingConfigRepository(loader.repository)  # shared, because the options have most configs in common
         return [
@@ -126,7 +126,7 @@ def _default(field: dataclasses.Field[Any]) -> object:
 
 
 def _text(source: str, name: str) -> str:
-    """Return the text of a YAML file in a config source; "" for the configs of Hydra."""
+    """Return the text of a YAML file in a config source, or "" for the configs of Hydra."""
     scheme, _, root = source.partition("://")
     return Path(root, name).read_text() if scheme == "file" else ""
 

@@ -84,7 +84,7 @@ def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> N
 
 
 def pose_of_frame(contents: RunContents, frame: int | None) -> int:
-    """Return the index of the pose of a frame in the trajectory; None = middle pose.
+    """Return the index of the pose of a frame in the trajectory. Without a frame, it is the middle pose.
 
     Raises:
         DataError: The frame was not mapped.

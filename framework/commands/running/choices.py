@@ -139,7 +139,7 @@ def check_row(chosen: Sequence[str], rows: Collection[str]) -> None:
 
 
 def error_of_first_run(words: Sequence[str]) -> HydraException | None:
-    """Return the error in the config of the first run of a sweep; None = no error.
+    """Return the error in the config of the first run of a sweep, if any.
 
     If the config of the experiment cannot be composed, Hydra reports the swept values as errors instead. `words` is the
     command line.
@@ -168,7 +168,7 @@ def _parsed(overrides: Sequence[str]) -> list[Override]:
 
 
 def _values(override: Override) -> list[str]:
-    """Return the values of an override, in order; [] if only Hydra can determine them, as for a glob()."""
+    """Return the values of an override. The list is empty if only Hydra can determine them, as for a glob()."""
     try:
         return [*override.sweep_string_iterator()] if override.is_sweep_override() else [str(override.value())]
     except HydraException:

@@ -41,14 +41,14 @@ WORKER_START = f"{end_with_parent.__module__}.{end_with_parent.__name__}"
 
 
 def cores_of(threads: int) -> int:
-    """Return the number of cores for a job with `threads` threads; 0 = all cores."""
+    """Return the number of cores for a job with `threads` threads, where 0 means all cores."""
     return threads or available_cores()
 
 
 def jobs_at_once(threads: int) -> int:
     """Return the number of jobs that run concurrently on this machine, at least 1.
 
-    Each job has `threads` threads; 0 = all cores.
+    Each job has `threads` threads, where 0 means all cores.
     """
     return max(1, available_cores() // cores_of(threads))
 
@@ -162,7 +162,7 @@ def by_joblib(own: DictConfig | HydraConf) -> bool:
 
 
 def joblib_workers(n_jobs: int | None) -> int:
-    """Return the number of worker processes that joblib starts for `n_jobs`; 1 = jobs run in this process."""
+    """Return the number of worker processes that joblib starts. With 1, jobs run in this process."""
     from joblib import effective_n_jobs  # type: ignore[import-untyped]
 
     return int(effective_n_jobs(n_jobs))
