@@ -62,7 +62,7 @@ class Matcher:
                     break
 
     def pair(self, k: int, step: int) -> MatchedPair | None:
-        """Return the pair of the frames k and k + step; None if too few points match."""
+        """Return the pair of the frames k and k + step, or None if too few points match."""
         if k + step >= len(self.sequence):
             return None
         found_first, found_second = self._features(k), self._features(k + step)

@@ -55,7 +55,7 @@ class PoseDelay:
 def find_delay(
     pairs: Sequence[MatchedPair], poses: Sequence[Float64 | None], fits: Sequence[PoseFit]
 ) -> PoseDelay | None:
-    """Return the delay of the poses; None = no significant delay.
+    """Return the delay of the poses, or None without a significant delay.
 
     Args:
         pairs: Pairs of frames.

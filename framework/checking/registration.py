@@ -73,7 +73,7 @@ class EdgeComparison:
         return found
 
     def _correlation(self, of_color: int, of_depth: int, zoom: float) -> Float32 | None:
-        """Return the mean color gradient at the depth edges for each shift; None = no usable edges.
+        """Return the mean color gradient at the depth edges for each shift, or None without usable edges.
 
         The color and depth images are those of the frames `of_color` and `of_depth`.
         """
@@ -92,7 +92,7 @@ class EdgeComparison:
         return np.asarray(cv2.matchTemplate(padded, edges, cv2.TM_CCORR) / edges.sum(), np.float32)
 
     def _find_edges(self, k: int) -> tuple[Float32, Float32] | None:
-        """Return the normalized color gradient and the depth edges of a frame; None = unusable frame."""
+        """Return the normalized color gradient and the depth edges of a frame, or None for an unusable frame."""
         try:
             frame = self.sequence[k]
         except FrameError:
@@ -126,7 +126,7 @@ def depth_edges(depth: Float32) -> Bool:
 def judge(
     by_delay: Sequence[EdgeAlignment], by_zoom: Sequence[EdgeAlignment], applied_delay: int, step: float
 ) -> tuple[Finding, int]:
-    """Return the check result, and the delay of the depth images in frames; 0 = no delay.
+    """Return the check result, and the delay of the depth images in frames.
 
     Args:
         by_delay: Alignments at each delay.
