@@ -75,13 +75,13 @@ def _hub_cache() -> Path:
 
 
 def _complete_size(snapshot: Path) -> int:
-    """Return the size of a complete download in bytes; 0 if its config or weights are missing."""
+    """Return the size of a complete download in bytes, or 0 if its config or weights are missing."""
     names = {file.name for file in snapshot.iterdir() if file.exists()}
     complete = "config.json" in names and any(name.endswith((".safetensors", ".bin")) for name in names)
     return _size(snapshot) if complete else 0
 
 
 def _size(path: Path) -> int:
-    """Return the size of a file or folder in bytes; 0 if it is missing."""
+    """Return the size of a file or folder in bytes, or 0 if it is missing."""
     files = path.rglob("*") if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files if file.is_file())
