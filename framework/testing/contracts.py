@@ -304,7 +304,7 @@ class RefinerContract:
 
 
 def readings(frame: Frame) -> Float64:
-    """Return the world point (H, W, 3) of each pixel of a frame, m; NaN where depth is missing."""
+    """Return the world point (H, W, 3) of each pixel of a frame, m. Pixels without depth are NaN."""
     whole = replace(spheres_in(frame), masks=np.ones((2, *CAMERA.shape), np.bool_))
     lifted = lift(whole, frame, Pose(pose_at(frame.index)))
     points = np.full((*CAMERA.shape, 3), np.nan)
