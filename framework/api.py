@@ -159,8 +159,8 @@ class Mapper(Map):
     Overrides of `dataset` are not supported. `prefetch` and `skip_completed` have no effect. `resume_from=DIR` resumes
     the map of a run. `viewer="rerun"` shows the map until the mapper is deleted.
 
-    All methods are thread-safe. While another thread may call `add`, hold the lock to read `scene` itself: `with
-    mapper.lock: mesh = mapper.scene.mesh()`.
+    All methods are thread-safe. While another thread may call `add`, hold the lock to read `scene` itself:
+    `with mapper.lock: mesh = mapper.scene.mesh()`.
 
     Raises:
         ConfigError: A name is unknown, or a value is invalid.

@@ -73,8 +73,8 @@ class Pipeline:
     def run(self, video: RGBDVideo) -> RunResult:
         """Map a sequence or live video, frame by frame.
 
-        Frames that raise FrameError are skipped, and lost frames are not fused. Both are counted. Ctrl-C and a full map
-        end the loop early, after the current frame. Other errors of stages are raised.
+        Frames that raise FrameError are skipped, and lost frames are not fused. Both are counted. Ctrl-C ends the loop
+        after the current frame. A full map also ends the loop early. Other errors of stages are raised.
 
         Ctrl-C is the normal end of a live video. If mapping falls behind, frames of a live video are dropped and
         counted.
