@@ -24,7 +24,7 @@ MIN_INSIDE = 0.5  # minimum interior area of a room, m^2
 
 @dataclass(frozen=True)
 class Door:
-    """The opening between two rooms."""
+    """An opening between two rooms."""
 
     rooms: tuple[int, int]  # numbers of the two rooms
     place: Float64  # (2,) m, center of the opening in the room frame
