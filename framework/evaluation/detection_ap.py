@@ -101,7 +101,6 @@ def detection_ap(
 
 
 def _annotation(image: int, category: int, mask: Bool) -> dict[str, Any]:
-    """Return the COCO annotation of a mask (H, W)."""
     segmentation = rle.encode(np.asfortranarray(mask, np.uint8))
     return {
         "image_id": image,
