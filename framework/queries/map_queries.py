@@ -1,4 +1,4 @@
-"""Queries of a map: its objects, their positions, and views."""
+"""Queries for the objects and views of a map."""
 
 from __future__ import annotations
 
