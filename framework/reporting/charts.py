@@ -245,11 +245,8 @@ def _chart(height: float, first: float, last: float, title: str, right: float = 
 def _horizontal(positions: Float64, up: Float64) -> Float64:
     """Return the right and up axes (2, 3) of the top view, unit vectors in the world frame.
 
-    The right axis is the horizontal direction in which the positions have the largest variance.
-
-    Args:
-        positions: Positions (P, 3) in the world frame, m.
-        up: Up direction (3,) in the world frame, a unit vector.
+    The right axis is the horizontal direction with the largest variance of the positions (P, 3). `up` (3,) is the up
+    direction, a unit vector.
     """
     any_level = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     level = np.stack([any_level, np.cross(up, any_level)]) / np.linalg.norm(any_level)

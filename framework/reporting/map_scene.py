@@ -94,7 +94,7 @@ class MapScene:
 
     @cached_property
     def view(self) -> tuple[Camera, Float64]:
-        """Initial view: a camera and its pose T_world_camera (4, 4)."""
+        """Camera and camera pose (4, 4) of the initial view."""
         return best_view(self.surface, self.likely_labels, self.contents.poses, VIEW_WIDTH, VIEW_HEIGHT)
 
     def data(self) -> dict[str, Any]:

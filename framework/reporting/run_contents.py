@@ -122,7 +122,6 @@ class RunContents:
 
 
 def _map_of(record: Record) -> tuple[InstanceMesh | None, list[StoredInstance]]:
-    """Read the mesh and the objects of a run."""
     mesh, instances = record.directory / MESH, record.directory / INSTANCES
     if path_exists(mesh) and path_exists(instances):
         return read_objects(record)

@@ -142,9 +142,10 @@ class RunReport:
         return {"whole": whole, "text": self._path_text(), "legend": keys, "details": details}
 
     def _top_views(self, up: Float64) -> tuple[str, str | None]:
-        """Return the SVG of the path with the objects, and the SVG of the enlarged path.
+        """Return the top view of the path and the objects, and an enlarged view of the path, both as SVG.
 
-        The second is None if the path is large enough in the first. `up` (3,) is the up direction in the world frame.
+        The second view is None if the path is large enough in the first. `up` (3,) is the up direction in the world
+        frame.
         """
         contents = self.contents
         colors = colors_by_id(contents.objects)
