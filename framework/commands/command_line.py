@@ -175,7 +175,6 @@ def _config_dirs(words: list[str]) -> list[Path]:
 
 
 def _is_handled_by_sweep(config: DictConfig) -> bool:
-    """Return True if the sweep handles the error of a job."""
     hydra_config = HydraConfig.get()
     # the process of the sweep receives only the error of a job that runs in a worker process
     with_workers = not str(hydra_config.launcher._target_).endswith(".BasicLauncher")
@@ -184,7 +183,7 @@ def _is_handled_by_sweep(config: DictConfig) -> bool:
 
 
 def _log_error(message: str, error: BaseException | None) -> None:
-    """Log an error to the console and the job's log file, or print it if logging is not configured."""
+    """Log an error, or print it if logging is not configured."""
     if logging.getLogger().handlers and not log.disabled:
         log.error("%s", message, exc_info=error)
         return

@@ -116,7 +116,6 @@ def _as_text(sections: Mapping[str, list[Check]], errors: int) -> str:
 
 
 def _as_json(sections: Mapping[str, list[Check]]) -> str:
-    """Return the checks of each section as JSON."""
     listed = [
         {"title": title, "checks": [asdict(check) | {"status": check.status.name.lower()} for check in checks]}
         for title, checks in sections.items()

@@ -1,4 +1,4 @@
-"""`instancemap raycast RUN`: draw a ray-cast view of a map from the pose of a frame, as in Figure 2 of the paper."""
+"""`instancemap raycast RUN`: draw a ray-cast view of a map from the pose of a frame."""
 
 from __future__ import annotations
 

@@ -130,7 +130,7 @@ def of_tables(overrides: Sequence[str]) -> list[str]:
 
 
 def check_row(chosen: Sequence[str], rows: Collection[str]) -> None:
-    """Raise ConfigError if a chosen row is not among the `rows` of the experiment."""
+    """Raise ConfigError if a row does not exist in the experiment."""
     for row in chosen:
         if row not in rows:
             close = get_close_matches(row, rows, n=1)
@@ -154,11 +154,11 @@ def error_of_first_run(words: Sequence[str]) -> HydraException | None:
 
 
 def single_run(overrides: Sequence[str]) -> list[str]:
-    """Return the overrides of the first run of a sweep: the first value of each swept key."""
+    """Return the overrides of the first run of a sweep."""
     chosen = []
     for override in _parsed(overrides):
         values = _values(override)
-        swept = override.value_type in COUNTED and values
+        swept = override.value_type in COUNTED and values  # the first run has the first value of each key
         chosen.append(f"{override.get_key_element()}={values[0]}" if swept else str(override.input_line))
     return chosen
 

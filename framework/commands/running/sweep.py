@@ -209,7 +209,6 @@ def at_work_in(directory: Path) -> list[BaseProcess]:
 
 
 def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
-    """Write the tables and the figure of the runs in a directory."""
     if with_table:
         from framework.tables.experiment_tables import write_tables
 
@@ -222,6 +221,5 @@ def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
 
 
 def _is_of_a_launcher(error: BaseException) -> bool:
-    """Return True for an error of a launcher."""
     # joblib and submitit raise a RuntimeError
     return isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] == "ray"
