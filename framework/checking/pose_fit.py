@@ -46,7 +46,10 @@ class PoseFit:
 
 
 def readings(pose_unit: float = 1.0) -> Iterator[PoseReading]:
-    """Yield all pose conventions with translations in `pose_unit` meters, starting with the default convention."""
+    """Yield all pose conventions, starting with the default convention.
+
+    Translations are in units of `pose_unit` meters.
+    """
     for order, kind, axes in product(QuaternionOrder, PoseKind, CameraAxes):
         yield PoseReading(kind, axes, order, pose_unit)
 
@@ -190,7 +193,6 @@ def _named(reading: PoseReading) -> str:
 
 
 def _equal_to_best(fits: Sequence[PoseFit]) -> list[PoseFit]:
-    """Return all fits that are as good as the best fit."""
     least = min(one.error for one in fits)  # for a panning camera, several conventions fit equally well
     return [one for one in fits if one.error <= ALIKE * least + ALIKE_PX]
 
