@@ -117,7 +117,7 @@ class DetectorContract:
         assert same(frame, frame_at(0)), "the frame was changed"
 
     def test_detector_uses_ground_truth_only_if_required(self) -> None:
-        """A detector that depends on ground truth is unusable without it, so that it is not mistaken for a real one."""
+        """A detector that depends on ground truth must raise an error without ground truth."""
         detector = self.plugin()
         frame = frame_at(0)
         if not same(detector.detect(frame), detector.detect(misleading(frame))):
