@@ -254,7 +254,6 @@ class Mapper(Map):
         return FrameResult(found.T_world_camera, new=tuple(sorted(now - before)), removed=tuple(sorted(before - now)))
 
     def _map(self, frame: Frame) -> Pose:
-        """Detect and map a frame, and show it in the viewer."""
         pipeline, journal = self.pipeline, self._journal
         try:
             detections, times = pipeline.detect(frame, self._frames - 1)
