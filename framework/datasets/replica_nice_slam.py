@@ -1,4 +1,6 @@
-"""Replica scenes as rendered for NICE-SLAM (Straub et al., 2019; Zhu et al., CVPR 2022).
+"""Replica dataset as rendered for NICE-SLAM.
+
+References: Straub et al., 2019; Zhu et al., CVPR 2022.
 
     cam_params.json                     for all scenes: {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}
     room0/results/frame000000.jpg       8-bit color, numbered from 0
@@ -24,7 +26,7 @@ CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 
 @dataclass
 class ReplicaNiceSlam(Recording):
-    """A Replica scene in NICE-SLAM's layout, with exact depth and poses but without ground-truth instances."""
+    """A Replica scene rendered for NICE-SLAM, with exact depth and poses but without ground-truth instances."""
 
     def open(self) -> Contents:
         path = self.folder.absolute().parent / "cam_params.json"  # not resolved: the scene may be a symbolic link

@@ -1,4 +1,6 @@
-"""Folder of color and depth images: the format for your own data.
+"""RGB-D videos as folders of color and depth images.
+
+This is the format for your own data:
 
     camera.json         {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}; meters = value / depth_scale;
                         optional "distortion": [k1, k2, p1, p2, k3] of all images, which are undistorted on reading;

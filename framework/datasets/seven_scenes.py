@@ -1,4 +1,6 @@
-"""7-Scenes (Shotton et al., CVPR 2013): handheld Kinect videos of seven scenes, with KinectFusion poses.
+"""7-Scenes dataset (Shotton et al., CVPR 2013).
+
+Handheld Kinect videos with KinectFusion poses:
 
     chess/seq-01/frame-000000.color.png     8-bit color
     chess/seq-01/frame-000000.depth.png     uint16, mm along z; 0 or 65535 = no reading

@@ -1,4 +1,6 @@
-"""TUM RGB-D (Sturm et al., IROS 2012): Kinect videos with motion-capture poses.
+"""TUM RGB-D dataset (Sturm et al., IROS 2012).
+
+Kinect videos with motion-capture poses:
 
     rgb.txt, depth.txt      one line per image: `timestamp filename`, timestamp in s; `#` begins a comment
     rgb/, depth/            8-bit color; uint16 depth along z, registered to color, 5000 units per m; 0 = no reading
@@ -6,9 +8,9 @@
     camera.json             for other recordings in this layout: intrinsics, depth scale and distortion, with the
                             same keys as in an RGB-D folder; read if the folder's name does not contain freiburg
 
-The published depth correction factors are already applied. Color and depth of freiburg1 and freiburg2 have the lens
-distortion of the color camera: 5 px or more in half of the pixels. The reader undistorts both images. freiburg3 was
-published undistorted.
+The published depth correction factors are already applied. The images of freiburg1 and freiburg2 have a lens distortion
+of 5 px or more in half of the pixels, which is corrected on reading. The images of freiburg3 were published
+undistorted.
 """
 
 from __future__ import annotations

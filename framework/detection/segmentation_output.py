@@ -78,6 +78,8 @@ class SegmentationLayout:
     def determined_by(self, outputs: Outputs) -> SegmentationLayout:
         """Return the layout with the kind and unit of the boxes, detected from their values.
 
+        If the kind is already known, it is not changed.
+
         Raises:
             DataError: The kind or unit of the boxes is ambiguous.
         """

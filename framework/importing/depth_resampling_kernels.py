@@ -47,7 +47,9 @@ def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, reg
 
 @njit(cache=True, nogil=True)
 def upsample(depth: Float32, guide: UInt8, u: Float64, v: Float64, color: UInt8, found: Float32) -> None:
-    """Resample a depth image to a target image, see `upsampled`.
+    """Resample a depth image to the resolution of a color image.
+
+    The method is described in `upsampled`.
 
     Args:
         depth: The depth (h, w), m, 0 = no reading.

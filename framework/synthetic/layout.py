@@ -152,7 +152,7 @@ def _inside(boxes: Float64, width: float, depth: float) -> bool:
 
 
 def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
-    """Return the distance, m, from each floor cell to the nearest box or wall, rounded down.
+    """Return a lower bound, m, of the distance from each floor cell to the nearest box or wall.
 
     The result is a grid with one row per CELL along y and one column per CELL along x.
 

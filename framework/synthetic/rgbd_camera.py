@@ -1,9 +1,9 @@
 """Error model of RGB-D cameras.
 
 - Axial depth noise follows the noise model of the sensor (`framework.sensors.noise_models`).
-- The disparity of a Kinect v1 is quantized to 1/8 px, so that the step of the depth z in m is 2.9e-3 z^2 m: Khoshelham
-  and Oude Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2),
-  2012. The disparity of a RealSense D400 is quantized to 1/32 px. The depth of other sensors has steps of 1 mm.
+- The disparity of a Kinect v1 is quantized to 1/8 px. The step of the depth z in m is therefore 2.9e-3 z^2 m
+  (Khoshelham and Oude Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors
+  12(2), 2012). The disparity of a RealSense D400 is quantized to 1/32 px. The depth of other sensors has steps of 1 mm.
 - Lateral noise moves readings across edges by about a pixel (Nguyen et al.). It is applied as in Handa et al., "A
   Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
 - Readings are missing where the projector or second camera is occluded, at many pixels along depth edges, and at
@@ -43,7 +43,7 @@ class Triangulation(NamedTuple):
     """Geometry of a sensor that measures disparity."""
 
     baseline: float  # m, distance to the projector or the second camera; 0 = no triangulation
-    steps_depth: float  # m, depth times disparity, in quantization steps of disparity; 0 = constant steps of depth
+    steps_depth: float  # product of depth (m) and disparity (quantization steps); 0 = constant steps of depth
 
 
 TRIANGULATION = {  # focal lengths: 580 px (Kinect v1, at 640 px width) and 424 px (D435, at 848 px width)

@@ -31,7 +31,10 @@ def depth_step(z: np.float32, steps_depth: np.float32) -> np.float32:
 
 @njit(cache=True, nogil=True)
 def quantized(z: np.float32, steps_depth: np.float32) -> np.float32:
-    """Round depth z, m, to a quantization step, see `depth_step`."""
+    """Round depth z, m, to a quantization step.
+
+    `steps_depth` is described in `depth_step`.
+    """
     if steps_depth > 0:
         steps = np.rint(steps_depth / max(z, np.float32(0.1)))
         return np.float32(steps_depth / max(steps, np.float32(1)))
@@ -140,7 +143,7 @@ def drop_patches(
 
 @njit(cache=True, nogil=True)
 def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> np.float32:
-    """Return the depth at an offset (dv, du), px, if a depth edge is in between, otherwise the depth at (v, u)."""
+    """Return the depth at a pixel, m, or at an offset from the pixel if a depth edge is in between."""
     # smooth surfaces have no lateral error, because the axial noise model already includes the effect
     y = min(max(v + int(np.rint(dv)), 0), depth.shape[0] - 1)
     x = min(max(u + int(np.rint(du)), 0), depth.shape[1] - 1)

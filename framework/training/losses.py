@@ -1,4 +1,4 @@
-"""Loss functions of Mask R-CNN (He et al. 2017; Ren et al. 2015).
+"""Loss functions of Mask R-CNN (He et al. 2017, Ren et al. 2015).
 
 Boxes are x1 y1 x2 y2, px, and have the width x2 - x1.
 """
@@ -190,7 +190,9 @@ def encode(boxes: Tensor, objects: Tensor) -> Tensor:
 
 
 def mask_targets(masks: Tensor, boxes: Tensor, own: Tensor, bins: int) -> Tensor:
-    """Return the target masks (N, bins, bins) of boxes, with 1 for bins that are at least half covered by the object.
+    """Return the target masks (N, bins, bins) of boxes.
+
+    The target is 1 in bins that are at least half covered by the object, and 0 in other bins.
 
     Args:
         masks: The masks (M, H, W) of the objects.

@@ -80,6 +80,6 @@ def _registered_color(images: StoredImages, registration: ColorRegistration) -> 
 
 
 def _line(f_color: float, c_color: float, f_depth: float, c_depth: float, fine: int) -> tuple[float, float]:
-    """Return (a, b), which map a coordinate i of the oversampled image to a * i + b in the color image."""
+    """Return (a, b) for the mapping of a coordinate i of the oversampled image to a * i + b in the color image."""
     slope = f_color / f_depth
     return slope / fine, slope * (0.5 / fine - 0.5 - c_depth) + c_color

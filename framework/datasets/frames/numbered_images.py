@@ -14,9 +14,10 @@ from framework.errors import DataError, FrameError
 def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     """Return the paths of the images in a folder by frame number, in ascending order.
 
+    Each name must end in a unique number. Names must not differ in other digits, such as the decimals of a timestamp.
+
     Raises:
-        DataError: The folder contains no images, or a name has no number. Two names have the same number, or names
-            differ in other digits, such as the decimals of a timestamp.
+        DataError: The folder contains no images, or a name is invalid.
     """
     if not folder.is_dir():
         raise DataError(f"{folder}: expected a folder, got none")

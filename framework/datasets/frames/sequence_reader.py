@@ -378,15 +378,12 @@ def choose_frames(
     The same `seed` always selects the same frames. At least one frame is selected.
 
     Args:
-        count: Number of frames in the recording.
-        start: Index of the first frame.
-        stop: Index after the last frame; TO_THE_END = to the end.
-        stride: Step between frames; 1 = every frame.
-        frame_fraction: Fraction of these frames that is selected at random, in (0, 1]; 1 = all frames.
-        seed: Seed of the random selection.
-
-    Returns:
-        Frame indices from 0.
+        count: The number of frames in the recording.
+        start: The index of the first frame.
+        stop: The index after the last frame; TO_THE_END = to the end.
+        stride: The step between frames; 1 = every frame.
+        frame_fraction: The fraction of these frames that is selected at random, in (0, 1]; 1 = all frames.
+        seed: The seed of the random selection.
 
     Raises:
         ConfigError: A parameter is invalid, or `start` is beyond the last frame.

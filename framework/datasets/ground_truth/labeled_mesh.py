@@ -22,8 +22,8 @@ class LabeledMesh:
     vertices: Float32  # (V, 3) m, world frame
     triangles: Int32  # (F, 3) vertex indices
     instance_ids: Int32  # (V,), 0 = no instance
-    class_names: Mapping[int, str | None]  # as in FrameTruth
-    classes: tuple[str, ...] | None = None  # as in SceneTruth
+    class_names: Mapping[int, str | None]  # by instance id; None = unknown class, not evaluated
+    classes: tuple[str, ...] | None = None  # all annotated classes; None = unknown
 
     def scene_truth(self) -> SceneTruth:
         """Return the vertices as ground-truth points."""

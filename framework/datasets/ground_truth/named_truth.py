@@ -1,8 +1,8 @@
 """The ground truth set by `dataset.ground_truth`: a labeled mesh or the map of a run.
 
     DIR/mesh.ply            a PLY file of any name: vertex x y z [m], integer property `instance`, 0 = none; faces
-    DIR/instances.json      next to it or in the parent folder: {"<id>": {"name", "class"}}; class = a COCO name, or
-                            null = unknown
+    DIR/instances.json      next to the mesh or in the parent folder: {"<id>": {"name", "class"}}; class = a COCO name,
+                            or null = unknown
     RUN/                    a run directory: mesh.ply, instances.json (a list) and trajectory.txt
 
 A labeled mesh is in the world frame of the recording's poses. The map of a run is in the world frame of the estimated

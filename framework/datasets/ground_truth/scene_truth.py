@@ -35,14 +35,17 @@ def fuse_scene_truth(
 ) -> SceneTruth:
     """Fuse labeled depth images into a point cloud with one labeled point per voxel.
 
-    Each pixel votes for its instance id in its voxel, and the id with the most votes wins. In a tie, the smaller id
-    wins. The point of a voxel is the mean of the points with the winning id. The points are in the order of first
+    Each pixel votes for its instance id in its voxel. The id with the most votes is selected, and the smaller id in a
+    tie. The point of a voxel is the mean of the points with the selected id. The points are in the order of first
     observation.
 
     Args:
         views: The labeled depth images.
         class_names: The class of each instance id.
         ground_truth_spacing: The side length of the voxels, m.
+
+    Raises:
+        DataError: A point is too far from the world origin.
     """
     slots, taken = Slots.empty(INITIAL_CAPACITY), 0
     for view in views:

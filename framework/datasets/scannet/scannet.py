@@ -1,4 +1,6 @@
-"""ScanNet (Dai et al., CVPR 2017): rooms scanned with an iPad and an attached depth sensor, with labeled meshes.
+"""ScanNet dataset (Dai et al., CVPR 2017).
+
+Rooms were scanned with an iPad and an attached depth sensor:
 
     scene0000_00/scene0000_00.sens      the video in one file (`sens_file.py`), or the export of ScanNet's SensReader:
     scene0000_00/color/0.jpg            8-bit color, numbered from 0

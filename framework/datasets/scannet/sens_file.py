@@ -1,4 +1,4 @@
-"""ScanNet's `.sens` files, version 4: a header, and frames with pose, timestamps and compressed images.
+"""Reader of ScanNet's `.sens` files, version 4.
 
     uint32 version, uint64 n, n bytes: sensor name
     float32[64]     four 4x4 matrices: color intrinsics, color extrinsics, depth intrinsics, depth extrinsics

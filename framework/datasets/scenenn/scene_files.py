@@ -1,4 +1,4 @@
-"""SceneNN's text files: poses, timestamps and intrinsics.
+"""SceneNN's text files with poses, timestamps and intrinsics.
 
 trajectory.log      per frame: a header of three integers, and the four rows of T_world_camera in meters
 timestamp.txt       per frame: number (from 1), and timestamps of color and depth in microseconds

@@ -1,4 +1,6 @@
-"""SceneNN (Hua et al., 3DV 2016): rooms scanned with an Asus Xtion or a Kinect v2, with labeled meshes.
+"""SceneNN dataset (Hua et al., 3DV 2016).
+
+Rooms were scanned with an Asus Xtion or a Kinect v2:
 
     NNN/image/image00001.png    8-bit color, numbered from 1
     NNN/depth/depth00001.png    uint16, mm, registered to color

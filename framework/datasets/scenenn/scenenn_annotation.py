@@ -48,8 +48,7 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
     Unknown elements and attributes are ignored.
 
     Raises:
-        DataError: The file is not valid XML, or it declares a document type. There are no labels, a label has no
-            integer id, or different labels have the same id.
+        DataError: The file is not valid XML, declares a document type, or contains no labels or invalid ids.
     """
     content = read_bytes(path, LARGEST_FILE)
     labels = _Labels(path)
@@ -166,7 +165,7 @@ def _color(text: str) -> tuple[int, int, int]:
 
 
 def _aabb(text: str) -> Float64 | None:
-    """Parse an axis-aligned box `minx miny minz maxx maxy maxz`, m; None = invalid."""
+    """Parse an axis-aligned box `minx miny minz maxx maxy maxz`, m, or return None if invalid."""
     numbers = _numbers(text, 6)
     if numbers is None or (numbers[:3] > numbers[3:]).any():
         return None
@@ -174,7 +173,7 @@ def _aabb(text: str) -> Float64 | None:
 
 
 def _obb(text: str) -> Box | None:
-    """Parse an oriented box: center (m), extent (m) and quaternion xyzw; None = invalid.
+    """Parse an oriented box with center (m), extent (m) and quaternion xyzw, or return None if invalid.
 
     The order of the numbers is documented in github.com/hkust-vgd/scenenn, issue 11.
     """
@@ -187,7 +186,7 @@ def _obb(text: str) -> Box | None:
 
 
 def _numbers(text: str, count: int) -> Float64 | None:
-    """Parse `count` finite numbers; None = invalid."""
+    """Parse `count` finite numbers, or return None if invalid."""
     try:
         numbers = np.array([float(word) for word in text.split(maxsplit=count)])
     except ValueError:

@@ -63,8 +63,8 @@ class TextPromptedBoxes:
             color: The image (H, W, 3), RGB.
 
         Returns:
-            The candidate boxes (P, 4) x1 y1 x2 y2, px, with pixel centers at integers, and the probability (P, T) of
-                each text for each box.
+            The candidate boxes (P, 4) x1 y1 x2 y2, px, and the probability (P, T) of each text. Pixel centers are at
+                integers.
         """
         long = max(color.shape[:2])
         square = np.full((long, long, 3), PADDING, np.uint8)

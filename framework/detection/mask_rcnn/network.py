@@ -1,4 +1,4 @@
-"""Mask R-CNN with a feature pyramid (He et al. 2017; Lin et al. 2017), in plain torch.
+"""Mask R-CNN with a feature pyramid (He et al. 2017, Lin et al. 2017), in plain torch.
 
     image ─► ResNet ─► feature pyramid ─► region proposals ─► boxes and class distributions ─► masks
 

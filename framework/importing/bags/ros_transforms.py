@@ -17,7 +17,7 @@ SMALLEST_QUATERNION = 0.5  # minimum norm of a valid quaternion
 
 
 def stream_motion(bag: RosBag, stream: str) -> Float64 | None:
-    """Return the transform (4, 4) from the reference frame to a RealSense stream, or None if it is not in the bag.
+    """Return the transform (4, 4) from the reference frame to a RealSense stream, or None if unknown.
 
     A stream is for example /device_0/sensor_1/Color_0. All streams have the same reference frame.
 
@@ -40,7 +40,7 @@ def stream_motion(bag: RosBag, stream: str) -> Float64 | None:
 
 
 def static_rotation(bag: RosBag, to: str, of: str) -> Float64 | None:
-    """Return the rotation (3, 3) between two frames from /tf_static, or None if it is not in the bag.
+    """Return the rotation (3, 3) between two frames from /tf_static, or None if unknown.
 
     Args:
         bag: The bag.

@@ -82,7 +82,7 @@ class ExrFolder:
         return readings(_read_exr(path, read_bytes(path, LARGEST_FILE), shape))
 
     def confidence(self, number: int, shape: tuple[int, int]) -> UInt8 | None:
-        """Read the confidence (h, w) of depth, from 0 to 2; None = unknown."""
+        """Read the confidence (h, w) of depth, from 0 to 2, or return None if unknown."""
         return None
 
     def name(self, number: int) -> str:

@@ -45,7 +45,10 @@ class Furniture:
         return lows.min(axis=0), highs.max(axis=0)
 
     def placed(self, x: float, y: float, z: float = 0.0, angle: float = 0.0) -> Furniture:
-        """Return a copy that is rotated about z by an angle in rad, then translated by x, y, z in m."""
+        """Return a copy that is rotated about z, then translated.
+
+        The angle is in rad, and the translation is in m.
+        """
         parts = [(solid.turned("z", angle).moved(x, y, z), material) for solid, material in self.parts]
         return Furniture(self.kind, self.class_name, parts)
 

@@ -64,7 +64,7 @@ def book(rng: Rng) -> Furniture:
 
 
 def book_pile(rng: Rng) -> Furniture:
-    """Return a pile of three or four books, labeled as one instance as in SceneNN."""
+    """Return a pile of three or four books, labeled as one instance."""
     piece = Furniture("pile of books", "book")
     z = 0.0
     for k in range(int(rng.integers(3, 5))):
