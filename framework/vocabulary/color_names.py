@@ -41,9 +41,9 @@ def nearest_names(srgb: Float32) -> Int32:
 
 
 def fits(srgb: Float32, name: str) -> Float32:
-    """Return a score in [0, 1] that rates a color name for each sRGB color (N, 3).
+    """Rate how well a color name describes each sRGB color (N, 3) in [0, 1].
 
-    The score is 1 if the name is the nearest name.
+    The scores (N,) are in [0, 1]. The score is 1 if the name is the nearest name.
     """
     distances = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
     # distance to this name minus the distance to the nearest name, in CIELAB

@@ -60,7 +60,7 @@ class LabelMapping:
 
         Returns:
             The distributions (N, C') over `classes`, and an array (N,) that is True if the best label has a COCO name.
-                A row without COCO names is a uniform distribution.
+            A row without COCO names is a uniform distribution.
         """
         has_meaning = self.meaning >= 0
         sums = np.zeros((len(probabilities), len(self.classes)))

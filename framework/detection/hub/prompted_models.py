@@ -64,7 +64,7 @@ class TextPromptedBoxes:
 
         Returns:
             The candidate boxes (P, 4) x1 y1 x2 y2, px, and the probability (P, T) of each text. Pixel centers are at
-                integers.
+            integers.
         """
         long = max(color.shape[:2])
         square = np.full((long, long, 3), PADDING, np.uint8)
