@@ -1,4 +1,4 @@
-"""Supported import formats and their detection."""
+"""Supported recording formats."""
 
 from __future__ import annotations
 
@@ -21,9 +21,15 @@ FORMATS = (
 
 
 def open_source(path: Path, topics: Topics | None = None) -> Source:
-    """Open the recording at `path`. Raises DataError for an unknown format or an unreadable recording.
+    """Open a recording in any supported format.
 
-    `topics` are topics of a ROS bag; only those that cannot be selected by type and name are required.
+    Args:
+        path: The file or folder of the recording.
+        topics: The topics of a ROS bag; None = selected by type and name.
+
+    Raises:
+        DataError: The format is unknown, or the recording is unreadable.
+        ConfigError: The topics are invalid, or they are set for another format.
     """
     if not path.exists():
         raise DataError(f"{path}: expected a recording, got no such file or folder")
