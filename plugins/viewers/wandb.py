@@ -1,4 +1,4 @@
-"""Logs for Weights & Biases (https://wandb.ai, MIT)."""
+"""Viewer that logs to Weights & Biases (https://wandb.ai, MIT)."""
 
 from __future__ import annotations
 
