@@ -67,7 +67,7 @@ def _add_class(labels, sums, label, total):
 
 @device
 def observe_mask(evidence, row, n, masks, k):
-    """Update the evidence of voxel n of a row under the mask of cluster k, and return the number of evicted classes."""
+    """Add the evidence of mask k to voxel n of a row, and return the number of evicted classes."""
     labels, sums = evidence.class_ids[row, n], evidence.log_ratio[row, n]
     known = 0  # bits of the named classes with a slot
     for s in range(len(labels)):

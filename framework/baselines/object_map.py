@@ -125,7 +125,7 @@ class ObjectMap(InstanceTableMap):
         volume.integrate(_cropped(frame, u0, v0, u1, v1), T_world_camera, part, band)
 
     def _boxes(self, camera: Camera, T_world_camera: Float64, volumes: list[ObjectVolume]) -> Int32:
-        """Return the pixel windows (N, 4) of volumes; see `boxes_in_view`."""
+        """Return the pixel window (N, 4) of each volume."""
         low, high = (np.array([getattr(volume, side) for volume in volumes]) for side in ("low", "high"))
         return boxes_in_view(camera, T_world_camera, low, high, float(self.background.sensor.min_depth))
 
@@ -262,7 +262,7 @@ def _part(surface: UnlabeledMesh, voxels: VoxelGrid, chosen: Bool, instance_ids:
 
 
 def _cropped(frame: Frame, u0: int, v0: int, u1: int, v1: int) -> Frame:
-    """Return the part of a frame between two pixels; the second pixel is exclusive."""
+    """Return the part of a frame from (u0, v0) to (u1, v1), exclusive."""
     camera = frame.camera
     part = replace(camera, width=u1 - u0, height=v1 - v0, cx=camera.cx - u0, cy=camera.cy - v0)
     return Frame(

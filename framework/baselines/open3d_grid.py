@@ -215,7 +215,7 @@ class BlockGrid:
         return voxels.numpy().ravel()[inside[near]], pixels[near]
 
     def voxels_at(self, points_world: Float32) -> Int64:
-        """Return the flat index (P,) of the voxel nearest to each world point (P, 3), m; -1 = not allocated."""
+        """Return the flat index (P,) of the voxel nearest to each world point (P, 3), m, -1 = not allocated."""
         if not len(points_world) or not self.block_count:
             return np.full(len(points_world), -1)
         r = self.settings.block_resolution
@@ -303,10 +303,11 @@ class BlockGrid:
         return coords[seen], float(z[seen].max(initial=0) + radius)
 
     def block_coords(self) -> Int32:
-        """Return the coordinates (B, 3) of the blocks in use; their order differs between runs."""
+        """Return the coordinates (B, 3) of the blocks in use."""
         if not self.block_count:
             return np.zeros((0, 3), np.int32)
         hashmap = self.blocks.hashmap()
+        # the order differs between runs
         return np.asarray(hashmap.key_tensor().numpy()[hashmap.active_buf_indices().numpy()], np.int32)
 
     def extract(self) -> tuple[Float32, Int32, UInt8]:
@@ -375,7 +376,7 @@ def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
 
 
 def points_of(surface: SurfaceView) -> Float32:
-    """Return the surface points (H, W, 3), m; the camera center where there is no surface."""
+    """Return the surface points (H, W, 3), m, or the camera center where there is no surface."""
     points = _rays(surface.camera, surface.T_world_camera)
     points *= surface.depth[..., None]
     points += surface.T_world_camera[:3, 3].astype(np.float32)

@@ -115,7 +115,7 @@ def _keep_near(
 
 @njit(cache=True, nogil=True)
 def _largest(pieces: Int64, sizes: Int32, waiting: Bool) -> int:
-    """Return the largest component that is still waiting; ties go to the first."""
+    """Return the largest component that is still waiting."""
     largest = -1
     for piece in pieces:  # np.argsort compiles slowly
         if waiting[piece] and (largest < 0 or sizes[piece] > sizes[largest]):

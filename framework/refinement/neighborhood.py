@@ -188,7 +188,7 @@ def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
 
 
 def thread_schedule(costs: Int64) -> ThreadSchedule:
-    """Assign clusters to threads in order of decreasing cost, each to the thread with the least work.
+    """Assign each cluster to the thread with the least work, in order of decreasing cost.
 
     `costs` (N,) is the number of points of each cluster. Numba would assign equal numbers of clusters, but a few large
     clusters contain most of the points.

@@ -210,7 +210,7 @@ def _highest(steps: Int16) -> np.int16:
 
 @njit(cache=True, nogil=True)
 def _distances_along(sources: Bool, row: Int16) -> None:
-    """Set each cell of a row to its distance to the nearest source in the row; FAR if there is no source."""
+    """Set each cell of a row to its distance to the nearest source in the row, FAR = no source."""
     columns = len(row)
     row[:] = 0
     begin = 0

@@ -12,7 +12,7 @@ PART = 8192  # number of rows that a thread processes at once
 
 @njit(cache=True, nogil=True)
 def part_starts(kept: Bool) -> Int64:
-    """Return the number of kept rows (parts + 1,) before each part of PART rows; the last entry is the total."""
+    """Return the number of kept rows (parts + 1,) before each part of PART rows, and in total."""
     parts = (len(kept) + PART - 1) // PART
     starts = np.zeros(parts + 1, np.int64)
     for part in range(parts):

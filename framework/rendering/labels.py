@@ -112,7 +112,9 @@ def _widest_part(mask: Bool) -> tuple[float, float, float]:
 def _place_next_to(
     u: float, v: float, size: tuple[float, float], boxes: Sequence[Box], objects: Bool, others: Bool
 ) -> tuple[float, float] | None:
-    """Return the best center (u, v) for a name next to its object, px, or None if there is no free position.
+    """Return the best center (u, v) for a name next to its object, px.
+
+    Return None if there is no free position.
 
     Args:
         u: The column of the point on the object, px.

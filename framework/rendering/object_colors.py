@@ -66,6 +66,6 @@ def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
 
 
 def relabeled(ids: Int32, object_of: Mapping[int, int]) -> Int32:
-    """Return the object number (V,) of each point from its instance (V,); 0 = none."""
+    """Return the object number (V,) of each point from its instance (V,), 0 = none."""
     values, inverse = np.unique(ids, return_inverse=True)
     return np.array([object_of.get(key, 0) for key in values.tolist()], np.int32)[inverse]

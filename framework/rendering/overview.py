@@ -44,7 +44,10 @@ def write_overview(
 
 
 def overview(mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], poses: Float64, title: str) -> UInt8:
-    """Return the overview image (H, W, 3), RGB; see `write_overview` for the arguments."""
+    """Return the overview image (H, W, 3), RGB.
+
+    See `write_overview` for the arguments.
+    """
     ids = np.where(np.isin(mesh.instance_ids, list(instances)), mesh.instance_ids, 0).astype(np.int32)
     shown = [key for key in sorted(instances) if (ids == key).any()]
     centroids = np.array([mesh.vertices[ids == key].mean(axis=0) for key in shown], np.float64).reshape(-1, 3)

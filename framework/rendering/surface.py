@@ -35,7 +35,7 @@ class Hits:
 
     @property
     def points_world(self) -> Float32:
-        """World points (H, W, 3), m; 0 = none."""
+        """World points (H, W, 3), m, 0 = none."""
         return self.interpolated(self.vertices)
 
     def subsampled(self, n: int) -> Hits:
@@ -48,7 +48,7 @@ class Hits:
         return replace(self, camera=camera, buffer=buffer)
 
     def interpolated(self, values: Float32) -> Float32:
-        """Return the interpolated vertex values (H, W, C) at each pixel; 0 = no surface."""
+        """Return the interpolated vertex values (H, W, C) at each pixel, 0 = no surface."""
         image = np.zeros((*self.camera.shape, values.shape[1]), np.float32)
         interpolate(self.buffer.triangle, self.buffer.uv, self.triangles, np.ascontiguousarray(values), image)
         return image

@@ -33,7 +33,9 @@ NEAREST = 0.05  # minimum depth of projected points in the view, m
 # Not cv2.blur: other threads that use OpenCV change the split of its running sums, and thus the rounding.
 @njit(cache=True, nogil=True, parallel=True)
 def smooth_normals(normals, reach, row_sums, smooth):
-    """Average normals over squares and normalize them; 0 = no normals in the square.
+    """Average normals over squares and normalize them.
+
+    The result is 0 if a square has no normals.
 
     Args:
         normals: The normals (3, H, W).
@@ -127,7 +129,7 @@ def _project(frame, v, u0, model, shape, R, t, points, pixel):
 
 @device
 def _gather_model(depth, normals, size, pixel, points):
-    """Read the depth and normal of the model at the pixel of each point; depth 0 = no surface."""
+    """Read the depth and normal of the model at the pixel of each point, depth 0 = no surface."""
     for n in range(BATCH):
         i = pixel[n]
         if i >= 0:

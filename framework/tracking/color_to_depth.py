@@ -64,7 +64,7 @@ class ColorToDepth:
 
     @property
     def delay(self) -> float:
-        """Delay in use, s; 0 until it is known."""
+        """Delay in use, s, 0 until it is known."""
         return self._given if self._estimator is None or not self._usable else self._estimator.estimate.seconds
 
     def predicted(self, frame: Frame) -> Frame:
@@ -129,7 +129,7 @@ def _shift(frame: Frame, T_a_b: Float64) -> float:
 
 
 def register(frame: Frame, T_color_depth: Float64) -> tuple[UInt8, Int32]:
-    """Return the nearest color (H, W, 3) of each depth pixel, and its flat index (H, W) in the color image.
+    """Return the nearest color (H, W, 3) of each depth pixel, and its flat index (H, W).
 
     The index is -1 outside the color image and without a depth reading. These pixels get the color of the nearest color
     pixel. Pixels without a reading are projected at the median depth. `T_color_depth` is the motion (4, 4) from the

@@ -112,7 +112,9 @@ def match(query: UInt8, reference: UInt8, max_ratio: float) -> Int32:
 
 
 def surface_depth(depth: Float32, pixels: Float32) -> Float32:
-    """Return the median depth (F,) of the patch around each pixel, m; 0 at surface edges and in holes.
+    """Return the median depth (F,) of the patch around each pixel, m.
+
+    The depth is 0 at surface edges and in holes.
 
     Args:
         depth: The depth image (H, W), m, 0 = no reading.

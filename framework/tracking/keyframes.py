@@ -93,7 +93,10 @@ class Keyframes:
         return len(self._keyframes)
 
     def saved(self) -> dict[str, Array]:
-        """Return the keyframes as arrays; empty without keyframes."""
+        """Return the keyframes as arrays.
+
+        The result is empty if there are no keyframes.
+        """
         self._settle()
         if not self._keyframes:
             return {}
@@ -239,7 +242,8 @@ class Keyframes:
         return self._estimator.estimate(frame.camera, features.pixels[query], points_world, features.depth[query])
 
     def _separation(self, poses: Float64, T_world_camera: Float64) -> Float64:
-        """Return the separation (K,) of a camera pose from other poses (K, 4, 4); 1 = far enough for a new keyframe."""
+        """Return the separation (K,) of a camera pose from other poses (K, 4, 4)."""
+        # 1 = far enough for a new keyframe
         distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
         cosine = (np.einsum("kij,ij->k", poses[:, :3, :3], T_world_camera[:3, :3]) - 1) / 2
         return np.asarray(distance / self.min_distance + np.arccos(np.clip(cosine, -1, 1)) / self.min_angle)
@@ -284,7 +288,9 @@ def write_keyframes(path: Path, keyframes: Mapping[str, Array]) -> None:
 
 
 def read_keyframes(path: Path) -> dict[str, Array]:
-    """Return the arrays in a file of `write_keyframes`; empty if there is no file.
+    """Return the arrays in a file of `write_keyframes`.
+
+    The result is empty if there is no file.
 
     Raises:
         DataError: If the file is invalid.

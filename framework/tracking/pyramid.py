@@ -115,7 +115,7 @@ def _intensity(color: UInt8) -> Float32:
 
 
 def model_intensities(view: SurfaceView, levels: int) -> list[Float32]:
-    """Return the intensity of a view at several resolutions, finest first; -1 = not mapped."""
+    """Return the intensity of a view at several resolutions, finest first, -1 = not mapped."""
     intensity = _intensity(view.color)
     intensity[view.depth == 0] = -1
     pyramid = [intensity]

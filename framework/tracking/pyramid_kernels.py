@@ -108,7 +108,7 @@ def compute_normals(depth, intrinsics, normals):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve_mapped(intensity, half):
-    """Halve the resolution of an intensity image with holes; -1 = too few mapped pixels.
+    """Halve the resolution of an intensity image with holes, -1 = not mapped.
 
     Only mapped pixels are averaged, because a new map has many holes of one pixel.
     """

@@ -2,7 +2,7 @@
 
 The map smooths structure below its voxel size, which biases each alignment. Because the map is updated at the biased
 poses, the estimated pose of a stationary camera drifts. A raw keyframe has no such bias. Its normal equations are added
-to those of the view of the map, after conversion to a twist of the view by the adjoint Ad of T_key_view:
+to those of the map. The adjoint Ad of T_key_view converts them to a twist of the view:
 
     A <- A + w Ad^T A_key Ad,    b <- b + w Ad^T b_key
 

@@ -32,11 +32,12 @@ FRAMES_IN_DOUBT = 30  # number of initial frames without an entry after which a 
 class Precomputed(Detector):
     """Detections from a COCO results file or a mask folder, by frame number.
 
-    COCO results files are written by `instancemap detect` and by other programs. For each frame NNNNNN, a mask folder
-    contains an image NNNNNN.png of 16-bit instance ids, and a file NNNNNN.json with a list of {"id", "class", "score"}.
+    COCO results files are written by `instancemap detect` and by other programs. A mask folder contains two files for
+    each frame NNNNNN. NNNNNN.png is an image of 16-bit instance ids, and NNNNNN.json is a list of {"id", "class",
+    "score"}.
 
     Both formats may contain `class_probabilities` over the names in `label_space`. Without them, a detection with the
-    score s gets the probability 1 - class_spread * (1 - s) for its class, but at least 1 / (number of classes). The
+    score s gets the probability 1 - class_spread * (1 - s) for its class. The minimum is 1 / (number of classes). The
     other classes share the rest equally. Labels are mapped to COCO names by `label_spaces.yaml`. A detection is dropped
     if its best label has no COCO name.
 

@@ -283,7 +283,7 @@ class SimulatedDetector(Detector):
         return replace(candidate, mask=self._coarsen(_placed(shape, x1 - margin, y1 - margin, (height, width))))
 
     def _coarsen(self, mask: Bool) -> Bool:
-        """Return the mask (H, W), resampled on a coarse grid over its box, as in Mask R-CNN."""
+        """Return the mask (H, W), resampled on a coarse grid over its box."""
         if self.mask_grid == 0 or not mask.any():
             return mask
         x1, y1, x2, y2 = tight_boxes(mask[None])[0].astype(int)
@@ -392,7 +392,10 @@ def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: flo
 
 
 def _dirichlet(random: np.random.Generator, alpha: Float64) -> Float64:
-    """Return a sample (C,) of a Dirichlet distribution; its mean if the sampled weights are all 0."""
+    """Return a sample (C,) of a Dirichlet distribution.
+
+    The result is its mean if the sampled weights are all 0.
+    """
     weights = random.gamma(alpha)
     return np.asarray(weights / weights.sum(), np.float64) if weights.sum() > 0 else alpha / alpha.sum()
 

@@ -183,7 +183,7 @@ def resample_masks(grids: Tensor, covered: tuple[float, float], shape: tuple[int
 
 
 def mean_probability(mask_logits: Tensor, inside: Tensor) -> Float32:
-    """Return the mean mask probability (N,) inside each mask; 0 for an empty mask.
+    """Return the mean mask probability (N,) inside each mask, 0 for an empty mask.
 
     Args:
         mask_logits: The mask logits (N, H, W).
@@ -312,7 +312,7 @@ class Checkpoint:
 
     @property
     def labels(self) -> Sequence[str]:
-        """Names of the classes; unnamed classes are NO_CLASS."""
+        """Names of the classes, NO_CLASS for unnamed classes."""
         named = {k: name for k, name in self.config.id2label.items() if not PLACEHOLDER.fullmatch(name)}
         names = [named.get(k, NO_CLASS) for k in range(max(self.config.id2label) + 1)]
         # RF-DETRs trained on COCO use its annotation ids; their configs have no names, or COCO's names without gaps

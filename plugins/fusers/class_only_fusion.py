@@ -1,4 +1,4 @@
-"""Class-only baseline: class fusion as in SemanticFusion, with connected components as instances."""
+"""Class-only baseline: class fusion in voxels, with connected components as instances."""
 
 from __future__ import annotations
 

@@ -19,7 +19,10 @@ from framework.mapping.voxels.tsdf_volume import VoxelHashing
 
 
 def existence(record: InstanceRecord) -> float:
-    """Return the existence probability of an object, as in Fusion++."""
+    """Return the existence probability of an object.
+
+    The definition follows Fusion++.
+    """
     # mean of Beta(1 + n, 1 + m): n frames with a detection, m frames in view without a detection
     return (1 + record.observations) / (2 + max(record.visible, record.observations))
 

@@ -1,4 +1,4 @@
-"""Cluster refinement by convexity, as in Voxblox++."""
+"""Cluster refinement by convexity."""
 
 from __future__ import annotations
 

@@ -20,8 +20,8 @@ from framework.refinement.refine import keep_points
 class GmmEm(ClusterRefiner):
     """Removal of background and outliers by a Gaussian mixture for each mask.
 
-    The mixture is fitted by eqs. (1) to (4) of docs/method.md. Object components are initialized by groups of the
-    points in the mask, and background components by groups of the points in a ring around the mask. A uniform component
+    The mixture is fitted by eqs. (1) to (4) of docs/method.md. Object components are initialized by groups of points in
+    the mask. Background components are initialized by groups of points in a ring around the mask. A uniform component
     can represent outliers.
 
     The mask is also evidence for the object. This is our choice, because otherwise object and background can swap. The

@@ -72,9 +72,9 @@ def _firsts_of_blocks(pixels: Int32, max_points: int) -> Int64:
 
 
 def rank_order_groups(points: Float32, neighbors: int, threshold: float) -> Int32:
-    """Return the rank-order group (P,) of each point; see `RankOrder`.
+    """Return the rank-order group (P,) of each point.
 
-    Groups are numbered in the order of their first points.
+    Groups are numbered in the order of their first points. See `RankOrder`.
 
     Args:
         points: The points (P, 3), m.

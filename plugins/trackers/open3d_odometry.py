@@ -98,7 +98,7 @@ class Open3dOdometry(PoseTracker):
     def _aligned(
         self, image: o3d.t.geometry.RGBDImage, reference: o3d.t.geometry.RGBDImage, frame: Frame
     ) -> tuple[Float64, str]:
-        """Return T_last_camera (4, 4) and the reason for rejecting it; "" = accepted."""
+        """Return T_last_camera (4, 4) and the reason for rejecting it, "" = accepted."""
         from open3d.t.pipelines import odometry
 
         readings = np.count_nonzero((frame.depth > 0) & (frame.depth <= self.max_depth))

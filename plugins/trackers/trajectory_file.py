@@ -29,9 +29,9 @@ class TrajectoryFile(PoseTracker):
     """Poses from a trajectory file in TUM format.
 
     Each frame gets the pose nearest in time. Frames without such a pose are skipped. By default, the trajectory is
-    moved rigidly, so that the first frame with a pose defines the world frame, as in `PoseTracker`. `world_frame=FILE`
-    keeps the world frame of the file, in which the ground-truth poses of the sequence are invalid. The tracker raises
-    DataError if a pose is not finite or not rigid, or if timestamps do not increase.
+    moved rigidly, so that the first frame with a pose defines the world frame. `world_frame=FILE` keeps the world frame
+    of the file. The ground-truth poses of the sequence are then invalid. The tracker raises DataError if a pose is not
+    finite or not rigid, or if timestamps do not increase.
     """
 
     path: Path  # trajectory in TUM format

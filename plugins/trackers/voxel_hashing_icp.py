@@ -41,7 +41,10 @@ RECOVERY_INFORMATION = 2.0  # factor of min_information for a lost camera
 
 
 class ResidualWeights(Enum):
-    """Weights of residuals; see framework/tracking/alignment.py."""
+    """Weights of residuals.
+
+    See framework/tracking/alignment.py.
+    """
 
     TUKEY = "weights by residual over expected noise, with larger noise at coarse levels and exposure compensation"
     LINEAR = "weights of VoxelHashing's code, equal at all levels, without noise model and exposure compensation"
@@ -454,7 +457,7 @@ class VoxelHashingIcp(PoseTracker):
         )
 
     def _rejection(self, frame: PyramidLevel, equations: NormalEquations, T_from_camera: Float64) -> str:
-        """Return the reason for rejecting a pose; "" = the pose is possible.
+        """Return the reason for rejecting a pose, "" = the pose is possible.
 
         Args:
             frame: The level of the frame whose points are counted in `equations`.

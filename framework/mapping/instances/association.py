@@ -105,7 +105,7 @@ def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> 
 
 
 def class_agreement(clusters: Float32, instances: Float32) -> npt.NDArray[np.float64]:
-    """Return the Bhattacharyya coefficients (N, M) between class distributions (N, C) and (M, C); 1 = equal."""
+    """Return the Bhattacharyya coefficients (N, M) between class distributions (N, C) and (M, C), 1 = equal."""
     return np.asarray(np.sqrt(clusters.astype(np.float64)) @ np.sqrt(instances.astype(np.float64)).T)
 
 

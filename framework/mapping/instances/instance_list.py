@@ -87,7 +87,7 @@ class InstanceTableMap(SceneMap):
     """A map with an instance table.
 
     `mesh` and `instances` contain only confirmed instances, and `render` contains all instances. `instance_ids` and
-    `most_likely_classes` ignore the minimum area, because they do not create a mesh.
+    `most_likely_classes` do not create a mesh. Therefore, they ignore the minimum area.
     """
 
     table: InstanceTable
@@ -179,7 +179,7 @@ def box_around(points: Float32, up: Float64 | None) -> Box:
 
 
 def upright_box(points: Float32, up: Float64) -> Box:
-    """Return the bounding box of points (M, 3), m, whose third axis is `up` and whose base area is minimal.
+    """Return the bounding box of points (M, 3), m, with its third axis along `up` and the smallest base.
 
     `up` is a unit vector (3,).
     """

@@ -165,7 +165,7 @@ class InstanceTable:
         return np.asarray(likelihood / total if total > 0 else np.full_like(evidence, 1 / len(evidence)), np.float32)
 
     def class_ids(self) -> Int32:
-        """Return the most likely class (last id + 1,) of each instance, indexed by id; -1 = no such instance."""
+        """Return the most likely class (last id + 1,) of each instance, indexed by id, -1 = no such instance."""
         class_ids = np.full(self.last_id + 1, -1, np.int32)
         for record in self.records.values():
             class_ids[record.id] = record.class_evidence.argmax()

@@ -45,7 +45,7 @@ class ObjectEmbedding:
 
     @property
     def mean(self) -> Float32:
-        """Normalized sum (D,) of the embeddings; zeros if they cancel out."""
+        """Normalized sum (D,) of the embeddings, or zeros if they cancel out."""
         length = float(np.linalg.norm(self.sum))
         return np.asarray(self.sum / length if length > 0 else self.sum, np.float32)
 
@@ -82,7 +82,10 @@ def agreed_space(known: str, found: str) -> str:
 
 
 def embedding_arrays(embeddings: Mapping[int, ObjectEmbedding]) -> dict[str, Array]:
-    """Return the arrays of embeddings for a map file; empty without embeddings."""
+    """Return the arrays of embeddings for a map file.
+
+    The result is empty if there are no embeddings.
+    """
     if not embeddings:
         return {}
     values = list(embeddings.values())

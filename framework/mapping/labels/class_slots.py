@@ -4,9 +4,9 @@ In compact storage, a voxel has sixteen class slots, which fit into one SIMD vec
 such short loops, the intrinsics in this module emit vector instructions. Exact storage uses ordinary loops with the
 same results.
 
-A quantized score is the evidence times a scale, rounded to an integer. `cluster_scores` (NO_CLASS + 1,) contains the
-quantized score of each class, shifted left by NEW_CLASSES bits. If a class is the m-th named class of the cluster, bit
-m of its entry is set.
+A quantized score is the evidence times a scale, rounded to an integer. An array of cluster scores (NO_CLASS + 1,) is
+indexed by class. It contains the quantized score, shifted left by NEW_CLASSES bits. Bit m is set for the m-th named
+class of the cluster.
 """
 
 from __future__ import annotations
@@ -46,13 +46,19 @@ def add_scores(classes, scores, cluster_scores, limit):
 
 @device
 def most_likely_slot(classes, scores):
-    """Return the slot with the highest score; ties go to the smaller class id."""
+    """Return the slot with the highest score.
+
+    Ties go to the smaller class id.
+    """
     return _most_likely_slot(classes, scores)
 
 
 @device
 def least_likely_slot(scores):
-    """Return the slot with the lowest score; ties go to the first slot."""
+    """Return the slot with the lowest score.
+
+    Ties go to the first slot.
+    """
     return _least_likely_slot(scores)
 
 

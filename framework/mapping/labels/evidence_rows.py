@@ -187,7 +187,10 @@ class EvidenceRows:
         self._row_bits[before : self.row_count] = 0
 
     def _reserve(self, rows: int, voxels: int) -> None:
-        """Set the number of rows and voxels in use; new entries are uninitialized."""
+        """Set the number of rows and voxels in use.
+
+        New entries are uninitialized.
+        """
         if rows > len(self._labeled):
             self._labeled = grown(self._labeled, max(rows, 2 * len(self._labeled)))
             self._row_bits = grown(self._row_bits, len(self._labeled))

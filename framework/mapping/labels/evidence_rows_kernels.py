@@ -41,8 +41,8 @@ def _label(evidence, row, n, voxel, free_classes):
 
 @device
 def _prefetch_slots(evidence, voxel):
-    """Prefetch the first and the last cache line of the slots of a voxel; in compact storage, there are no others."""
-    size = evidence.instance_ids.strides[0]
+    """Prefetch the first and the last cache line of the slots of a voxel."""
+    size = evidence.instance_ids.strides[0]  # compact storage has no other cache lines
     start = np.int64(voxel) * size
     prefetch_line(evidence.instance_ids, start)
     prefetch_line(evidence.instance_ids, start + size - 1)

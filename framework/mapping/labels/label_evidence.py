@@ -39,9 +39,10 @@ MAX_CLUSTER_SCORE = 2**15 - 1 - MAX_SCORE  # maximum quantized score of a cluste
 
 
 class Evidence(NamedTuple):
-    """The label evidence of all voxels; see the module docstring.
+    """The label evidence of all voxels.
 
-    The arrays of slots are views of one structured array, so that the slots of a voxel are contiguous in memory.
+    See the module docstring. The arrays of slots are views of one structured array, so that the slots of a voxel are
+    contiguous in memory.
     """
 
     labeled: Int32  # (R, 512) index of a voxel among the voxels with slots, -1 = no slots

@@ -139,7 +139,7 @@ def best_class_first(classes, scores):
 
 @device
 def sum_classes(classes, scores, measurement, k):
-    """Add the class scores of cluster k to the class slots of a voxel, and return the number of classes not kept."""
+    """Add the class scores of cluster k to the slots of a voxel, and return the number of classes not kept."""
     limit, cluster_scores = measurement.max_score, measurement.class_scores[k]
     known, filled, excess = add_scores(classes, scores, cluster_scores, limit)
     for s in range(filled if excess > 0 else 0):  # subtracting preserves the differences between scores

@@ -12,8 +12,9 @@ CHUNKS = 16  # number of chunks of image rows
 
 @device
 def _are_inside(coordinates, width, height):
-    """Return True if all pixels are inside the image; `coordinates` alternates u and v."""
-    right = bottom = np.uint32(0)  # negative coordinates become large unsigned numbers
+    """Return True if all pixels are inside the image."""
+    # coordinates alternate u and v; negative coordinates become large unsigned numbers
+    right = bottom = np.uint32(0)
     for p in range(coordinates.shape[0] // 2):
         right = max(right, np.uint32(coordinates[2 * p]))
         bottom = max(bottom, np.uint32(coordinates[2 * p + 1]))
@@ -22,7 +23,9 @@ def _are_inside(coordinates, width, height):
 
 @njit(cache=True, nogil=True)
 def link_points(coordinates, cluster, list_ids, tree):
-    """Fill `list_ids` (H, W) and the tree of lists, and return the number of lists, 0 if a point is outside the image.
+    """Build the tree of lists and the list (H, W) of each pixel, and return the number of lists.
+
+    The result is 0 if a point is outside the image.
 
     Args:
         coordinates: The pixels (2 P,) of the points, alternating u and v.

@@ -82,13 +82,13 @@ def majority(labels, weights):
 
 @device
 def _elect(grid, evidence, counts, blocks, voxels, weights, ids):
-    """Return the instance and class of a vertex by majority vote of its eight voxels; 0 and -1 without a majority."""
+    """Return the instance and the class of a vertex by majority vote of its eight voxels."""
     keep_near(grid, blocks, voxels, weights)
     for c in range(CORNERS):
         voxel = labeled_voxel(grid, evidence, blocks[c], voxels[c]) if weights[c] > 0 else np.int32(-1)
         ids[c] = best_counted_instance(evidence, voxel, counts) if voxel >= 0 else np.int32(0)
     elected = majority(ids, weights)
-    if elected < 0:
+    if elected < 0:  # no majority
         return np.int32(0), np.int32(-1)
     return ids[elected], best_class(evidence, labeled_voxel(grid, evidence, blocks[elected], voxels[elected]))
 
@@ -105,7 +105,10 @@ def color_of(color, voxel, out):
 
 @njit(cache=True, nogil=True, parallel=True)
 def color_vertices(color, voxels, colors):
-    """Fill the colors (V, 3), RGB, of voxels (V,), numbered as in an UnlabeledMesh."""
+    """Fill the colors (V, 3), RGB, of voxels (V,).
+
+    The voxels are numbered as in an UnlabeledMesh.
+    """
     for v in prange(len(voxels)):
         color_of(color, voxels[v], colors[v])
 

@@ -221,7 +221,10 @@ def _plain_record(record: InstanceRecord) -> dict[str, Any]:
 
 
 def table_arrays(table: InstanceTable) -> dict[str, Array]:
-    """Return the arrays of the embeddings of an instance table; empty without embeddings."""
+    """Return the arrays of the embeddings of an instance table.
+
+    The result is empty if there are no embeddings.
+    """
     embeddings = {k: record.embedding for k, record in table.records.items() if record.embedding is not None}
     return embedding_arrays(embeddings)
 

@@ -81,7 +81,7 @@ class MapHeader:
         return options[found]
 
     def classes(self) -> tuple[str, ...]:
-        """Return the names of the map's classes."""
+        """Return the names of the classes."""
         found = self.items("classes")
         names = [name for name in found if isinstance(name, str) and len(name) <= LONGEST_NAME]
         if len(names) < len(found) or len(found) > MAX_CLASSES:

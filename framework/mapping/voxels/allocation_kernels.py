@@ -18,7 +18,7 @@ PROBES = 4  # number of probed pixels along each side of a block in the image, t
 
 @device
 def _remembered(recent, key):
-    """Return True if the key was seen recently; otherwise remember it."""
+    """Return True if the key is in the cache, otherwise add it."""
     slot = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(54)
     if recent[slot] == key:
         return True
@@ -28,7 +28,7 @@ def _remembered(recent, key):
 
 @device
 def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
-    """Write the keys of the blocks along the truncation band of each reading of an image row to keys[1:].
+    """Write the keys of the blocks along the truncation bands of an image row to keys[1:].
 
     `readings` are every stride-th depth reading of row v, m. Readings out of range get NO_KEY.
     """

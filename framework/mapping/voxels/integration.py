@@ -70,15 +70,16 @@ class Integrator:
     def integrate_object(self, frame: Frame, T_world_camera: Float64, near_band: float, mask: Bool) -> SeenBlocks:
         """Integrate one frame into the grid of a single object, and return the updated blocks.
 
-        New blocks are allocated only inside the object's `mask` (H, W). Existing blocks are also updated outside the
-        mask.
+        New blocks are allocated only inside the `mask` (H, W) of the object. Existing blocks are also updated outside
+        the mask.
         """
         depth = np.where(mask, frame.depth, np.float32(0.0))
         self._allocator.allocate(frame.camera, depth, T_world_camera)
         return self._update(frame, T_world_camera, near_band, np.arange(self.voxels.block_count, dtype=np.int32))
 
     def _sensor_of(self, frame: Frame) -> Sensor:
-        """Return the sensor parameters with the full-weight depth of the frame's sensor, if larger."""
+        """Return the sensor parameters for a frame."""
+        # the full-weight depth of the sensor of the frame, if larger
         full_weight_depth = max(self.sensor.full_weight_depth, np.float32(frame.sensor.noise.full_weight_depth))
         return self.sensor._replace(full_weight_depth=full_weight_depth)
 

@@ -121,7 +121,7 @@ def number_slices(cells, starts):
 
 @device
 def _crossing(a, b):
-    """Return (1, fraction from a to b) of the zero crossing between a and b, or (0, 0) without a sign change."""
+    """Return (1, position between a and b) of a zero crossing, or (0, 0) if there is none."""
     crosses = (a ^ b) < 0
     where = np.float32(a) / np.float32(a - b if crosses else 1)
     return (np.float32(1.0), where) if crosses else (np.float32(0.0), np.float32(0.0))
@@ -129,7 +129,7 @@ def _crossing(a, b):
 
 @device
 def _cell_vertex(corners):
-    """Return the mean (x, y, z) of the zero crossings on the edges of a cell, in voxels from its first corner."""
+    """Return the mean (x, y, z) of the zero crossings on the edges of a cell, in voxels."""
     x = y = z = crossings = np.float32(0.0)
     for edge in range(4):  # along each axis, at (u, v) along the other two axes
         u, v = np.float32(edge & 1), np.float32(edge >> 1)

@@ -55,7 +55,9 @@ def cast_view(
     voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None,
     kind: SensorKind = SensorKind.KINECT_V1,
 ) -> tuple[Float32, Float32]:  # fmt: skip
-    """Return the depth (H, W), m, and the normals (H, W, 3) of the visible surface; depth 0 = no surface.
+    """Return the depth (H, W), m, and the normals (H, W, 3) of the visible surface.
+
+    The depth is 0 where there is no surface.
 
     Args:
         voxels: The voxel grid.
@@ -85,7 +87,8 @@ def cast_view(
 
 
 def _stride(camera: Camera, voxel_size: float, max_depth: float) -> int:
-    """Return the spacing of the coarse rays, px, a power of 2 that resolves details of the map at any depth."""
+    """Return the spacing of the coarse rays, px, a power of 2."""
+    # resolves the details of the map at any depth
     resolved = DETAIL * voxel_size * min(camera.fx, camera.fy) / max_depth
     return 1 << int(np.log2(min(max(resolved, 1.0), MAX_STRIDE)))
 

@@ -34,7 +34,7 @@ MAX_SHIFT = 10.0  # maximum distance between a depth reading and the surface of 
 
 @device
 def _ray(view, scale, u, v):
-    """Return the ray of a pixel, voxels per m of depth, and the depth difference of one voxel along it, m."""
+    """Return the ray of a pixel, voxels per m of depth, and the depth of one voxel along the ray, m."""
     dx, dy, dz = ray_direction(view, u, v)
     dx, dy, dz = dx * scale, dy * scale, dz * scale
     return (dx, dy, dz), np.float32(1.0) / np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -42,7 +42,7 @@ def _ray(view, scale, u, v):
 
 @device
 def _refined(grid, o, d, step, z, reach, key, region):
-    """Return (z, nx, ny, nz, key, region) of the zero crossing near depth z, refined by Newton's method.
+    """Return (z, nx, ny, nz, key, region) of the zero crossing near depth z.
 
     z is 0 if there is no front face within `reach`, m. The gradient (nx, ny, nz) is in stored units per voxel. See
     find_block() for `key` and `region`.
@@ -50,7 +50,7 @@ def _refined(grid, o, d, step, z, reach, key, region):
     zero = np.float32(0.0)
     nx = ny = nz = zero
     start = z
-    for _ in range(REFINEMENTS):
+    for _ in range(REFINEMENTS):  # Newton's method
         x, y, w = o[0] + z * d[0], o[1] + z * d[1], o[2] + z * d[2]
         i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(w))
         block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
@@ -71,9 +71,9 @@ def _refined(grid, o, d, step, z, reach, key, region):
 
 @device
 def _first_surface(grid, o, d, step, near, far, key, region):
-    """Return (z, nx, ny, nz, key, region) of the first front face between two depths; z is 0 without a front face.
+    """Return (z, nx, ny, nz, key, region) of the first front face between two depths.
 
-    See _refined() for the parameters.
+    z is 0 if there is no front face. See _refined() for the parameters.
     """
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     to_voxels = grid.tsdf_unit / grid.voxel_size
@@ -208,7 +208,7 @@ def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near
 
 @device
 def _start_row(corners, b, stride, limits, depth):
-    """Interpolate the depths (W,) of an image row between the corners of its cells; 0 = unknown.
+    """Interpolate the depths (W,) of an image row between the corners of its cells, 0 = unknown.
 
     The vertical position `b` is 0 at the upper corners and 1 at the lower corners.
     """
@@ -226,7 +226,7 @@ def _start_row(corners, b, stride, limits, depth):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, normals):
-    """Compute the depth and the normal of the visible surface at every pixel; 0 = no surface.
+    """Compute the depth and the normal of the visible surface at every pixel.
 
     Args:
         grid: The voxel grid.
@@ -236,7 +236,7 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
         limits: The maximum depth (H, W) of each pixel, m.
         stride: The spacing of the coarse rays, px.
         coarse: The depths of the coarse rays, from cast_coarse() or cast_near().
-        depth: The output (H, W), m.
+        depth: The output (H, W), m, 0 = no surface.
         normals: The output (H, W, 3) in the world frame, the normalized gradients of the field.
     """
     height, width = depth.shape

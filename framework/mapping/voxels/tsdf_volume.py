@@ -72,7 +72,7 @@ class TsdfVolume:
         mark_outdated(self.voxels.grid.color, self.voxels.block_count)
 
     def changed(self, blocks: Int32 | None = None) -> None:
-        """Invalidate the cached surface after voxels of the given blocks changed; None = any block."""
+        """Invalidate the cached surface after a change of voxels in the given blocks, None = any block."""
         self._mesh = self._gravity = None
         if blocks is None:
             self._nets = None

@@ -307,10 +307,10 @@ def gather_corners(grid, values, depth, points, missing, found):
 
 @device
 def step_to_surface(view, scale, v, found, points, converged, reach, limits, depth, normals):
-    """Move the depths of an image row by one Newton step along their rays to the zero of the trilinear field.
+    """Move the depths of an image row by one Newton step toward the surface.
 
-    A depth becomes 0 if the field is unknown or does not decrease along the ray. The depth also becomes 0 if the zero
-    is too far away. A depth that has not converged is negated.
+    A depth becomes 0 if the field is unknown or does not decrease along the ray. The depth also becomes 0 if the
+    surface is too far away. A depth that has not converged is negated.
 
     Args:
         view: The camera with the pose T_world_camera.

@@ -50,7 +50,7 @@ class FrameTree:
         return weights, means, covariances, masks
 
     def masks_of(self, points: Float32) -> Int32:
-        """Return the mask (S,) of the most probable leaf for each point (S, 3), m; -1 = the tree has no leaf."""
+        """Return the mask (S,) of the most probable leaf for each point (S, 3), m, -1 = none."""
         weights, means, covariances, masks = self.leaves()
         best = np.empty(len(points), np.int32)
         find_most_probable(points, coefficients(weights, means, covariances), best)

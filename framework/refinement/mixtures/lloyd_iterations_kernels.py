@@ -118,7 +118,10 @@ def start_all(
     points: Float32, log_odds: Float32, starts: Int64, mask_counts: Int64, object_components: int,
     background_components: int, iterations: int, labels: Int32,
 ) -> None:  # fmt: skip
-    """Set the initial component (S,) of each point; see start_labels()."""
+    """Set the initial component (S,) of each point.
+
+    See start_labels().
+    """
     for k in prange(len(starts) - 1):
         own = slice(starts[k], starts[k + 1])
         _start_one(

@@ -103,7 +103,7 @@ def blocks_of(begins: Int64, ends: Int64, size: int) -> Blocks:
 
 
 def log_densities_of(densities: Float64) -> Float32:
-    """Return the logarithm of densities; ABSENT for densities of 0."""
+    """Return the logarithm of densities, or ABSENT for densities of 0."""
     return np.where(densities > 0, np.log(np.maximum(densities, 1e-300)), ABSENT).astype(np.float32)
 
 

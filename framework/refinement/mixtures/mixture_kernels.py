@@ -67,9 +67,9 @@ def fit_all(
     points: Float32, starts: Int64, labels: Int32, odds: Float32, own_components: int, settings: EmSettings,
     mixtures: Mixtures,
 ) -> None:  # fmt: skip
-    """Fit a mixture to each set of points; see mixture.fit().
+    """Fit a mixture to each set of points.
 
-    The result is written to `mixtures`.
+    The result is written to `mixtures`. See mixture.fit().
     """
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
@@ -241,7 +241,9 @@ def claim(
     points: Float32, blocks: Blocks, odds: Float32, rows: Float32, log_outliers: Float32, own_components: int,
     min_posterior: float, claimed: Bool,
 ) -> None:  # fmt: skip
-    """Find the points that belong to the object; see likely_members().
+    """Find the points that belong to the object.
+
+    See likely_members().
 
     Args:
         points: The points (S, 3), m.

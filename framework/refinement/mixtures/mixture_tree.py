@@ -44,7 +44,7 @@ class Level:
 
     @property
     def outlier_densities(self) -> Float64:
-        """Density (Q,) of the uniform component, 1 / m^3; 0 for a leaf."""
+        """Density (Q,) of the uniform component, 1 / m^3, 0 for a leaf."""
         volumes = np.prod(self.outlier_boxes[:, 1] - self.outlier_boxes[:, 0], axis=1)
         return np.asarray(np.where(volumes > 0, 1.0 / np.where(volumes > 0, volumes, 1.0), 0.0), np.float64)
 
@@ -56,9 +56,10 @@ class MixtureTree:
     levels: tuple[Level, ...]  # coarsest first; at least one
 
     def best_nodes(self, k: int, points: Float32, starts: Int64) -> Int64:
-        """Return the best node (S,) of level k for each point; -1 = the uniform component is more likely.
+        """Return the best node (S,) of level k for each point.
 
-        The best node of a point is the child of its current node with the largest weighted density.
+        The best node of a point is the child of its current node with the largest weighted density. The result is -1 if
+        the uniform component is more likely.
 
         Args:
             k: The level.
@@ -167,7 +168,9 @@ def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: f
 
 
 def object_ratios(tree: MixtureTree, sample: Neighborhoods, odds: Float32, parent_points: float) -> list[Float32]:
-    """Return, for each level, the object fraction (M,) of the density of each node; see own_ratios().
+    """Return, for each level, the object fraction (M,) of the density of each node.
+
+    See own_ratios().
 
     Args:
         tree: The trees.

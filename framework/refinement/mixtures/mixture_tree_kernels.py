@@ -14,7 +14,10 @@ RATIO_ITERATIONS = 20  # number of EM iterations for an object fraction; each it
 
 @njit(cache=True, nogil=True, parallel=True)
 def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
-    """Divide each set of points into groups, and set their labels (S,); see cut()."""
+    """Divide each set of points into groups, and set their labels (S,).
+
+    See cut().
+    """
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             _cut_one(points[starts[k] : starts[k + 1]], groups, labels[starts[k] : starts[k + 1]])
@@ -22,7 +25,7 @@ def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _cut_one(points: Float32, groups: int, labels: Int32) -> None:
-    """Divide one set of points into groups; `labels` are initially 0."""
+    """Divide one set of points into groups."""
     # the points of a group are contiguous in `order`, so that a cut reads only its own group
     n = len(points)
     order, upper = np.arange(n), np.empty(n, np.int64)
@@ -159,7 +162,10 @@ def _add_scaled(densities: Float32, scale: np.float32, values: Float32) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def set_own_ratios(log_odds: Float32, starts: Int64, above_points: float, ratios: Float32) -> None:
-    """Replace the object fractions (M,) of the parents by the fractions of the nodes; see own_ratios()."""
+    """Replace the object fractions (M,) of the parents by those of the nodes.
+
+    See own_ratios().
+    """
     for j in prange(len(starts) - 1):
         if starts[j + 1] > starts[j]:
             odds = np.exp(log_odds[starts[j] : starts[j + 1]])

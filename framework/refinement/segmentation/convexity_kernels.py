@@ -48,7 +48,9 @@ def _noise_at(inverse: float, noise: Noise) -> np.float32:
 
 @njit(cache=True, nogil=True, parallel=True)
 def mean_inverse_depth(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Float32:
-    """Return the mean inverse depth (rows, columns), 1 / m, of the nearest surface in each cell; 0 = no reading.
+    """Return the mean inverse depth (rows, columns), 1 / m, of the nearest surface in each cell.
+
+    The result is 0 for cells without a reading.
 
     Args:
         depth: The depth image (H, W), m.
@@ -278,8 +280,7 @@ def _set_surface(
 def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool) -> None:
     """Mark the cells whose opposite neighbors are on different surfaces or form a concave crease.
 
-    `spacing` is the distance of the neighbors at a depth of 1 m, m. At a convex edge, each neighbor may be this far
-    behind the plane of the other one.
+    `spacing` is the distance of the neighbors at a depth of 1 m, m.
     """
     zero = np.float32(0)
     ax, ay, az, ad, apx, apy, apz, gate, min_cosine = one
@@ -291,6 +292,7 @@ def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool
         cosine = ax[c] * bx[c] + ay[c] * by[c] + az[c] * bz[c]
         far, near = h if h > zero else -h, g if g > zero else -g
         z = apz[c] if apz[c] < bpz[c] else bpz[c]
+        # at a convex edge, each neighbor may be as far behind the plane of the other one as they are apart
         jump = (far if far < near else near) > gate[c] + (spacing * z if h * g > zero else zero)
         concave = (h + g > zero) & (cosine < min_cosine[c])
         both = (apz[c] > zero) & (bpz[c] > zero)

@@ -333,16 +333,18 @@ def label_points(
 def find_off_planes(
     cluster: Int32, pixels: Int32, on_plane: UInt8, max_own: float, counts: Int64, stays: Bool, structure: Bool
 ) -> Bool:
-    """Return a Boolean array (P,), True for the points to keep; see off_planes().
+    """Return a Boolean array (P,), True for the points to keep.
+
+    See off_planes().
 
     Args:
         cluster: The cluster (P,) of each point, -1 = none.
         pixels: The pixels (P, 2), u and v, of the points.
         on_plane: The plane (H, W) of each pixel, 0 = none.
         max_own: The maximum fraction of the readings of a plane that is removed from a cluster.
-        counts: The number of points by cluster and plane (parts, N + 1, K + 1); initially 0.
-        stays: The pairs of cluster and plane (N + 1, K + 1) whose points are kept; initially True.
-        structure: The pixels (H, W) on planes; set to False at kept points.
+        counts: The number of points by cluster and plane (parts, N + 1, K + 1), initially 0.
+        stays: The pairs of cluster and plane (N + 1, K + 1) whose points are kept, initially True.
+        structure: The pixels (H, W) on planes, set to False at kept points.
     """
     labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
     for part in prange(len(counts)):

@@ -21,7 +21,10 @@ def root(parents: Int32, cell: int) -> int:
 
 @njit(cache=True, nogil=True)
 def unite(parents: Int32, a: int, b: int) -> None:
-    """Join the components of two cells; the smaller root remains."""
+    """Join the components of two cells.
+
+    The smaller root remains.
+    """
     a, b = root(parents, a), root(parents, b)
     if a < b:
         parents[b] = a
