@@ -168,7 +168,6 @@ class ClassRows:
         self.row_count = len(self.evidence.rest)
 
     def _add_rows(self, blocks: Int32) -> None:
-        """Add a row of evidence for each of the blocks."""
         needed = self.row_count + len(blocks)
         if needed > len(self.evidence.rest):
             capacity = max(needed, 2 * len(self.evidence.rest))
@@ -201,7 +200,6 @@ def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: i
 
 
 def _free_rows(class_slots: int) -> ClassEvidence:
-    """Return the evidence without rows."""
     voxels = (0, BLOCK_VOXELS)
     return ClassEvidence(
         unmasked=np.empty(voxels, np.uint16),

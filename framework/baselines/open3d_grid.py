@@ -33,8 +33,8 @@ ATTRIBUTES = {  # name: (type, channels) of a voxel; Open3D's `integrate` expect
 }
 FIRST_BLOCKS = 1000  # maximum initial capacity, blocks; Open3D allocates it immediately
 FIRST_VOXELS = 2**23  # maximum initial capacity, voxels; 0.2 GB
-METERS = 1.0  # Open3D's depth_scale: units of a float image per meter
-TOUCH_STRIDE = 4  # pixel stride of Open3D's block search, px
+METERS = 1.0  # depth_scale of Open3D: units of a float image per meter
+TOUCH_STRIDE = 4  # stride of the block search of Open3D, px
 NEAR = 0.05  # start depth of rays, m
 RANGE_TILE = 8  # side of a tile with common depth bounds in the range map, px; the default of Open3D
 FRAGMENTS = 2**18  # capacity of the range map, fragments; a view of 10,000 blocks has 20,000 fragments
@@ -362,7 +362,6 @@ def _image(pixels: Float32) -> o3d.t.geometry.Image:
 
 
 def _blank(camera: Camera) -> tuple[Float32, Float32, UInt8]:
-    """Return an empty depth image, normals and color image."""
     shape = camera.shape
     return np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.uint8)
 

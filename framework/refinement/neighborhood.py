@@ -37,7 +37,7 @@ class Neighborhoods:
     """
 
     points_camera: Float32  # (S, 3) m, camera frame
-    depth_in_mask: Float32  # (S,) distance to the mask's border, px, positive in the mask, negative in the ring
+    depth_in_mask: Float32  # (S,) distance to the border of the mask, px, positive in the mask, negative in the ring
     starts: Int64  # (N + 1,) start of each neighborhood
     mask_counts: Int64  # (N,) number of points of each mask
     ring_widths: Int64  # (N,) width of each ring, px
@@ -167,7 +167,7 @@ def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundi
     if ring.ring_fraction == 0:
         widths[:] = 0
     bounds = np.zeros((len(clusters), 4), np.int64)
-    bound(pixels, firsts, np.maximum(widths, 1), *frame.camera.shape, bounds)  # the mask's border needs a neighbor
+    bound(pixels, firsts, np.maximum(widths, 1), *frame.camera.shape, bounds)  # the border of a mask needs a neighbor
     cells = np.concatenate([[0], np.cumsum((bounds[:, 2] - bounds[:, 0]) * (bounds[:, 3] - bounds[:, 1]))])
     windows, steps = Windows(pixels, firsts, bounds, cells), np.empty(cells[-1], np.int16)
     ring_counts, radii = np.zeros(len(widths), np.int64), np.zeros(len(widths), np.float32)

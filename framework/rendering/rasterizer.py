@@ -21,7 +21,7 @@ class VisibilityBuffer:
 
     triangle: Int32  # (H, W) index of the triangle, NO_TRIANGLE = none
     depth: Float32  # (H, W) m along z, 0 = none
-    uv: Float32  # (H, W, 2) barycentric weights of the triangle's second and third vertex
+    uv: Float32  # (H, W, 2) barycentric weights of the second and third vertex
 
     def nearest(self, triangles: Int32, labels: Int32) -> Int32:
         """Return the label (H, W) of the vertex with the largest barycentric weight at each pixel, 0 = none.

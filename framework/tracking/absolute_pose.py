@@ -13,7 +13,7 @@ from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64
 from framework.geometry import inverse, nearest_rotation, transform
 
-COLMAP_PIXEL_CENTER = 0.5  # coordinate of the first pixel's center in COLMAP, px; it is 0 in this project
+COLMAP_PIXEL_CENTER = 0.5  # coordinate of the center of the first pixel in COLMAP, px; 0 in this project
 REFERENCE_SIDE = 640  # longer image side for max_error, px; for larger images, max_error increases proportionally
 CONFIDENCE = 0.9999  # probability that RANSAC draws a sample without outliers
 MAX_DEPTH_ERROR = 0.05  # maximum depth error of an inlier, fraction of its depth

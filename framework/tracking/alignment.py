@@ -63,7 +63,7 @@ class ModelView(NamedTuple):
     """A view of the map, to which frames are aligned."""
 
     depth: Float32  # (H, W) m, 0 = nothing mapped
-    normals: Float32  # (3, H, W) unit normals in the view's camera frame; 0 = nothing mapped
+    normals: Float32  # (3, H, W) unit normals in the camera frame of the view; 0 = nothing mapped
     fx: np.float32  # px, as cx, cy and fy
     fy: np.float32
     cx: np.float32
@@ -110,7 +110,7 @@ class Weights(NamedTuple):
 
     max_distance: np.float32  # maximum distance of a point from its model point, m; proportional to depth beyond RANGE
     close_distance: np.float32  # maximum depth difference for agreement with the model, m; at least 3 sigma
-    min_normal_dot: np.float32  # minimum cosine between the frame's and the model's normal
+    min_normal_dot: np.float32  # minimum cosine between the normals of frame and model
     geometric_scale: np.float32  # geometric residual with Tukey's weight 0, in standard deviations
     photometric_scale: np.float32  # photometric residual with Tukey's weight 0, in standard deviations
     intensity_noise: np.float32  # standard deviation of an intensity difference; intensities are in [0, 1]

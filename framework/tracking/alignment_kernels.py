@@ -180,7 +180,7 @@ def _add_geometry(model, R, weights, linear, noise_model, points, J):
     for n in range(BATCH):
         q = points[QZ + n]
         px, py, pz = points[PX + n], points[PY + n], points[PZ + n]
-        # the model point is on the ray of the pixel's center
+        # the model point is on the ray through the center of the pixel
         qx = (np.floor(points[U + n]) + half - cx) * inv_fx * q
         qy = (np.floor(points[V + n]) + half - cy) * inv_fy * q
         ex, ey, ez = px - qx, py - qy, pz - q

@@ -40,7 +40,7 @@ class RegisteredFrame(NamedTuple):
 
     frame: Frame  # color is registered to the depth pixels
     T_world_color: Float64  # (4, 4) pose of the color camera at the time of the color image
-    color_pixels: Int32 | None = None  # (H, W) flat index of each reading's color pixel, -1 = none; None = same pixel
+    color_pixels: Int32 | None = None  # (H, W) flat index of the color pixel of each reading, -1 = none; None = same
 
 
 class ColorToDepth:

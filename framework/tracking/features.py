@@ -56,7 +56,7 @@ class FeatureExtractor:
         This method is thread-safe.
         """
         gray, scale = _reduced(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY))
-        # without precise upscaling, OpenCV's keypoints are off by a quarter of a pixel
+        # without precise upscaling, keypoints of OpenCV are off by a quarter of a pixel
         sift = cv2.SIFT.create(self.max_features, contrastThreshold=self.contrast, enable_precise_upscale=True)
         keypoints, descriptors = sift.detectAndCompute(gray, None)
         if not keypoints:
@@ -98,7 +98,7 @@ def match(query: UInt8, reference: UInt8, max_ratio: float) -> Int32:
     if len(query) == 0 or len(reference) < 2:
         return np.zeros((0, 2), np.int32)
     a, b = query.astype(np.float32), reference.astype(np.float32)
-    # OpenCV's product runs in this thread; BLAS threads wait for each other on busy cores
+    # the product of OpenCV runs in this thread; BLAS threads wait for each other on busy cores
     squared = cv2.gemm(a, b, -2, None, 0, flags=cv2.GEMM_2_T)
     squared += (a * a).sum(axis=1)[:, None]
     squared += (b * b).sum(axis=1)

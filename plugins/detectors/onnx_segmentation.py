@@ -30,9 +30,9 @@ class OnnxSegmentation(Detector):
     if the layout is ambiguous.
 
     The class distribution of a detection is its normalized class scores, and its score is the largest class score. If
-    the network reports only one class, the other classes share `class_spread` * (1 - score) equally, so that uncertain
-    detections contribute less to the map. The defaults are for exports of Ultralytics, whose code and weights (AGPL)
-    are not part of this project.
+    the network reports only one class, the other classes share `class_spread` * (1 - score) equally. Uncertain
+    detections then contribute less to the map. The defaults are for exports of Ultralytics. The code and weights of
+    Ultralytics (AGPL) are not part of this project.
     """
 
     weights: Path  # ONNX file, relative to the working or project folder

@@ -40,7 +40,7 @@ class Family:
     logits: str  # output with the class logits, (1, Q, C or C + 1)
     masks: str  # output with the mask logits, (1, Q, h, w)
     any_size: bool  # True = the network accepts images of any size
-    mask_quality: bool  # True = the score is multiplied by the mean probability of the mask's pixels, as published
+    mask_quality: bool  # True = the score is multiplied by the mean probability inside the mask, as published
 
 
 UNIVERSAL, INSTANCE = "AutoModelForUniversalSegmentation", "AutoModelForInstanceSegmentation"
@@ -315,7 +315,7 @@ class Checkpoint:
         """Names of the classes, NO_CLASS for unnamed classes."""
         named = {k: name for k, name in self.config.id2label.items() if not PLACEHOLDER.fullmatch(name)}
         names = [named.get(k, NO_CLASS) for k in range(max(self.config.id2label) + 1)]
-        # RF-DETRs trained on COCO use its annotation ids; their configs have no names, or COCO's names without gaps
+        # RF-DETR models for COCO use annotation ids; their configs have no names, or the COCO names without gaps
         known = {name.lower() for name in names} - {NO_CLASS}
         if self.config.model_type == "rf_detr" and len(names) == len(COCO_BY_ID) and known in (set(COCO), set()):
             return COCO_BY_ID

@@ -111,7 +111,6 @@ class ObjectVolumes(MapFuser):
                 instance_ids[instance_ids == instance_id] = 0
 
     def _remove_unlikely(self) -> None:
-        """Remove the objects with an existence probability below `min_existence`."""
         for record in list(self.scene.table.records.values()):
             if existence(record) < self.min_existence:
                 self.scene.remove(record.id)

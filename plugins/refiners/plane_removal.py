@@ -57,6 +57,6 @@ class PlaneRemoval(ClusterRefiner):
     def structure(self, frame: Frame) -> Planes:
         """Return the planes of the frame that are structure, such as floors and walls."""
         planes = find_planes(frame, self.plane_distance, self.inverse_depth_noise, self.min_area)
-        upright = -planes.normals[:, 1] >= np.cos(np.deg2rad(self.max_tilt)) - 1e-9  # the camera's y axis points down
+        upright = -planes.normals[:, 1] >= np.cos(np.deg2rad(self.max_tilt)) - 1e-9  # the camera y axis points down
         large = planes.fractions >= self.min_frame_fraction
         return planes.chosen(large & (planes.behind <= self.max_behind_ratio) & upright)

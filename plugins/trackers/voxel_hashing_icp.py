@@ -59,8 +59,8 @@ class Alignment(NamedTuple):
     T_world_camera: Float64  # (4, 4)
     matched: float  # fraction of points with a nonzero weight
     agreement: float  # fraction of points that agree with the map
-    behind: float  # fraction of points behind the map's surface
-    agreement_in_front: float  # fraction of the points not behind the map's surface that agree with the map
+    behind: float  # fraction of points behind the surface of the map
+    agreement_in_front: float  # fraction of points that agree with the map, among those not behind its surface
     reason: str  # reason for rejection, empty if the pose is possible
     doubt: str  # reason to require confirmation by a second source, empty if it is not required
     covariance: Float64 | None = None  # (6, 6) Pose.covariance; None = unknown

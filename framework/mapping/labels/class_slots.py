@@ -140,7 +140,6 @@ class _Slots:
         return self.builder.bitcast(conditions, ir.IntType(CLASS_SLOTS))
 
     def call(self, name: str, *arguments: Any, of: str = "i16") -> Any:
-        """Call an LLVM intrinsic."""
         result = _INT32 if of.endswith("i32") else _INT16
         kind = ir.FunctionType(result, [argument.type for argument in arguments])
         function = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.{name}.{of}")

@@ -48,7 +48,7 @@ class NewVoxels(NamedTuple):
 
     counts: Int32  # (A,) number of new voxels of each block
     rows: Int32  # (A,) evidence row of each block
-    starts: Int32  # (A,) index of each block's first new voxel among the labeled voxels
+    starts: Int32  # (A,) index of the first new voxel of each block among the labeled voxels
 
 
 class EvidenceRows:

@@ -30,7 +30,7 @@ LARGEST_HEADER = 2**28  # maximum size of the header, bytes; an hour of mapping 
 LARGEST_ID = 2**24  # maximum instance id
 MAX_EVIDENCE = 1e12  # maximum absolute evidence for a class
 MAX_ARRAYS = 100  # maximum number of arrays listed in the header of a file
-MAX_MEMORY_FRACTION = 0.5  # maximum fraction of the machine's memory for a loaded map
+MAX_MEMORY_FRACTION = 0.5  # maximum size of a loaded map, as a fraction of the memory
 
 
 class _TooLargeError(DataError):

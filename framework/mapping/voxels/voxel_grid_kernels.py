@@ -144,7 +144,6 @@ def insert_blocks(grid, coords, start, region_count, block_count, blocks):
 
 @njit(cache=True, nogil=True)
 def _link_neighbors(grid, block):
-    """Link a new block with its neighbors."""
     bx, by, bz = grid.block_coords[block, 0], grid.block_coords[block, 1], grid.block_coords[block, 2]
     key, region = NO_LOOK_UP
     for c in range(8):

@@ -126,7 +126,7 @@ def corners(grid, values, block, i, j, k, missing):
             values[here, np.uint32(n + 72)],
             values[here, np.uint32(n + 73)],
         )
-    # the carry of a coordinate into the next block is the bit of this coordinate in the neighbor's index
+    # neighbor index: bit 0, 1 or 2 is set if x, y or z is in the next block
     next_x, next_y, next_z = (x + 1) & 7, ((y + 1) & 7) * 8, ((z + 1) & 7) * 64
     over_x, over_y, over_z = (x + 1) >> 3, ((y + 1) >> 3) << 1, ((z + 1) >> 3) << 2
     y *= 8

@@ -32,7 +32,7 @@ class Level:
     covariances: Float64  # (M, 3, 3) Sigma, m^2
     firsts: Int64  # (Q + 1,) start of the children of each node
     outlier_weights: Float64  # (Q,) pi of the uniform component among the children of node q; 0 for a leaf
-    outlier_boxes: Float64  # (Q, 2, 3) m, minimum and maximum corner of the uniform component's box
+    outlier_boxes: Float64  # (Q, 2, 3) m, minimum and maximum corner of the box of the uniform component
 
     def __len__(self) -> int:
         return len(self.weights)

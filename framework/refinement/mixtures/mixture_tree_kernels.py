@@ -25,7 +25,6 @@ def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _cut_one(points: Float32, groups: int, labels: Int32) -> None:
-    """Divide one set of points into groups."""
     # the points of a group are contiguous in `order`, so that a cut reads only its own group
     n = len(points)
     order, upper = np.arange(n), np.empty(n, np.int64)

@@ -14,7 +14,7 @@ from framework.sensors.noise_models_kernels import axial_sigma, axial_sigma_sing
 
 MIN_CELLS = 6  # minimum number of cells of a plane fit; any three cells fit a plane exactly
 MIN_SPREAD = 0.1  # minimum determinant of the covariance of the positions in a window, cells^4; 0 for a line
-SWITCH = 1.5  # minimum factor by which an adjacent window must fit better than the cell's own window
+SWITCH = 1.5  # minimum factor by which an adjacent window must fit better than the window of the cell
 STRIP = 16  # number of rows of cells in a strip; strips are connected in parallel
 
 
@@ -26,12 +26,12 @@ class Noise(NamedTuple):
 
     factor: float  # depth difference that counts as noise, standard deviations
     min_noise: float  # minimum standard deviation of depth, m
-    least: float  # coefficients of the sensor's DepthNoise
+    least: float  # coefficients of the DepthNoise of the sensor
     near: float
     growth: float
 
 
-_axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the caller's fast-math flags
+_axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the fast-math flags of the caller
 
 
 @njit(cache=True, nogil=True)
@@ -286,13 +286,13 @@ def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool
     ax, ay, az, ad, apx, apy, apz, gate, min_cosine = one
     bx, by, bz, bd, bpx, bpy, bpz, _, _ = other
     for c in range(len(edges)):
-        # distance of each neighbor's point in front of the other's plane
+        # distance of the point of each neighbor in front of the plane of the other neighbor
         h = ad[c] - (ax[c] * bpx[c] + ay[c] * bpy[c] + az[c] * bpz[c])
         g = bd[c] - (bx[c] * apx[c] + by[c] * apy[c] + bz[c] * apz[c])
         cosine = ax[c] * bx[c] + ay[c] * by[c] + az[c] * bz[c]
         far, near = h if h > zero else -h, g if g > zero else -g
         z = apz[c] if apz[c] < bpz[c] else bpz[c]
-        # at a convex edge, each neighbor may be as far behind the plane of the other one as they are apart
+        # at a convex edge, a neighbor may be behind the plane of the other neighbor by the distance between them
         jump = (far if far < near else near) > gate[c] + (spacing * z if h * g > zero else zero)
         concave = (h + g > zero) & (cosine < min_cosine[c])
         both = (apz[c] > zero) & (bpz[c] > zero)

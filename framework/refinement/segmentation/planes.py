@@ -38,7 +38,7 @@ class Planes:
     m: Float64  # (K, 3) 1/m, normal / distance; a point p in camera coordinates is on plane k if m . p = 1
     deviations: Float64  # (K,) 1/m, rms deviation of the inverse depth of the readings, limited to the allowed noise
     areas: Float64  # (K,) visible area, m^2
-    fractions: Float64  # (K,) fraction of the frame's readings
+    fractions: Float64  # (K,) fraction of all readings of the frame
     behind: Float64  # (K,) ratio of readings behind the plane to readings on the plane
 
     def __len__(self) -> int:

@@ -16,7 +16,7 @@ CELL = 16  # side of a cell, px: 9 cm at 3 m and 540 px focal length, smaller th
 STEP = 2  # stride of the readings used in a cell, px
 FULL = (CELL // STEP) ** 2  # number of readings in a full cell
 REFITS = 3  # number of passes that collect the cells of a plane again; the last pass hardly changes the plane
-TRIM = 1.5  # maximum deviation of a cell in a fit, times the median deviation of the plane's cells
+TRIM = 1.5  # maximum deviation of a cell in a fit, relative to the median deviation of all cells on the plane
 SIGMAS = 3.0  # maximum distance of a reading on a plane, in standard deviations of the noise
 MAX_PLANES = 32  # maximum number of planes; frames have fewer large planes
 
