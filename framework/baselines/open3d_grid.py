@@ -272,8 +272,8 @@ class BlockGrid:
     def _distance(self, corners: Int64, weights: Float32) -> Float32:
         """Return the signed distance (P,), m, interpolated between voxels.
 
-        Rays of Open3D sample the distance at coordinates rounded down to voxels, and end up to half a voxel too far
-        along each axis. Adding this distance to the depth corrects the error.
+        Rays of Open3D sample the distance at coordinates rounded down to voxels, and end half a voxel too far along
+        each axis. Adding this distance to the depth corrects the error.
 
         Args:
             corners: The flat indices (P, 8) of the voxels.

@@ -30,8 +30,8 @@ class RankOrder(ClusterRefiner):
 
     Two points are linked if D is at most `threshold` and one point is among the k nearest of the other. Groups are
     connected components, and ties go to the first group in the image. A cluster of at most k points is not changed. In
-    large clusters, only `max_points` evenly distributed points are compared. Every other point joins the group of the
-    nearest one.
+    large clusters, at most `max_points` evenly distributed points are compared. Every other point joins the group of
+    the nearest one.
     """
 
     neighbors: int = 16  # number k of nearest neighbors, in [2, 254]

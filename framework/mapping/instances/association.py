@@ -167,7 +167,7 @@ class Matches:
 def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min_pixels: int) -> None:
     """Add the matched clusters of a frame to the instance table.
 
-    Frames without detections (detector not run) are ignored.
+    Frames on which the detector did not run are ignored.
 
     Args:
         table: The instance table.

@@ -37,7 +37,7 @@ SLOTS = Evidence._fields[1:]  # fields with one row per labeled voxel
 
 
 class Storage(Enum):
-    """Which labels a voxel stores: COMPACT = the most likely labels, EXACT = all labels."""
+    """Labels stored in a voxel: the most likely labels (COMPACT) or all labels (EXACT)."""
 
     COMPACT = "compact"
     EXACT = "exact"

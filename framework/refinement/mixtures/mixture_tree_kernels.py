@@ -9,7 +9,7 @@ from framework.data import Float32, Float64, Int32, Int64
 from framework.refinement.mixtures.gaussian import SIMD, constant_exponential, exponentials, log_densities
 from framework.refinement.mixtures.mixture_kernels import MIN_SUPPORT, Blocks
 
-RATIO_ITERATIONS = 20  # number of EM iterations for an object fraction; each iteration about halves the error
+RATIO_ITERATIONS = 20  # number of EM iterations for an object fraction; with clear evidence, each halves the error
 
 
 @njit(cache=True, nogil=True, parallel=True)
