@@ -1,4 +1,7 @@
-"""Shared settings of the benchmarks: they run only when requested, and their tables are printed at the end."""
+"""Shared settings of the benchmarks.
+
+Benchmarks run only on request. The tables are printed at the end.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session")
 def tables(pytestconfig: pytest.Config) -> list[Table]:
-    """Return the list of tables that are printed when all tests are done."""
+    """Return the list of tables that are printed after all tests."""
     return pytestconfig.stash[TABLES]
 
 

@@ -1,4 +1,4 @@
-"""Tests of the Python API, which maps frame by frame like the command."""
+"""Tests for the Python API, which maps frame by frame like the command."""
 
 from __future__ import annotations
 

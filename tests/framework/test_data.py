@@ -1,4 +1,4 @@
-"""Tests of the data objects and of their validation."""
+"""Tests for the data objects and of their validation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of rigid motions and of the pinhole camera, compared with their definitions."""
+"""Tests for rigid motions and of the pinhole camera, compared with their definitions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of `python -m framework` as a process: its streams and its exit status."""
+"""Tests for `python -m framework` as a process: its streams and its exit status."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the main loop: order, errors, early ends, and worker threads, which do not change the result."""
+"""Tests for the main loop: order, errors, early ends, and worker threads, which do not change the result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the registry, which builds a plugin from a config node or raises a one-line error."""
+"""Tests for the registry, which builds a plugin from a config node or raises a one-line error."""
 
 from __future__ import annotations
 

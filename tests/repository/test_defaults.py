@@ -1,4 +1,4 @@
-"""Tests of the default detector of each dataset, and that the files of all defaults are part of the project."""
+"""Tests for the default detector of each dataset, and that the files of all defaults are part of the project."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the demo: its data, and its first frames mapped with the defaults."""
+"""Tests for the demo: its data, and its first frames mapped with the defaults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of all real stages together on a small synthetic room."""
+"""Tests for all real stages together on a small synthetic room."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Tests of the layout rules: folders, names, and the direction of imports. CONTRIBUTING.md describes the layout."""
+"""Tests for the layout rules: folders, names, and the direction of imports. CONTRIBUTING.md describes the layout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of docs/results/ranks.py, compared with manual results and scipy's rank correlation."""
+"""Tests for docs/results/ranks.py, compared with manual results and scipy's rank correlation."""
 
 from __future__ import annotations
 

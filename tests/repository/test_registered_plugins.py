@@ -1,4 +1,4 @@
-"""Contract tests of `framework.interfaces` on every registered plugin. A new plugin needs no change here.
+"""Contract tests for `framework.interfaces` on every registered plugin. A new plugin needs no change here.
 
 The contracts are in framework/testing, which other packages can import.
 """

@@ -1,4 +1,4 @@
-"""Tests of the ROS 2 node of examples/ with fake ROS modules."""
+"""Tests for the ROS 2 node of examples/ with fake ROS modules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the comparison of run directories across renamed config keys."""
+"""Tests for the comparison of run directories across renamed config keys."""
 
 from __future__ import annotations
 

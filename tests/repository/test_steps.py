@@ -1,4 +1,4 @@
-"""Tests of docs/results/steps.py, compared with manual results."""
+"""Tests for docs/results/steps.py, compared with manual results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of original recordings from dataset publishers, apps and drivers, with known values."""
+"""Tests for original recordings from dataset publishers, apps and drivers, with known values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of Replica in NICE-SLAM's layout, with valid and invalid files."""
+"""Tests for Replica in NICE-SLAM's layout, with valid and invalid files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of RGB-D folders with valid and invalid files."""
+"""Tests for RGB-D folders with valid and invalid files."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Tests of 7-Scenes in the published format; registration is compared with exact projection."""
+"""Tests for 7-Scenes in the published format; registration is compared with exact projection."""
 
 from __future__ import annotations
 

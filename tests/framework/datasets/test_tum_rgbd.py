@@ -1,4 +1,4 @@
-"""Tests of TUM RGB-D in the published format, with valid and invalid files."""
+"""Tests for TUM RGB-D in the published format, with valid and invalid files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of every candidate layout, compared with a slow reference decoder."""
+"""Tests for every candidate layout, compared with a slow reference decoder."""
 
 import math
 

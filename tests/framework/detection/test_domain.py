@@ -1,4 +1,4 @@
-"""Tests of the warning for images outside the domain of a detector that was trained on rendered rooms."""
+"""Tests for the warning for images outside the domain of a detector that was trained on rendered rooms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of recurring false positives, which keep their 3D position in all views."""
+"""Tests for recurring false positives, which keep their 3D position in all views."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the detection of output layouts from shapes and values."""
+"""Tests for the detection of output layouts from shapes and values."""
 
 import numpy as np
 import pytest

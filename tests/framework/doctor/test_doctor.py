@@ -1,4 +1,4 @@
-"""Tests of the command `doctor` on this machine and on simulated machines with errors."""
+"""Tests for the command `doctor` on this machine and on simulated machines with errors."""
 
 from __future__ import annotations
 

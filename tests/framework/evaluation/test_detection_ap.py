@@ -1,4 +1,4 @@
-"""Tests of the AP of masks and boxes on masks with hand-computed results."""
+"""Tests for the AP of masks and boxes on masks with hand-computed results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of detection statistics on rectangles with hand-computed results."""
+"""Tests for detection statistics on rectangles with hand-computed results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of instance AP on scenes with hand-computed results."""
+"""Tests for instance AP on scenes with hand-computed results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the invariances of instance AP in random scenes, and comparison with a slow reference."""
+"""Tests for the invariances of instance AP in random scenes, and comparison with a slow reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the evaluation of refiners, on frames with hand-computed results."""
+"""Tests for the evaluation of refiners, on frames with hand-computed results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of trajectory errors of known motions, and comparison with evo."""
+"""Tests for trajectory errors of known motions, and comparison with evo."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the alignment of ground truth to maps with known world frames."""
+"""Tests for the alignment of ground truth to maps with known world frames."""
 
 from __future__ import annotations
 

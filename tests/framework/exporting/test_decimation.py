@@ -1,4 +1,4 @@
-"""Tests of mesh decimation."""
+"""Tests for mesh decimation."""
 
 from __future__ import annotations
 

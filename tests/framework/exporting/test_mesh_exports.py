@@ -1,4 +1,4 @@
-"""Tests of the mesh exports: positions, sizes and colors of objects."""
+"""Tests for the mesh exports: positions, sizes and colors of objects."""
 
 from __future__ import annotations
 

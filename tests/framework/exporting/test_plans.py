@@ -1,4 +1,4 @@
-"""Tests of floor plans, ROS maps and scene graphs of rooms with exact geometry."""
+"""Tests for floor plans, ROS maps and scene graphs of rooms with exact geometry."""
 
 from __future__ import annotations
 

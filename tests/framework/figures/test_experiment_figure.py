@@ -1,4 +1,4 @@
-"""Tests of the figures of experiments: included runs, notes about missing runs, and the two output files."""
+"""Tests for the figures of experiments: included runs, notes about missing runs, and the two output files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of map panels: an object has the same color and position in all panels."""
+"""Tests for map panels: an object has the same color and position in all panels."""
 
 from __future__ import annotations
 

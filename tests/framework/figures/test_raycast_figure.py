@@ -1,4 +1,4 @@
-"""Tests of the panels of a ray-cast view, on a wall with a known view."""
+"""Tests for the panels of a ray-cast view, on a wall with a known view."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Tests of the refinement figure: marks and layout on synthetic frames with known results."""
+"""Tests for the refinement figure: marks and layout on synthetic frames with known results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the curves of stage times and of their labels."""
+"""Tests for the curves of stage times and of their labels."""
 
 from __future__ import annotations
 

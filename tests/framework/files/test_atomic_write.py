@@ -1,4 +1,4 @@
-"""Tests of the file readers (oversized files, byte order marks, pipes) and of atomic writes."""
+"""Tests for the file readers (oversized files, byte order marks, pipes) and of atomic writes."""
 
 from __future__ import annotations
 

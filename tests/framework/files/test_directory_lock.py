@@ -1,4 +1,4 @@
-"""Tests of directory locks, which last as long as their process."""
+"""Tests for directory locks, which last as long as their process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of JPEG and PNG files: valid ones are read exactly, and damaged ones raise."""
+"""Tests for JPEG and PNG files: valid ones are read exactly, and damaged ones raise."""
 
 import io
 

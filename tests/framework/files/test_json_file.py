@@ -1,4 +1,4 @@
-"""Tests of JSON files: invalid, too deep or too large files raise a one-line error."""
+"""Tests for JSON files: invalid, too deep or too large files raise a one-line error."""
 
 from __future__ import annotations
 

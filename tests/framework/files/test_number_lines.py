@@ -1,4 +1,4 @@
-"""Tests of lines of numbers: formats, and one-line errors for lines of any length."""
+"""Tests for lines of numbers: formats, and one-line errors for lines of any length."""
 
 from __future__ import annotations
 

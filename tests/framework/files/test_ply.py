@@ -1,4 +1,4 @@
-"""Tests of PLY files: all encodings give the same mesh, and errors give the line or byte."""
+"""Tests for PLY files: all encodings give the same mesh, and errors give the line or byte."""
 
 from __future__ import annotations
 

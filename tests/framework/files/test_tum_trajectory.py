@@ -1,4 +1,4 @@
-"""Tests of TUM trajectories: round trips, and errors with line numbers."""
+"""Tests for TUM trajectories: round trips, and errors with line numbers."""
 
 from __future__ import annotations
 

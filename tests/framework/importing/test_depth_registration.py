@@ -1,4 +1,4 @@
-"""Tests of depth registration to a second camera, with exact synthetic geometry."""
+"""Tests for depth registration to a second camera, with exact synthetic geometry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of depth upsampling to the color image: exact on planes, and without values between two surfaces."""
+"""Tests for depth upsampling to the color image: exact on planes, and without values between two surfaces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the written RGB-D folder and of errors after which no folder is left."""
+"""Tests for the written RGB-D folder and of errors after which no folder is left."""
 
 from __future__ import annotations
 

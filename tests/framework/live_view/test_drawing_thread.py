@@ -1,4 +1,4 @@
-"""Tests of the drawing thread, which must not block the mapping loop and logs each failure once."""
+"""Tests for the drawing thread, which must not block the mapping loop and logs each failure once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of instance colors: constant over time and distinct between neighbors."""
+"""Tests for instance colors: constant over time and distinct between neighbors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of mesh regions: their parts together equal the mesh, and only changed parts are returned."""
+"""Tests for mesh regions: their parts together equal the mesh, and only changed parts are returned."""
 
 from __future__ import annotations
 

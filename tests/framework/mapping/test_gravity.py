@@ -1,4 +1,4 @@
-"""Tests of the up direction, the floor height and upright boxes.
+"""Tests for the up direction, the floor height and upright boxes.
 
 The error of the up direction is below 0.1 degrees on exact surfaces, and below 2 degrees with noise and clutter.
 """

@@ -1,4 +1,4 @@
-"""Tests of the mesh, instances, saving and loading of a small map with two objects."""
+"""Tests for the mesh, instances, saving and loading of a small map with two objects."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Tests of changes between two visits: objects removed, added or moved in a known room."""
+"""Tests for changes between two visits: objects removed, added or moved in a known room."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of map queries, on growing and on stored maps."""
+"""Tests for map queries, on growing and on stored maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of text queries: by embeddings, and by class names and colors."""
+"""Tests for text queries: by embeddings, and by class names and colors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of masks lifted to point clusters, in a room with known geometry."""
+"""Tests for masks lifted to point clusters, in a room with known geometry."""
 
 from __future__ import annotations
 

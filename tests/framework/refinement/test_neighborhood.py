@@ -1,4 +1,4 @@
-"""Tests of the rings around masks, compared with slow references."""
+"""Tests for the rings around masks, compared with slow references."""
 
 from __future__ import annotations
 

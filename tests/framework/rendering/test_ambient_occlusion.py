@@ -1,4 +1,4 @@
-"""Tests of ambient occlusion on planes, whose openness is known."""
+"""Tests for ambient occlusion on planes, whose openness is known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of label placement: on large objects, next to small objects, and without overlap."""
+"""Tests for label placement: on large objects, next to small objects, and without overlap."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the shaded view in surface and instance colors, on planes with a known image."""
+"""Tests for the shaded view in surface and instance colors, on planes with a known image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of object matching over several maps of a scene."""
+"""Tests for object matching over several maps of a scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the overview image of a map, on surfaces with a known image."""
+"""Tests for the overview image of a map, on surfaces with a known image."""
 
 from __future__ import annotations
 

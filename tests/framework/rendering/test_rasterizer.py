@@ -1,4 +1,4 @@
-"""Tests of the rasterizer, compared with ray casting per pixel."""
+"""Tests for the rasterizer, compared with ray casting per pixel."""
 
 from __future__ import annotations
 

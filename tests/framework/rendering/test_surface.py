@@ -1,4 +1,4 @@
-"""Tests of the surface kernels, compared with slow references."""
+"""Tests for the surface kernels, compared with slow references."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the SVG charts: content and degenerate input."""
+"""Tests for the SVG charts: content and degenerate input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the report page in a browser without network access: clicks, keys and the canvas."""
+"""Tests for the report page in a browser without network access: clicks, keys and the canvas."""
 
 from __future__ import annotations
 

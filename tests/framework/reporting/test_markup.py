@@ -1,4 +1,4 @@
-"""Tests of the page markup: values are escaped, and scripts are restricted."""
+"""Tests for the page markup: values are escaped, and scripts are restricted."""
 
 from __future__ import annotations
 

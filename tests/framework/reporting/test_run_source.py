@@ -1,4 +1,4 @@
-"""Tests of run sources, which read the sequence of a stored run."""
+"""Tests for run sources, which read the sequence of a stored run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of maps as GLB files."""
+"""Tests for maps as GLB files."""
 
 from __future__ import annotations
 

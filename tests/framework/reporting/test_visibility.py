@@ -1,4 +1,4 @@
-"""Tests of the visibility of a map from the cameras of a trajectory."""
+"""Tests for the visibility of a map from the cameras of a trajectory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of stored runs as a data frame."""
+"""Tests for stored runs as a data frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of instances.json."""
+"""Tests for instances.json."""
 
 from __future__ import annotations
 

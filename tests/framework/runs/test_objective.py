@@ -1,4 +1,4 @@
-"""Tests of the objective that a sweeper optimizes."""
+"""Tests for the objective that a sweeper optimizes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the run directory."""
+"""Tests for the run directory."""
 
 from __future__ import annotations
 

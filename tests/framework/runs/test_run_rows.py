@@ -1,4 +1,4 @@
-"""Tests of rows, means and paired differences, compared with manual results."""
+"""Tests for rows, means and paired differences, compared with manual results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of stored runs: complete, damaged and missing runs."""
+"""Tests for stored runs: complete, damaged and missing runs."""
 
 from __future__ import annotations
 

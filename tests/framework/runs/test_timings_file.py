@@ -1,4 +1,4 @@
-"""Tests of timings.csv."""
+"""Tests for timings.csv."""
 
 from __future__ import annotations
 

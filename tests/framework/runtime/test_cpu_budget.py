@@ -1,4 +1,4 @@
-"""Tests of the CPU budget, which divides the cores by the recent load of prefetching and of mapping."""
+"""Tests for the CPU budget, which divides the cores by the recent load of prefetching and of mapping."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the digests of stage results."""
+"""Tests for the digests of stage results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of live videos: the newest frame is mapped, others are dropped and counted, and a stop ends the run."""
+"""Tests for live videos: the newest frame is mapped, others are dropped and counted, and a stop ends the run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of commands without Python's Linux-specific and POSIX modules."""
+"""Tests for commands without Python's Linux-specific and POSIX modules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of prefetching: order, bounds, concurrency and turns."""
+"""Tests for prefetching: order, bounds, concurrency and turns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of process settings: threads, seeds, garbage collection and caches."""
+"""Tests for process settings: threads, seeds, garbage collection and caches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of deferred signals: the first takes effect after the current step, and the second immediately."""
+"""Tests for deferred signals: the first takes effect after the current step, and the second immediately."""
 
 from __future__ import annotations
 

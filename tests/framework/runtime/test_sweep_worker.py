@@ -1,4 +1,4 @@
-"""Tests of worker processes whose parent process is killed."""
+"""Tests for worker processes whose parent process is killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the depth noise models against the published formulas, in double and single precision."""
+"""Tests for the depth noise models against the published formulas, in double and single precision."""
 
 import numpy as np
 import pytest

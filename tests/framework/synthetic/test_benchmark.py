@@ -1,4 +1,4 @@
-"""Tests of the ten benchmark rooms and of their layouts, without rendering."""
+"""Tests for the ten benchmark rooms and of their layouts, without rendering."""
 
 from __future__ import annotations
 

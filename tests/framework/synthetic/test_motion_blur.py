@@ -1,4 +1,4 @@
-"""Tests of motion blur: its length is the displacement of a pixel, px, and zero for a static camera."""
+"""Tests for motion blur: its length is the displacement of a pixel, px, and zero for a static camera."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Tests of the renderer's geometry, to float precision."""
+"""Tests for the renderer's geometry, to float precision."""
 
 from dataclasses import replace
 

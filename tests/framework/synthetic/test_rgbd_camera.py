@@ -1,4 +1,4 @@
-"""Tests of the simulated depth sensor: noise compared with publications, quantization and dropout."""
+"""Tests for the simulated depth sensor: noise compared with publications, quantization and dropout."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Tests of the tessellation of room surfaces and of their visible parts."""
+"""Tests for the tessellation of room surfaces and of their visible parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of scenes that several processes write: resuming, and files identical to those of one process."""
+"""Tests for scenes that several processes write: resuming, and files identical to those of one process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of a rendered room as SceneNN files, compared with the renderer."""
+"""Tests for a rendered room as SceneNN files, compared with the renderer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of rendered rooms as sequences: exact poses, repeatable frames and hand-held motion."""
+"""Tests for rendered rooms as sequences: exact poses, repeatable frames and hand-held motion."""
 
 import hashlib
 import os

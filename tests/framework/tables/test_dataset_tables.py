@@ -1,4 +1,4 @@
-"""Tests of tables of sweeps without an experiment, across datasets and detectors."""
+"""Tests for tables of sweeps without an experiment, across datasets and detectors."""
 
 from __future__ import annotations
 

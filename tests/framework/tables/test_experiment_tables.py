@@ -1,4 +1,4 @@
-"""Tests of experiment tables in three formats."""
+"""Tests for experiment tables in three formats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of table cells in Markdown and LaTeX."""
+"""Tests for table cells in Markdown and LaTeX."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the headings and directions of metrics."""
+"""Tests for the headings and directions of metrics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the published results."""
+"""Tests for the published results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of tables over sequences (the paper's Tables 2 and 3), and of values that must not be averaged."""
+"""Tests for tables over sequences (the paper's Tables 2 and 3), and of values that must not be averaged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of means over sequences and seeds, compared with manual results."""
+"""Tests for means over sequences and seeds, compared with manual results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of paired statistics, compared with scipy, published examples and simulations."""
+"""Tests for paired statistics, compared with scipy, published examples and simulations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the contract tests, on plugins that each break one rule."""
+"""Tests for the contract tests, on plugins that each break one rule."""
 
 from __future__ import annotations
 

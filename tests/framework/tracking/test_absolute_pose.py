@@ -1,4 +1,4 @@
-"""Tests of the absolute pose: exact matches give the exact pose, and ambiguous ones give None."""
+"""Tests for the absolute pose: exact matches give the exact pose, and ambiguous ones give None."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of one alignment step, term by term and level by level, between two exact views of a scene."""
+"""Tests for one alignment step, term by term and level by level, between two exact views of a scene."""
 
 import dataclasses
 from collections.abc import Callable

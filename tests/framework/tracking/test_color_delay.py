@@ -1,4 +1,4 @@
-"""Tests of the estimation of the delay between color and depth."""
+"""Tests for the estimation of the delay between color and depth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the registration of color to depth by the camera's motion."""
+"""Tests for the registration of color to depth by the camera's motion."""
 
 from __future__ import annotations
 

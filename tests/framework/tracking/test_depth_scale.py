@@ -1,4 +1,4 @@
-"""Tests of the depth scale: limits that increase with depth, and scale-invariant measures."""
+"""Tests for the depth scale: limits that increase with depth, and scale-invariant measures."""
 
 from __future__ import annotations
 

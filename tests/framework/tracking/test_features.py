@@ -1,4 +1,4 @@
-"""Tests of features: subpixel positions, the depth of their surface, and matching compared with a reference."""
+"""Tests for features: subpixel positions, the depth of their surface, and matching compared with a reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of keyframes in a textured room with known poses, and on real video."""
+"""Tests for keyframes in a textured room with known poses, and on real video."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the image pyramid."""
+"""Tests for the image pyramid."""
 
 from types import SimpleNamespace
 

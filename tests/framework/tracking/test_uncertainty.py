@@ -1,4 +1,4 @@
-"""Tests of pose covariances from normal equations with known noise."""
+"""Tests for pose covariances from normal equations with known noise."""
 
 from __future__ import annotations
 

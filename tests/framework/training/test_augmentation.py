@@ -1,4 +1,4 @@
-"""Tests of the augmentation of images and masks."""
+"""Tests for the augmentation of images and masks."""
 
 from __future__ import annotations
 

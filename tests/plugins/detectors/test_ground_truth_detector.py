@@ -1,4 +1,4 @@
-"""Tests of detector=ground_truth and detector=none."""
+"""Tests for detector=ground_truth and detector=none."""
 
 import numpy as np
 import pytest

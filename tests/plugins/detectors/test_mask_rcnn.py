@@ -1,4 +1,4 @@
-"""Tests of detector=mask_rcnn with random tiny networks, and with one that detects a known object."""
+"""Tests for detector=mask_rcnn with random tiny networks, and with one that detects a known object."""
 
 from dataclasses import replace
 from pathlib import Path

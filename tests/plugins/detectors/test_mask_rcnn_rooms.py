@@ -1,4 +1,4 @@
-"""Tests of the included network, on rooms that were not used in training."""
+"""Tests for the included network, on rooms that were not used in training."""
 
 from __future__ import annotations
 

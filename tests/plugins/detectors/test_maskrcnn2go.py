@@ -1,4 +1,4 @@
-"""Tests of Mask R-CNN 2Go: the published network on real images, in 8-bit integers and in float."""
+"""Tests for Mask R-CNN 2Go: the published network on real images, in 8-bit integers and in float."""
 
 import json
 from pathlib import Path

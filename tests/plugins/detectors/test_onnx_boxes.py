@@ -1,4 +1,4 @@
-"""Tests of box detectors from ONNX files: networks with known outputs, and YOLOX-nano on real images."""
+"""Tests for box detectors from ONNX files: networks with known outputs, and YOLOX-nano on real images."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Tests of YOLO-style segmentation networks with known boxes, scores and masks."""
+"""Tests for YOLO-style segmentation networks with known boxes, scores and masks."""
 
 import cv2
 import numpy as np

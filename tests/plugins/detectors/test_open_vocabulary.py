@@ -1,4 +1,4 @@
-"""Tests of text-prompted detection: boxes and masks of fake networks are mapped to pixels for any image shape."""
+"""Tests for text-prompted detection: boxes and masks of fake networks are mapped to pixels for any image shape."""
 
 from __future__ import annotations
 

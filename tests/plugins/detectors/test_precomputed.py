@@ -1,4 +1,4 @@
-"""Tests of precomputed detections: all formats of COCO results, mask folders, and rejected files."""
+"""Tests for precomputed detections: all formats of COCO results, mask folders, and rejected files."""
 
 from __future__ import annotations
 

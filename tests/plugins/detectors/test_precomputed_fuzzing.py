@@ -1,4 +1,4 @@
-"""Fuzz tests of detection files: a file is used, or raises a one-line error.
+"""Fuzz tests for detection files: a file is used, or raises a one-line error.
 
 `INSTANCEMAP_FUZZ=2000 pytest tests/plugins/detectors/test_precomputed_fuzzing.py` tries 2000 cases per format.
 """

@@ -1,4 +1,4 @@
-"""Tests of the simulated detector: without errors it is the ground truth; each error has its configured statistics."""
+"""Tests for the simulated detector: without errors it is the ground truth; each error has its configured statistics."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Tests of the transformers detector on random tiny networks of each family, compared with reference decoders."""
+"""Tests for the transformers detector on random tiny networks of each family, compared with reference decoders."""
 
 import json
 import math

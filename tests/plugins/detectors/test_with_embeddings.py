@@ -1,4 +1,4 @@
-"""Tests of detections with embeddings of random CLIP and SigLIP models, compared with transformers."""
+"""Tests for detections with embeddings of random CLIP and SigLIP models, compared with transformers."""
 
 from __future__ import annotations
 

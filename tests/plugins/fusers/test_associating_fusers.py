@@ -1,4 +1,4 @@
-"""Tests of association and of the instance table in all fusers that use them, on spheres with exact masks."""
+"""Tests for association and of the instance table in all fusers that use them, on spheres with exact masks."""
 
 import dataclasses
 from collections.abc import Callable

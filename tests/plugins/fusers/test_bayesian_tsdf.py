@@ -1,4 +1,4 @@
-"""Tests of fuser=bayesian_tsdf: map limits, evidence rows, and independence of the thread count."""
+"""Tests for fuser=bayesian_tsdf: map limits, evidence rows, and independence of the thread count."""
 
 import dataclasses
 

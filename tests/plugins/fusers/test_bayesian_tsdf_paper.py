@@ -1,4 +1,4 @@
-"""Tests of the fuser of preset=paper, compared with slow float64 references."""
+"""Tests for the fuser of preset=paper, compared with slow float64 references."""
 
 import dataclasses
 from pathlib import Path

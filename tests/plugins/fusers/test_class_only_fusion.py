@@ -1,4 +1,4 @@
-"""Tests of class-only fusion on analytic scenes, compared with a float64 recursion per voxel."""
+"""Tests for class-only fusion on analytic scenes, compared with a float64 recursion per voxel."""
 
 from __future__ import annotations
 

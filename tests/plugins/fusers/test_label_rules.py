@@ -1,4 +1,4 @@
-"""Tests of the label rules of the fusers on three detections of one object."""
+"""Tests for the label rules of the fusers on three detections of one object."""
 
 from __future__ import annotations
 

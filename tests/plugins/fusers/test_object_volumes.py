@@ -1,4 +1,4 @@
-"""Tests of the baseline with one volume per object, on boxes with exact depth and masks."""
+"""Tests for the baseline with one volume per object, on boxes with exact depth and masks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of Open3D's voxel blocks as a fuser: votes, surfaces and storage, on exact scenes."""
+"""Tests for Open3D's voxel blocks as a fuser: votes, surfaces and storage, on exact scenes."""
 
 import dataclasses
 from pathlib import Path

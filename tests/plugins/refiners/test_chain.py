@@ -1,4 +1,4 @@
-"""Tests of chained refiners, as composed by Hydra."""
+"""Tests for chained refiners, as composed by Hydra."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of connected components: parts beyond a depth step are removed, parts split by an occluder are kept."""
+"""Tests for connected components: parts beyond a depth step are removed, parts split by an occluder are kept."""
 
 from __future__ import annotations
 

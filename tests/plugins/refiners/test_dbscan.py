@@ -1,4 +1,4 @@
-"""Tests of refiner=dbscan, density-based clustering."""
+"""Tests for refiner=dbscan, density-based clustering."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of masks that claim convex segments: a box on a table under small, bleeding and overlapping masks."""
+"""Tests for masks that claim convex segments: a box on a table under small, bleeding and overlapping masks."""
 
 from __future__ import annotations
 

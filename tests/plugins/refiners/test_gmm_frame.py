@@ -1,4 +1,4 @@
-"""Tests of the mixture tree over all masks of a frame, compared with a slow float64 reference."""
+"""Tests for the mixture tree over all masks of a frame, compared with a slow float64 reference."""
 
 from __future__ import annotations
 

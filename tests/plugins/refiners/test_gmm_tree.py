@@ -1,4 +1,4 @@
-"""Tests of the mixture tree: a box on a floor in front of a wall, under a bleeding mask."""
+"""Tests for the mixture tree: a box on a floor in front of a wall, under a bleeding mask."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of plane removal: floors and walls are removed from clusters, and flat parts of objects are kept."""
+"""Tests for plane removal: floors and walls are removed from clusters, and flat parts of objects are kept."""
 
 from __future__ import annotations
 

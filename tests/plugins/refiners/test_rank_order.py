@@ -1,4 +1,4 @@
-"""Tests of rank-order clustering."""
+"""Tests for rank-order clustering."""
 
 from __future__ import annotations
 

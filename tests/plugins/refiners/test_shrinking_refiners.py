@@ -1,4 +1,4 @@
-"""Tests of the shrinking refiners: a box on a floor in front of a wall, under a bleeding mask."""
+"""Tests for the shrinking refiners: a box on a floor in front of a wall, under a bleeding mask."""
 
 from __future__ import annotations
 

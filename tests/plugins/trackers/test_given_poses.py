@@ -1,4 +1,4 @@
-"""Tests of trackers with given poses: frames without a pose are skipped, counted and logged in one line."""
+"""Tests for trackers with given poses: frames without a pose are skipped, counted and logged in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of Open3D's odometry as a tracker: known motion, and uninformative frames."""
+"""Tests for Open3D's odometry as a tracker: known motion, and uninformative frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of sparse tracking in a textured room with known poses, and on real video."""
+"""Tests for sparse tracking in a textured room with known poses, and on real video."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Acceptance tests of the tracker: accuracy on exact scenes, and accurate maps despite bad frames.
+"""Acceptance tests for the tracker: accuracy on exact scenes, and accurate maps despite bad frames.
 
 Longer runs (300 real frames, 200 synthetic frames) are rows of `pytest tests/benchmarks -k slam`.
 """

@@ -1,4 +1,4 @@
-"""Tests of poses from a file, found by timestamp, in the world frame of the sequence or of the file."""
+"""Tests for poses from a file, found by timestamp, in the world frame of the sequence or of the file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of tracker=voxel_hashing_icp on a scene with known motion."""
+"""Tests for tracker=voxel_hashing_icp on a scene with known motion."""
 
 import dataclasses
 import pickle

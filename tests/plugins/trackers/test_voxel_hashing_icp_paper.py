@@ -1,4 +1,4 @@
-"""Tests of the tracker of preset=paper: VoxelHashing's parameters, without additional checks and relocalization."""
+"""Tests for the tracker of preset=paper: VoxelHashing's parameters, without additional checks and relocalization."""
 
 import dataclasses
 from typing import Any

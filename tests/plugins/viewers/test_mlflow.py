@@ -1,4 +1,4 @@
-"""Tests of the logs for MLflow, which MLflow reads back."""
+"""Tests for the logs for MLflow, which MLflow reads back."""
 
 from __future__ import annotations
 

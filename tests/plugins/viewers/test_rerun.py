@@ -1,4 +1,4 @@
-"""Tests of rerun recordings: their content, killed runs, and errors."""
+"""Tests for rerun recordings: their content, killed runs, and errors."""
 
 from __future__ import annotations
 

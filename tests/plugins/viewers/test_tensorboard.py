@@ -1,4 +1,4 @@
-"""Tests of the logs for TensorBoard, which TensorBoard reads back."""
+"""Tests for the logs for TensorBoard, which TensorBoard reads back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the offline logs for Weights & Biases, which are read with its record format."""
+"""Tests for the offline logs for Weights & Biases, which are read with its record format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the command `convert-oni`: its output files, including those written before an error."""
+"""Tests for the command `convert-oni`."""
 
 import sys
 
@@ -29,7 +29,10 @@ def command(monkeypatch, *arguments):
 
 
 def deliver(monkeypatch, count, fault=None):
-    """Replace OpenNI 2, which may not be installed, with a reader of `count` frames that can raise `fault`."""
+    """Replace OpenNI 2 with a reader of `count` frames.
+
+    If `fault` is given, the reader raises it after the last frame.
+    """
 
     def read_frames(contents, scratch):
         yield from FRAMES[:count]

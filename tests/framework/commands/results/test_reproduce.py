@@ -1,4 +1,4 @@
-"""Tests of `instancemap reproduce` and `instancemap bundle`."""
+"""Tests for the commands `reproduce` and `bundle`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Shift(ClusterRefiner):
 
 
 def command(folder: Path, *words: str, path: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a command of InstanceMap in `folder`; `path` is an additional import folder."""
+    """Run a command of InstanceMap in `folder`. `path` is an additional folder for imports."""
     paths = [str(CHECKOUT), *([str(path)] if path else [])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     line = [sys.executable, "-m", "framework", *words]
@@ -41,7 +41,7 @@ def command(folder: Path, *words: str, path: Path | None = None) -> subprocess.C
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with one run of the fake stages and a third-party refiner, and the package of the refiner."""
+    """Return a folder with a run of the fake stages and a third-party refiner, and the package of the refiner."""
     folder = tmp_path_factory.mktemp("runs")
     (folder / "package/shift_refiner").mkdir(parents=True)
     (folder / "package/shift_refiner/__init__.py").write_text(REFINER)

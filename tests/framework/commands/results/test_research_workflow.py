@@ -1,4 +1,7 @@
-"""Test of a research workflow: own plugins, an experiment over datasets and detectors, table, figure and bundle."""
+"""Test of a research workflow with custom plugins.
+
+An experiment over datasets and detectors is run, and the results are written as a table, a figure and a bundle.
+"""
 
 from __future__ import annotations
 
@@ -130,7 +133,7 @@ def write_package(folder: Path, recording: Path) -> None:
 
 
 def command(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """Run a command of InstanceMap in `folder`, with the package installed there."""
+    """Run a command of InstanceMap in `folder`, where the package is installed."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(CHECKOUT), str(folder / "installed")])}
     line = [sys.executable, "-m", "framework", *words]
     return subprocess.run(line, cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False)
@@ -138,7 +141,7 @@ def command(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of the installed package and the outputs of its experiment."""
+    """Return the folder with the installed package and the outputs of its experiment."""
     folder = tmp_path_factory.mktemp("week")
     (folder / "recording").mkdir()
     option_files.overrides("dataset", "rgbd_folder", folder / "recording")
@@ -192,7 +195,7 @@ def test_workflow_table_compiles_in_latex(folder: Path, tmp_path: Path) -> None:
 
 
 def test_workflow_bundle_is_reproduced_in_new_environment(folder: Path, tmp_path: Path) -> None:
-    """The new environment has InstanceMap, but not the package with the plugins."""
+    """InstanceMap is installed in the new environment, but the package with the plugins is not."""
     done = command(folder, "bundle", "outputs/week", "--out", str(tmp_path / "week.zip"))
     assert done.returncode == 0, done.stderr
     assert "week.zip: 12 runs, " in done.stdout

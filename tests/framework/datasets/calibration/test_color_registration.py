@@ -1,4 +1,4 @@
-"""Tests of color registration between two cameras at one position, on images with known values."""
+"""Tests for color registration between two cameras at one position, on images with known values."""
 
 from __future__ import annotations
 

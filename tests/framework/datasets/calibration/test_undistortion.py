@@ -1,4 +1,4 @@
-"""Tests of undistortion, compared with OpenCV and with the view of a pinhole camera."""
+"""Tests for undistortion, compared with OpenCV and with the view of a pinhole camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of depth cameras with fake vendor libraries."""
+"""Tests for depth cameras with fake vendor libraries."""
 
 from __future__ import annotations
 

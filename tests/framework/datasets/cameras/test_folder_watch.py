@@ -1,4 +1,4 @@
-"""Tests of a watched folder: complete frames in order, and reports of all skipped files."""
+"""Tests for a watched folder: complete frames in order, and reports of all skipped files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of configurable conventions for poses, units and image pairs that differ from the dataset format."""
+"""Tests for configurable conventions for poses, units and image pairs that differ from the dataset format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of frame selection: start, stop, stride and frame_fraction."""
+"""Tests for frame selection: start, stop, stride and frame_fraction."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Tests of ground truth that the user selects, with a labeled wall in front of a camera."""
+"""Tests for ground truth that the user selects, with a labeled wall in front of a camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of voxel voting on small scenes, compared with exact results and a slow reference implementation."""
+"""Tests for voxel voting on small scenes, compared with exact results and a slow reference implementation."""
 
 from collections import Counter, defaultdict
 

@@ -1,4 +1,4 @@
-"""Tests of ScanNet scans as `.sens` files and as exported folders."""
+"""Tests for ScanNet scans as `.sens` files and as exported folders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of ScanNet's labeled mesh: instances from segments and objects, and classes from names."""
+"""Tests for ScanNet's labeled mesh: instances from segments and objects, and classes from names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of valid and truncated `.sens` files, and of files with one invalid field."""
+"""Tests for valid and truncated `.sens` files, and of files with one invalid field."""
 
 from __future__ import annotations
 

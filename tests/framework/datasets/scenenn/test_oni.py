@@ -1,4 +1,4 @@
-"""Tests of .oni frames: pairing of color and depth, and real playback if OpenNI 2 is installed."""
+"""Tests for .oni frames: pairing of color and depth, and real playback if OpenNI 2 is installed."""
 
 import ctypes
 import signal

@@ -1,4 +1,4 @@
-"""Tests of trajectory.log: the published format, lost and truncated frames, and errors with line numbers."""
+"""Tests for trajectory.log: the published format, lost and truncated frames, and errors with line numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of SceneNN folders in the documented layout, and of folders with missing or invalid files."""
+"""Tests for SceneNN folders in the documented layout, and of folders with missing or invalid files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of NNN.xml: published attributes, missing or invalid values, and malicious files."""
+"""Tests for NNN.xml: published attributes, missing or invalid values, and malicious files."""
 
 from __future__ import annotations
 

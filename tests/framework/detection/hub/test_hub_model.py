@@ -1,4 +1,4 @@
-"""Tests of models by hub id, with a local hub server."""
+"""Tests for models by hub id, with a local hub server."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Tests of detectron2 checkpoints: the pickle executes no code, and the network outputs equal detectron2's.
+"""Tests for detectron2 checkpoints: the pickle executes no code, and the network outputs equal detectron2's.
 
 The reference follows detectron2's definitions and names, in double precision and without the project's network code.
 """

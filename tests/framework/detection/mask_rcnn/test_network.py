@@ -1,4 +1,4 @@
-"""Tests of fused normalization, pyramid anchors, and the selection of the best anchors."""
+"""Tests for fused normalization, pyramid anchors, and the selection of the best anchors."""
 
 import numpy as np
 import pytest

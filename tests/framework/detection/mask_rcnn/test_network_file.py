@@ -1,4 +1,4 @@
-"""Tests of network files: exact round trips, and errors for damaged files."""
+"""Tests for network files: exact round trips, and errors for damaged files."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Tests of downloaded weights, with a local web server."""
+"""Tests for downloaded weights, with a local web server."""
 
 import hashlib
 import threading

@@ -1,4 +1,4 @@
-"""Tests of both RoIAlign implementations, compared with the sample loops of Detectron and torchvision."""
+"""Tests for both RoIAlign implementations, compared with the sample loops of Detectron and torchvision."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Tests of torchvision checkpoints: weight names, COCO ids and, if torchvision is installed, outputs."""
+"""Tests for torchvision checkpoints: weight names, COCO ids and, if torchvision is installed, outputs."""
 
 from dataclasses import replace
 

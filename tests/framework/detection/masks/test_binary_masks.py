@@ -1,4 +1,4 @@
-"""Tests of pasted and prototype masks, boxes and overlaps, compared with per-pixel references."""
+"""Tests for pasted and prototype masks, boxes and overlaps, compared with per-pixel references."""
 
 import numpy as np
 import pytest

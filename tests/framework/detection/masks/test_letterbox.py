@@ -1,4 +1,4 @@
-"""Tests of the letterbox transform between image and network input."""
+"""Tests for the letterbox transform between image and network input."""
 
 import numpy as np
 import pytest

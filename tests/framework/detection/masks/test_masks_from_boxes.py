@@ -1,4 +1,4 @@
-"""Tests of masks from boxes and depth, on scenes with known masks."""
+"""Tests for masks from boxes and depth, on scenes with known masks."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Tests of COCO run lengths, compared with pycocotools, and of strings that pycocotools misreads."""
+"""Tests for COCO run lengths, compared with pycocotools, and of strings that pycocotools misreads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of 8-bit networks: operators compared with their definitions, in float and in integers."""
+"""Tests for 8-bit networks: operators compared with their definitions, in float and in integers."""
 
 import os
 import subprocess

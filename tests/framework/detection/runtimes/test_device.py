@@ -1,4 +1,4 @@
-"""Tests of torch's thread counts in threads of the pipeline."""
+"""Tests for torch's thread counts in threads of the pipeline."""
 
 import threading
 

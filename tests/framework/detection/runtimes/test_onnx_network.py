@@ -1,4 +1,4 @@
-"""Tests of ONNX networks: their outputs, and one-line errors for unsupported files."""
+"""Tests for ONNX networks: their outputs, and one-line errors for unsupported files."""
 
 import sys
 

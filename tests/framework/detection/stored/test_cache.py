@@ -1,4 +1,4 @@
-"""Tests of the detection cache: byte-identical detections, one detector call per image, no effect of errors."""
+"""Tests for the detection cache: byte-identical detections, one detector call per image, no effect of errors."""
 
 from __future__ import annotations
 

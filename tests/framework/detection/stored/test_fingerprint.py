@@ -1,4 +1,4 @@
-"""Tests of detector fingerprints."""
+"""Tests for detector fingerprints."""
 
 from __future__ import annotations
 

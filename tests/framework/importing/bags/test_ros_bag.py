@@ -1,4 +1,4 @@
-"""Tests of ROS bags of a small room: valid and damaged files in all formats."""
+"""Tests for ROS bags of a small room: valid and damaged files in all formats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of valid and damaged exports of Polycam and 3D Scanner App, which store each frame separately."""
+"""Tests for valid and damaged exports of Polycam and 3D Scanner App, which store each frame separately."""
 
 from __future__ import annotations
 

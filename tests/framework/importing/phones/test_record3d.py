@@ -1,4 +1,4 @@
-"""Tests of EXR exports and .r3d files of Record3D: valid files, damaged files and a real export."""
+"""Tests for EXR exports and .r3d files of Record3D: valid files, damaged files and a real export."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of Stray Scanner recordings: valid folders, damaged folders and a real recording."""
+"""Tests for Stray Scanner recordings: valid folders, damaged folders and a real recording."""
 
 from __future__ import annotations
 

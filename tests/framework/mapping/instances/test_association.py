@@ -1,4 +1,4 @@
-"""Tests of the association of point clusters with instances, on small exact cases."""
+"""Tests for the association of point clusters with instances, on small exact cases."""
 
 from dataclasses import replace
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Tests of the instance table: frame sets and merged instances."""
+"""Tests for the instance table: frame sets and merged instances."""
 
 import numpy as np
 import pytest

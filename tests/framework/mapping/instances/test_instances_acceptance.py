@@ -1,4 +1,4 @@
-"""Acceptance tests of the default refiner and fuser: they separate touching objects and keep each object whole."""
+"""Acceptance tests for the default refiner and fuser: they separate touching objects and keep each object whole."""
 
 import numpy as np
 import pytest

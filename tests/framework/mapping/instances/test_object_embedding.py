@@ -1,4 +1,4 @@
-"""Tests of object embeddings: mean, spread, and their assignment to objects."""
+"""Tests for object embeddings: mean, spread, and their assignment to objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of vectorized class slots, compared with scalar loops."""
+"""Tests for vectorized class slots, compared with scalar loops."""
 
 import numpy as np
 from hypothesis import given, settings

@@ -1,4 +1,4 @@
-"""Tests of evidence rows, compared voxel by voxel: updates, merged instances and growing slots."""
+"""Tests for evidence rows, compared voxel by voxel: updates, merged instances and growing slots."""
 
 import numpy as np
 import pytest

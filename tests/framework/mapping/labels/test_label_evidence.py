@@ -1,4 +1,4 @@
-"""Tests of the compact Bayesian update, compared with the recursions over all instances and all classes."""
+"""Tests for the compact Bayesian update, compared with the recursions over all instances and all classes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Tests of the vertex label vote, compared with a voxel-wise reference."""
+"""Tests for the vertex label vote, compared with a voxel-wise reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of invalid arrays in a map file, which raise a one-line error before a kernel reads them."""
+"""Tests for invalid arrays in a map file, which raise a one-line error before a kernel reads them."""
 
 from __future__ import annotations
 

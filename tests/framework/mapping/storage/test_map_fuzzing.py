@@ -1,4 +1,4 @@
-"""Fuzz tests of map files with valid checksums: a file is a usable map, or raises a one-line error."""
+"""Fuzz tests for map files with valid checksums: a file is a usable map, or raises a one-line error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of TSDF integration, compared with a slow reference and with exact surfaces."""
+"""Tests for TSDF integration, compared with a slow reference and with exact surfaces."""
 
 import tracemalloc
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Tests of surface nets, compared with a slow reference and exact surfaces, and of their incremental updates."""
+"""Tests for surface nets, compared with a slow reference and exact surfaces, and of their incremental updates."""
 
 import itertools
 

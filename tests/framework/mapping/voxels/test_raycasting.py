@@ -1,4 +1,4 @@
-"""Tests of rendered views of the map, compared with closed-form depth, normals and color."""
+"""Tests for rendered views of the map, compared with closed-form depth, normals and color."""
 
 import numpy as np
 import pytest

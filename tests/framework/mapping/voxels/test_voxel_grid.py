@@ -1,4 +1,4 @@
-"""Tests of the voxel grid: its hash table and its blocks."""
+"""Tests for the voxel grid: its hash table and its blocks."""
 
 import resource
 

@@ -1,4 +1,4 @@
-"""Tests of Lloyd's algorithm, compared with scikit-learn, and of its start labels, compared with a reference."""
+"""Tests for Lloyd's algorithm, compared with scikit-learn, and of its start labels, compared with a reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the Gaussian mixtures, compared with scikit-learn from the same start."""
+"""Tests for the Gaussian mixtures, compared with scikit-learn from the same start."""
 
 from __future__ import annotations
 

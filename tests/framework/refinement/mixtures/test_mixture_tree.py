@@ -1,4 +1,4 @@
-"""Tests of mixture trees, compared with a slow NumPy recursion and with flat mixtures."""
+"""Tests for mixture trees, compared with a slow NumPy recursion and with flat mixtures."""
 
 from __future__ import annotations
 

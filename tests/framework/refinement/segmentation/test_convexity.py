@@ -1,4 +1,4 @@
-"""Tests of convex segments of rendered boxes, and of each step, compared with a slow reference."""
+"""Tests for convex segments of rendered boxes, and of each step, compared with a slow reference."""
 
 from __future__ import annotations
 

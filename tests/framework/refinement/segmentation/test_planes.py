@@ -1,4 +1,4 @@
-"""Tests of plane detection in depth images: exact planes are recovered, and noisy planes match Open3D's RANSAC."""
+"""Tests for plane detection in depth images: exact planes are recovered, and noisy planes match Open3D's RANSAC."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of furniture solids: they are closed and oriented outward, and their normals match."""
+"""Tests for furniture solids: they are closed and oriented outward, and their normals match."""
 
 import numpy as np
 import pytest
