@@ -46,10 +46,8 @@ def test_slurm_sweep_resumes_preempted_and_killed_jobs(tmp_path: Path, undisturb
     wait_until(lambda: len(mapping(tmp_path)) == 3, first)
     preempted, killed, _ = map(psutil.Process, mapping(tmp_path))
     preempted.send_signal(signal.SIGUSR2)
-    for process in (
-        *killed.parents()[:1],
-        killed,
-    ):  # the process of the queue first, because it would end the job normally
+    # the process of the queue first, because it would end the job normally
+    for process in (*killed.parents()[:1], killed):
         process.kill()
     done = end(first)
     assert done.returncode == 1
