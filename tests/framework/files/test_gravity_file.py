@@ -1,4 +1,4 @@
-"""Tests for gravity files: round trips and invalid lines."""
+"""Tests for gravity files."""
 
 from __future__ import annotations
 

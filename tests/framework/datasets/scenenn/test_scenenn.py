@@ -140,9 +140,8 @@ def test_scenenn_true_masks_match_mesh_at_true_pose(root: Path) -> None:
     row = vertex_labels.reshape(41, 41)[0]
     expected = np.where(np.abs(x) <= 1, row[np.clip(nearest, 0, 40)], 0)
     expected[expected == CABINET] = 0
-    sure = (
-        np.abs(x / 0.05 - np.floor(x / 0.05) - 0.5) > 0.01
-    )  # midway between two vertices, the label depends on rounding
+    # midway between two vertices, the label depends on rounding
+    sure = np.abs(x / 0.05 - np.floor(x / 0.05) - 0.5) > 0.01
     np.testing.assert_array_equal(frame.truth.instance_ids[11, sure], expected[sure])
 
 
