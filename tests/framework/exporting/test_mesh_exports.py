@@ -116,7 +116,7 @@ def test_export_triangles_between_objects_belong_to_room(room: UprightRoom) -> N
     halves = replace(room, mesh=mesh, objects=objects_of(mesh, two))
     found = parts(halves)
     seams = len(found[0].mesh.triangles)
-    assert seams >= 2 * (4 * 3 / 0.1)  # at least the faces of floor and ceiling
+    assert seams >= 2 * (4 * 3 / 0.1)  # at least the triangles across floor and ceiling
     assert sum(len(part.mesh.triangles) for part in found) == len(mesh.triangles)
     assert (surface_points(halves, 1.0).owner == 0).sum() == seams
 

@@ -34,7 +34,7 @@ def directory(mapped: Path, tmp_path: Path) -> Path:
 
 
 def change_config(directory: Path, **dataset: Any) -> None:
-    """Replace the dataset in the stored config and update the config hash."""
+    """Replace the dataset in the stored config, and update the config hash."""
     config = OmegaConf.load(directory / "config.yaml")
     config.dataset = dataset
     OmegaConf.save(config, directory / "config.yaml")

@@ -26,7 +26,7 @@ def run(tmp_path: Path) -> Path:
     [(None, None), ("frames", 6.0), (["instances.ap50", "frames"], [0.25, 6.0]), (["frames"], [6.0])],
 )
 def test_objective_returns_chosen_metrics(run: Path, objective: Any, value: Any) -> None:
-    """A list of keys gives a list, also with one key."""
+    """The result is a list if the keys are a list, also for a single key."""
     assert objective_of(run, OmegaConf.create({"objective": objective}).objective) == value
 
 
@@ -53,6 +53,6 @@ def test_objective_of_run_without_truth_names_cause(run: Path) -> None:
 
 
 @pytest.mark.parametrize("objective", [3, [], ["frames", 3]])
-def test_objective_keys_other_types_raise_error(objective: Any) -> None:
+def test_objective_keys_of_other_types_raise(objective: Any) -> None:
     with pytest.raises(ConfigError, match=r"objective: expected a key of metrics\.json or a list of keys, got"):
         objective_keys(objective)

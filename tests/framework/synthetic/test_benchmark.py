@@ -1,4 +1,4 @@
-"""Tests for the ten benchmark rooms and of their layouts, without rendering."""
+"""Tests for the ten benchmark rooms and their layouts."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_cluttered_groups_place_objects_on_furniture(make, seed: int) -> None:
 
 
 def gap(piece, other) -> float:
-    """Return the distance, m, between two bounding boxes; negative = depth of their overlap."""
+    """Return the distance, m, between two bounding boxes. Overlapping boxes have a negative distance."""
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
     return float(np.maximum(low - other_high, other_low - high).max())
 

@@ -1,4 +1,4 @@
-"""Tests for the content and the validation of comparison tables."""
+"""Tests for the settings of comparison tables."""
 
 from __future__ import annotations
 

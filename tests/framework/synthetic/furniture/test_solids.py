@@ -1,4 +1,4 @@
-"""Tests for furniture solids: they are closed and oriented outward, and their normals match."""
+"""Tests for the solids of furniture."""
 
 import numpy as np
 import pytest
