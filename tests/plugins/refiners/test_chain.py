@@ -19,7 +19,7 @@ from tests.support import registered
 
 
 class Halving(LargestComponent):
-    """Refiner that keeps every other point, so its result depends on its input."""
+    """Refiner that keeps every other point. The result depends on the order of the refiners."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return PointClusters(

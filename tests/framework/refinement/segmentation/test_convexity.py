@@ -61,7 +61,7 @@ def noisy(depth: np.ndarray, noise: float) -> np.ndarray:
 
 
 def main_segment(labels: np.ndarray, region: np.ndarray) -> tuple[int, float, float]:
-    """Return the main segment of a region, its fraction of the region, and the fraction of it inside the region."""
+    """Return the main segment of a region, its fraction of the region, and the region's fraction of the segment."""
     label = np.bincount(labels[region] + 1).argmax() - 1
     both = ((labels == label) & region).sum()
     return int(label), both / region.sum(), both / (labels == label).sum()
