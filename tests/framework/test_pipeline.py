@@ -388,7 +388,7 @@ def pretend_cores(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("prefetch", [2, 3])
-def test_concurrent_detector_gets_two_frames_in_order(prefetch: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_concurrent_detector_receives_two_frames_in_order(prefetch: int, monkeypatch: pytest.MonkeyPatch) -> None:
     pretend_cores(2, monkeypatch)
     threads = working_threads()
     result = pipeline(prefetch, detector=_InPairs()).run(_OneReader())

@@ -43,7 +43,7 @@ def test_print_for_directories_continues_after_error(
 
 
 @pytest.mark.parametrize("command", ["tables", "figures", "evaluate", "plugins"])
-def test_command_with_closed_pipe_ends_silently(command: str) -> None:
+def test_command_with_closed_pipe_ends_without_output(command: str) -> None:
     """An example is `python -m framework tables DIR | head -1`."""
     reader, writer = os.pipe()
     os.close(reader)

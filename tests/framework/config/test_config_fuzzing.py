@@ -120,7 +120,7 @@ def test_config_option_linked_to_device_raises(option: Path) -> None:
         composed("~dataset", "detector=mine")
 
 
-def test_stored_config_with_alias_bomb_raises(tmp_path: Path) -> None:
+def test_stored_config_with_nested_aliases_raises(tmp_path: Path) -> None:
     from framework.runs.stored_runs import read_yaml
 
     (tmp_path / "config.yaml").write_text(BOMB)

@@ -106,7 +106,7 @@ def test_replica_missing_results_or_trajectory_raises(root: Path, name: str) -> 
         ReplicaNiceSlam(root, scene="room0")
 
 
-def test_replica_missing_scene_parameter_raises_with_hint(root: Path) -> None:
+def test_replica_missing_scene_parameter_error_has_fix(root: Path) -> None:
     with pytest.raises(DataError, match=r"cam_params\.json: expected camera parameters .*, such as room0"):
         ReplicaNiceSlam(root)
 

@@ -287,7 +287,7 @@ def test_rgbd_folder_unreadable_optional_file_raises(folder, name, kind):
 
 
 @pytest.mark.parametrize("key", ["Distortion", "distorsion", "depthscale", "Width"])
-def test_rgbd_folder_misspelled_camera_key_has_suggestion(folder, key):
+def test_rgbd_folder_misspelled_camera_key_error_has_suggestion(folder, key):
     change_camera(folder, **{key: 1})
     with pytest.raises(DataError, match=f"expected a known key, got '{key}'; did you mean"):
         RgbdFolder(folder)

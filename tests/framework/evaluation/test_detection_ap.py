@@ -102,7 +102,7 @@ def with_boxes(found: Detections, boxes: Sequence[Sequence[float]]) -> Detection
     return replace(found, boxes=np.array(boxes, np.float32))
 
 
-def test_box_ap_depends_on_boxes_alone() -> None:
+def test_box_ap_depends_only_on_boxes() -> None:
     """First, the box is correct and the mask covers 30% of the object.
 
     Then, the mask is correct and the box covers 60%.

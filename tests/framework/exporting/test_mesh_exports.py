@@ -230,7 +230,7 @@ def test_usd_stage_has_semantics_and_collision_shapes(run: Path, tmp_path: Path)
     np.testing.assert_allclose((low, high), ((-0.1, -0.1, 0), (0.1, 0.1, 0.2)), atol=1e-5)
 
 
-def test_usd_export_without_usd_core_raises_install_hint(
+def test_usd_export_without_usd_core_error_names_extra(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)

@@ -345,7 +345,7 @@ def by_hand(text: str) -> Plan:
     return Plan(0.5, np.zeros(2), occupied | wall, free, free, wall, np.zeros(rows.shape, np.int32))
 
 
-def test_rooms_are_separated_only_by_walls_with_door() -> None:
+def test_rooms_are_separated_by_wall_with_door() -> None:
     one = by_hand(
         "##############\n#......o.....#\n#......o.....#\n#......o.....#\n#............#\n#.. .........#\n##############"
     )

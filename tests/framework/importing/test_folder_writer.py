@@ -143,7 +143,7 @@ def test_open_source_finds_nested_export_folder(tmp_path: Path) -> None:
         open_source(tmp_path / "outer")
 
 
-def test_open_source_zip_file_raises_with_unpack_hint(tmp_path: Path) -> None:
+def test_open_source_zip_file_error_has_fix(tmp_path: Path) -> None:
     (tmp_path / "scan.zip").touch()
     with pytest.raises(DataError, match=r"scan\.zip: expected a folder or recording, got a zip archive; unpack it"):
         open_source(tmp_path / "scan.zip")

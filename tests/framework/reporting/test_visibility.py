@@ -44,7 +44,7 @@ def test_sightings_first_seen_is_first_visible_pose() -> None:
     assert (np.diff(found.growth) > 0).all()
 
 
-def test_sightings_best_pose_shows_whole_object() -> None:
+def test_sightings_best_pose_shows_complete_object() -> None:
     mesh = wall()
     near = at(-1.0)
     near[2, 3] = 1.0  # the object has more pixels, but only 0.59 of it is visible

@@ -46,7 +46,7 @@ def test_objective_without_number_raises_error(run: Path, objective: Any, messag
     assert str(error.value) == message
 
 
-def test_objective_of_run_without_truth_names_cause(run: Path) -> None:
+def test_objective_of_run_without_truth_error_names_cause(run: Path) -> None:
     (run / "metrics.json").write_text(json.dumps({"frames": 6, "instances.count": 2}))
     with pytest.raises(ConfigError, match=r"got instances\.ap50; choose a dataset with ground truth"):
         objective_of(run, "instances.ap50")

@@ -71,7 +71,7 @@ def test_thread_limit_is_passed_to_scipy_and_open3d(monkeypatch: pytest.MonkeyPa
     assert asked == [1, 1]
 
 
-def test_apply_seeds_torch_only_if_it_is_loaded() -> None:
+def test_apply_seeds_torch_only_if_loaded() -> None:
     code = """
 import sys
 from framework.runtime.process_settings import Settings

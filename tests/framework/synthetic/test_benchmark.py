@@ -132,7 +132,7 @@ def test_cluttered_groups_place_neighbors_in_contact(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_laid_table_objects_stand_on_top_without_overlap(seed: int) -> None:
+def test_laid_table_objects_are_on_table_without_overlap(seed: int) -> None:
     table, *others = laid_table_group(np.random.default_rng(seed)).pieces
     low, high = table.bounds()
     things = [piece for piece in others if piece.class_name != "chair"]

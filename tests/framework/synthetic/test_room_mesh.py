@@ -121,7 +121,7 @@ def test_tessellate_treats_negative_zero_as_zero():
     assert len(tessellate(replace(surfaces, vertices=signed), 0.1).vertices) == len(tessellate(surfaces, 0.1).vertices)
 
 
-def test_visible_mesh_excludes_screen_and_surface_behind_it():
+def test_visible_mesh_excludes_screen_and_occluded_surface():
     objects = []
     for instance, (side, x, dark) in enumerate(((3.0, 3.0, 0.9), (1.0, 2.998, 1.0))):
         piece = Furniture("thing", None)

@@ -110,7 +110,7 @@ all equal.
 """
 
 
-def test_sequence_columns_table_matches_golden_text(sweep: Path) -> None:
+def test_sequence_columns_table_matches_expected_text(sweep: Path) -> None:
     text = write_tables(sweep)
     [line] = [line for line in text.splitlines() if "SHA-256" in line]
     assert text.replace(line.rpartition(" ")[2], "DIGEST.") == GOLDEN

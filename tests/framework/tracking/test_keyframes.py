@@ -230,7 +230,7 @@ def test_keyframes_parameter_out_of_range_raises(bound: dict[str, float]) -> Non
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="requires ../shared/data")
-def test_relocalize_real_video_succeeds_only_in_known_scene() -> None:
+def test_relocalize_in_real_video_requires_known_scene() -> None:
     kitchen = RgbdFolder(SHARED / "redkitchen")
     keyframes = Keyframes()
     for k in range(0, 150, 10):

@@ -230,6 +230,6 @@ def test_onnx_boxes_config_defaults_fit_yolox_nano(shared, nano):
     np.testing.assert_array_equal(found.scores, nano.detect(shared_frame(shared, "redkitchen", 0)).scores)
 
 
-def test_onnx_boxes_missing_weights_parameter_raises_with_url():
+def test_onnx_boxes_missing_weights_parameter_error_has_url():
     with pytest.raises(ConfigError, match=r"got none; set detector\.weights=\.\.\.; yolox_nano\.onnx .* https://"):
         registered.built("detector", "onnx_boxes")

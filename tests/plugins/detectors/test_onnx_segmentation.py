@@ -60,7 +60,7 @@ class TestContract(DetectorContract):
 
 
 @pytest.mark.parametrize(("objectness", "transposed"), [(False, False), (True, True)])
-def test_onnx_segmentation_known_network_gives_expected_output(tmp_path, objectness, transposed):
+def test_onnx_segmentation_known_network_matches_expected_output(tmp_path, objectness, transposed):
     check_cup_and_chair(tiny(tmp_path, objectness, transposed).detect(frame()))
 
 

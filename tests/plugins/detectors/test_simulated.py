@@ -178,7 +178,7 @@ def test_simulated_coarse_mask_grid_keeps_square_and_blurs_comb():
     assert np.mean(mask != (comb == 5)) > 0.2
 
 
-def test_confusion_kernel_is_normalized_and_favors_similar_classes():
+def test_confusion_kernel_is_larger_for_similar_classes():
     kernel = confusion_kernel(COCO, 0.25)
     np.testing.assert_allclose(kernel.sum(axis=1), 1)
     np.testing.assert_allclose(np.diag(kernel), 0.75)

@@ -277,7 +277,7 @@ def one_line(caught):
 
 
 @pytest.mark.parametrize("variable", ["HF_HUB_OFFLINE", "INSTANCEMAP_OFFLINE"])
-def test_transformers_missing_model_offline_raises_with_advice(monkeypatch, variable):
+def test_transformers_missing_model_offline_error_has_fix(monkeypatch, variable):
     monkeypatch.delenv("INSTANCEMAP_OFFLINE", raising=False)
     monkeypatch.setenv(variable, "1")
     with pytest.raises(

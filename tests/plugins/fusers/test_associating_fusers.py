@@ -73,7 +73,7 @@ def test_fuser_match_requires_overlap_and_class_agreement(
     assert (len(fuser.scene.table.records) == 1) == updates
 
 
-def test_fuser_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
+def test_fuser_split_instance_is_merged_by_complete_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
     """First, the object is detected in two parts, and later as a whole."""
     fuser = new_fuser()
     whole = masks_of(frames[0])[0]
@@ -189,7 +189,7 @@ def test_fuser_different_label_space_raises(new_fuser: NewFuser, frames: list[Fr
         fuser.fuse(frames[1], Pose(np.eye(4)), clusters)
 
 
-def test_fuser_empty_scene_leaves_map_unchanged(new_fuser: NewFuser) -> None:
+def test_fuser_empty_frame_keeps_map_unchanged(new_fuser: NewFuser) -> None:
     fuser = new_fuser()
     frame = Scene().frame(np.eye(4))
     fuse_masks(fuser, frame, [np.ones(CAMERA.shape, np.bool_)], [0.9])

@@ -78,7 +78,7 @@ def test_paper_fuser_association_agrees_with_slow_reference(frames: list[Frame])
 
 
 @pytest.mark.parametrize(("source", "found"), [("RAYCAST", True), ("SURFACE_LOOKUP", False)])
-def test_paper_fuser_new_surface_votes_for_instance_behind(source: str, found: bool) -> None:
+def test_paper_fuser_new_surface_votes_for_occluded_instance(source: str, found: bool) -> None:
     """A new sphere appears in front of the mapped sphere."""
     behind, front = (Scene([(np.array([0.0, 0.0, -1.0]), -2.5)], [(np.array([0.0, 0.0, z]), 0.35)]) for z in (2.0, 1.6))
     fuser = paper_fuser(f"fuser.association={source}")

@@ -80,7 +80,7 @@ def test_object_volumes_each_box_is_one_instance(mapped: ObjectVolumes) -> None:
         assert (owners == key).sum() > 300
 
 
-def test_object_volumes_label_whole_object_surface(mapped: ObjectVolumes) -> None:
+def test_object_volumes_label_complete_object_surface(mapped: ObjectVolumes) -> None:
     """The surface of the background must be labeled, too. Half of the true points are nearest to its vertices."""
     mesh = mapped.scene.mesh()
     owners = BOXES.owners(mesh.vertices.astype(np.float64), VOXEL / 4)
@@ -113,7 +113,7 @@ def room_fraction(fuser: ObjectVolumes) -> float:
     return float((BOXES.owners(points, VOXEL) == 0).mean())
 
 
-def test_object_volumes_remove_single_but_not_constant_bleed() -> None:
+def test_object_volumes_remove_only_temporary_mask_bleed() -> None:
     """With constant bleed and little camera motion, the mask covers the same voxels in all frames."""
     once, always = new_fuser(), new_fuser()
     for k, frame in enumerate(pan(0.1)):

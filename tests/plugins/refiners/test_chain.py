@@ -99,6 +99,6 @@ def test_chain_error_names_link(overrides: list[str], message: str) -> None:
         registered.built("refiner", "chain", *overrides)
 
 
-def test_chain_without_links_raises_with_advice() -> None:
+def test_chain_without_links_error_names_identity() -> None:
     with pytest.raises(ConfigError, match="refiner=identity"):
         Chain({})

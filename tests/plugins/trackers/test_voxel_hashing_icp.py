@@ -86,7 +86,7 @@ def enlarged(frame: Frame, scale: float) -> Frame:
 
 
 @pytest.mark.parametrize("scale", [1, 8])
-def test_voxel_hashing_icp_hall_is_tracked_as_accurately_as_room(scale: float) -> None:
+def test_voxel_hashing_icp_accuracy_is_independent_of_scale(scale: float) -> None:
     """At scale 8, the depth is 10 to 25 m, and the steps are 8 cm."""
     frames = [enlarged(room().frame(T, k), scale) for k, T in enumerate(walk(20))]
     fuser = assemble(BayesianTsdf, voxel_size=0.02 * scale, max_depth=4.0 * scale)

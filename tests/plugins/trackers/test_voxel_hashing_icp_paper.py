@@ -171,7 +171,7 @@ def test_paper_tracker_frame_of_single_wall_is_lost() -> None:
     assert "does not determine the motion" in poses[1].reason
 
 
-def test_paper_tracker_linear_weights_alone_have_little_effect() -> None:
+def test_paper_tracker_linear_weights_have_small_effect() -> None:
     frames = walked(12)
     tukey, linear = (
         run(VoxelHashingIcp(finest_scale=1.0, residual_weights=weights), frames) for weights in ResidualWeights

@@ -342,7 +342,7 @@ if "--port" in sys.argv:
         rerun_program.open_window(free_port(), "1GB")
 
 
-def test_rerun_browser_page_connects_only_to_own_server(tmp_path: Path) -> None:
+def test_rerun_browser_page_connects_only_to_viewer_server(tmp_path: Path) -> None:
     viewer = RerunViewer(mode=Mode.BROWSER, port=free_port(), web_port=free_port(), file="also.rrd")
     begun(viewer, tmp_path)
     with urlopen(f"http://127.0.0.1:{viewer.web_port}/?url=data", timeout=30) as page:

@@ -126,7 +126,7 @@ def test_new_plugin_installed_plugins_pass_their_tests(place: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_new_plugin_and_builtin_option_share_sweep_table(place: Path) -> None:
+def test_new_plugin_and_builtin_option_are_in_one_sweep_table(place: Path) -> None:
     (place / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")
     chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"

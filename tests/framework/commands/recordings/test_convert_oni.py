@@ -73,7 +73,7 @@ def test_convert_oni_writes_scene_images(tmp_path, monkeypatch, capsys, source):
     assert f"{tmp_path / '011'}: 4 frames; skipped 0 color" in capsys.readouterr().out
 
 
-def test_convert_oni_color_and_depth_keep_own_timestamps(tmp_path, monkeypatch, source):
+def test_convert_oni_color_and_depth_timestamps_are_kept(tmp_path, monkeypatch, source):
     deliver(monkeypatch, 3)
     convert_oni.convert(source, tmp_path / "011")
     assert (tmp_path / "011/timestamp.txt").read_text() == "1 7 0\n2 1007 1000\n3 2007 2000\n"

@@ -223,7 +223,7 @@ def test_evaluate_folder_without_runs_is_rejected(stored: Path, tmp_path: Path, 
     assert err == f"refused: {tmp_path / 'nothing'}: expected a run directory or a folder of runs, got neither\n"
 
 
-def test_evaluate_runs_with_same_truth_load_it_once(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evaluate_runs_with_same_truth_load_truth_once(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(stored, stored.parent / "second")
     _with_dataset(Path(shutil.copytree(stored, stored.parent / "other")), stop=3)
     made = []

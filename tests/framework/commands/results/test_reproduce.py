@@ -111,7 +111,7 @@ def test_reproduce_unknown_row_lists_rows(runs: Path, run: Path) -> None:
     assert "error: --cell: expected one of " in done.stderr
 
 
-def test_bundle_contains_plugin_and_is_reproduced_without_package(runs: Path, run: Path, tmp_path: Path) -> None:
+def test_bundle_with_plugin_is_reproduced_without_package(runs: Path, run: Path, tmp_path: Path) -> None:
     done = command(tmp_path, "bundle", "sweep", "--out", "experiment.zip", path=runs / "package")
     assert done.returncode == 0, done.stderr
     assert "experiment.zip: 1 runs, " in done.stdout

@@ -127,7 +127,7 @@ def test_scannet_label_table_name_spellings_are_equivalent() -> None:
     assert all(len(meant) == 1 for meant in meanings.values())
 
 
-def test_scannet_annotation_later_object_gets_shared_segment(tmp_path: Path) -> None:
+def test_scannet_annotation_later_object_has_shared_segment(tmp_path: Path) -> None:
     mesh = read(tmp_path, [group(0, "bed", 3, 70), group(1, "pillow", 70), group(2, "chair", 3)])
     np.testing.assert_array_equal(mesh.instance_ids[:4], [3, 3, 0, 0])
 

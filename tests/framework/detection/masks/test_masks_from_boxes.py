@@ -67,7 +67,7 @@ def test_masks_in_boxes_equal_depths_select_central_object():
 
 
 @pytest.mark.parametrize(("slant", "whole"), [(75.0, True), (84.0, False)])
-def test_masks_in_boxes_slanted_plane_is_whole_below_limit(slant, whole):
+def test_masks_in_boxes_slanted_plane_is_one_mask_below_limit(slant, whole):
     """The depth of the plane is 3 m + tan(slant) x. Planes with a slant above 80 degrees are split."""
     direction = (U - 69.5) / CAMERA.fx
     depth = np.clip(3 / (1 - np.tan(np.radians(slant)) * direction), 0, None).astype(np.float32)

@@ -182,7 +182,7 @@ def test_caffe2_int8_weight_overflow_rounds_only_its_channel():
 
 
 @in_integers
-def test_caffe2_blob_is_rounded_for_convolution_but_not_for_sum():
+def test_caffe2_blob_is_rounded_only_for_convolution():
     """The sum is y = x + linear(relu(linear(x)))."""
     one = {"Y_scale": 0.02, "Y_zero_point": 100}
     convolution = {"kernel": 1, "stride": 1, "pad": 0, **one}

@@ -337,7 +337,7 @@ def test_cache_read_only_writes_nothing(room: CornerRoom, tmp_path: Path) -> Non
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_cache_full_disk_stops_storing_but_not_run(
+def test_cache_full_disk_disables_storing_with_warning(
     room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(path: Path) -> Any:

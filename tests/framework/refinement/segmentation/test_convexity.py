@@ -111,7 +111,7 @@ def faces_of(box: np.ndarray, pitch: float, camera: Camera, depth: np.ndarray, i
 
 
 @pytest.mark.parametrize("cell", [1, 2])
-def test_segments_split_at_depth_step_but_not_at_slope(cell):
+def test_segments_split_at_depth_step_not_at_slope(cell):
     """The step is 2.5 cm, like between a book and a table. On the slope, depth changes more from pixel to pixel."""
     depth = np.full(CAMERA.shape, 1.025)
     depth[30:90, 40:100] = 1.0
@@ -169,7 +169,7 @@ def test_fit_planes_matches_lstsq_on_similar_depth():
     assert found > 50
 
 
-def test_best_planes_at_crease_use_own_side():
+def test_best_planes_at_crease_use_same_side():
     u = np.arange(31)
     inverse = np.tile(np.where(u < 15, 0.5, 0.5 + 0.02 * (u - 14.5)), (15, 1)).astype(np.float32)
     planes = convexity_kernels.best_planes(
