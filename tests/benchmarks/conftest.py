@@ -17,7 +17,7 @@ TABLES = pytest.StashKey[list[Table]]()
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-benchmark reads its options
 def pytest_configure(config: pytest.Config) -> None:
-    """Enable the benchmarks if pytest is called on this folder; a plain `pytest` skips them."""
+    """Enable the benchmarks if pytest is called on this folder. A plain `pytest` skips them."""
     config.stash.setdefault(TABLES, [])
     named = [Path(config.invocation_params.dir, argument.split("::")[0]).resolve() for argument in config.args]
     if named and all(path.is_relative_to(HERE) for path in named):

@@ -43,7 +43,7 @@ GAP = (1305031244.897635, 1305031244.997688)  # times of the color images with d
 
 @pytest.fixture(scope="module")
 def originals(shared_data: Path) -> Path:
-    """Return `shared/data/originals`; skip the test if it is missing."""
+    """Return `shared/data/originals`. Skip the test if the folder is missing."""
     if not (shared_data / "originals").is_dir():
         pytest.skip(f"{shared_data / 'originals'} does not exist")
     return shared_data / "originals"

@@ -144,11 +144,11 @@ def test_mask_rcnn_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch,
 
 @pytest.mark.parametrize("short_side", [32, 40, 80])
 def test_mask_rcnn_resize_keeps_ramp_position(path, short_side):
-    """The ramp has the value 5 u at u, where u = (u' + 0.5) / scale - 0.5 for pixel u' of the resized image."""
+    """The value of the ramp at u is 5 u."""
     ramp = np.repeat(np.tile(5 * np.arange(50, dtype=np.uint8), (40, 1))[..., None], 3, axis=2)
     image = MaskRCNNDetector(weights=path, device="cpu", short_side=short_side, long_side=400)._resize(picture(ramp))
     places = (np.arange(image.shape[3]) + 0.5) * 40 / short_side - 0.5
-    # values are rounded to integers
+    # pixel u' of the resized image shows u = (u' + 0.5) / scale - 0.5; values are rounded to integers
     np.testing.assert_allclose(image[0, 0, 5, 2:-2].numpy(), 5 * places[2:-2], atol=0.51)
 
 

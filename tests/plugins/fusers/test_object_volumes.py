@@ -81,7 +81,7 @@ def test_object_volumes_each_box_is_one_instance(mapped: ObjectVolumes) -> None:
 
 
 def test_object_volumes_label_complete_object_surface(mapped: ObjectVolumes) -> None:
-    """The surface of the background must be labeled, too. Half of the true points are nearest to its vertices."""
+    """The surface of the background also needs labels, because half of the true points are nearest to its vertices."""
     mesh = mapped.scene.mesh()
     owners = BOXES.owners(mesh.vertices.astype(np.float64), VOXEL / 4)
     for key in (1, 2):

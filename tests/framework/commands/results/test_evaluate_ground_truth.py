@@ -53,7 +53,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def mapped(directory: Path, root: Path, **changes: Any) -> dict[str, Any]:
-    """Map the recording in `root` into the run directory `directory`; return the metrics."""
+    """Map the recording in `root` into the run directory `directory` and return the metrics."""
     dataset = {"_target_": "framework.datasets.rgbd_folder.RgbdFolder", "root": str(root)}
     config = reported_run.CONFIG | {
         "dataset": dataset | changes.pop("dataset", {}),

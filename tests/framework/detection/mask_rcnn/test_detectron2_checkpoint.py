@@ -1,7 +1,7 @@
 """Tests for detectron2 checkpoints.
 
-The outputs of the network are compared with a reference in double precision, which follows the definitions and names of
-detectron2 and uses no code of this project. Reading a checkpoint must not execute code in the pickle.
+The outputs of the network are compared with a reference in double precision. The reference follows the definitions and
+names of detectron2 and uses no code of this project. Reading a checkpoint must not execute code in the pickle.
 """
 
 import math

@@ -98,7 +98,7 @@ def test_torchvision_invalid_checkpoints_raise():
 
 
 def test_torchvision_p6_anchor_stride_is_matched():
-    """At 800 px, P5 has 25 rows and P6 has 13, so the stride of P6 is 800 // 13 = 61 px instead of 64 px."""
+    """At 800 px, P6 has 13 rows. Its stride is 800 // 13 = 61 px instead of 64 px."""
     _, state = published()
     network = from_torchvision(state, "here")
     pyramid = [
