@@ -1,4 +1,4 @@
-"""Tests that every command and script of the README and of docs/ is tested."""
+"""Tests that every command and script in the README and in docs/ is tested."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ RUN_ELSEWHERE = {"python -m framework doctor"}  # executed in test_doctor.py
 
 
 class ParsedError(Exception):
-    """Error raised instead of running a command."""
+    """Error that is raised instead of running a command."""
 
 
 @pytest.mark.parametrize("command", [line for line in PARSED if line not in {*COMMANDS, *RUNNABLE, *RUN_ELSEWHERE}])
@@ -54,7 +54,7 @@ def test_documented_command_line_is_parsed(command: str, monkeypatch: pytest.Mon
 
 
 def test_documented_commands_and_scripts_are_all_tested() -> None:
-    """All scripts and console lines are checked, except those of other programs such as viewers."""
+    """Commands of other programs such as viewers are excluded."""
     make = re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE)
     looked_at = {*COMMANDS, *RUNNABLE, *PARSED, *BENCHMARKS, *(f"make {target}" for target in make), OWN_PLUGIN}
     shown_in = (CHECKOUT / "docker" / "Dockerfile").read_text()

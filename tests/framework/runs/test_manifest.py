@@ -1,4 +1,4 @@
-"""Tests of manifest.json."""
+"""Tests for manifest.json."""
 
 from __future__ import annotations
 

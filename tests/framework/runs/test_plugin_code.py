@@ -1,4 +1,4 @@
-"""Tests of the version and hash of plugin code."""
+"""Tests for the version and hash of plugin code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of training with a tiny network; a resumed run equals an uninterrupted one."""
+"""Tests for training with a tiny network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of `instancemap reproduce` and `instancemap bundle`."""
+"""Tests for the commands `reproduce` and `bundle`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Shift(ClusterRefiner):
 
 
 def command(folder: Path, *words: str, path: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a command of InstanceMap in `folder`; `path` is an additional import folder."""
+    """Run a command of InstanceMap in `folder`. `path` is an additional folder for imports."""
     paths = [str(CHECKOUT), *([str(path)] if path else [])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     line = [sys.executable, "-m", "framework", *words]
@@ -42,7 +42,7 @@ def command(folder: Path, *words: str, path: Path | None = None) -> subprocess.C
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with one run of the fake stages and a third-party refiner, and the package of the refiner."""
+    """Return a folder with a run of the fake stages and a third-party refiner, and the package of the refiner."""
     folder = tmp_path_factory.mktemp("runs")
     (folder / "package/shift_refiner").mkdir(parents=True)
     (folder / "package/shift_refiner/__init__.py").write_text(REFINER)
@@ -123,7 +123,7 @@ def test_reproduce_unknown_row_lists_rows(runs: Path, run: Path) -> None:
     assert "error: --cell: expected one of the rows all runs, got 'nothing'" in done.stderr
 
 
-def test_bundle_contains_plugin_and_is_reproduced_without_package(runs: Path, run: Path, tmp_path: Path) -> None:
+def test_bundle_with_plugin_is_reproduced_without_package(runs: Path, run: Path, tmp_path: Path) -> None:
     done = command(tmp_path, "bundle", "sweep", "--out", "experiment.zip", path=runs / "package")
     assert done.returncode == 0, done.stderr
     assert "experiment.zip: 1 run, " in done.stdout

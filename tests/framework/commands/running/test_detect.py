@@ -1,4 +1,4 @@
-"""Tests of the command `detect`."""
+"""Tests for the command `detect`."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_detect_without_detections_writes_valid_file(tmp_path: Path) -> None:
 
 @dataclass
 class PartlyTrueRoom(CornerRoom):
-    """A room whose frame 2 has no pose, so that its ground-truth instances cannot be rendered."""
+    """A room in which frame 2 has no pose and therefore no ground-truth instances."""
 
     def __getitem__(self, k: int) -> Frame:
         frame = super().__getitem__(k)

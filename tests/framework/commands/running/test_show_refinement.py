@@ -1,4 +1,4 @@
-"""Tests of the command `show-refinement`."""
+"""Tests for the command `show-refinement`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_show_refinement_errors_are_one_line(tmp_path: Path, overrides: list[str
 
 
 class FoundOnlyIn(SphereDetector):
-    """Detector of both spheres in one frame and of nothing in the other frames."""
+    """Detector that finds both spheres in one frame and nothing in the other frames."""
 
     def __init__(self, index: int) -> None:
         super().__init__()
