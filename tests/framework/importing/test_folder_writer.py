@@ -135,6 +135,12 @@ def test_open_source_unknown_format_error_lists_formats(tmp_path: Path) -> None:
         open_source(tmp_path / "nowhere")
 
 
+def test_open_source_of_rgbd_folder_names_dataset(tmp_path: Path) -> None:
+    write_folder(source(frame(0)), tmp_path / "out", Writing())
+    with pytest.raises(DataError, match=r"got an RGB-D folder; run instancemap dataset=rgbd_folder dataset.root=.*out"):
+        open_source(tmp_path / "out")
+
+
 def test_open_source_finds_nested_export_folder(tmp_path: Path) -> None:
     write_scanner_app(tmp_path / "outer/2026_11_23", room_frames(1))
     assert open_source(tmp_path / "outer").format == "3D Scanner App"
