@@ -47,8 +47,7 @@ def open_source(path: Path, topics: Topics | None = None) -> Source:
                 raise ConfigError(f"{', '.join(topics.given)}: expected a ROS bag, got {path}; omit these options")
             return kind.open(place)
     if (path / "camera.json").exists() and (path / "depth").is_dir():
-        raise DataError(
-            f"{path}: expected a recording, got an RGB-D folder; run instancemap dataset=rgbd_folder dataset.root={path}"
-        )
+        command = f"instancemap dataset=rgbd_folder dataset.root={path}"
+        raise DataError(f"{path}: expected a recording, got an RGB-D folder; run {command}")
     known = "; ".join(f"{kind.name}: {kind.needs}" for kind in FORMATS)
     raise DataError(f"{path}: expected a supported format, got an unknown format; supported: {known}")
