@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from instancemap import ClusterRefiner
 @dataclass
 class Shift(ClusterRefiner):
     distance: float = 0.0
+    weights: str = ""
 
     def refine(self, clusters, frame):
         return replace(clusters, points_world=clusters.points_world + np.float32(self.distance))
@@ -47,11 +49,13 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "package/shift_refiner").mkdir(parents=True)
     (folder / "package/shift_refiner/__init__.py").write_text(REFINER)
     (folder / "conf/refiner").mkdir(parents=True)
-    (folder / "conf/refiner/shift.yaml").write_text("_target_: shift_refiner.Shift\ndistance: 0.0\n")
+    (folder / "conf/refiner/shift.yaml").write_text("_target_: shift_refiner.Shift\ndistance: 0.0\nweights: ''\n")
+    (folder / "network.onnx").write_bytes(b"weights")
     conf = folder / "fake_conf"
     shutil.copytree(CHECKOUT / "tests/support/fake_conf", conf)
     shutil.copy(folder / "conf/refiner/shift.yaml", conf / "refiner")
     words = ["--config-dir", str(conf), *FAKES[2:-2], "refiner=shift", FAKES[-1], "hydra.run.dir=sweep/run"]
+    words.append(f"refiner.weights={folder / 'network.onnx'}")
     done = command(folder, *words, path=folder / "package")
     assert done.returncode == 0, done.stderr
     return folder
@@ -87,6 +91,15 @@ def test_reproduce_edited_metrics_are_named(runs: Path, run: Path) -> None:
     done = reproduce(runs, run, "--check-only")
     assert done.returncode == 1
     assert "metrics.json: expected the SHA-256" in done.stdout
+
+
+def test_reproduce_replaced_network_is_named(runs: Path, run: Path) -> None:
+    network = runs / "network.onnx"
+    network.write_bytes(b"other weights")
+    done = reproduce(runs, run, "--check-only")
+    network.write_bytes(b"weights")
+    assert done.returncode == 1
+    assert re.search(rf"changed: refiner.weights: expected the file with the SHA-256 .* in {network}", done.stdout)
 
 
 def test_reproduce_edited_table_names_cell(runs: Path, run: Path) -> None:
