@@ -153,7 +153,7 @@ class Pipeline:
             first = journal.first_without_pose
             return f"expected poses, got none for the {result.frames} frames (first: {first}); {WITHOUT_POSES}"
         if result.frames_skipped == result.frames:
-            return f"expected usable frames, got none of {result.frames}; the log lists the reasons"
+            return f"expected usable frames, got none among {result.frames}; the log lists the reasons"
         lost = next((frame.pose.reason for frame in result.tracked if frame.pose.lost), "")
         nearest, farthest = self.fuser.scene.depth_range
         rest = result.frames - result.frames_skipped - result.frames_lost
@@ -162,7 +162,7 @@ class Pipeline:
             (result.frames_lost, f"lost (first reason: {lost or 'none given'})"),
             (rest, f"without depth within {nearest:g} to {farthest:g} m"),
         ]
-        return f"expected mapped frames, got none of {result.frames}: " + "; ".join(
+        return f"expected mapped frames, got none among {result.frames}: " + "; ".join(
             f"{count} {what}" for count, what in parts if count
         )
 

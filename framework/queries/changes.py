@@ -133,7 +133,7 @@ def _observe(visit: Visit, other: Visit) -> list[_Object]:
 
 
 def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
-    """Return the masks (P,) of points on an observed surface and in observed free space.
+    """Return two masks (P,): points on an observed surface, and points in observed free space.
 
     A point is in free space if it was observed as free from at least one pose.
 

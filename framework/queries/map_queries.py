@@ -96,7 +96,7 @@ class Map:
             T_world_camera: Camera pose (4, 4).
 
         Returns:
-            The view. Pixels of instances that are not in `instances` have instance 0 and class -1.
+            The view. Pixels of unconfirmed instances have instance 0 and class -1.
         """
         with self.lock:
             view = self.scene.render(camera, T_world_camera)

@@ -13,7 +13,7 @@ MIN_INTERVAL, MAX_INTERVAL = 3.0, 60.0  # s, minimum and maximum interval of log
 
 
 class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
-    """Progress bar, or timer of log lines if no bar is shown.
+    """Progress bar, or timer for log lines if no bar is shown.
 
     The total number of items may be unknown (None).
     """

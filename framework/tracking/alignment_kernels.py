@@ -145,8 +145,8 @@ def _gather_model(depth, normals, size, pixel, points):
 def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
     """Write the weight, the error and the derivative of the error for one point.
 
-    The derivative is with respect to a twist of the view. (gx, gy, gz) is the derivative with respect to the point (px,
-    py, pz).
+    The derivative is with respect to a left twist (translation, rotation) of T_view_camera. (gx, gy, gz) is the
+    derivative with respect to the point (px, py, pz).
     """
     zero = np.float32(0.0)
     weighted = weight > zero  # values of points with weight 0 may be NaN

@@ -141,7 +141,7 @@ class Trainer:
         unknown = sorted(set(example.class_names) - set(index))
         if unknown:
             raise DataError(
-                f"pictures.folder: expected only classes of the network in the rendered rooms, got "
+                f"pictures.folder: expected rendered scenes with only the classes of the network, got "
                 f"{', '.join(unknown)}; set pictures.folder to an empty folder"
             )
         boxes = tight_boxes(example.masks) + np.array([0, 0, 1, 1], np.float32)  # from pixel centers to borders

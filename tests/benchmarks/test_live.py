@@ -35,7 +35,7 @@ def resident(process: subprocess.Popen[str]) -> int:
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="requires /proc")
-def test_live_folder_latency_and_drops(
+def test_live_folder_reports_latency_and_dropped_frames(
     benchmark: BenchmarkFixture, shared: Path, tmp_path: Path, tables: list[Table]
 ) -> None:
     source, watched, place = shared / "data" / "redkitchen", tmp_path / "watched", tmp_path / "run"

@@ -192,7 +192,7 @@ def test_pipeline_limits_log_of_skipped_frames(caplog: pytest.LogCaptureFixture)
 
 
 def test_pipeline_without_usable_frame_raises() -> None:
-    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
+    with pytest.raises(DataError, match="expected usable frames, got none among 1"):
         pipeline().run(CornerRoom(frames=1, unreadable=0))
     with pytest.raises(DataError, match="expected at least 1 frame, got 0"):
         pipeline().run(CornerRoom(start=6))
@@ -215,7 +215,7 @@ def test_pipeline_empty_map_raises_with_frame_summary() -> None:
     with pytest.raises(DataError) as caught:
         pipeline(tracker=GivenPose(lost_from=0, lost_to=3), fuser=fuser).run(CornerRoom(unreadable=5))
     assert str(caught.value) == (
-        "corner_room: expected mapped frames, got none of 6: 1 unusable; 3 lost (first reason: too few points "
+        "corner_room: expected mapped frames, got none among 6: 1 unusable; 3 lost (first reason: too few points "
         "associate); 2 without depth within 50 to 60 m"
     )
 

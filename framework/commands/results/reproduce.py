@@ -26,13 +26,14 @@ def main() -> None:
     """Run the command `instancemap reproduce`."""
     parser = argparse.ArgumentParser(
         description="Run stored runs again and compare the results: byte-identical, or the first stage and frame that "
-        "differ. Changes of tables, files, parameters, inputs, code and packages since the runs are listed first."
+        "differ. Changes to tables, files, parameters, inputs, code and packages since then are listed first."
     )
-    kinds = "run directory, folder of runs, table in this folder (table.md, .tex or .csv), or bundle (.zip)"
+    kinds = "run directory, folder of runs, its table (table.md, table.tex or table.csv), or bundle (.zip)"
     parser.add_argument("source", metavar="SOURCE", type=Path, help=kinds)
     parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="overrides, e.g. dataset.root=DIR")
     parser.add_argument("--cell", metavar="ROW", help="reproduce only the runs of this row of the table; default: all")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="folder of the repeated runs; default: temporary")
+    repeated = "output folder of the repeated runs; default: a temporary folder"
+    parser.add_argument("--out", metavar="DIR", type=Path, help=repeated)
     check = "list the changes since the runs without running them again"
     parser.add_argument("--check-only", action="store_true", help=check)
     trust = "run the plugin code in a bundle; inspect its folder plugins/ first"
@@ -131,5 +132,6 @@ def _run_again(record: Record, overrides: Sequence[str], directory: Path) -> Non
         try:
             config.merge_with_dotlist([override])
         except OmegaConfBaseException as error:
-            raise ConfigError(f"{override}: expected KEY=VALUE with a key of the run's config, got another") from error
+            expected = "KEY=VALUE with a key and a type of the run's config"
+            raise ConfigError(f"{override}: expected {expected}, got another key or type") from error
     run(config, directory, record.choices)

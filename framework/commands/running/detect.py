@@ -162,7 +162,7 @@ def _written(
                 yield true_ids == ids[:, None, None], [names[i] for i in ids.tolist()], found
     if results.frames == 0:
         raise DataError(
-            f"{sequence.name}: expected usable frames, got none of {len(sequence)}; the log lists the reasons"
+            f"{sequence.name}: expected usable frames, got none among {len(sequence)}; the log lists the reasons"
         )
 
 

@@ -95,7 +95,8 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
         if best is None or len(found) > len(best[2]):
             best = k, frame, found
     if best is None:
-        raise DataError(f"{sequence.name}: expected a usable frame, got none of {len(tried)} candidates; set frame=K")
+        fix = "set frame to the number of a usable frame"
+        raise DataError(f"{sequence.name}: expected a usable frame, got none among {len(tried)} candidates; {fix}")
     return best
 
 

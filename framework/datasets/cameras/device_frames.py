@@ -39,7 +39,7 @@ class DepthCamera(LiveVideo):
     serial: str = ""  # serial number of the device; "" = the first device found
     width: int = 640  # width of the color image and of the registered depth image, px, in [64, 4096]
     height: int = 480  # height of the color image and of the registered depth image, px, in [64, 4096]
-    # frame rate, Hz, in [1, 300]; width, height and fps must be a mode of the device
+    # frame rate, Hz, in [1, 300]; width, height and fps must match a mode of the device
     fps: int = 30
     max_depth: float = 10.0  # maximum depth, m, >= 0; farther readings are dropped; 0 = unlimited
     # delay of color relative to depth at equal timestamps, s, in [-0.2, 0.2]; positive = color captured later; AUTO =

@@ -158,7 +158,8 @@ def _check_input(state: Mapping[str, Tensor], where: str) -> None:
     for name, expected in (("pixel_mean", PIXEL_MEAN[::-1]), ("pixel_std", PIXEL_STD)):
         if name in state and not torch.allclose(state[name].float().flatten(), torch.tensor(expected), atol=1e-2):
             found = [round(value, 3) for value in state[name].flatten().tolist()]
-            raise DataError(f"{where}: {name}: expected {expected}, as in networks initialized from MSRA, got {found}")
+            origin = "as in networks initialized with MSRA weights"
+            raise DataError(f"{where}: {name}: expected {expected}, {origin}, got {found}")
 
 
 def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:

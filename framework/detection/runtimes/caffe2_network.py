@@ -195,7 +195,8 @@ def _int8_steps(
         on_integers = kind in CONVOLUTIONS and name not in outputs
         for blob in blobs:
             if on_integers and blob not in quantizations:
-                raise DataError(f"graph.json: {blob}: expected a scale for the integers of a convolution, got none")
+                expected = "quantization parameters for the input of an 8-bit convolution"
+                raise DataError(f"graph.json: {blob}: expected {expected}, got none")
             if blob not in converted and (blob in in_integers) != on_integers:
                 converted[blob] = f"{blob}, converted"
                 convert = quantizations[blob].quantize if on_integers else quantizations[blob].dequantize

@@ -164,7 +164,9 @@ def _loaded(path: Path, device: str) -> InferenceSession:
             f"{path}: expected an ONNX file for onnxruntime, got an error ({in_one_line(error)})"
         ) from error
     if device == "cuda" and CUDA not in session.get_providers():
-        raise ConfigError("detector.device: expected cpu or auto because CUDA did not start, got cuda")
+        raise ConfigError(
+            "detector.device: expected a GPU that onnxruntime can initialize, got none; set detector.device=cpu or auto"
+        )
     return session
 
 

@@ -61,7 +61,8 @@ def _code(kind: type) -> Iterator[str]:
 def _parameters(detector: object) -> Iterator[str]:
     if not dataclasses.is_dataclass(detector):
         raise ConfigError(
-            f"{type(detector).__qualname__}: expected a dataclass, got a class without fields; implement fingerprint()"
+            f"{type(detector).__qualname__}: expected a dataclass, got another class; make it a dataclass "
+            "or implement fingerprint()"
         )
     for field in dataclasses.fields(detector):
         value = getattr(detector, field.name)

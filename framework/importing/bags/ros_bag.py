@@ -2,8 +2,9 @@
 
     sensor_msgs/Image, CompressedImage      color (8 bits) and depth (16UC1 and similar: mm; 32FC1: m)
     sensor_msgs/CameraInfo                  intrinsics of color, and of depth if it is not registered
-    nav_msgs/Odometry, geometry_msgs/PoseStamped    camera poses, optional; in optical axes if the frame name contains
-                                            "optical" or is missing, otherwise in ROS axes (x forward)
+    geometry_msgs/PoseStamped               camera poses in optical axes, optional
+    nav_msgs/Odometry                       camera poses, optional; in optical axes if child_frame_id contains
+                                            "optical", otherwise in ROS axes (x forward)
     sensor_msgs/Imu, tf2_msgs/TFMessage     up direction, optional, from the accelerometer and /tf_static
     /device_0/sensor_1/Color_0/image/data   RealSense's color; Depth_0 contains depth. .../tf/0 is T_stream_depth, with
                                             the rotation as in the recorder's player. .../option/Depth Units is the

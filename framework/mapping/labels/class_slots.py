@@ -123,7 +123,7 @@ class _Slots:
         stored.align = 1
 
     def gather(self, table: Any, indices: Any) -> Any:
-        """Return the table entries at the byte indices that are stored at address `indices`."""
+        """Return the table entries selected by the 8-bit indices stored at address `indices`."""
         found = ir.Constant(_vector(table.type.pointee), ir.Undefined)
         for s in range(CLASS_SLOTS):
             index = self.builder.zext(self.builder.load(self.builder.gep(indices, [_INT32(s)])), _INT32)

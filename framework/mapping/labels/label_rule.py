@@ -76,7 +76,7 @@ class LabeledVoxels:
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    # maximum area ratio (smaller / larger) of two overlapping clusters to assign their common pixels to the smaller one
+    # maximum area ratio (smaller / larger) of two overlapping clusters whose common pixels belong to the smaller one
     # only, in [0, 1]; 0 = off
     occlusion_area_ratio: float = 0.25
     # minimum fraction of an instance inside a larger mask of another class for the mask not to update the instance
@@ -139,7 +139,7 @@ class LabeledVoxels:
     ) -> Measurement:
         """Return the evidence of the clusters of a frame for the voxel update.
 
-        A cluster has no effect at the pixels where the occlusion order or the support rule exclude it.
+        A cluster has no effect at the pixels where the occlusion order or the support rule excludes it.
         """
         updating = np.ones_like(matches.instance_ids) if self.update_unmatched else matches.instance_ids
         points = keep_on_top(points, updating, self.occlusion_area_ratio)

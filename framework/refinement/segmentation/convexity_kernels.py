@@ -219,7 +219,7 @@ def count_edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: floa
         pinhole: The intrinsics fx, fy, cx, cy, in cells.
         noise: The noise limits.
         max_angle: The maximum angle of a concave bend, rad.
-        normal_sigma_1m: The result of normal_sigma() for a depth noise of 1 m.
+        normal_sigma_1m: The result of normal_sigma() per depth noise, rad/m.
     """
     _, rows, columns = planes.shape
     surface = np.empty((9, rows, columns), np.float32)

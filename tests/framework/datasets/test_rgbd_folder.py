@@ -512,7 +512,7 @@ def test_rgbd_folder_images_are_undistorted(folder):
     assert not np.array_equal(frame.color, picture(0))
 
 
-def test_rgbd_folder_gravity_file_gives_up_direction(folder):
+def test_rgbd_folder_gravity_file_is_read_as_up_vector(folder):
     (folder / "gravity.txt").write_text("0 -9.81 0\nnan nan nan\n0 0 -2\n# the last one\n0.6 -0.8 0\n")
     ups = [frame.up for frame in RgbdFolder(folder, start=1)]
     assert ups[0] is None

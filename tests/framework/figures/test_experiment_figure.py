@@ -138,7 +138,7 @@ def test_figure_note_names_overrides_and_data(maps: Path) -> None:
     assert expected in " ".join(note.split())
 
 
-def test_map_figure_omits_damaged_maps_and_missing_truth(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_map_figure_labels_damaged_map_and_missing_truth(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
     (maps / "dataset.scene=011,row=part,seed=0" / "mesh.ply").write_bytes(b"ply\n")
     run(maps, "whole", "gone")
     found = texts(maps)

@@ -215,7 +215,7 @@ def test_ply_written_file_is_read_by_open3d(tmp_path):
         ),
     ],
 )
-def test_ply_invalid_ascii_error_gives_line_number(tmp_path, old, new, message):
+def test_ply_invalid_ascii_error_reports_location(tmp_path, old, new, message):
     path = written(tmp_path / "a.ply", TRIANGLE.replace(old, new, 1))
     with pytest.raises(DataError, match=f"a.ply(, |: the header's |: ).*({message})") as caught:
         read_ply(path)

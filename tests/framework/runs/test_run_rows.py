@@ -209,7 +209,7 @@ def test_rows_average_over_datasets() -> None:
 
 
 @pytest.mark.parametrize("asked", [None, {"dataset", "refiner", "detector"}])
-def test_rows_split_by_detector_unless_dataset_sets_it(asked: set[str] | None) -> None:
+def test_rows_of_unknown_or_swept_detectors_are_split(asked: set[str] | None) -> None:
     rows = rows_of(of_two_datasets(), ["seed", "dataset"], asked=asked)
     assert [list(row.records) for row in rows] == [[("0", "desk")]] * 2 + [[("0", "rooms")]] * 2
 

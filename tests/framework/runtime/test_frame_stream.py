@@ -232,7 +232,7 @@ def test_live_video_failure_keeps_partial_map() -> None:
 def test_live_video_without_usable_frame_raises() -> None:
     with pytest.raises(DataError, match="live_room: expected at least one frame, got none"):
         pipeline().run(LiveRoom(frames_sent=0))
-    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
+    with pytest.raises(DataError, match="expected usable frames, got none among 1"):
         pipeline().run(LiveRoom(frames_sent=1, unreadable=0))
     with pytest.raises(DataError, match="expected ground-truth poses, got none for its frames;"):
         pipeline(tracker=GivenPose()).run(Handed())

@@ -145,7 +145,7 @@ def test_bootstrap_interval_of_few_units_is_undefined() -> None:
     assert all(map(math.isnan, bootstrap_interval(np.array([0.1, 0.2, 0.3, 0.4, 0.6]))))
 
 
-def test_table_statistics_correct_within_metric() -> None:
+def test_table_statistics_holm_correction_is_per_metric() -> None:
     rng = np.random.default_rng(0)
     noise = {key: of_differences(rng.normal(0.5, 0.5, 12)) for key in (("a", "ap"), ("b", "ap"), ("a", "fps"))}
     # equal differences have no test, so the other p-values are not corrected for it

@@ -102,7 +102,7 @@ def test_reproduce_replaced_network_is_named(runs: Path, run: Path) -> None:
     assert re.search(rf"changed: refiner.weights: expected the file with the SHA-256 .* in {network}", done.stdout)
 
 
-def test_reproduce_edited_table_names_cell(runs: Path, run: Path) -> None:
+def test_reproduce_edited_table_reports_changed_cell(runs: Path, run: Path) -> None:
     assert command(run.parent.parent, "tables", "sweep").returncode == 0
     table = run.parent / "table.csv"
     lines = table.read_text().splitlines()
@@ -127,7 +127,7 @@ def test_reproduce_changed_plugin_names_package_frame_and_stage(runs: Path, run:
 def test_reproduce_override_of_unknown_key_raises(runs: Path, run: Path) -> None:
     done = reproduce(runs, run, "dataset.nothing=3")
     assert done.returncode == 1
-    assert "dataset.nothing=3: expected KEY=VALUE with a key of the run's config" in done.stderr
+    assert "dataset.nothing=3: expected KEY=VALUE with a key and a type of the run's config" in done.stderr
 
 
 def test_reproduce_unknown_row_lists_rows(runs: Path, run: Path) -> None:

@@ -124,7 +124,7 @@ def test_detect_failing_detector_leaves_no_file(tmp_path: Path) -> None:
     (tmp_path / "found.json").write_text("before")
     with pytest.raises(DataError, match="expected ground-truth instances"):
         write_detections(tmp_path / "found.json", SphereDetector(), CornerRoom(truth=False))
-    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
+    with pytest.raises(DataError, match="expected usable frames, got none among 1"):
         write_detections(tmp_path / "found.json", SphereDetector(broken_at=0), CornerRoom(frames=1))
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("found.json", "before")]
 
@@ -151,5 +151,5 @@ class PartlyTrueRoom(CornerRoom):
 def test_detect_accepts_frame_without_rendered_truth(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_detections(tmp_path / "found.json", NoDetections(), PartlyTrueRoom())
     assert "frame skipped in the evaluation: frame 2 has no pose" in caplog.text
-    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
+    with pytest.raises(DataError, match="expected usable frames, got none among 1"):
         write_detections(tmp_path / "found.json", SphereDetector(), PartlyTrueRoom(start=2, stop=3))

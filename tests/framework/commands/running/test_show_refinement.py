@@ -83,7 +83,7 @@ def test_show_refinement_skips_unusable_frames() -> None:
     assert position == 1
     with pytest.raises(FrameError, match="truncated"):
         detected(CornerRoom(unreadable=0), SphereDetector(), 0)
-    with pytest.raises(DataError, match="expected a usable frame, got none of 1 candidates"):
+    with pytest.raises(DataError, match="expected a usable frame, got none among 1 candidates"):
         detected(CornerRoom(frames=1, unreadable=0), SphereDetector(), None)
 
 

@@ -204,5 +204,5 @@ def test_caffe2_integers_without_scale_raise():
     tensors = {"w": torch.ones(1, 1, 1, 1), "b": torch.zeros(1)}
     args = {"kernel": 1, "stride": 1, "pad": 0, "Y_scale": 0.1, "Y_zero_point": 0}
     graph = [{"type": "Int8Conv", "inputs": ["x", "w", "b"], "outputs": ["y"], "args": args}, LAST]
-    with pytest.raises(DataError, match="x: expected a scale for the integers of a convolution"):
+    with pytest.raises(DataError, match="x: expected quantization parameters for the input of an 8-bit convolution"):
         network_between(graph, tensors, ("x",), ("z",), {"w": 1.0})

@@ -217,5 +217,5 @@ OTHER = (
 
 
 @pytest.mark.parametrize("text", OTHER)
-def test_export_metadata_other_text_is_ignored(text):
+def test_export_metadata_invalid_text_is_ignored(text):
     assert ExportMetadata.parse({"names": text, "imgsz": text}) == ExportMetadata()
