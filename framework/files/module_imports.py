@@ -1,4 +1,4 @@
-"""Modules of a package that a class depends on, found by the import statements in their source code."""
+"""Search for the modules that a class depends on, by the import statements in the source code."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ DYNAMIC = {"__import__", "import_module", "iter_modules", "walk_packages"}  # fu
 def required_modules(target: str, modules: Mapping[str, Path]) -> set[str]:
     """Return the modules of a package that a class depends on.
 
-    These are the module of the class, the modules that it imports directly or indirectly, and the packages around them.
-    Other imports of a package that only re-exports a name are omitted.
+    These are the module of the class, its direct and indirect imports, and their parent packages. If a package only
+    re-exports an imported name, its other imports are omitted.
 
     Args:
-        target: The dotted name of the class.
-        modules: The source files of the package by dotted module name.
+        target: The full name of the class.
+        modules: The source files of the package by module name.
 
     Returns:
-        The dotted names of the modules; all modules if a module cannot be parsed or imports other modules by name.
+        The names of the modules. All modules are returned if a module cannot be parsed or uses dynamic imports.
     """
     pending, visited, found = [target], set(), set()
     while pending:
@@ -44,25 +44,25 @@ def required_modules(target: str, modules: Mapping[str, Path]) -> set[str]:
 
 
 def _with_parents(name: str) -> Iterator[str]:
-    """Yield a dotted name, then the names of the packages around it."""
+    """Yield a dotted name, followed by the names of its parent packages."""
     while name:
         yield name
         name = name.rpartition(".")[0]
 
 
 def _absolute(name: str, package: str) -> str:
-    """Return the absolute name of an import; the name itself if it is outside of the top-level package."""
+    """Return the absolute name of a relative import."""
     try:
         return resolve_name(name, package)
-    except ImportError:
+    except ImportError:  # outside of the top-level package
         return name
 
 
 @cache
 def _imports(source: bytes, package: str) -> dict[str, list[str]] | None:
-    """Return the dotted names that a module imports, by the name that it assigns; "*" for star imports.
+    """Return the imported names of a module by local name, or None if they are unknown.
 
-    The result is None if the source code does not show the imports.
+    Star imports have the local name "*".
     """
     try:
         nodes = list(ast.walk(ast.parse(source)))

@@ -1,4 +1,4 @@
-"""Comparison of stored tables with the runs below their folder."""
+"""Comparison of stored tables with the stored runs."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from framework.tables.experiment_tables import rendered_tables
 
 TABLE_FORMATS = (".md", ".tex", ".csv")
 
-Grid = list[list[str]]  # cells of the lines of a table, with the column headings in the first line
+Grid = list[list[str]]  # cells of each line of a table; the first line contains the headings
 
 
 def changed_tables(directory: Path) -> Iterator[str]:
-    """Yield one message for each cell of table.md, table.tex and table.csv that differs from the stored runs.
+    """Yield one message for each table cell that differs from the stored runs.
 
-    Captions and notes are not compared.
+    The tables are table.md, table.tex and table.csv. Captions and notes are not compared.
 
     Args:
         directory: The folder of the tables. The runs are in this folder and its subfolders.

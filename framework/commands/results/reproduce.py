@@ -54,15 +54,18 @@ def main() -> None:
 
 
 def reproduce_all(folder: Path, overrides: Sequence[str], row: str | None, out: Path | None) -> int:
-    """Print the changes and the comparison of each completed run. Return the number of changed tables and runs.
+    """Run completed runs again, and print the changes and the differences.
 
-    A run whose config.yaml or metrics.json was edited is different, and is not run again.
+    A run with an edited config.yaml or metrics.json counts as different and is not run again.
 
     Args:
         folder: The folder of the runs and their tables.
         overrides: Overrides of the stored configs.
         row: Only the runs in this row of the table; None = all runs.
         out: The folder of the repeated runs; None = only list the changes.
+
+    Returns:
+        The number of changed tables and different runs.
     """
     records, incomplete = find_records(folder)
     edited = [one for one in incomplete if (one.directory / METRICS).exists()]
@@ -92,9 +95,9 @@ def reproduce_all(folder: Path, overrides: Sequence[str], row: str | None, out: 
 
 
 def _is_different(record: Record, overrides: Sequence[str], repeated: Path | None) -> bool:
-    """Return True if a run differs from its repetition in the folder `repeated`, and print both comparisons.
+    """Run a stored run again in the folder `repeated`, and return True if the results differ.
 
-    With `repeated` = None, the run is not repeated. It is then different if anything has changed since the run.
+    Without a folder, the run is not repeated. The result is then True if anything has changed since the run.
     """
     changed = _print_changes(record)
     if repeated is None:
@@ -106,7 +109,7 @@ def _is_different(record: Record, overrides: Sequence[str], repeated: Path | Non
 
 
 def _print_changes(record: Record) -> bool:
-    """Print what has changed since a run. Return True if there are changes."""
+    """Print the changes since a run, and return True if there are any."""
     changes = causes(record)
     for change in changes:
         print(f"{record.directory.name}: changed: {change}")
@@ -114,7 +117,7 @@ def _print_changes(record: Record) -> bool:
 
 
 def _of_row(folder: Path, row: str) -> list[Record]:
-    """Return the runs in a row of the table. Raises ConfigError if the table has no row of this name."""
+    """Return the runs in a row of the table."""
     comparison = ComparisonTable.below(folder)
     rows = {comparison.called(one): list(one.records.values()) for one in comparison.rows}
     if row not in rows:
@@ -123,7 +126,7 @@ def _of_row(folder: Path, row: str) -> list[Record]:
 
 
 def _run_again(record: Record, overrides: Sequence[str], directory: Path) -> None:
-    """Run the stored config, with overrides, in a new run directory. Raises ConfigError for an unknown key."""
+    """Run the stored config, with overrides, in a new run directory."""
     from framework.commands.running.run import run
 
     config = OmegaConf.create(dict(record.config))
