@@ -27,6 +27,7 @@ COMMANDS = {
     "bundle": "pack the runs, tables and plugin code of an experiment into a ZIP file",
     "reproduce": "run stored runs or a bundle again and compare the results",
     "query": 'rank the objects of a run by a text query: "a red chair"',
+    "import-map": "convert the map of another system to a run directory, as a row of tables",
     "evaluate": "re-evaluate stored runs without re-running them",
     "detect": "write the detections of a sequence to a COCO results file",
     "show-refinement": "draw the masks of a frame before and after refinement",
@@ -43,7 +44,10 @@ COMMANDS = {
 
 FOLDERS = {
     "running": ("run", "detect", "show-refinement"),
-    "results": ("tables", "figures", "raycast", "report", "diff", "export", "query", "evaluate", "bundle", "reproduce"),
+    "results": (
+        *("tables", "figures", "raycast", "report", "diff", "export", "query"),
+        *("import-map", "evaluate", "bundle", "reproduce"),
+    ),
     "recordings": ("import", "check", "synthesize", "convert-oni"),
     "installation": ("compile", "doctor", "plugins", "new-plugin", "train-detector", "convert-weights"),
 }

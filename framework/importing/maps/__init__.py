@@ -1,0 +1,1 @@
+"""Readers of maps from other systems: labeled meshes, point clouds and instance masks."""
