@@ -84,7 +84,7 @@ class RunReport:
 
     def html(self) -> str:
         """Return the HTML page. The result is deterministic."""
-        contents, metrics = self.contents, self.contents.record.metrics
+        contents = self.contents
         match_results = self.check.match_results if self.check else {}
         data: dict[str, Any] = {
             "likely": LIKELY,

@@ -88,8 +88,7 @@ def read_labels(name_or_path: str, key: str = "detector.label_space") -> tuple[s
         lines = read_text(path, LARGEST_FILE).rstrip().splitlines()
     except DataError as error:
         raise ConfigError(
-            f"{key}: expected one of {', '.join(SPACES)}, or a text file with one name per line, got "
-            f"{name_or_path}"
+            f"{key}: expected one of {', '.join(SPACES)}, or a text file with one name per line, got {name_or_path}"
         ) from error
     names = tuple(line.strip() for line in lines)
     if "" in names:  # skipping an empty line would shift the following names

@@ -197,6 +197,7 @@ FAULTY = {
     "diff": ["old", "old"],
     "export": ["nowhere", "--to", "glb"],
     "query": ["old", "a red chair"],
+    "import-map": ["nowhere.ply", "new"],
     "evaluate": ["old"],
     "detect": ["dataset=synthetic", "detector=simulated"],
     "show-refinement": ["dataset=synthetic", "detector=simulated"],

@@ -38,11 +38,8 @@ def main() -> None:
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
         if not in_world(parsed.after, parsed.before):
-            message = (
-                "%s: expected the world frame of %s, got a different or unknown world frame; run it again with "
-                "localize_in=%s, or run both with tracker=ground_truth"
-            )
-            log.warning(message, parsed.after, parsed.before, parsed.before)
+            message = "%s: expected the world frame of %s, got a different or unknown world frame; %s"
+            log.warning(message, parsed.after, parsed.before, world_fix(parsed.before, parsed.after))
         found = changes(*visits_of(parsed.before, parsed.after))
         if parsed.out is not None:
             write_json(parsed.out, [entry(change) for change in found])
@@ -89,6 +86,13 @@ def in_world(run: Path, world: Path) -> bool:
     records = [read_json(place / METRICS) if path_exists(place / METRICS) else None for place in (run, world)]
     shared = ("ground_truth", EXTERNAL)
     return all(isinstance(record, dict) and record.get("pose_source") in shared for record in records)
+
+
+def world_fix(before: Path, after: Path) -> str:
+    """Return the fix for two runs with different world frames."""
+    if is_imported(before) or is_imported(after):
+        return "import the map with --transform, or run the other map with tracker=ground_truth"
+    return f"run it again with localize_in={before}, or run both with tracker=ground_truth"
 
 
 def line(change: Change) -> str:

@@ -26,12 +26,9 @@ def read_array(path: Path) -> Numbers:
     """
     content = read_bytes(path, LARGEST_FILE)
     try:
-        found = np.load(BytesIO(content), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
+        return np.lib.format.read_array(BytesIO(content), allow_pickle=False)
+    except (ValueError, EOFError, MemoryError, OverflowError) as error:
         raise DataError(f"{path}: expected an NPY file, got an error ({in_one_line(error)})") from error
-    if not isinstance(found, np.ndarray):
-        raise DataError(f"{path}: expected an NPY file with one array, got an NPZ file")
-    return found
 
 
 def read_mask(path: Path, points: int) -> Int32:

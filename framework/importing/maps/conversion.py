@@ -72,9 +72,9 @@ class ConvertedMap:
     def of(cls, external: ExternalMap, placement: Placement) -> ConvertedMap:
         """Convert the map of another system.
 
-        Instances without a COCO class are left out, except in a map without classes. At a point of several instances, the instance with the highest
-        confidence is kept; of equal confidences, the one with the lowest id. An unknown confidence is 1. Class
-        distributions are unknown, so the class of an instance has the probability 1.
+        Instances without a COCO class are left out, except in a map without classes. At a point of several instances,
+        the instance with the highest confidence is kept; of equal confidences, the one with the lowest id. An unknown
+        confidence is 1. Class distributions are unknown, so the class of an instance has the probability 1.
 
         Raises:
             DataError: No instance is left, or a coordinate is too large.
@@ -86,13 +86,14 @@ class ConvertedMap:
         if remark := _left_out(external.instances, kept):
             remarks.append(remark)
         if not kept:
-            raise DataError(f"map: expected an instance of a COCO class, got none ({'; '.join(remarks) or 'no labels'})")
+            found = remarks[0] if remarks else "no instances"
+            raise DataError(f"map: expected an instance with a COCO class, got none ({found})")
         if unknown := sum(one.confidence is None for one in kept.values()):
             remarks.append(f"confidence: unknown for {unknown} instances, set to 1; AP ranks equal confidences by id")
         vertices = placement.placed(external.surface.vertices)
         ids = _painted(len(vertices), kept)
         if overlapping := sum(len(one.vertices) for one in kept.values()) - int(np.count_nonzero(ids)):
-            remarks.append(f"overlaps: {overlapping} labels of points in several instances removed")
+            remarks.append(f"overlaps: removed {overlapping} labels at points of several instances")
         instances = {
             key: _instance(key, one, names, classes[key], vertices, ids, placement.up)
             for key, one in sorted(kept.items())
