@@ -57,13 +57,13 @@ def visits_of(*runs: Path) -> list[Visit]:
     """
     from framework.api import scene_of  # slow import: after the arguments are checked
 
+    scenes = [LabeledSurface.of_run(run) if is_imported(run) else scene_of("diff", run) for run in runs]
     poses = [read_tum(run / TRAJECTORY)[1] for run in runs if not is_imported(run)]
     if not poses:
         raise DataError(
             f"diff: expected a run with {TRAJECTORY}, whose poses show observed space, got two imported maps; compare "
             "each with a run"
         )
-    scenes = [LabeledSurface.of_run(run) if is_imported(run) else scene_of("diff", run) for run in runs]
     return [Visit(scene, of_run) for scene, of_run in zip(scenes, [poses[0], poses[-1]], strict=True)]
 
 

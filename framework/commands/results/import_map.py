@@ -5,16 +5,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.data import Float64
 from framework.errors import ConfigError
-
-if TYPE_CHECKING:
-    from framework.importing.maps.external_map import ExternalMap
 
 IMPORT_OPTIONS = ("labels", "label_space", "instance_property", "class_property", "no_instance", "scale", "transform")
 
@@ -72,14 +68,17 @@ def import_map(parsed: argparse.Namespace) -> list[str]:
         InstanceMapError: A file or option is invalid.
     """
     from framework.importing.folder_writer import check_new  # slow imports: after the arguments are checked
-    from framework.importing.maps.conversion import ConvertedMap, Placement, read_transform
-    from framework.runs.imported_run import MappedData, write_imported_run
+    from framework.runs.external_maps.conversion import ConvertedMap, MapPlacement, read_transform
+    from framework.runs.external_maps.imported_run import MappedData, write_imported_run
+    from framework.runs.external_maps.map_formats import read_external_map
+    from framework.runs.external_maps.ply_instances import LabelProperties
 
     check_new(parsed.directory)
     T_world_map = np.eye(4) if parsed.transform is None else read_transform(parsed.transform)
-    placement = Placement(parsed.scale, T_world_map, None if parsed.up is None else unit_vector("--up", parsed.up))
+    placement = MapPlacement(parsed.scale, T_world_map, None if parsed.up is None else unit_vector("--up", parsed.up))
     data = MappedData.of(parsed.overrides)
-    external = read_external_map(parsed)
+    properties = LabelProperties(parsed.instance_property, parsed.class_property, parsed.no_instance)
+    external = read_external_map(parsed.mesh, parsed.labels, parsed.label_space, properties)
     converted = ConvertedMap.of(external, placement)
     name = parsed.name or parsed.directory.resolve().name
     title = write_imported_run(parsed.directory, name, converted, data, placement.up, chosen_options(parsed))
@@ -87,33 +86,11 @@ def import_map(parsed: argparse.Namespace) -> list[str]:
     return [external.source, *converted.remarks, *compared, title, str(parsed.directory)]
 
 
-def read_external_map(parsed: argparse.Namespace) -> ExternalMap:
-    """Read the map of another system. The format of --labels is detected.
-
-    Raises:
-        InstanceMapError: A file or option is invalid.
-    """
-    from framework.importing.maps.class_labels import ClassNames, read_labels_by_id
-    from framework.importing.maps.external_map import read_surface
-    from framework.importing.maps.mask_predictions import read_mask_predictions
-    from framework.importing.maps.ply_instances import LabelProperties, read_ply_instances
-    from framework.runs.mesh_file import listed_classes
-
-    surface = read_surface(parsed.mesh)
-    names = None if parsed.label_space is None else ClassNames.of(parsed.label_space)
-    labels: Path | None = parsed.labels
-    if labels is not None and (labels.is_dir() or labels.suffix.lower() == ".txt"):
-        return read_mask_predictions(parsed.mesh, surface, labels, names)
-    if names is None and (in_header := listed_classes(surface.comments)):  # a mesh.ply of InstanceMap
-        names = ClassNames(dict(enumerate(in_header[0])), str(parsed.mesh))
-    properties = LabelProperties(parsed.instance_property, parsed.class_property, parsed.no_instance)
-    by_id = None if labels is None else read_labels_by_id(labels, names)
-    return read_ply_instances(parsed.mesh, surface, properties, names, by_id)
-
-
 def chosen_options(parsed: argparse.Namespace) -> Mapping[str, Path | str | float | None]:
     """Return the import options that differ from their defaults, by name."""
     chosen = {name: getattr(parsed, name) for name in IMPORT_OPTIONS}
+    if parsed.label_space is not None and Path(parsed.label_space).is_file():  # files are hashed
+        chosen["label_space"] = Path(parsed.label_space)
     defaults = {"no_instance": 0, "scale": 1.0}
     return {"mesh": parsed.mesh} | {key: value for key, value in chosen.items() if value != defaults.get(key)}
 

@@ -189,7 +189,11 @@ def test_table_shows_imported_map_as_named_row(folder: Path, command) -> None:
     cells = {row[0]: dict(zip(heads, row, strict=True)) for row in rows}
     assert cells.keys() == {"InstanceMap", "Other system"}
     assert cells["Other system"]["AP50"] == cells["InstanceMap"]["AP50"] == "1.000"
-    assert (cells["Other system"]["Hz"], cells["Other system"]["integration (ms)"], cells["Other system"]["ATE (m)"]) == ("–", "–", "–")
+    assert (
+        cells["Other system"]["Hz"],
+        cells["Other system"]["integration (ms)"],
+        cells["Other system"]["ATE (m)"],
+    ) == ("–", "–", "–")
     assert (cells["Other system"]["poses"], cells["InstanceMap"]["poses"]) == ("external", "ground_truth")
     assert f"Other system from {folder / 'ours' / 'mesh.ply'}" in text
     assert "None cores" not in text

@@ -10,10 +10,10 @@ import pytest
 
 from framework.errors import DataError
 from framework.files.ply import PlyMesh
-from framework.importing.maps.array_files import read_mask
-from framework.importing.maps.class_labels import ClassNames
-from framework.importing.maps.external_map import ExternalMap, read_surface
-from framework.importing.maps.mask_predictions import read_mask_predictions
+from framework.runs.external_maps.array_files import read_mask
+from framework.runs.external_maps.class_labels import ClassNames
+from framework.runs.external_maps.external_map import ExternalMap, read_surface
+from framework.runs.external_maps.mask_predictions import read_mask_predictions
 
 POINTS = 5
 SURFACE = PlyMesh(np.zeros((POINTS, 3), np.float32), np.empty((0, 3), np.int32), {}, ())

@@ -11,7 +11,7 @@ from typing import Any
 from framework.errors import DataError
 from framework.files.atomic_write import read_text
 from framework.files.json_file import read_json
-from framework.importing.maps.external_map import UNLABELED
+from framework.runs.external_maps.external_map import UNLABELED
 from framework.vocabulary.label_spaces import SPACES, read_labels
 
 KEY = "--label-space"
@@ -59,7 +59,7 @@ class ClassNames:
 
 
 @dataclass(frozen=True)
-class Label:
+class InstanceLabel:
     """The class and the confidence of an instance."""
 
     name: str | None  # UNLABELED = no class; None = the file contains no classes
@@ -93,7 +93,7 @@ def read_entries(path: Path) -> list[tuple[str, dict[str, Any]]]:
     return entries
 
 
-def label_of(where: str, entry: Mapping[str, Any], names: ClassNames | None) -> Label:
+def label_of(where: str, entry: Mapping[str, Any], names: ClassNames | None) -> InstanceLabel:
     """Return the label in an entry with the keys `class` and `confidence`, which are optional.
 
     Args:
@@ -105,19 +105,19 @@ def label_of(where: str, entry: Mapping[str, Any], names: ClassNames | None) -> 
         DataError: A value is invalid, or a class id has no name.
     """
     confidence = entry.get("confidence")
-    return Label(
+    return InstanceLabel(
         None if "class" not in entry else _class_name(where, entry["class"], names),
         None if confidence in (None, "") else checked_confidence(where, confidence),
     )
 
 
-def read_labels_by_id(path: Path, names: ClassNames | None) -> dict[int, Label]:
+def read_labels_by_id(path: Path, names: ClassNames | None) -> dict[int, InstanceLabel]:
     """Read the label of each instance id from a JSON or CSV file.
 
     Raises:
         DataError: The file is missing or invalid.
     """
-    found: dict[int, Label] = {}
+    found: dict[int, InstanceLabel] = {}
     for where, entry in read_entries(path):
         key = _whole(entry.get("id"))
         if key is None:

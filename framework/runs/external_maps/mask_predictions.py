@@ -22,10 +22,17 @@ from framework.errors import DataError
 from framework.files.atomic_write import path_exists
 from framework.files.number_lines import read_lines
 from framework.files.ply import PlyMesh
-from framework.importing.maps.array_files import read_mask
-from framework.importing.maps.class_labels import NYU40, ClassNames, Label, class_of_id, label_of, read_entries
-from framework.importing.maps.class_labels import checked_confidence as confidence_of
-from framework.importing.maps.external_map import ExternalInstance, ExternalMap
+from framework.runs.external_maps.array_files import read_mask
+from framework.runs.external_maps.class_labels import (
+    NYU40,
+    ClassNames,
+    InstanceLabel,
+    class_of_id,
+    label_of,
+    read_entries,
+)
+from framework.runs.external_maps.class_labels import checked_confidence as confidence_of
+from framework.runs.external_maps.external_map import ExternalInstance, ExternalMap
 
 LISTS = ("instances.json", "instances.csv")  # names of the file with the classes of a mask folder
 
@@ -77,7 +84,7 @@ def _text_file(mesh: Path, labels: Path) -> Path:
     return found[0]
 
 
-def _scannet_entries(path: Path, names: ClassNames) -> Iterator[tuple[str, str, Label]]:
+def _scannet_entries(path: Path, names: ClassNames) -> Iterator[tuple[str, str, InstanceLabel]]:
     for number, line in enumerate(read_lines(path), start=1):
         words = line.split()
         if not words:
@@ -87,10 +94,10 @@ def _scannet_entries(path: Path, names: ClassNames) -> Iterator[tuple[str, str, 
             mask, class_id, confidence = words[0], int(words[1]), words[2]
         except (ValueError, IndexError) as error:
             raise DataError(f"{where}: expected MASK_FILE CLASS_ID CONFIDENCE, got {line!r:.60}") from error
-        yield where, mask, Label(class_of_id(where, class_id, names), confidence_of(where, confidence))
+        yield where, mask, InstanceLabel(class_of_id(where, class_id, names), confidence_of(where, confidence))
 
 
-def _folder_entries(path: Path, names: ClassNames | None) -> Iterator[tuple[str, str, Label]]:
+def _folder_entries(path: Path, names: ClassNames | None) -> Iterator[tuple[str, str, InstanceLabel]]:
     for where, entry in read_entries(path):
         mask = entry.get("mask")
         if not isinstance(mask, str) or not mask:

@@ -9,9 +9,9 @@ import pytest
 
 from framework.errors import DataError
 from framework.files.ply import PlyMesh, read_ply, write_ply
-from framework.importing.maps.class_labels import ClassNames, Label
-from framework.importing.maps.external_map import UNLABELED, ExternalMap
-from framework.importing.maps.ply_instances import LabelProperties, read_ply_instances
+from framework.runs.external_maps.class_labels import ClassNames, InstanceLabel
+from framework.runs.external_maps.external_map import UNLABELED, ExternalMap
+from framework.runs.external_maps.ply_instances import LabelProperties, read_ply_instances
 
 VERTICES = np.array([[k, 0, 0] for k in range(6)], np.float32)
 TRIANGLES = np.array([[0, 1, 2], [3, 4, 5]], np.int32)
@@ -97,7 +97,7 @@ def test_whole_numbers_in_float_property_are_ids(tmp_path: Path) -> None:
 
 def test_labels_by_id_use_ids_of_the_file(tmp_path: Path) -> None:
     surface = surface_of(tmp_path, instance=[-1, 0, 0, 1, 2, 2])
-    labels = {0: Label("chair", 0.5), 2: Label("couch", None)}
+    labels = {0: InstanceLabel("chair", 0.5), 2: InstanceLabel("couch", None)}
     found = instances_in(surface, LabelProperties(no_instance=-1), labels)
     assert {key: (one.label, one.confidence) for key, one in found.instances.items()} == {
         1: ("chair", 0.5),

@@ -9,13 +9,13 @@ import pytest
 
 from framework.errors import DataError
 from framework.files.ply import PlyMesh
-from framework.importing.maps.conversion import NO_FRAME, ConvertedMap, Placement, read_transform
-from framework.importing.maps.external_map import ExternalInstance, ExternalMap
+from framework.runs.external_maps.conversion import NO_FRAME, ConvertedMap, MapPlacement, read_transform
+from framework.runs.external_maps.external_map import ExternalInstance, ExternalMap
 from framework.vocabulary.label_spaces import COCO
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 4], [1, 1, 1]], np.float32)
 TRIANGLES = np.array([[0, 1, 2]], np.int32)
-HERE = Placement()
+HERE = MapPlacement()
 
 
 def external_map(*instances: tuple[list[int], str | None, float | None], **properties: np.ndarray) -> ExternalMap:
@@ -82,14 +82,14 @@ def test_imported_instance_has_no_frames() -> None:
 
 def test_placement_scales_before_it_transforms() -> None:
     T_world_map = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])
-    converted = ConvertedMap.of(external_map(([0, 1], "chair", 0.5)), Placement(0.001, T_world_map))
+    converted = ConvertedMap.of(external_map(([0, 1], "chair", 0.5)), MapPlacement(0.001, T_world_map))
     np.testing.assert_allclose(converted.mesh.vertices[1], [10, 20.001, 30], atol=1e-5)
     np.testing.assert_allclose(converted.mesh.vertices[2], [9.998, 20, 30], atol=1e-5)
 
 
 def test_placement_up_gives_upright_boxes() -> None:
     up = np.array([0.0, 1.0, 0.0])
-    box = ConvertedMap.of(external_map(([0, 1, 2, 3], "chair", 0.5)), Placement(up=up)).instances[1].obb
+    box = ConvertedMap.of(external_map(([0, 1, 2, 3], "chair", 0.5)), MapPlacement(up=up)).instances[1].obb
     np.testing.assert_allclose(box.rotation[:, 2], up)
     assert box.extent[2] == pytest.approx(2)
 
@@ -97,12 +97,12 @@ def test_placement_up_gives_upright_boxes() -> None:
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
 def test_invalid_scale_is_error(scale: float) -> None:
     with pytest.raises(DataError, match="--scale: expected a positive number"):
-        Placement(scale)
+        MapPlacement(scale)
 
 
 def test_coordinates_in_millimeters_are_error() -> None:
     with pytest.raises(DataError, match="set --scale"):
-        ConvertedMap.of(external_map(([0, 1], "chair", 0.5)), Placement(1e6))
+        ConvertedMap.of(external_map(([0, 1], "chair", 0.5)), MapPlacement(1e6))
 
 
 def test_transform_must_be_rigid(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from framework.errors import ConfigError, DataError
-from framework.importing.maps.class_labels import ClassNames, Label, read_labels_by_id
+from framework.runs.external_maps.class_labels import ClassNames, InstanceLabel, read_labels_by_id
 
 
 def written(path: Path, content: object) -> Path:
@@ -49,12 +49,12 @@ def test_invalid_names_are_error(content: object, tmp_path: Path) -> None:
 )
 def test_labels_by_id_are_read(content: object, tmp_path: Path) -> None:
     found = read_labels_by_id(written(tmp_path / "labels.json", content), None)
-    assert found == {3: Label("chair", 0.5), 12: Label("sofa", None)}
+    assert found == {3: InstanceLabel("chair", 0.5), 12: InstanceLabel("sofa", None)}
 
 
 def test_labels_without_classes_have_no_name(tmp_path: Path) -> None:
     path = written(tmp_path / "labels.csv", "id,confidence\n3,0.5\n")
-    assert read_labels_by_id(path, None) == {3: Label(None, 0.5)}
+    assert read_labels_by_id(path, None) == {3: InstanceLabel(None, 0.5)}
 
 
 @pytest.mark.parametrize(

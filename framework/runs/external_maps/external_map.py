@@ -11,7 +11,7 @@ import numpy as np
 from framework.data import Int32
 from framework.errors import DataError
 from framework.files.ply import PlyMesh, read_ply
-from framework.importing.maps.array_files import read_array
+from framework.runs.external_maps.array_files import read_array
 
 UNLABELED = "unlabeled"  # name of an instance without a class, in a map with classes
 MAX_COORDINATE = 1e6  # maximum absolute coordinate of a point; float32 has a resolution of 6 cm there

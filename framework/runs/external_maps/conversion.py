@@ -14,8 +14,8 @@ from framework.errors import DataError
 from framework.files.number_lines import read_matrix
 from framework.files.ply import PlyMesh
 from framework.geometry import transform
-from framework.importing.maps.external_map import MAX_COORDINATE, UNLABELED, ExternalInstance, ExternalMap
 from framework.mapping.instances.instance_list import aligned_box, box_around
+from framework.runs.external_maps.external_map import MAX_COORDINATE, UNLABELED, ExternalInstance, ExternalMap
 from framework.vocabulary.label_spaces import COCO, MEANINGS
 
 GRAY = 180  # RGB value of surfaces without colors
@@ -24,7 +24,7 @@ CHANNELS = ("red", "green", "blue")
 
 
 @dataclass(frozen=True)
-class Placement:
+class MapPlacement:
     """The transform from the coordinates of a file to the world frame, in meters."""
 
     scale: float = 1.0  # meters per unit of the file, > 0
@@ -69,7 +69,7 @@ class ConvertedMap:
     remarks: tuple[str, ...]  # changes and assumptions, for the user
 
     @classmethod
-    def of(cls, external: ExternalMap, placement: Placement) -> ConvertedMap:
+    def of(cls, external: ExternalMap, placement: MapPlacement) -> ConvertedMap:
         """Convert the map of another system.
 
         Instances without a COCO class are left out, except in a map without classes. At a point of several instances,

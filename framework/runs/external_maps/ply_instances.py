@@ -13,9 +13,9 @@ import numpy.typing as npt
 from framework.data import Int32, Int64
 from framework.errors import DataError
 from framework.files.ply import PlyMesh
-from framework.importing.maps.class_labels import ClassNames, Label, class_of_id
-from framework.importing.maps.external_map import ExternalInstance, ExternalMap
 from framework.mapping.instances.instance_list import vertices_by_id
+from framework.runs.external_maps.class_labels import ClassNames, InstanceLabel, class_of_id
+from framework.runs.external_maps.external_map import ExternalInstance, ExternalMap
 
 INSTANCE_NAMES = ("instance", "instance_id", "instanceid", "object_id", "objectid", "object", "inst", "instance_label")
 CLASS_NAMES = ("class", "class_id", "classid", "semantic", "semantic_id", "semantic_label", "category", "label")
@@ -38,7 +38,7 @@ def read_ply_instances(
     surface: PlyMesh,
     chosen: LabelProperties,
     names: ClassNames | None,
-    labels: Mapping[int, Label] | None,
+    labels: Mapping[int, InstanceLabel] | None,
 ) -> ExternalMap:
     """Return the map in a labeled PLY file.
 
@@ -74,10 +74,10 @@ def read_ply_instances(
         if chosen.class_ != "":
             class_name = _found(path, properties, chosen.class_, CLASS_NAMES, "--class-property")
         source = f"instances: property {instance_name}; classes: {f'property {class_name}' if class_name else 'none'}"
-        found = dict.fromkeys(members, Label(None, None))
+        found = dict.fromkeys(members, InstanceLabel(None, None))
         if class_name is not None:
             classes = _whole_numbers(path, class_name, properties[class_name])
-            found = {key: Label(_majority(path, classes[own], names), None) for key, own in members.items()}
+            found = {key: InstanceLabel(_majority(path, classes[own], names), None) for key, own in members.items()}
     instances = {
         key + offset: ExternalInstance(members[key], label.name, label.confidence) for key, label in found.items()
     }

@@ -1,1 +1,0 @@
-"""Readers of maps from other systems: labeled meshes, point clouds and instance masks."""
