@@ -60,7 +60,7 @@ def test_scannet_predictions_of_scene_are_selected_by_mesh(tmp_path: Path) -> No
     scannet_predictions(tmp_path)
     assert "scene0000_00.txt" in read(tmp_path).source
     (tmp_path / "scene0000_00.txt").rename(tmp_path / "scene0002_00.txt")
-    with pytest.raises(DataError, match="expected instances.json, instances.csv, or the ScanNet predictions"):
+    with pytest.raises(DataError, match="or the ScanNet predictions scene0000_00_vh_clean_2"):
         read(tmp_path)
 
 

@@ -72,7 +72,7 @@ def test_class_ids_without_names_are_error(tmp_path: Path) -> None:
 
 
 def test_class_id_above_label_space_is_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="expected a class id of nyu40 .1 to 40., got 41"):
+    with pytest.raises(DataError, match=r"expected a class id of nyu40 \(1 to 40\), got 41"):
         instances_in(surface_of(tmp_path, instance=[1] * 6, label=[41] * 6))
 
 
