@@ -105,7 +105,7 @@ def write_imported_run(
         "seed": data.config.get("seed"),
         "config_hash": config_hash(config),
         INPUTS: hash_of(inputs),
-        **{key: value if isinstance(value, float) else str(value) for key, value in given.items()},
+        **{key: value if isinstance(value, int | float) else str(value) for key, value in given.items()},
         **code_version(),
     }
     title = headline({**found, "sequence": f"{name} | {found['sequence']}"} if video else found)
