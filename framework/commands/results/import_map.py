@@ -82,7 +82,7 @@ def import_map(parsed: argparse.Namespace) -> list[str]:
     converted = ConvertedMap.of(external, placement)
     name = parsed.name or parsed.directory.resolve().name
     title = write_imported_run(parsed.directory, name, converted, data, placement.up, chosen_options(parsed))
-    compared = [] if data.config else ["no dataset: import the map again with dataset=NAME to evaluate it"]
+    compared = [] if data.dataset else ["no dataset: import the map again with dataset=NAME to evaluate it"]
     return [external.source, *converted.remarks, *compared, title, str(parsed.directory)]
 
 

@@ -41,10 +41,11 @@ NO_POSES = np.zeros((0, 4, 4))
 
 @dataclass(frozen=True)
 class MappedData:
-    """The dataset that a map of another system shows."""
+    """The dataset of the map of another system."""
 
-    config: Mapping[str, Any]  # resolved config of the dataset, and the seed; empty = unknown dataset
-    option: str | None  # chosen option of the config group `dataset`
+    dataset: Mapping[str, Any]  # resolved config; empty = unknown dataset
+    option: str | None  # chosen option of the config group `dataset`; None = unknown dataset
+    seed: int  # seed of the runs that are compared in pairs with the map
 
     @classmethod
     def of(cls, overrides: Sequence[str]) -> MappedData:
@@ -57,12 +58,15 @@ class MappedData:
         for word, key in zip(overrides, keys, strict=True):
             if "=" not in word or key.partition(".")[0] not in ("dataset", "seed"):
                 raise ConfigError(f"import-map: expected dataset=NAME, dataset.KEY=VALUE or seed=N, got {word!r:.60}")
-        if not overrides:
-            return cls({}, None)
-        if "dataset" not in keys:
+        if any(key.startswith("dataset.") for key in keys) and "dataset" not in keys:
             raise ConfigError(f"import-map: expected dataset=NAME, got only {', '.join(overrides)}; add dataset=NAME")
         config, choices = composed_with_choices(*overrides)
-        return cls({key: resolved(config)[key] for key in ("seed", "dataset")}, choices["dataset"])
+        plain = resolved(config)
+        return (
+            cls(plain["dataset"], choices["dataset"], plain["seed"])
+            if "dataset" in keys
+            else cls({}, None, plain["seed"])
+        )
 
 
 def write_imported_run(
@@ -89,8 +93,8 @@ def write_imported_run(
     Raises:
         InstanceMapError: The dataset cannot be read, or a file cannot be written.
     """
-    config = {"row": name, **data.config}
-    video = build(RGBDVideo, OmegaConf.create(dict(data.config["dataset"]))) if data.config else None
+    config = {"row": name, "seed": data.seed, **({"dataset": dict(data.dataset)} if data.dataset else {})}
+    video = build(RGBDVideo, OmegaConf.create(dict(data.dataset))) if data.dataset else None
     given = {f"{ORIGIN}{key}": value for key, value in options.items() if value is not None}
     files = {key: value for key, value in given.items() if isinstance(value, Path)}
     inputs = {**input_hashes(config), **{key: path_hash(path) for key, path in files.items()}}
@@ -102,7 +106,7 @@ def write_imported_run(
         **_up_metrics(converted, up),
         "instances.count": len(converted.instances),
         **({} if video is None else _evaluation(video, converted)),
-        "seed": data.config.get("seed"),
+        "seed": data.seed,
         "config_hash": config_hash(config),
         INPUTS: hash_of(inputs),
         **{key: value if isinstance(value, int | float) else str(value) for key, value in given.items()},
