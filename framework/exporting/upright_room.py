@@ -175,13 +175,14 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
     }
     seen = sorted((one for one in instances if len(owned[one.id])), key=lambda one: one.id)
     likely = {one.id for one in seen if one.confidence >= LIKELY}
-    colors = object_colors({one.id: mesh.vertices[owned[one.id]].mean(axis=0) for one in seen}, likely)
+    centers = {one.id: mesh.vertices[owned[one.id]].mean(axis=0).astype(np.float64) for one in seen}
+    colors = object_colors(centers, likely)
     of_class = class_colors([(one.class_name, one.confidence) for one in seen])
     found = []
     for one in seen:
         own = owned[one.id]
         _, piece, sizes = np.unique(pieces[own], return_inverse=True, return_counts=True)
-        own = own[(sizes >= min(SPECK * len(own), sizes.max()))[piece]]
+        own = own[(sizes >= min(SPECK * len(own), int(sizes.max())))[piece]]
         found.append(
             RoomObject(
                 id=one.id,

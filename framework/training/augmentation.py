@@ -25,7 +25,7 @@ def augmented(example: Example, rng: np.random.Generator) -> Example:
     color, masks = example.color, example.masks
     if rng.uniform() < 0.5:
         color, masks = color[:, ::-1], masks[:, :, ::-1]
-    areas = masks.sum(axis=(1, 2))
+    areas = masks.sum(axis=(1, 2)).astype(np.float64)
     if rng.uniform() < ZOOMED:
         color, masks, scale = _zoomed(color, masks, rng)
         areas = areas * scale

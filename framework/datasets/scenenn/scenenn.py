@@ -134,7 +134,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
     labels = ply.properties.get("label")
     if labels is None or labels.dtype.kind not in "iu":
         raise DataError(f"{mesh}: expected an integer vertex property 'label', got {found_property(ply, labels)}")
-    if len(labels) and (labels.min() < 0 or labels.max() > LARGEST_ID):
+    if len(labels) and (int(labels.min()) < 0 or int(labels.max()) > LARGEST_ID):
         raise DataError(f"{mesh}: label: expected values in [0, {LARGEST_ID}], got {labels.min()} to {labels.max()}")
     names = {one.id: one for one in read_annotation(annotation)}
     present, inverse = np.unique(labels.astype(np.int32), return_inverse=True)
