@@ -19,7 +19,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from framework.config.composition import config_loader
-from framework.config.validation import checked_rows
+from framework.config.validation import check_known, checked_rows
 from framework.errors import ConfigError
 from framework.runs.provenance import OF_SPEED, leaves, relevant
 from framework.runs.stored_runs import GROUPS
@@ -74,25 +74,28 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
     return prod(runs.values())
 
 
-def check_table(config: DictConfig, overrides: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
-    """Raise ConfigError for an invalid `table` of a sweep, such as an unknown key.
+def check_outputs(config: DictConfig, overrides: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
+    """Raise ConfigError for an invalid `table` or `figure` of a sweep, such as an unknown key.
 
     A key may exist only with one of the swept options or rows. These are composed if the key is not found otherwise.
     """
-    table = config.get("table")
-    if table is None:
-        return
+    from framework.figures.figure_choice import FigureChoice
     from framework.tables.table_choice import TableChoice
 
-    choice = TableChoice.of_sweep(OmegaConf.to_container(table) if OmegaConf.is_config(table) else table)
-    choice.check_base(rows)
+    keys: list[tuple[str, str]] = []
+    if (table := config.get("table")) is not None:
+        choice = TableChoice.of_sweep(OmegaConf.to_container(table) if OmegaConf.is_config(table) else table)
+        choice.check_base(rows)
+        keys += choice.keys
+    if (figure := config.get("figure")) is not None:
+        keys += FigureChoice.of(figure).keys
     known = {*_keys_of(config), *swept_keys(overrides), *GROUPS, *(["row"] if rows else [])}
     for alternative in _alternatives(overrides, rows):
-        if not choice.unknown(known):
+        if all(key in known for _, key in keys):
             break
         with suppress(HydraException), config_loader() as loader:  # its job reports the error
             known |= _keys_of(loader.compose([*single_run(overrides), *alternative]))
-    choice.check_keys(known)
+    check_known(keys, known)
 
 
 def _keys_of(config: DictConfig) -> set[str]:
