@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from framework.config.validation import checked_rows
@@ -25,7 +25,7 @@ class Pictured:
     choice: FigureChoice
     rows: Mapping[str, RunRow | None]  # by display name; None = no complete run
     incomplete: Sequence[Incomplete]
-    requested: Sequence[str] = ()  # values of figure.by that the sweep requested
+    requested: Mapping[str, Sequence[str]] = field(default_factory=dict)  # values that the sweep requested, by KEY
     command_line: Sequence[str] = ()  # overrides of the sweep on the command line
     asked: Collection[str] | None = None  # keys in the overrides of the sweep; None = unknown
 
@@ -53,9 +53,8 @@ class Pictured:
                 if row.system == system
             }
             rows |= of_system or {choice.called(system): None}
-        requested = [value for (value,) in requested_runs(sweep, [choice.by])] if choice.by else []
-        if choice.by == "row":
-            requested = list(changes)
+        keys = filter(None, (choice.by, choice.color_by))
+        requested = {key: [value for (value,) in requested_runs(sweep, [key])] for key in keys} | {"row": list(changes)}
         return cls(choice, rows, incomplete, requested, command_line(sweep), asked)
 
     @property
@@ -63,24 +62,20 @@ class Pictured:
         """The runs of each row, or of each value of figure.by, by display name; [] = no complete run."""
         if self.choice.by is None:
             return {name: list(row.records.values()) if row else [] for name, row in self.rows.items()}
-        found: dict[str, list[Record]] = {value: [] for value in self.requested}
-        found |= self.split(self.records, self.choice.by)
-        order = found if self.choice.by == "row" else sorted(found, key=_numbers_first)
-        return {self.choice.called(value): found[value] for value in order}
+        return {self.choice.called(value): records for value, records in self._split(self.choice.by).items()}
 
-    @staticmethod
-    def split(records: Iterable[Record], key: str) -> dict[str, list[Record]]:
-        """Return the runs of each value of a KEY."""
-        found: dict[str, list[Record]] = {}
-        for record in records:
+    def _split(self, key: str) -> dict[str, list[Record]]:
+        """Return the runs of each value of a KEY: numbers by value, then other values in the order of the sweep."""
+        found: dict[str, list[Record]] = {value: [] for value in self.requested.get(key, ())}
+        for record in sorted(self.records, key=lambda record: value_of(record, key)):
             found.setdefault(value_of(record, key), []).append(record)
-        return found
+        return {value: found[value] for value in sorted(found, key=_number)}
 
     @property
     def colors(self) -> list[str]:
         """Values of figure.color_by, in order; one empty value without it."""
         key = self.choice.color_by
-        return [""] if key is None else sorted(self.split(self.records, key), key=_numbers_first)
+        return [""] if key is None else list(self._split(key))
 
     @property
     def color_names(self) -> list[str]:
@@ -143,9 +138,9 @@ class Pictured:
                 yield f"{name} without {', '.join(absent)}"
 
 
-def _numbers_first(value: str) -> tuple[float, str]:
-    """Return a sort key that orders numbers by value, and other texts alphabetically after them."""
+def _number(value: str) -> float:
+    """Return the number in a text; infinity for other texts."""
     try:
-        return float(value), value
+        return float(value)
     except ValueError:
-        return math.inf, value
+        return math.inf

@@ -98,12 +98,19 @@ def test_bar_figure_interval_requires_six_runs(plain: Path) -> None:
 
 
 def test_bar_figure_shows_requested_values_without_runs(tmp_path: Path) -> None:
-    root = sweep(tmp_path / "sweep", task=["refiner=a,b,c"])
+    root = sweep(tmp_path / "sweep", task=["refiner=c,b,a"])
     run(root, {AP50: 0.5}, refiner="a")
     run(root, {AP50: None}, refiner="b")
     found = texts(page(root, "figure.kind=bar", "figure.by=refiner"))
-    assert [text for text in found if text in ("a", "b", "c")] == ["a", "b", "c"]
+    assert [text for text in found if text in ("a", "b", "c")] == ["c", "b", "a"]
     assert (found.count("n = 1"), found.count("n = 0")) == (1, 2)
+
+
+def test_bar_figure_sorts_numbers_by_value(tmp_path: Path) -> None:
+    root = sweep(tmp_path / "sweep", task=["dataset.stop=100,9"])
+    for stop in (100, 9):
+        run(root, {AP50: stop / 1000}, dataset={"scene": "office", "stop": stop})
+    assert bar_ends(root, "figure.by=dataset.stop") == pytest.approx([0.009, 0.1])
 
 
 def test_box_figure_shows_quartiles(plain: Path) -> None:
