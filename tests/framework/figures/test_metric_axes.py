@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 from framework.figures.figure_page import text_width, wrapped
-from framework.figures.metric_axes import LINES, spread, styles
+from framework.figures.metric_axes import LINES, Names, draw_labels, spread, styles
 from framework.figures.tradeoff_figure import pareto_front
 from framework.tables.metric_columns import Direction
 
@@ -56,6 +59,20 @@ def test_styles_of_many_groups_are_distinct() -> None:
     assert len(set(styles(28))) == 28
     assert len({style.color for style in styles(7)}) == 7
     assert {style.line for style in styles(28)} == set(LINES)
+
+
+def test_draw_labels_lines_start_at_points() -> None:
+    axes = Figure((3, 2)).add_subplot()
+    points = [(0.0, 1.0), (2.0, 8.0), (2.0, 8.5)]
+    axes.plot(*zip(*points, strict=True), "o")
+    names = Names(["a", "b", "a name of two lines"], 10.0)
+    draw_labels(axes, points, names, ["black"] * 3, (40.0, 30.0))
+    axes.figure.draw_without_rendering()
+    starts = [axes.transAxes.transform(line.get_xydata()[0]) for line in axes.lines[1:]]
+    np.testing.assert_allclose(starts, axes.transData.transform(points))
+    boxes = [text.get_window_extent() for text in axes.texts]
+    assert [text.get_text() for text in axes.texts] == names.texts
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
 
 
 @settings(derandomize=True, deadline=None, max_examples=50)
