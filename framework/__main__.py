@@ -17,7 +17,7 @@ import framework
 
 COMMANDS = {
     "tables": "write the tables of an experiment or sweep: Markdown, LaTeX, CSV",
-    "figures": "draw the figures of an experiment",
+    "figures": "draw the figure of an experiment or sweep",
     "raycast": "draw a ray-cast view of a map: depth, normals, vertex map, RGB, object indices",
     "report": "write HTML reports of runs and compare them",
     "import": "convert a phone or sensor recording to an RGB-D folder for dataset=rgbd_folder",

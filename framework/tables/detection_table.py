@@ -16,7 +16,9 @@ from framework.evaluation.detection_errors import FOUND_IOU, DetectionErrors
 from framework.files.atomic_write import atomic_write
 from framework.files.json_file import read_json, write_json
 from framework.runs.stored_runs import is_number
-from framework.tables.grid import TextTable, decimals, figure, latex_grid, markdown_grid
+from framework.tables.grid import TextTable, decimals, figure, markdown_grid
+from framework.tables.latex_table import LatexTable, escaped, latex_file, latex_label
+from framework.tables.metric_columns import Direction
 
 METRICS = "detection_metrics.json"  # file in the folder of each job
 OVERRIDES = "overrides"  # key of the overrides in this file
@@ -34,6 +36,9 @@ COLUMNS = {
     "false detections per image": "false per image",
 }
 """Column headings by metric."""
+
+DIRECTIONS = [Direction.HIGHER] * 6 + [Direction.LOWER]
+"""Directions of better values, in the order of COLUMNS."""
 
 COUNTS = ("frames", "detections", "objects", "classes")
 
@@ -101,7 +106,8 @@ def write_detection_table(directory: Path, swept: Collection[str], min_pixels: i
     grid = _grid(jobs, swept)
     notes = list(_notes(jobs, incomplete, min_pixels))
     text = "\n\n".join([f"# {directory.name}", markdown_grid(grid), "\n".join(f"- {note}" for note in notes)]) + "\n"
-    latex = "\n".join([*(f"% {note}" for note in notes), *latex_grid(grid)])
+    caption = escaped(f"{directory.name}: 2D metrics of detections. {notes[0]}")
+    latex = latex_file([LatexTable(grid, caption, latex_label(directory.name))], notes)
     for name, content in (("md", text), ("tex", latex), ("csv", _comma_separated(jobs))):
         with atomic_write(directory / f"table.{name}") as temporary:
             temporary.write_text(content, "utf-8")
@@ -124,7 +130,9 @@ def _grid(jobs: Sequence[Job], swept: Collection[str]) -> TextTable:
         values = [(key, job.value(key)) for key in COLUMNS]
         cells = ["–" if math.isnan(value) else figure(value, math.nan, digits[key]) for key, value in values]
         body.append([job.called(swept), str(job.metrics.get("sequence")), *counts, *cells])
-    return TextTable(["row", "sequence", *COUNTS, *COLUMNS.values()], body, 2)
+    heads = ["row", "sequence", *COUNTS]
+    directions = {len(heads) + k: direction for k, direction in enumerate(DIRECTIONS)}
+    return TextTable([*heads, *COLUMNS.values()], body, 2, directions=directions)
 
 
 def _notes(jobs: Sequence[Job], incomplete: Sequence[str], min_pixels: int) -> Iterator[str]:

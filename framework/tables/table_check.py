@@ -8,7 +8,8 @@ from itertools import groupby
 from pathlib import Path
 
 from framework.files.atomic_write import read_text
-from framework.tables.experiment_tables import rendered_tables
+from framework.runs.stored_runs import read_yaml
+from framework.tables.experiment_tables import SETTINGS, rendered_tables
 
 TABLE_FORMATS = (".md", ".tex", ".csv")
 
@@ -30,7 +31,8 @@ def changed_tables(directory: Path) -> Iterator[str]:
     stored = [path for path in (directory / f"table{suffix}" for suffix in TABLE_FORMATS) if path.exists()]
     if not stored:
         return
-    rendered = rendered_tables(directory)
+    settings = read_yaml(directory / SETTINGS) if (directory / SETTINGS).exists() else {}
+    rendered = rendered_tables(directory, list(map(str, settings.get("overrides") or ())))
     for path in stored:
         expected, found = (_grids(path.suffix, text) for text in (rendered[path.name], read_text(path)))
         if _shape(expected) != _shape(found):
