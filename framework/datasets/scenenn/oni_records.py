@@ -48,11 +48,11 @@ class Stream(IntEnum):
 
 @dataclass
 class Images:
-    """The complete images of a stream."""
+    """Node and image counts of a stream."""
 
     node: int  # node id of this stream's records
-    count: int = 0
-    last: int = 0  # number of the last image, from 1
+    count: int = 0  # number of complete images
+    last: int = 0  # number of the last complete image, from 1
 
 
 @dataclass(frozen=True)
