@@ -97,7 +97,7 @@ def playable(contents: OniContents, scratch: Path) -> Iterator[Path]:
         copy = Path(folder) / "repaired.oni"
         shutil.copyfile(contents.path, copy)
         with copy.open("r+b") as file:
-            file.seek(LARGEST_NODE_AT)  # missing in the header if the recorder was killed
+            file.seek(LARGEST_NODE_AT)  # missing from the header if the recorder was killed
             file.write(struct.pack("<I", contents.largest_node))
             for note in contents.table_notes:
                 file.seek(note)

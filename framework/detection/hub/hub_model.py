@@ -53,7 +53,8 @@ def find_model(model: str, revision: str, more: Sequence[str] = ()) -> Path:
         cached = _cached(model, revision, more)
     if cached is None:
         raise DataError(
-            f"detector.model: expected a complete cache after the download of {model}, got an incomplete cache; run again"
+            f"detector.model: expected a complete cache after the download of {model}, got an incomplete cache; run "
+            "the command again"
         )
     return cached
 

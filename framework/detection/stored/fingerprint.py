@@ -62,7 +62,7 @@ def _code(kind: type) -> Iterator[str]:
 def _parameters(detector: object) -> Iterator[str]:
     if not dataclasses.is_dataclass(detector):
         raise ConfigError(
-            f"{type(detector).__qualname__}: expected a dataclass, got another class; make it a dataclass "
+            f"{type(detector).__qualname__}: expected a dataclass, got a plain class; make it a dataclass "
             "or implement fingerprint()"
         )
     for field in dataclasses.fields(detector):
