@@ -33,7 +33,7 @@ JPEG_QUALITY = 95  # percent
 class Writing:
     """Options for writing an RGB-D folder."""
 
-    width: int = 0  # px, before rotation, at most the stored width; 0 = LONGER_SIDE for the longer side
+    width: int = 0  # width of the images before rotation, px, at most the stored width; 0 = 640 px for the longer side
     stride: int = 1  # step between frames; 1 = every frame
     confidence: int = 1  # minimum confidence of depth readings, 0, 1 or 2, for recordings with confidence images
     rotate: int = 0  # rotation of the written images, degrees clockwise, 0, 90, 180 or 270
@@ -75,7 +75,7 @@ def check_new(directory: Path) -> None:
     if directory.is_dir() and not any(directory.iterdir()):
         return
     if directory.exists() or directory.is_symlink():
-        found = "got a file or non-empty folder; remove it or set another"
+        found = "got a file or non-empty folder; remove it or set another folder"
         raise DataError(f"{directory}: expected a new or empty folder, {found}")
 
 

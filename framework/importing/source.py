@@ -108,5 +108,5 @@ def meters(raw: NDArray[np.uint16]) -> Float32:
 
 
 def readings(depth: NDArray[np.floating]) -> Float32:
-    """Convert depth (h, w), m, to float32 and replace invalid values by 0."""
+    """Convert depth (h, w), m, to float32 and replace invalid values with 0."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

@@ -20,7 +20,7 @@ BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # fractions of blurred, noisy and gray im
 def augmented(example: Example, rng: np.random.Generator) -> Example:
     """Apply random mirroring, zoom, color changes, blur and noise to a training image.
 
-    Small and mostly cropped objects are removed.
+    Small objects and mostly cropped objects are removed.
     """
     color, masks = example.color, example.masks
     if rng.uniform() < 0.5:

@@ -125,7 +125,7 @@ def architecture(network: DictConfig) -> Architecture:
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace non-finite numbers by None, because JSON does not support them."""
+    """Replace non-finite numbers with None, because JSON does not support them."""
     inner = {name: _known(value) if isinstance(value, Mapping) else value for name, value in values.items()}
     return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in inner.items()}
 

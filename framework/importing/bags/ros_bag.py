@@ -138,7 +138,7 @@ class Device:
 def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
     """Associate color and depth images by time.
 
-    Header timestamps are used, unless they give less than half as many pairs as the recording times.
+    Header timestamps are used, unless they give fewer than half as many pairs as the recording times.
     """
     sensed: dict[str, list[float]] = {topics.color: [], topics.depth: []}
     stored: dict[str, list[float]] = {topics.color: [], topics.depth: []}

@@ -40,7 +40,7 @@ def stream_motion(bag: RosBag, stream: str) -> Float64 | None:
 
 
 def static_rotation(bag: RosBag, to: str, of: str) -> Float64 | None:
-    """Return the rotation (3, 3) between two frames from /tf_static, or None if unknown.
+    """Return the rotation (3, 3) from the frame `of` to the frame `to` in /tf_static, or None if unknown.
 
     Args:
         bag: The bag.

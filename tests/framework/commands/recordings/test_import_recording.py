@@ -68,7 +68,7 @@ def test_import_existing_output_raises_before_reading(
         command(monkeypatch, tmp_path / "nothing", tmp_path / "out")
     assert ended.value.code == 1
     expected = "expected a new or empty folder, got a file or non-empty folder"
-    assert capsys.readouterr().err == f"error: {tmp_path}/out: {expected}; remove it or set another\n"
+    assert capsys.readouterr().err == f"error: {tmp_path}/out: {expected}; remove it or set another folder\n"
 
 
 @pytest.mark.acceptance

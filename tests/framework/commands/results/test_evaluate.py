@@ -281,7 +281,7 @@ def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
     with locked(stored):
         status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert f"refused: {stored}: expected an unlocked directory, got one in use by process {os.getpid()}" in err
+    assert f"refused: {stored}: expected an unlocked directory, got a directory in use by process {os.getpid()}" in err
     assert (stored / "metrics.json").read_bytes() == before
     assert command(stored)[0] == 0
 

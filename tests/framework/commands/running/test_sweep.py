@@ -359,7 +359,7 @@ def test_sweep_in_locked_folder_is_rejected(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (1, "")
     assert len(done.stderr.splitlines()) == 1
     assert (
-        f"error: {tmp_path / PLACE}: expected an unlocked directory, got one in use by process {os.getpid()} on "
+        f"error: {tmp_path / PLACE}: expected an unlocked directory, got a directory in use by process {os.getpid()} "
         in done.stderr
     )
     assert not (tmp_path / PLACE / "multirun.yaml").exists()

@@ -134,7 +134,7 @@ def test_camera_missing_device_raises_one_line_error(brand: Brand, device: FakeC
 
 @pytest.mark.parametrize(
     ("parameters", "message"),
-    [({"serial": "999"}, "expected device 999 with 96x72"), ({"width": 640}, "expected device with 640x72")],
+    [({"serial": "999"}, "expected device 999 with 96x72"), ({"width": 640}, "expected a device with 640x72")],
 )
 def test_camera_unsupported_request_raises_one_line_error(
     brand: Brand, device: FakeCamera, parameters: dict[str, object], message: str
