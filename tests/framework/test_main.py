@@ -189,7 +189,7 @@ def test_command_misspelled_name_suggests_nearest_name(tmp_path: Path) -> None:
 def test_command_unknown_name_suggests_run(tmp_path: Path) -> None:
     error = words("run", directory=tmp_path).stderr
     assert error.startswith("error: command: expected one of tables, figures, ")
-    assert error.endswith(", got 'run'; omit the command to start a run: instancemap KEY=VALUE ...\n")
+    assert error.endswith(", got 'run'; omit the command to start a run: python -m framework KEY=VALUE ...\n")
 
 
 FAULTY = {
