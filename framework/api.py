@@ -157,13 +157,14 @@ class Mapper(Map):
     command line, as strings or as keywords. The defaults are those of a run.
 
     Overrides of `dataset` are not supported. `prefetch` and `skip_completed` have no effect. `resume_from=DIR` resumes
-    the map of a run. `viewer="rerun"` shows the map until the mapper is deleted.
+    the map of a run. `viewer="rerun"` records or shows the map until the mapper is deleted.
 
     All methods are thread-safe. While another thread may call `add`, hold the lock to read `scene` itself:
     `with mapper.lock: mesh = mapper.scene.mesh()`.
 
     Raises:
         ConfigError: A name is unknown, or a value is invalid.
+        DataError: The map of `resume_from` or `localize_in` cannot be read.
     """
 
     def __init__(self, *overrides: str, **named: object) -> None:
@@ -351,7 +352,8 @@ def export(
         out: The output folder; None = `export` in the run directory.
         objects: Classes or ids of the exported objects; () = the whole scene.
         up: The up direction (3,) in the world frame; None = the up direction of the run.
-        floor: The floor height along the up direction, m; None = the floor height of the run.
+        floor: The floor height along the up direction, m; None = the floor height of the run, or unknown if `up` is
+            given.
         choices: min_confidence, triangles, coloring, collision, resolution, robot_height; see `instancemap export
             --help`.
 

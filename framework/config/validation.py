@@ -75,7 +75,7 @@ def require(holds: bool, name: str, value: object, allowed: str) -> None:
 def check_package(key: str, package: str, extra: str) -> None:
     """Raise ConfigError with the installation command if an optional package is missing."""
     if importlib.util.find_spec(package) is None:
-        raise ConfigError(f"{key}: expected the package {package}, got none; run pip install instancemap[{extra}]")
+        raise ConfigError(f"{key}: expected the package {package}, got none; run pip install 'instancemap[{extra}]'")
 
 
 def checked_path(name: str, value: object) -> Path:
@@ -134,7 +134,8 @@ def checked_rows(node: Any) -> dict[str, list[str]]:
     """
     if node is not None and not isinstance(node, Mapping):
         raise ConfigError(
-            f"rows: expected a mapping of names to overrides, got {node!r}; for example, mine: [refiner=identity]"
+            f"rows: expected a mapping of names to overrides, got {node!r}; write, for example, "
+            "mine: [refiner=identity]"
         )
     rows = {str(name): overrides for name, overrides in (node or {}).items()}
     for name, overrides in rows.items():

@@ -117,7 +117,7 @@ class UprightRoom:
             if not by_id and not of_class:
                 best = max(one.confidence for one in by_class)
                 raise DataError(
-                    f"object: expected a confidence >= {min_confidence:g} of {word!r}, got at most {best:.2f}; "
+                    f"object: expected a confidence >= {min_confidence:g} for {word!r}, got at most {best:.2f}; "
                     "lower min_confidence"
                 )
             found |= {one.id: one for one in (*by_id, *of_class)}
@@ -139,7 +139,7 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
     Args:
         run: Run directory.
         up: Up direction (3,) in the world frame; None = stored direction.
-        floor: Floor height along the up direction, m; None = stored height.
+        floor: Floor height along the up direction, m; None = stored height, or unknown if `up` is given.
 
     Raises:
         DataError: Files are missing, invalid or inconsistent.

@@ -88,7 +88,7 @@ def opened_bundle(path: Path, trust_code: bool) -> Iterator[Path]:
         if has_code and not trust_code:
             raise DataError(
                 f"{path}: expected --trust-code for a bundle with plugin code, got none; inspect {PLUGINS}/ in the "
-                "file first"
+                "file, then set --trust-code"
             )
         archive.extractall(temporary)
         folder = Path(temporary)

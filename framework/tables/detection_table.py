@@ -49,7 +49,7 @@ class Job:
 
     folder: str  # relative to the sweep
     overrides: Sequence[str]
-    metrics: Mapping[str, Any]  # None = undefined
+    metrics: Mapping[str, Any]  # by name; a value of None = undefined
 
     def called(self, swept: Collection[str]) -> str:
         """Return the overrides of the swept keys, or the folder of the job if there are none."""
@@ -139,11 +139,12 @@ def _notes(jobs: Sequence[Job], incomplete: Sequence[str], min_pixels: int) -> I
     if any(job.value("objects") for job in jobs):
         yield (
             "AP: COCO, in [0, 1], by the IoU of masks or boxes, mean over IoU 0.5 to 0.95 and the classes. AP50: at "
-            f"IoU 0.5. objects: ground-truth objects of at least {min_pixels} px in all frames. classes: of objects."
+            f"IoU 0.5. objects: number of ground-truth objects of at least {min_pixels} px, summed over the frames. "
+            "classes: number of their classes."
         )
         yield (
             f"found: fraction of the objects with a mask IoU of at least {FOUND_IOU:g}, regardless of class. correct "
-            "class: fraction of these with the most likely class of the ground truth."
+            "class: fraction of these whose most likely class is that of the ground truth."
         )
     if not all(job.value("objects") for job in jobs):
         yield "–: the sequence has no ground-truth instances of the detector's classes."

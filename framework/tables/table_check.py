@@ -19,7 +19,8 @@ Grid = list[list[str]]  # cells of each line of a table; the first line contains
 def changed_tables(directory: Path) -> Iterator[str]:
     """Yield one message for each table cell that differs from the stored runs.
 
-    The tables are table.md, table.tex and table.csv. Captions and notes are not compared.
+    A table with different rows or columns has a single message. The tables are table.md, table.tex and table.csv.
+    Captions and notes are not compared.
 
     Args:
         directory: The folder of the tables. The runs are in this folder and its subfolders.
@@ -37,7 +38,7 @@ def changed_tables(directory: Path) -> Iterator[str]:
         expected, found = (_grids(path.suffix, text) for text in (rendered[path.name], read_text(path)))
         if _shape(expected) != _shape(found):
             rewrite = f"run instancemap tables {directory}"
-            yield f"{path}: expected the rows and columns of the runs' table, got others; {rewrite}"
+            yield f"{path}: expected the rows and columns of the runs' table, got different ones; {rewrite}"
             continue
         for grid, stored_grid in zip(expected, found, strict=True):
             for line, stored_line in zip(grid, stored_grid, strict=True):

@@ -46,7 +46,7 @@ class OptionContract:
 
     stage: str  # config group; set by the contract of the stage
     option: str  # name of the tested option in the config group of the stage
-    overrides: tuple[str, ...] = ()  # values that the user must set: ("detector.weights=FILE",)
+    overrides: tuple[str, ...] = ()  # values that the user must set, such as ("detector.weights=FILE",)
 
     def plugin(self) -> Any:
         return build(GROUPS[self.stage], self.node())
@@ -175,7 +175,7 @@ def assert_valid(found: Detections, detector: Detector, frame: Frame) -> None:
 
 
 class TrackerContract:
-    """Tests of a tracker with an immutable map. Changes of the map raise an error."""
+    """Tests of a tracker with an immutable map. Changes to the map raise an error."""
 
     stage = "tracker"
 

@@ -40,7 +40,7 @@ class GmmFrame(ClusterRefiner):
     the hierarchy. The levels, the number of children (Eckart et al., CVPR 2016) and the initialization are our choice.
     """
 
-    levels: int = 2  # number of levels of hierarchical EM, >= 1; 1 = flat mixture; 2 is our choice
+    levels: int = 2  # number of levels of hierarchical EM, in [1, 8]; 1 = flat mixture; 2 is our choice
     # number of children of a node: 2, 4 or 8; 8 is our interpretation of section 3.2.2
     children: int = 8
     # number of level-1 Gaussians per mask, >= 1; section 3.2.2 has one group for each of K classes; 1 per mask is our

@@ -48,7 +48,7 @@ class RerunViewer(Viewer):
     """
 
     mode: Mode = Mode.RECORD  # output: RECORD (file), WINDOW (rerun's viewer) or BROWSER (local web page)
-    # path of the .rrd file; "" = recording.rrd in the run directory for RECORD, no file for the other modes
+    # path of the .rrd file, relative to the run directory; "" = recording.rrd for RECORD, no file for the other modes
     file: str = ""
     frame_interval: int = 3  # interval between logged images, in frames, >= 1; 1 = every frame
     mesh_interval: float = 2.0  # minimum interval between mesh snapshots, s, in [0.1, 3600]

@@ -158,7 +158,7 @@ def test_map_figure_inconsistent_objects_are_not_drawn(
 ) -> None:
     list_objects(maps / "dataset.scene=011,row=part,seed=0", "bed", vertices)
     texts(maps)
-    assert "the files are from different runs, repeat the run" in caplog.text
+    assert "repeat the run, because the files are from different runs" in caplog.text
 
 
 def test_map_figure_has_one_line_per_seed(tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_write_tables_values_match_manual_result(sweep: Path) -> None:
         ("table.tex", "0.700", "0.900", "chain: AP50 $\\uparrow$: expected 0.700 $\\pm$ 0.265 as in the runs, got 0.9"),
         ("table.csv", ",0.6,", ",0.61,", "row=chain,seed=1: instances.ap50: expected 0.6 as in the runs, got 0.61"),
         ("table.md", "| identity | 3 | -", "| x | 3 | -", "minus chain: expected identity as in the runs, got x"),
-        ("table.md", " poses ", " x | poses ", "expected the rows and columns of the runs' table, got others"),
+        ("table.md", " poses ", " x | poses ", "expected the rows and columns of the runs' table, got different ones"),
     ],
 )
 def test_changed_tables_name_edited_cell(sweep: Path, name: str, before: str, after: str, message: str) -> None:

@@ -338,7 +338,7 @@ def test_transformers_resize_of_fixed_size_model_raises(folders):
 
 def test_transformers_missing_package_error_names_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ConfigError, match=r"pip install instancemap\[transformers\]"):
+    with pytest.raises(ConfigError, match=r"pip install 'instancemap\[transformers\]'"):
         built("nowhere")
 
 

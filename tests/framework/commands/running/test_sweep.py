@@ -396,7 +396,7 @@ def test_cluster_launchers_run_locally(tmp_path: Path, package: str, arguments: 
 
 def test_launcher_missing_error_names_extra() -> None:
     error = MissingConfigException("?", missing_cfg_file="hydra/launcher/submitit_slurm", options=["basic"])
-    assert one_line(error).endswith("pip install instancemap[slurm]")
+    assert one_line(error).endswith("pip install 'instancemap[slurm]'")
 
 
 @pytest.mark.parametrize(("threads", "jobs"), [(1, 12), (5, 2), (12, 1), (13, 1), (0, 1)])

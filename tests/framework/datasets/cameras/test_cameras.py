@@ -121,7 +121,7 @@ def test_camera_missing_package_raises_one_line_error(brand: Brand, monkeypatch:
     monkeypatch.setitem(sys.modules, brand.library, None)
     with pytest.raises(
         ConfigError,
-        match=rf"^{brand.library}: expected an installed package .*, .* pip install instancemap\[{brand.name}\]$",
+        match=rf"^{brand.library}: expected an installed package .*, .* pip install 'instancemap\[{brand.name}\]'$",
     ):
         next(brand.video().frames())
 

@@ -58,7 +58,7 @@ def test_onnx_network_dynamic_input_requires_size(tmp_path):
 
 def test_onnx_network_without_onnxruntime_names_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ConfigError, match=r"pip install instancemap\[onnx\]"):
+    with pytest.raises(ConfigError, match=r"pip install 'instancemap\[onnx\]'"):
         OnnxNetwork(doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8)), "", "cpu", 0)
 
 
