@@ -1,4 +1,4 @@
-"""Tests for the directory names of sweeps and of the exit of commands."""
+"""Tests for the directory names of sweeps, the exit of commands, and config directories."""
 
 from __future__ import annotations
 

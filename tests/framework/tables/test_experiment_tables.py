@@ -248,7 +248,7 @@ def test_table_on_scenenn_has_published_run_times(sweep: Path, annotation: str |
     ("dataset", "annotation", "only"),
     [
         ("scenenn", BenchmarkSettings().release, ""),
-        # one row is on synthetic rooms, the others are on real data
+        # one row is on synthetic rooms, and the others are on real data
         ("scenenn", BenchmarkSettings().release, "chain"),
         ("scannet", "ScanNet v2", ""),
         ("synthetic", None, ""),

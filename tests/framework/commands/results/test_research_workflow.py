@@ -1,4 +1,4 @@
-"""Test of docs/tutorials/research_project.md: plugins, an experiment over datasets and detectors, and its bundle."""
+"""Tests for docs/tutorials/research_project.md: plugins, an experiment over datasets and detectors, and its bundle."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_workflow_data_frame_has_run_of_each_combination(folder: Path) -> None:
+def test_workflow_data_frame_has_one_run_per_combination(folder: Path) -> None:
     runs = load_runs(folder / EXPERIMENT)
     combinations = runs[["dataset", "detector", "row"]].itertuples(index=False, name=None)
     assert sorted(combinations) == sorted((d, n, row) for d in DATASETS for n in DETECTORS for row in ROWS)

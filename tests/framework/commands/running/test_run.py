@@ -309,7 +309,7 @@ def test_run_removes_leftover_partial_files(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_run_viewer_is_called_from_start_to_outputs(
+def test_run_calls_viewer_from_begin_run_to_end_run(
     tmp_path: Path, overrides: list[str], status: int, frames: int, outcome: list[object]
 ) -> None:
     process = begin(tmp_path, "viewer=noted", "seed=3", "hydra.run.dir=run", *overrides)

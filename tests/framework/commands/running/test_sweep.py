@@ -46,8 +46,8 @@ def begin(directory: Path, *arguments: str, sweep: str = "experiment=fake_ablati
     clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
     environment = clean | {
         "PYTHONPATH": str(CHECKOUT),
-        "RAY_AUTH_MODE": "disabled",
-    }  # otherwise Ray writes into the home directory
+        "RAY_AUTH_MODE": "disabled",  # otherwise Ray writes into the home directory
+    }
     return subprocess.Popen(
         [sys.executable, "-m", "framework", *fakes, *arguments],
         cwd=directory,
@@ -179,7 +179,10 @@ def test_sweep_without_experiment_reports_failures(tmp_path: Path) -> None:
 
 
 def swept(directory: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, int]]:
-    """Run a sweep without an experiment in `folder`, and return the process and the completion times."""
+    """Run a sweep without an experiment in `directory`.
+
+    Return the process, and the completion time of each run, ns, keyed by the varying part of the directory name.
+    """
     done = end(begin(directory, *FAKES, "dataset.frames=3", "hydra.sweep.dir=s", *arguments, sweep="-m"))
     assert done.returncode == 0, done.stderr
     runs = (directory / "s").glob("*/metrics.json")

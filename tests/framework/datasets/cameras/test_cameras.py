@@ -145,7 +145,7 @@ def test_camera_unsupported_request_raises_one_line_error(
     assert not device.running
 
 
-def test_camera_disconnected_device_error_stops_stream(
+def test_camera_disconnect_raises_and_stops_stream(
     brand: Brand, device: FakeCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device.unplugged_at = 2
