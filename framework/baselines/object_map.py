@@ -96,7 +96,7 @@ class ObjectMap(InstanceTableMap):
             frame: The frame.
             T_world_camera: The camera pose (4, 4).
             masks: The mask (H, W) of each detected object by id.
-            band: The maximum distance from the measured surface of voxels that count observations, m.
+            band: The maximum distance between the measured surface and the voxels that count observations, m.
 
         Raises:
             MapFullError: If the map needs too many blocks.

@@ -375,7 +375,7 @@ def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
 
 
 def points_of(surface: SurfaceView) -> Float32:
-    """Return the surface points (H, W, 3), m, or the camera center where there is no surface."""
+    """Return the surface points (H, W, 3) in the world frame, m, or the camera center where there is no surface."""
     points = _rays(surface.camera, surface.T_world_camera)
     points *= surface.depth[..., None]
     points += surface.T_world_camera[:3, 3].astype(np.float32)

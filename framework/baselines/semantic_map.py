@@ -68,7 +68,7 @@ class SemanticMap(SceneMap):
         """Set the label space of the map.
 
         Raises:
-            DataError: If the map has a different label space.
+            DataError: If the map has a different label space, or if there are too many classes.
         """
         if not self.classes:
             self.labels.begin(len(classes))
@@ -135,9 +135,9 @@ class SemanticMap(SceneMap):
     def instances(self) -> Mapping[int, Instance]:
         """Return the connected components of the mesh as instances.
 
-        The class distribution is the mean over the voxels nearest to the vertices, without the background. The
-        confidence is the mean probability of the class, including the background. The number of observations is the
-        maximum number of frames under a mask of any of these voxels.
+        The class distribution is the mean over the voxels nearest to the vertices, renormalized without the background.
+        The confidence is the mean probability of the class of the instance before this normalization. The number of
+        observations is the maximum, over these voxels, of the number of frames under a mask.
         """
         mesh, up, instances = self.mesh(), self.gravity().up, {}
         found = self._sum_components(self.volume.surface().voxels, mesh.instance_ids)

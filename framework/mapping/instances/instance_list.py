@@ -39,7 +39,8 @@ class Confirmation:
     """
 
     min_observations: int = 3  # minimum number of frames with a detection to confirm an instance, >= 1
-    min_confidence: float = 0.05  # minimum InstanceRecord.confidence to confirm an instance, in [0, 1]
+    # minimum confidence to confirm an instance (mean score times detection rate while visible), in [0, 1]
+    min_confidence: float = 0.05
     min_area: float = 0.01  # minimum surface area of a confirmed instance, m^2, >= 0; voxel_size^2 per mesh vertex
 
     def __post_init__(self) -> None:
