@@ -349,7 +349,7 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, line
         weights: The weights and limits, a Weights.
         linear: The limits of the linear weights, or None for Tukey's weights.
         noise_model: The noise parameters of the depth sensor.
-        brightness: The mean difference of frame and model intensity.
+        brightness: The mean of frame minus model intensity.
         sums: The output (CHUNKS, TERMS).
     """
     height, width = frame.depth.shape

@@ -60,7 +60,7 @@ class _Tracked(NamedTuple):
 
 
 class DelayEstimator:
-    """Online estimator of the delay of color relative to depth with equal timestamps.
+    """Online estimator of the delay of color relative to depth at equal timestamps.
 
     The delay is positive if color is captured later.
     """
