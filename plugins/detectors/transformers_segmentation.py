@@ -99,7 +99,7 @@ class TransformersSegmentation(Detector):
         with errors_of("detector.model"):
             self._preprocessing = Preprocessing.parse(read_json(path), str(path))
         if short:
-            require(self._family.any_size, "detector.short_side", short, "0, because this model has a fixed input size")
+            require(self._family.any_size, "detector.short_side", short, "0 (this model has a fixed input size)")
             size = {"shortest_edge": short, "longest_edge": long}
             self._preprocessing = replace(self._preprocessing, size=size)
         self._mapping = to_coco(checkpoint.labels, "detector.model")
@@ -151,7 +151,10 @@ def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]
         labels: The number of labels C.
     """
     if logits.shape[1] not in (labels, labels + 1):
-        raise DataError(f"detector.model: expected {labels} class logits (as in config.json), got {logits.shape[1]}")
+        raise DataError(
+            f"detector.model: expected {labels} or {labels + 1} class logits ({labels} labels in config.json), got "
+            f"{logits.shape[1]}; choose another model"
+        )
     # Softmax without "no object". For independent sigmoids p_c, the distribution with exactly one true label is
     # P(c) ~ p_c prod_{j != c} (1 - p_j) ~ p_c / (1 - p_c) = exp(logit_c).
     objects = logits[:, :labels]
@@ -268,7 +271,7 @@ class Preprocessing:
     def __call__(self, color: UInt8, device: torch.device) -> tuple[Tensor, tuple[float, float]]:
         """Return the network input (1, 3, H, W) for an image (h, w, 3).
 
-        The second result is the fractions of H and W that the image covers.
+        The second result contains the fractions of H and W that the image covers.
         """
         pixels = torch.from_numpy(color).to(device).permute(2, 0, 1)[None].float()
         height, width = self.resized((color.shape[0], color.shape[1]))

@@ -51,7 +51,7 @@ class GmmFrame(ClusterRefiner):
     # section 3.2.2), DROP or STAY
     foreign_points: ForeignPoints = ForeignPoints.MOVE
     max_iterations: int = 10  # maximum number of EM iterations in a node, >= 1
-    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
+    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point, >= 0
     std_floor: float = 0.005  # minimum standard deviation of a Gaussian along any axis, m, in [0.0001, 1]; our choice
     # minimum fraction of the frame's points in a Gaussian, in [0, 1); smaller Gaussians are dropped; our choice
     min_support: float = 1e-4
