@@ -189,7 +189,7 @@ def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: i
     wrong = ratios[..., 0] < best
     if wrong.any():
         raise DataError(
-            f"log_ratio: expected the maximum of a voxel in slot 0 ({best[wrong][0]:g}), got {ratios[wrong][0, 0]:g}"
+            f"log_ratio: expected {best[wrong][0]:g} (the maximum of the voxel) in slot 0, got {ratios[wrong][0, 0]:g}"
         )
     excess = np.where(named.sum(axis=-1) == classes, rest - np.maximum(best, 0), np.float32(-np.inf))
     if (excess > MAX_EXPONENT).any():

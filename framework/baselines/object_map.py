@@ -63,7 +63,7 @@ class ObjectMap(InstanceTableMap):
 
     @property
     def block_count(self) -> int:
-        """Number of blocks of all volumes."""
+        """Number of blocks in all volumes."""
         return self.background.voxels.block_count + sum(volume.block_count for volume in self.volumes.values())
 
     @property
@@ -233,7 +233,7 @@ class ObjectMap(InstanceTableMap):
             foreground, observed = (arrays[OBJECT + name] for name in ("foreground", "observed"))
             if (wrong := foreground > observed).any():
                 raise DataError(
-                    f"{OBJECT}foreground: expected at most the value in {OBJECT}observed, {observed[wrong][0]}, got "
+                    f"{OBJECT}foreground: expected at most {observed[wrong][0]} (the value in {OBJECT}observed), got "
                     f"{foreground[wrong][0]}"
                 )
             start = 0

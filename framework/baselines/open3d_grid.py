@@ -45,7 +45,7 @@ CPU = o3d.core.Device("CPU:0")
 
 @dataclass(frozen=True)
 class BlockGridSettings:
-    """Parameters of a BlockGrid."""
+    """Parameters of the voxel blocks."""
 
     voxel_size: float  # side of a voxel, m
     block_resolution: int  # number of voxels per side of a block

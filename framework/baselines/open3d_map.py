@@ -88,7 +88,7 @@ class Open3DMap(InstanceTableMap):
         self.changed()
 
     def changed(self) -> None:
-        """Discard the cached mesh after a change of the map."""
+        """Discard the cached mesh after a change to the map."""
         self.__dict__.pop("_mesh", None)
 
     def instances_at(self, points_world: Float32) -> Int32:

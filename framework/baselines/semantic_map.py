@@ -121,7 +121,7 @@ class SemanticMap(SceneMap):
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
     def _smooth(self, surface: UnlabeledMesh, class_ids: Int32) -> None:
-        """Regularize the classes (V,) in place by a Potts model over the edges of the mesh."""
+        """Regularize the classes (V,) in place with a Potts model over the edges of the mesh."""
         # iterated conditional modes (Besag, 1986)
         starts, neighbors = vertex_neighbors(surface.triangles, len(class_ids))
         grid, evidence = self.volume.voxels.grid, self.labels.evidence

@@ -328,7 +328,7 @@ def _back_project(u: int, v: int, z: np.float32, pinhole: Float32, points: Float
 def ramps(
     depth_in_mask: Float32, starts: Int64, widths: Float32, expected_bleed: float, largest: float, log_odds: Float32
 ) -> None:
-    """Compute the log-odds of Neighborhoods.mask_log_odds().
+    """Compute the log-odds of each point for the object, from its distance to the border of the mask.
 
     Args:
         depth_in_mask: The distance (S,) of each point to the border of the mask, px.

@@ -170,7 +170,7 @@ def poses_at(times: Float64, poses: Float64, at: Float64) -> Float64:
 
 
 def regress(comparisons: Float64, start: float) -> DelayEstimate:
-    """Return the estimated delay by robust regression.
+    """Return the delay, estimated by robust regression.
 
     Args:
         comparisons: The delay, s, and the image motion (x, y), image widths / s, of each compared frame (K, 3).

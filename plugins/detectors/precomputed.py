@@ -1,4 +1,4 @@
-"""Detections of other programs, read from files."""
+"""Detections from other programs, read from files."""
 
 from __future__ import annotations
 

@@ -393,7 +393,7 @@ def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: flo
 
 
 def _dirichlet(random: np.random.Generator, alpha: Float64) -> Float64:
-    """Return a sample (C,) of a Dirichlet distribution.
+    """Return a sample (C,) from a Dirichlet distribution.
 
     The result is its mean if the sampled weights are all 0.
     """

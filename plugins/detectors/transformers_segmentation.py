@@ -230,7 +230,10 @@ class Preprocessing:
         if content.get("pad_size"):
             raise DataError(f"{where}: pad_size: expected no value, got {content['pad_size']}; choose another model")
         if content.get("resample", 2) not in RESAMPLING:
-            raise DataError(f"{where}: resample: expected one of {[*RESAMPLING]}, got {content['resample']}")
+            raise DataError(
+                f"{where}: resample: expected 2 (bilinear) or 3 (bicubic), got {content['resample']}; choose another "
+                "model"
+            )
         size = content.get("size") if content.get("do_resize", True) else None
         if isinstance(size, int):  # files before 2023
             size = {"shortest_edge": size, "longest_edge": content.get("max_size", size)}
@@ -239,7 +242,7 @@ class Preprocessing:
         if content.get("do_resize", True) and keys not in known:
             raise DataError(
                 f"{where}: size: expected height and width, max_height and max_width, or shortest_edge and "
-                f"longest_edge, got {size}"
+                f"longest_edge, got {size}; choose another model"
             )
         normalizes = content.get("do_normalize", True)
         pads = content.get("do_pad") and str(content.get("image_processor_type", "")).startswith("Eomt")
@@ -342,7 +345,7 @@ class Checkpoint:
         if missing:
             raise DataError(
                 f"detector.model: {self.folder}: expected a checkpoint for segmentation, got no weights for "
-                f"{len(missing)} of the network's tensors ({', '.join(missing[:3])}, ...)"
+                f"{len(missing)} of the network's tensors ({', '.join(missing[:3])}, ...); choose another model"
             )
         module: torch.nn.Module = network.float().eval()
         return module

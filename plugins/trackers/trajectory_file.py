@@ -1,4 +1,4 @@
-"""Poses of another SLAM system, read from a file."""
+"""Poses from another SLAM system, read from a file."""
 
 from __future__ import annotations
 

@@ -57,14 +57,11 @@ class Confirmation:
         return cls(saved.whole("min_observations"), saved.number("min_confidence"), saved.number("min_area"))
 
     def is_met(self, record: InstanceRecord) -> bool:
-        """Return True if an instance meets all conditions except the minimum area."""
+        """Return True if an instance meets all conditions but the minimum area."""
         return record.observations >= self.min_observations and record.confidence >= self.min_confidence
 
     def counts(self, table: InstanceTable) -> Bool:
-        """Return a Boolean array (last id + 1,), True for the instances that meet all conditions.
-
-        The minimum area is ignored.
-        """
+        """Return a Boolean array (last id + 1,), True for instances that meet all conditions but the minimum area."""
         counts = np.zeros(table.last_id + 1, np.bool_)
         for record in table.records.values():
             counts[record.id] = self.is_met(record)

@@ -44,7 +44,7 @@ def pack(tsdf, blocks, inside, seen):
 
 @njit(cache=True, nogil=True, parallel=True)
 def mark_stale(grid, changed, stale):
-    """Mark the blocks with a cell whose corner is in a changed block, in `stale` (B,)."""
+    """Set `stale` (B,) to True for blocks with a cell that has a corner in a changed block."""
     for b in prange(len(changed)):
         before = np.empty(8, np.int32)
         _blocks_before(grid, changed[b], before)

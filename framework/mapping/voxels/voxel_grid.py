@@ -38,7 +38,7 @@ FIRST_RESERVED = 1024  # initial capacity, blocks or voxels
 
 
 class Grid(NamedTuple):
-    """The arrays of a VoxelGrid.
+    """The arrays of a voxel grid.
 
     B and S are the capacities for blocks and regions. Only the first entries are in use.
     """

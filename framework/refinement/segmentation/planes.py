@@ -84,7 +84,7 @@ def find_planes(frame: Frame, distance: float, noise: float, min_area: float) ->
 
 
 def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
-    """Return 1 + the index of the nearest plane (H, W) for each depth reading, 0 = none.
+    """Return 1 + the index of the nearest plane for each depth reading (H, W), 0 = none.
 
     A reading is on a plane if its distance to the plane is at most `distance`, m, plus three standard deviations.
     """
@@ -105,7 +105,7 @@ def off_planes(clusters: PointClusters, on_plane: UInt8, planes: int, max_own: f
 
     Args:
         clusters: The clusters.
-        on_plane: The plane (H, W) of each pixel, from plane_image().
+        on_plane: 1 + the index (H, W) of the plane at each pixel, 0 = none.
         planes: The number of planes.
         max_own: The maximum fraction of the readings of a plane that is removed from a cluster.
 
