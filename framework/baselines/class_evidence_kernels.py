@@ -112,7 +112,7 @@ def update_classes(grid, seen, evidence, masks, evicted):
     Voxels outside all masks only count the frame. The number of evicted classes of each block is written to `evicted`
     (A,).
     """
-    unmasked = evidence.unmasked  # numba 0.68 drops assignments to an element of a tuple's array within prange
+    unmasked = evidence.unmasked  # Numba 0.68 loses assignments to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):
         evicted[a] = 0
         block = seen.blocks[a]

@@ -27,7 +27,7 @@ from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
-MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of the fields of Elections
+MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of missed, min_area and smoothness
 SWEEPS = 20  # maximum number of sweeps of the regularization
 FORMAT = "semantic 4"  # format of the map file; increment it when the meaning of the contents changes
 

@@ -132,7 +132,7 @@ class NormalEquations(NamedTuple):
     The twist xi is in m and rad.
     """
 
-    A: Float64  # (6, 6) J^T W J of the weighted residuals
+    A: Float64  # (6, 6) J^T W J for the residuals r with the weights W
     b: Float64  # (6,) J^T W r
     visible: int  # number of points on a mapped part of the view
     matched: int  # number of visible points with a nonzero weight
@@ -142,7 +142,7 @@ class NormalEquations(NamedTuple):
     energy: float  # sum of w r^2 over the residuals r of the geometric term; of both terms for LinearWeights
     color_energy: float  # sum of v r^2 over the residuals r of the photometric term; 0 for LinearWeights
     matched_colors: int  # number of visible points with a nonzero photometric weight
-    brightness: float  # mean of frame minus model intensity; nonzero after a change of exposure
+    brightness: float  # mean of frame minus model intensity; nonzero after a change in exposure
 
 
 def linearize(

@@ -188,7 +188,7 @@ def _add_geometry(model, R, weights, linear, noise_model, points, J):
         distance2 = ex * ex + ey * ey + ez * ez
         z = points[DEPTH + n]
         growth = max(one, z * inv_range)
-        if linear is None:  # numba compiles only the branch for the type of `linear`
+        if linear is None:  # Numba compiles only the branch for the type of `linear`
             near = mapped & (distance2 <= max_distance2 * growth * growth)
         else:
             near = mapped & (distance2 <= max_distance2)

@@ -61,7 +61,7 @@ class Keyframes:
     min_distance: float = 0.25  # minimum distance of a new view without rotation, m, > 0
     min_angle: float = 0.3  # minimum angle of a new view without translation, rad, > 0
     max_features: int = 800  # maximum number of features of a frame, >= 1
-    min_features: int = 30  # minimum number of features with depth of a keyframe, >= 4
+    min_features: int = 30  # minimum number of features with depth in a keyframe, >= 4
     candidates: int = 6  # maximum number of keyframes matched with a frame, >= 1
     max_ratio: float = 0.8  # maximum ratio of best to second-best descriptor distance (Lowe's ratio test), in (0, 1]
     max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0

@@ -205,9 +205,9 @@ class Preprocessing:
 
     size: Mapping[str, int] | None  # target size, px, with the keys in the file; None = original size
     divisor: int  # px; sides are rounded up to multiples of it
-    pad_to: tuple[int, int] | None  # padded (height, width) px, black at the right and bottom; None = no padding
+    pad_to: tuple[int, int] | None  # padded (height, width), px, black at the right and bottom; None = no padding
     mode: str  # interpolation mode: bilinear or bicubic
-    factor: float  # factor of the values 0..255
+    factor: float  # factor for the values 0..255
     mean: tuple[float, ...]  # RGB, subtracted after the factor is applied
     std: tuple[float, ...]  # RGB, divides the difference
 

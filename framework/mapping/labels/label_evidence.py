@@ -64,7 +64,7 @@ class Measurement(NamedTuple):
     matched: Bool  # (ids + 1,) indexed by id, True where an instance was matched in this frame
     class_scores: Integers  # (N, NO_CLASS + 1) quantized class scores with named bits; int32, in exact storage int64
     named_classes: UInt8  # (N, NEW_CLASSES) most likely classes of each cluster
-    combine: int  # value of Combine
+    combine: int  # rule for combining new and old evidence, a value of Combine
     max_score: int  # maximum quantized score of a class in a voxel
 
 

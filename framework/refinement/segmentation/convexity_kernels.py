@@ -26,7 +26,7 @@ class Noise(NamedTuple):
 
     factor: float  # depth difference that counts as noise, standard deviations
     min_noise: float  # minimum standard deviation of depth, m
-    least: float  # coefficients of the DepthNoise of the sensor
+    least: float  # coefficients least, near and growth of the depth noise of the sensor
     near: float
     growth: float
 
