@@ -27,7 +27,7 @@ from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
-MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of the fields of Elections
+MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of missed, min_area and smoothness
 SWEEPS = 20  # maximum number of sweeps of the regularization
 FORMAT = "semantic 4"  # format of the map file; increment it when the meaning of the contents changes
 
@@ -68,7 +68,7 @@ class SemanticMap(SceneMap):
         """Set the label space of the map.
 
         Raises:
-            DataError: If the map has a different label space.
+            DataError: If the map has a different label space, or if there are too many classes.
         """
         if not self.classes:
             self.labels.begin(len(classes))
@@ -121,7 +121,7 @@ class SemanticMap(SceneMap):
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
     def _smooth(self, surface: UnlabeledMesh, class_ids: Int32) -> None:
-        """Regularize the classes (V,) in place by a Potts model over the edges of the mesh."""
+        """Regularize the classes (V,) in place with a Potts model over the edges of the mesh."""
         # iterated conditional modes (Besag, 1986)
         starts, neighbors = vertex_neighbors(surface.triangles, len(class_ids))
         grid, evidence = self.volume.voxels.grid, self.labels.evidence
@@ -135,9 +135,9 @@ class SemanticMap(SceneMap):
     def instances(self) -> Mapping[int, Instance]:
         """Return the connected components of the mesh as instances.
 
-        The class distribution is the mean over the voxels nearest to the vertices, without the background. The
-        confidence is the mean probability of the class, including the background. The number of observations is the
-        maximum number of frames under a mask of any of these voxels.
+        The class distribution is the mean over the voxels nearest to the vertices, renormalized without the background.
+        The confidence is the mean probability of the class of the instance before this normalization. The number of
+        observations is the maximum, over these voxels, of the number of frames under a mask.
         """
         mesh, up, instances = self.mesh(), self.gravity().up, {}
         found = self._sum_components(self.volume.surface().voxels, mesh.instance_ids)

@@ -29,7 +29,7 @@ class DepthScale:
 
     @property
     def growth(self) -> float:
-        """Factor of limits in m, >= 1."""
+        """Factor for limits in m, >= 1."""
         return max(1.0, self.depth / RANGE)
 
     def length(self, xi: Float64) -> float:

@@ -29,7 +29,7 @@ class PyramidLevel:
     camera: Camera
     depth: Float32  # (H, W) m, 0 = no reading
     intensity: Float32  # (H, W) in [0, 1]
-    normals: Float32  # (3, H, W) surface normals towards the camera, in the camera frame; 0 at edges
+    normals: Float32  # (3, H, W) surface normals toward the camera, in the camera frame; 0 at edges
     sensor: SensorKind = SensorKind.KINECT_V1  # kind of the depth sensor
 
 

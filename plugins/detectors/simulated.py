@@ -92,7 +92,8 @@ class Candidate:
 class SimulatedDetector(Detector):
     """The ground truth with the errors of a mid-quality detector.
 
-    Each error has a parameter. If all are 0, the detections are the ground truth. The errors are applied in this order:
+    Each error has a parameter. Without errors, the detections are the ground truth. The errors are applied in this
+    order:
 
     - Objects of unknown class are detected as an arbitrary class (`clutter_rate`).
     - The mask of an object includes a touching object of unknown class, e.g. the cupboard of a sink (`attach_rate`).
@@ -101,7 +102,7 @@ class SimulatedDetector(Detector):
       nearly always missed, and others never (`miss_spread`).
     - Objects are split in two (`split_rate`).
     - Masks are shifted, extend beyond the object, have a noisy border and have a coarse resolution.
-    - The class distribution is random, with similar classes more likely (`confusion`). In a fraction of the frames, an
+    - The class distribution is random, with similar classes more likely (`confusion`). In a fraction of its frames, an
       object has the same distribution (`confusion_consistency`).
     - The score depends on the quality of the mask and the certainty of the class.
     - False detections occur, some of them repeatedly at the same locations (`recurring_fraction`, needs poses).
@@ -392,7 +393,7 @@ def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: flo
 
 
 def _dirichlet(random: np.random.Generator, alpha: Float64) -> Float64:
-    """Return a sample (C,) of a Dirichlet distribution.
+    """Return a sample (C,) from a Dirichlet distribution.
 
     The result is its mean if the sampled weights are all 0.
     """
@@ -423,7 +424,7 @@ def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
 
 
 def _placed(crop: Bool, x: int, y: int, shape: tuple[int, int]) -> Bool:
-    """Return an empty mask of the given shape with `crop` at (x, y)."""
+    """Return a mask of the given shape with `crop` at (x, y), False elsewhere."""
     image = np.zeros(shape, np.bool_)
     height, width = shape
     top, left = max(0, -y), max(0, -x)

@@ -29,7 +29,7 @@ from framework.live_view.sealed_page import SealedPage
 log = logging.getLogger(__name__)
 
 RECORDING = "recording.rrd"
-FLUSH_S = 0.2  # maximum duration of the data that are lost if a run is killed, s
+FLUSH_S = 0.2  # maximum duration of data lost by a killed run, s
 
 
 class Mode(Enum):
