@@ -69,12 +69,14 @@ class OdometryFile:
     def read(self) -> Odometry | None:
         """Return the odometry; None = no file is set.
 
-        Raises a DataError that names the file and the line of an invalid pose.
+        Raises DataError for a missing file, or with the file and the line of an invalid pose.
         """
         if self.odometry is None:
             return None
         found = candidates(Path(self.odometry))
-        path = next((place for place in found if place.is_file()), found[0])
+        path = next((place for place in found if place.is_file()), None)
+        if path is None:
+            raise DataError(f"{KEY}: expected an existing file in TUM format, got {found[0]}; set another path")
         timestamps, T_odom_base = read_tum(path)
         if len(timestamps) < 2:
             raise DataError(f"{path}: expected at least 2 poses in TUM format, got {len(timestamps)}")

@@ -114,6 +114,11 @@ def test_odometry_invalid_file_raises(content: str, message: str, tmp_path: Path
         OdometryFile(path).read()
 
 
+def test_odometry_missing_file_raises(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"dataset\.odometry: expected an existing file in TUM format, got .*none"):
+        OdometryFile(tmp_path / "none.txt").read()
+
+
 @pytest.mark.parametrize(
     ("camera", "message"),
     [("0 0 0", r"expected 7 numbers \(tx ty tz qx qy qz qw\), got 3"), ("0 0 0 0 0 0 2", "of length 1, got 2")],
