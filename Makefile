@@ -61,6 +61,29 @@ format: $(INSTALLED_DEV) ## format the code and auto-fix lint errors
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
+# Versions of all dependencies for pip --constraint. A local version such as 2.13.0+cpu is written as 2.13.0.
+PYTHONS ?= python3.11 python3.12 python3.13
+define CONSTRAINTS
+import json, sys
+found = {one["metadata"]["name"].lower(): one["metadata"]["version"].partition("+")[0] for one in json.load(sys.stdin)["install"]}
+print("# Versions of all dependencies on Linux with the extra all and the group dev, written by make lock")
+print("\n".join(f"{name}=={version}" for name, version in sorted(found.items()) if name != "instancemap"))
+endef
+export CONSTRAINTS
+
+.PHONY: lock
+lock: ## write constraints/pythonX.Y.txt; PYTHONS="..." selects the interpreters
+	@mkdir -p constraints
+	@for python in $(PYTHONS); do \
+		folder="$$(mktemp -d)"; trap 'rm -rf "$$folder"' EXIT; \
+		"$$python" -m venv "$$folder"; "$$folder/bin/pip" install --quiet 'pip>=25.1'; \
+		name="$$("$$python" -c 'import sys; print("python{}.{}.txt".format(*sys.version_info))')"; \
+		"$$folder/bin/pip" install --quiet --dry-run --ignore-installed --report "$$folder/report" \
+			'$(TORCH)' --group dev '.[all]'; \
+		"$$folder/bin/python" -c "$$CONSTRAINTS" <"$$folder/report" >"$$folder/constraints"; \
+		mv "$$folder/constraints" "constraints/$$name"; rm -rf "$$folder"; echo "constraints/$$name"; \
+	done
+
 .PHONY: clean
 clean: ## remove the environment and all caches, but not outputs/
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis
@@ -72,12 +95,13 @@ PIP_INSTALL = PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_USE_PEP517=1 $(BIN)/python -m 
 	$(if $(wildcard $@),--quiet)
 
 # torch is installed first with its exact version, so that pip uses a local CPU wheel if the machine has one.
+TORCH := torch==2.13.0
 $(INSTALLED): pyproject.toml
 	@$(MAKE) --no-print-directory system-libraries
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || "$(or $(PYTHON),python3)" -m venv $(VENV)
 	@echo "installing the Python dependencies into $(VENV)"
 	@$(PIP_INSTALL) 'pip>=25.1' # supports dependency groups
-	@$(PIP_INSTALL) 'torch==2.13.0'
+	@$(PIP_INSTALL) '$(TORCH)'
 	@$(PIP_INSTALL) --editable .
 	@touch $(INSTALLED)
 

@@ -85,10 +85,10 @@ def module_of(command: str) -> str:
 
 
 def leave_working_folder(arguments: list[str]) -> None:
-    """Remove the working directory from the module search path, because its files may be from an untrusted source.
+    """Remove the working directory from the module search path.
 
-    With --config-dir, which registers the user's own plugins, the directory is moved to the end of the path instead.
-    `python -P` always excludes it.
+    Its files may be from an untrusted source. With --config-dir, which registers plugins of the user, the directory is
+    moved to the end of the search path instead. `python -P` always excludes it.
     """
     try:
         here = str(Path.cwd())
@@ -107,7 +107,7 @@ def leave_working_folder(arguments: list[str]) -> None:
 def open_standard_streams() -> None:
     """Open /dev/null for closed standard streams (`2>&-`).
 
-    Otherwise, an output file of the run would reuse the file descriptor of a closed stream and receive library output.
+    Otherwise, an output file could get the file descriptor of a closed stream and receive output of libraries.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
@@ -161,7 +161,10 @@ def main() -> None:
 
 
 def flush_output(rest: str = "") -> None:
-    """Write `rest` to stdout and flush it. If this fails, exit with an error unless another exception is active."""
+    """Write `rest` to stdout and flush it. On failure, exit with an error.
+
+    The error is not reported if another exception is active.
+    """
     reported = sys.exc_info()[0] is not None
     try:
         sys.stdout.write(rest)

@@ -101,10 +101,14 @@ __all__ = [
 
 
 def begin(config: DictConfig) -> Pipeline:
-    """Build the pipeline of a config: build its stages, load the map to resume or localize in, and compile the kernels.
+    """Build the pipeline of a config, and compile the kernels.
 
-    With a stored map, the tracker reports lost poses until it relocalizes. Raises ConfigError if the stages are
-    incompatible with the stored map, and DataError if the map cannot be read.
+    With `resume_from` or `localize_in`, the stored map is loaded. The tracker then reports lost poses until it
+    relocalizes.
+
+    Raises:
+        ConfigError: The stages are incompatible with the stored map.
+        DataError: The stored map cannot be read.
     """
     fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
     tracker = build(PoseTracker, config.get("tracker"))
@@ -124,7 +128,15 @@ def begin(config: DictConfig) -> Pipeline:
 
 
 def scene_of(key: str, run: Path) -> SceneMap:
-    """Read the map of a stored run. The message of a DataError begins with `key`, a config key or command."""
+    """Read the map of a stored run.
+
+    Args:
+        key: Config key or command, for error messages.
+        run: Run directory.
+
+    Raises:
+        DataError: The map is missing or cannot be read.
+    """
     if not (run / MAP).is_file():
         raise DataError(f"{key}: expected a run directory, got {run} without {MAP}")
     return load_scene(run / MAP)
@@ -139,13 +151,15 @@ class FrameResult(Pose):
 
 
 class Mapper(Map):
-    """Incremental mapping, frame by frame: `Mapper("fuser.voxel_size=0.02", detector="mask_rcnn")`.
+    """Incremental mapping, frame by frame.
 
-    The arguments are the overrides of a run on the command line, as strings or as keywords. The defaults are those of
-    a run. Overrides of `dataset` are not supported. `prefetch` and `skip_completed` have no effect.
-    `resume_from=DIR` resumes the map of a run. `viewer="rerun"` shows the map until the mapper is deleted.
+    Example: `Mapper("fuser.voxel_size=0.02", detector="mask_rcnn")`. The arguments are the overrides of a run on the
+    command line, as strings or as keywords. The defaults are those of a run.
 
-    All methods are thread-safe. To read `scene` itself while another thread may call `add`, hold the lock:
+    Overrides of `dataset` are not supported. `prefetch` and `skip_completed` have no effect. `resume_from=DIR` resumes
+    the map of a run. `viewer="rerun"` shows the map until the mapper is deleted.
+
+    All methods are thread-safe. While another thread may call `add`, hold the lock to read `scene` itself:
     `with mapper.lock: mesh = mapper.scene.mesh()`.
 
     Raises:
@@ -192,12 +206,12 @@ class Mapper(Map):
         """Detect, track, refine and fuse the next frame of a video. A lost frame is not fused.
 
         Args:
-            color: (H, W, 3) uint8 RGB, or a Frame, which replaces all other arguments.
-            depth: (H, W) float32, m along z; 0 = no reading.
-            pose: (4, 4) T_world_camera; None = unknown.
+            color: RGB image (H, W, 3), uint8, or a Frame, which replaces all other arguments.
+            depth: Depth image (H, W), float32, m along z; 0 = no reading.
+            pose: Camera pose T_world_camera (4, 4); None = unknown.
             camera: The camera; None = the camera of the last frame.
             timestamp: Time of the color image, s; None = the frame number (from 0) / 30.
-            up: (3,) unit vector opposite to gravity in the camera frame; None = unknown.
+            up: Up direction (3,) in the camera frame, a unit vector; None = unknown.
             depth_timestamp: Time of the depth image, s; None = the time of the color image.
             sensor: The kind of depth sensor; None = the kind of the last frame, initially KINECT_V1.
             odometry: (4, 4) T_odom_camera, the pose of the camera in any fixed frame by odometry; None = unknown.
@@ -242,7 +256,6 @@ class Mapper(Map):
         return FrameResult(found.T_world_camera, new=tuple(sorted(now - before)), removed=tuple(sorted(before - now)))
 
     def _map(self, frame: Frame) -> Pose:
-        """Detect and map a frame, and show it in the viewer."""
         pipeline, journal = self.pipeline, self._journal
         try:
             detections, times = pipeline.detect(frame, self._frames - 1)
@@ -287,7 +300,9 @@ def _override(name: str, value: object) -> str:
 
 
 def open_dataset(name: str, **parameters: object) -> RGBDSequence:
-    """Open an RGB-D sequence: `open_dataset("rgbd_folder", root="DIR", stride=2)`.
+    """Open an RGB-D sequence.
+
+    Example: `open_dataset("rgbd_folder", root="DIR", stride=2)`.
 
     Args:
         name: An option of `dataset=` on the command line.
@@ -328,7 +343,9 @@ def export(
     floor: float | None = None,
     **choices: object,
 ) -> list[Path]:
-    """Export a run: `export("outputs/demo", "glb", objects=["chair", 7])`.
+    """Export a run to standard 3D and map formats.
+
+    Example: `export("outputs/demo", "glb", objects=["chair", 7])`.
 
     Args:
         run: The run directory.
@@ -337,8 +354,8 @@ def export(
         objects: Classes or ids of the exported objects; () = the whole scene.
         up: The up direction (3,) in the world frame; None = the up direction of the run.
         floor: The floor height along the up direction, m; None = the floor height of the run.
-        choices: min_confidence, triangles, coloring, collision, resolution, robot_height; see
-            `instancemap export --help`.
+        choices: min_confidence, triangles, coloring, collision, resolution, robot_height; see `instancemap export
+            --help`.
 
     Returns:
         The paths of the files.
@@ -355,13 +372,15 @@ def export(
 
 
 def query(run: Map | Path | str, words: str, by: str | None = None, model: Path | str | None = None) -> QueryResult:
-    """Rank the objects of a run or map by a text query: `query("outputs/demo", "a red chair").objects`.
+    """Rank the objects of a run or map by a text query.
+
+    Example: `query("outputs/demo", "a red chair").objects`.
 
     Args:
         run: The run directory, or a map.
         words: The text query.
         by: "embeddings" of images, or "names" of classes and colors; None = embeddings if available.
-        model: Folder, file or huggingface.co id of the embedding model; None = the model of the run's detector.
+        model: Folder, file or huggingface.co id of the embedding model; None = the model of the detector of the run.
 
     Returns:
         The matching objects, best match first, and the ranking method.
@@ -377,7 +396,11 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
 
 
 def load_scene(path: Path | str) -> SceneMap:
-    """Read a map as a SceneMap, without the queries of `Map`. Raises DataError if the file is not a map."""
+    """Read a map as a SceneMap, without the queries of `Map`.
+
+    Raises:
+        DataError: The file is not a map.
+    """
     from framework.baselines import object_map, open3d_map, semantic_map
     from framework.mapping import instance_map
     from framework.mapping.storage.map_file import read_format

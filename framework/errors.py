@@ -1,4 +1,4 @@
-"""Exceptions for user-correctable errors.
+"""Exceptions for errors that the user can correct.
 
 Each message is one line with the file or key, the expected value, the found value, and the fix.
 """
@@ -18,9 +18,9 @@ _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
 
 
 class InstanceMapError(Exception):
-    """Base class of all errors that a user can correct. Commands print the message on one line.
+    """Base class of all errors that the user can correct. Commands print the message on one line.
 
-    The message is printable and has at most about 1000 characters, whatever its input. `debug=true` adds the traceback.
+    The message is printable and has at most about 1000 characters. `debug=true` adds the traceback.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -40,7 +40,7 @@ class FrameError(DataError):
 
 
 class NoPoseError(FrameError):
-    """A frame without a required pose, such as in a gap of the ground-truth trajectory. The pipeline skips it."""
+    """A frame without a required pose. The pipeline skips the frame."""
 
 
 class MapFullError(InstanceMapError):
@@ -52,7 +52,7 @@ class PartialRunError(InstanceMapError):
 
 
 def printable(message: object) -> str:
-    """Return a message with unprintable characters escaped, and with the middle of long words and messages omitted."""
+    """Return a message with unprintable characters escaped, and with long words and messages shortened."""
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(message))
     return _shortened(_LONG_WORD.sub(lambda match: _shortened(match[0], LONGEST_WORD), text), LONGEST_MESSAGE)
 
@@ -75,7 +75,10 @@ def first_line(error: BaseException) -> str:
 
 @contextmanager
 def errors_of(where: object) -> Iterator[None]:
-    """Prepend `where`, a key, a file or a position in a file, to the message of a DataError inside the context."""
+    """Prepend a location to the message of a DataError in the `with` body.
+
+    The location `where` is a key, a file or a position in a file.
+    """
     try:
         yield
     except DataError as error:
@@ -86,12 +89,12 @@ def import_optional(module: str, purpose: str, extra: str) -> Any:
     """Import a module of an optional package, and return it.
 
     Args:
-        module: The full name of the module.
-        purpose: The function of the package as a verb phrase, such as "reads ROS bags", for the message.
-        extra: The extra of InstanceMap that installs the package.
+        module: Full name of the module.
+        purpose: Verb phrase for the message, such as "reads ROS bags".
+        extra: Extra of InstanceMap that installs the package.
 
     Raises:
-        ConfigError: The package is not installed. The message contains the command that installs it.
+        ConfigError: The package is not installed. The message contains the installation command.
     """
     try:
         return importlib.import_module(module)

@@ -1,4 +1,7 @@
-"""Rigid motions and the pinhole camera. Conventions: see `framework.data`."""
+"""Rigid transforms and camera projection.
+
+The conventions are described in `framework.data`.
+"""
 
 from __future__ import annotations
 
@@ -45,14 +48,17 @@ def transform(T_a_b: Float64, points_b: npt.NDArray[np.floating]) -> npt.NDArray
 
 
 def skew(v: Float64) -> Float64:
-    """Return the skew-symmetric matrix S (3, 3) of a vector v (3,), with S @ w = v x w."""
+    """Return the skew-symmetric matrix S (3, 3) of a vector v (3,).
+
+    The product S @ w is the cross product of v and w.
+    """
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def adjoint(T: Float64) -> Float64:
-    """Return the adjoint Ad (6, 6) of a rigid motion T (4, 4), with T exp(xi) = exp(Ad xi) T.
+    """Return the adjoint matrix (6, 6) of a rigid transform T (4, 4).
 
-    The twist xi (6,) consists of translation, m, and rotation, rad.
+    The adjoint Ad satisfies T exp(xi) = exp(Ad xi) T. A twist xi (6,) consists of translation, m, and rotation, rad.
     """
     Ad = np.zeros((6, 6))
     Ad[:3, :3] = Ad[3:, 3:] = T[:3, :3]
@@ -61,13 +67,13 @@ def adjoint(T: Float64) -> Float64:
 
 
 def exp_se3(xi: Float64) -> Float64:
-    """Return the exponential map of SE(3).
+    """Return the rigid transform of a twist, i.e. the exponential map of SE(3).
 
     Args:
         xi: The twist (6,): translation, m, and rotation, rad.
 
     Returns:
-        The rigid motion exp(xi^) (4, 4).
+        The transform (4, 4).
     """
     rho, phi = np.asarray(xi[:3], np.float64), np.asarray(xi[3:], np.float64)
     theta = math.sqrt(phi @ phi)
@@ -88,27 +94,28 @@ def _sinc(x: float) -> float:
 
 
 def rotation_angle(R: Float64) -> float:
-    """Return the angle of a rotation (3, 3) in rad, accurate for small angles."""
+    """Return the angle of a rotation matrix (3, 3) in rad."""
     sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
     return float(np.arctan2(sine, (np.trace(R) - 1) / 2))
 
 
 def pose_distance(T_world_a: Float64, T_world_b: Float64) -> float:
-    """Return the larger value of distance, m, and rotation angle, rad, between two poses (4, 4)."""
+    """Return the distance, m, or the rotation angle, rad, between two poses (4, 4), whichever is larger."""
     T_a_b = inverse(T_world_a) @ T_world_b
     return max(float(np.linalg.norm(T_a_b[:3, 3])), rotation_angle(T_a_b[:3, :3]))
 
 
 def nearest_rotation(R: Float64) -> Float64:
-    """Return the rotation (3, 3) nearest to a matrix (3, 3) in the Frobenius norm (orthogonal Procrustes)."""
+    """Return the nearest rotation matrix (3, 3) in the Frobenius norm."""
     U, _, Vt = np.linalg.svd(R)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def nearest_rigid(matrix: Float64) -> Float64:
-    """Return the rigid transform (4, 4) nearest to a matrix (4, 4), for example to remove rounding errors of a file.
+    """Return the nearest rigid transform (4, 4), for example to remove rounding errors.
 
-    Raises DataError if the matrix is not finite, or not rigid within RIGID_WITHIN.
+    Raises:
+        DataError: The matrix is not finite, or its error exceeds RIGID_WITHIN.
     """
     if not np.isfinite(matrix).all():
         raise DataError("pose: expected finite values, got NaN or infinity")
@@ -126,9 +133,14 @@ def nearest_rigid(matrix: Float64) -> Float64:
 
 
 def interpolate(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Float64:
-    """Return the pose (4, 4) at `fraction` of the motion from pose a to pose b, both (4, 4); 0 = a, 1 = b.
+    """Interpolate between two poses (4, 4).
 
     The translation is interpolated linearly, and the rotation spherically (slerp).
+
+    Args:
+        T_world_a: The first pose (4, 4).
+        T_world_b: The second pose (4, 4).
+        fraction: The position between the poses, from 0 (first) to 1 (second).
     """
     R_a, R_b = T_world_a[:3, :3], T_world_b[:3, :3]
     T = np.eye(4)
@@ -153,7 +165,7 @@ def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDAr
 
 
 def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Float32:
-    """Back-project pixels with depth.
+    """Return the 3D points of pixels with known depth.
 
     Args:
         camera: The camera.
@@ -169,9 +181,9 @@ def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Flo
 
 
 def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
-    """Raise DataError if a pixel of `clusters` is outside of an image of `shape` (height, width), px.
+    """Raise DataError if a pixel of `clusters` is outside of an image of size `shape` (height, width), px.
 
-    Kernels index images with these pixels, without bounds checks.
+    Kernels access images at these pixels without bounds checks.
     """
     u, v = clusters.pixels.T
     if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):

@@ -1,4 +1,4 @@
-"""The mapping loop: detection, tracking, lifting, refinement, fusion."""
+"""The mapping loop: detection, tracking, lifting, refinement and fusion."""
 
 from __future__ import annotations
 
@@ -46,7 +46,10 @@ WITHOUT_THREADS = (
 
 @dataclass
 class Pipeline:
-    """The stages and the mapping loop: `Pipeline(detector, tracker, refiner, fuser).run(video)`."""
+    """The stages and the mapping loop.
+
+    Example: `Pipeline(detector, tracker, refiner, fuser).run(video)`.
+    """
 
     detector: Detector
     tracker: PoseTracker
@@ -68,10 +71,10 @@ class Pipeline:
         self.T_world_color: Float64 | None = None  # (4, 4) pose of the color camera in the last mapped frame
 
     def run(self, video: RGBDVideo) -> RunResult:
-        """Map `video` frame by frame.
+        """Map a sequence or live video, frame by frame.
 
-        Frames that raise FrameError are skipped, and lost frames are not fused. Both are counted. Ctrl-C (after the
-        current frame) and a full map end the loop early. Other errors of stages are raised.
+        Frames that raise FrameError are skipped, and lost frames are not fused. Both are counted. Ctrl-C ends the loop
+        after the current frame. A full map also ends the loop early. Other errors of stages are raised.
 
         Ctrl-C is the normal end of a live video. If mapping falls behind, frames of a live video are dropped and
         counted.
@@ -95,9 +98,11 @@ class Pipeline:
             raise result.stopped_by
 
     def run_to_any_end(self, video: RGBDVideo, directory: Path = Path()) -> RunResult:
-        """Map `video`. An error of a stage after the first mapped frame is returned in `stopped_by`.
+        """Map a sequence or live video. After the first mapped frame, errors are returned in `stopped_by`.
 
-        `directory` is the output folder of the viewer.
+        Args:
+            video: The sequence or live video.
+            directory: Output folder of the viewer.
         """
         frames_expected = len(video) if isinstance(video, RGBDSequence) else None
         if frames_expected == 0:
@@ -129,7 +134,10 @@ class Pipeline:
         return replace(journal.result(), keyframes=keyframes, color_delay=self.color_to_depth.estimate)
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
-        """Return the tracker's keyframes by array name. An error of its thread is stored in `journal.stopped_by`."""
+        """Return the keyframes of the tracker by array name.
+
+        An error of the tracker thread is stored in `journal.stopped_by`.
+        """
         try:
             return self.tracker.keyframes()
         except Exception as error:
@@ -137,7 +145,7 @@ class Pipeline:
             return self.tracker.keyframes()
 
     def empty_map_reason(self, journal: Journal) -> str:
-        """Return the reason for an empty map, as the text of an error message."""
+        """Return the reason for an empty map, for an error message."""
         result = journal.result()
         if result.frames == 0:
             return "expected at least one frame, got none"
@@ -145,7 +153,7 @@ class Pipeline:
             first = journal.first_without_pose
             return f"expected poses, got none for the {result.frames} frames (first: {first}); {WITHOUT_POSES}"
         if result.frames_skipped == result.frames:
-            return f"expected usable frames, got none of {result.frames}; the log lists the reasons"
+            return f"expected usable frames, got none among {result.frames}; the log lists the reasons"
         lost = next((frame.pose.reason for frame in result.tracked if frame.pose.lost), "")
         nearest, farthest = self.fuser.scene.depth_range
         rest = result.frames - result.frames_skipped - result.frames_lost
@@ -154,12 +162,16 @@ class Pipeline:
             (result.frames_lost, f"lost (first reason: {lost or 'none given'})"),
             (rest, f"without depth within {nearest:g} to {farthest:g} m"),
         ]
-        return f"expected mapped frames, got none of {result.frames}: " + "; ".join(
+        return f"expected mapped frames, got none among {result.frames}: " + "; ".join(
             f"{count} {what}" for count, what in parts if count
         )
 
     def map_all(self, video: RGBDVideo, journal: Journal, interruption: Interruption) -> None:
-        """Map all frames of `video`. Raises Interrupted between two frames after a signal."""
+        """Map all frames of a video.
+
+        Raises:
+            Interrupted: A signal was received. It is raised between two frames.
+        """
         prefetch = self.prefetch
         if prefetch > 0 and not parallel_kernels_are_thread_safe():
             log.info(WITHOUT_THREADS)
@@ -189,8 +201,8 @@ class Pipeline:
     ) -> Generator[tuple[Frame, Detections]]:
         """Yield the usable frames with their detections, in the order of the video.
 
-        While the caller maps a frame, other threads process up to `prefetch` later frames, in parallel if the detector
-        supports it. The results of a stored sequence do not depend on `prefetch`.
+        While the caller maps a frame, other threads process up to `prefetch` later frames. They run in parallel if the
+        detector supports this. The results of a stored sequence do not depend on `prefetch`.
         """
         stream = stream_of(video, lambda: interruption.received is not None)
         prefetch = prefetch if stream.max_prefetched is None else min(prefetch, stream.max_prefetched)
@@ -219,9 +231,15 @@ class Pipeline:
     def read_and_detect(
         self, stream: FrameStream, turn: AbstractContextManager[None], number: int
     ) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
-        """Read frame `number` (from 0) of the video in its `turn`, and detect its objects.
+        """Read a frame in its turn, and detect its objects.
 
-        Returns the frame with its detections and stage times, or the error of the frame; None = end of the video.
+        Args:
+            stream: Frames of the video.
+            turn: Context in which the frame is read.
+            number: Frame number, starting at 0.
+
+        Returns:
+            The frame with its detections and stage times, or the error of the frame; None = end of the video.
         """
         try:
             with turn:
@@ -237,9 +255,9 @@ class Pipeline:
         return frame, detections, [reading, *times]
 
     def detect(self, frame: Frame, number: int) -> tuple[Detections, list[StageTime]]:
-        """Return the detections of frame `number` (from 0) of the video, and the detection time.
+        """Return the detections of a frame and the detection time.
 
-        For frames between two detections, both are empty.
+        Both are empty for frames between two detections. `number` is the frame number, starting at 0.
         """
         if number % self.detection_interval:
             return Detections.none(frame.depth.shape, self.detector.classes, detected=False), []
@@ -248,9 +266,12 @@ class Pipeline:
         return detections, [StageTime(frame.index, "detection", 1e3 * (time.perf_counter() - began))]
 
     def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> Pose:
-        """Track a frame, and lift, refine and fuse its detections unless the pose is lost. Return the pose.
+        """Track a frame, and lift, refine and fuse its detections. Return the pose.
 
-        Raises FrameError if the frame is unusable.
+        A lost frame is only tracked.
+
+        Raises:
+            FrameError: The frame is unusable.
         """
         with journal.timed(frame.index, "tracking"):
             pose = self.tracker.track(self.color_to_depth.predicted(frame), self.fuser.scene)
@@ -280,7 +301,7 @@ class Pipeline:
 
 @contextmanager
 def watched(viewer: Viewer, scene: SceneMap, video: str, directory: Path) -> Iterator[None]:
-    """Begin the viewer, and end it when the context exits, even after an error."""
+    """Begin the viewer, and end it after the `with` body, also after an error."""
     viewer.begin(scene, video, directory)
     try:
         yield

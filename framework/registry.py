@@ -1,4 +1,7 @@
-"""Construction of plugins from config nodes. No other module runs code named in a config."""
+"""Construction of plugins from config nodes.
+
+No other module runs code that is named in a config.
+"""
 
 from __future__ import annotations
 
@@ -46,21 +49,24 @@ Plugin = TypeVar("Plugin")
 
 
 def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
-    """Build the plugin of a config node: `_target_` names the class, the other keys are its parameters.
+    """Build the plugin of a config node.
 
-    The class must be the `_target_` of a registered option of the stage. Options are registered by this project, by
-    installed packages, and by folders given by --config-dir (without a running Hydra:
-    `framework.config.composition.add_config_dir`). The modules of other classes are not imported, so a config cannot
-    run unregistered code. The class must also be a concrete dataclass that implements `interface`. Interpolations in
-    the node are resolved against the config that contains it.
+    The key `_target_` of the node is the class name. All other keys are parameters. The class must be a concrete
+    dataclass that implements `interface`. Interpolations are resolved against the config that contains the node.
+
+    The class must also be the `_target_` of a registered option of the stage. This project, installed packages and the
+    folders of --config-dir register options. Without a running Hydra application,
+    `framework.config.composition.add_config_dir` adds a folder. Modules of other classes are not imported, so a config
+    cannot run unregistered code.
 
     Args:
-        interface: The interface of the plugin. It is not annotated as `type[Plugin]`, which excludes abstract classes.
-        node: The config of the plugin.
+        interface: Interface of the plugin. It is not annotated as `type[Plugin]`, which excludes abstract classes.
+        node: Config of the plugin.
 
     Raises:
         ConfigError: The class or a parameter is invalid. The message names the stage and the plugin.
-        InstanceMapError: The constructor of the plugin raises it. The message begins with the stage and the plugin.
+        InstanceMapError: The constructor of the plugin raised this error. The message begins with the stage and the
+            plugin.
     """
     stage = stage_of(interface)
     if not isinstance(node, DictConfig) or OmegaConf.is_missing(node, "_target_") or not node.get("_target_"):
@@ -85,7 +91,7 @@ def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
 
 @contextmanager
 def _errors_at(where: str) -> Iterator[None]:
-    """Prepend `where` to the message of an InstanceMapError that is raised inside the context, and keep its class."""
+    """Prepend `where` to the message of an InstanceMapError in the `with` body."""
     try:
         yield
     except InstanceMapError as error:
@@ -93,11 +99,13 @@ def _errors_at(where: str) -> Iterator[None]:
 
 
 def assemble(plugin_class: type[Plugin], /, **values: Any) -> Plugin:
-    """Build a plugin from its parameters, including the parameters of its parts.
+    """Build a plugin from its parameters and the parameters of its parts.
+
+    A part is a field with a dataclass as type.
 
     Args:
-        plugin_class: The class of the plugin.
-        values: The parameters by name.
+        plugin_class: Class of the plugin.
+        values: Parameters by name.
 
     Returns:
         The plugin.
@@ -111,10 +119,12 @@ def assemble(plugin_class: type[Plugin], /, **values: Any) -> Plugin:
 
 
 def parameter_fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
-    """Return the field and type of each parameter of a plugin by name.
+    """Return the field and type of each parameter of a plugin, by name.
 
-    A part (a field with a dataclass as type) is replaced by its own parameters. Raises ConfigError for a duplicate
-    name.
+    A part (a field with a dataclass as type) is replaced by its own parameters.
+
+    Raises:
+        ConfigError: A name is not unique.
     """
     found: dict[str, tuple[dataclasses.Field[Any], Any]] = {}
     for name, (field, kind) in _fields(plugin_class).items():
@@ -138,14 +148,17 @@ def _fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]
 
 
 def stage_of(interface: Callable[..., object]) -> str:
-    """Return the config group of plugins that implement `interface`, which may be a subclass, such as RGBDSequence."""
+    """Return the config group of plugins that implement an interface, such as RGBDSequence."""
     assert isinstance(interface, type)
     return next(stage for stage, of in GROUPS.items() if issubclass(interface, of))
 
 
 @contextmanager
 def _options_loader() -> Iterator[Any]:
-    """Yield the loader of the running Hydra application if it finds InstanceMap's configs, otherwise a new loader."""
+    """Yield a config loader that finds the configs of InstanceMap.
+
+    The loader of the running Hydra application is preferred.
+    """
     if (running := running_loader()) is not None:
         yield running
         return
@@ -154,9 +167,10 @@ def _options_loader() -> Iterator[Any]:
 
 
 def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
-    """Yield the class names in the options of a stage, starting with the options whose name occurs in `sought`."""
+    """Yield the class names in the options of a stage."""
     inheriting = []
     files: Any = CachingConfigRepository(loader.repository)
+    # an option whose name occurs in the class name is most likely the right one
     for name in sorted(loader.get_group_options(stage), key=lambda name: name not in sought):
         own = files.load_config(f"{stage}/{name}").config
         if OmegaConf.is_interpolation(own, "_target_"):
@@ -173,10 +187,17 @@ def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
 
 
 def composition(files: Any, stage: str, name: str) -> dict[str, str]:
-    """Return the Hydra package of each config file of a stage's option, by path, in the order of composition.
+    """Return the Hydra package of each config file of an option by path, in the order of composition.
 
-    The option is composed as in a run, because it may override the choice of another stage. `files` is the caching
-    repository of a loader. Raises HydraException for a broken option.
+    The option is composed as in a run, because it may override the choice of another stage.
+
+    Args:
+        files: Caching repository of a config loader.
+        stage: Config group of the option.
+        name: Name of the option.
+
+    Raises:
+        HydraException: The option is broken.
     """
     own = files.load_config(f"{stage}/{name}")
     if not own.defaults_list and own.header.get("package") is None:  # a single file: skip the composition (10 ms)
@@ -187,9 +208,14 @@ def composition(files: Any, stage: str, name: str) -> dict[str, str]:
 
 
 def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
-    """Import the class `target` ("package.module.Class").
+    """Import the class of a plugin.
 
-    Raises ConfigError unless it is a concrete dataclass that implements `interface`.
+    Args:
+        interface: Interface of the plugin.
+        target: Class name, as package.module.Class.
+
+    Raises:
+        ConfigError: The class is not a concrete dataclass that implements the interface.
     """
     assert isinstance(interface, type)
     stage = stage_of(interface)
@@ -226,10 +252,15 @@ def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
 
 
 def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, Any]:
-    """Return the keyword arguments for `plugin_class` from `node`, each with the type of its dataclass field.
+    """Return the keyword arguments for a plugin from its config node, with the types of its fields.
 
-    Raises a ConfigError that names `where` for an unknown parameter, a wrong type or a missing value. The metadata key
-    `source` of a field is a hint for obtaining its value.
+    Args:
+        where: Stage and class name, for error messages.
+        plugin_class: Class of the plugin. The metadata key `source` of a field describes how to obtain its value.
+        node: Config of the plugin.
+
+    Raises:
+        ConfigError: A parameter is unknown or missing, or has a wrong type.
     """
     stages = plugin_fields(plugin_class)
     fields = parameter_fields(plugin_class)
@@ -248,9 +279,12 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
 
 
 def check_option(where: str, plugin_class: type, node: DictConfig) -> None:
-    """Raise ConfigError if an option has an unknown parameter or a value of a wrong type.
+    """Check the parameters of an option.
 
     Values that depend on other configs, and values that the user must set, are not checked.
+
+    Raises:
+        ConfigError: A parameter is unknown or has a wrong type.
     """
     plugins = plugin_fields(plugin_class)
     settled = [key for key in map(str, node) if key not in plugins and not OmegaConf.is_interpolation(node, key)]
@@ -258,7 +292,7 @@ def check_option(where: str, plugin_class: type, node: DictConfig) -> None:
 
 
 def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
-    """Return the parameters of a plugin, with defaults for omitted parameters, and its nested plugins by parameter."""
+    """Return the parameters of a plugin, including defaults, and its nested plugins by parameter."""
     stages = plugin_fields(plugin_class)
     fields = parameter_fields(plugin_class)
     typed = [
@@ -302,7 +336,7 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
 
 
 def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
-    """Return the interface of each field that contains a plugin or a mapping of plugins (Mapping[str, interface])."""
+    """Return the interface of each field that contains a plugin or a mapping of plugins, by name."""
     found = {}
     for name, hint in get_type_hints(plugin_class).items():
         of = get_args(hint)
@@ -314,12 +348,12 @@ def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
 
 
 def holds_one(plugin_class: type, name: str) -> bool:
-    """Return True if a plugin field contains a single plugin, not a mapping of plugins."""
+    """Return True if a field contains a single plugin, not a mapping of plugins."""
     return get_type_hints(plugin_class)[name] in STAGES.values()
 
 
 def _inner(where: str, interface: type[Any], node: Any, one: bool) -> Any:
-    """Return a nested plugin if `one`, otherwise a mapping of nested plugins by name, without null entries."""
+    """Return a nested plugin or a mapping of nested plugins by name, without null entries."""
     if one:
         with _errors_at(where):
             return build(interface, node)
@@ -350,7 +384,10 @@ def _import(where: str, module_name: str) -> ModuleType:
 
 
 def _check_module(where: str, module_name: str) -> None:
-    """Raise ConfigError if a module does not exist. Unlike importlib.util.find_spec, this imports no packages."""
+    """Raise ConfigError if a module does not exist.
+
+    Unlike importlib.util.find_spec, this function imports no packages.
+    """
     package, *inner = module_name.split(".")
     name = package
     try:
@@ -374,7 +411,7 @@ def _check_module(where: str, module_name: str) -> None:
 
 
 def _check_plugins_package(plugins: ModuleSpec) -> None:
-    """Raise InstanceMapError if another package named `plugins` precedes InstanceMap's on the module search path."""
+    """Raise InstanceMapError if another package named `plugins` is found before that of InstanceMap."""
     found = Path([*(plugins.submodule_search_locations or []), str(plugins.origin)][0]).resolve()
     if found != PROJECT_ROOT / "plugins":
         raise InstanceMapError(

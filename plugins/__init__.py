@@ -1,1 +1,1 @@
-"""Plugins that ship with InstanceMap, one plugin per file."""
+"""Plugins that are part of InstanceMap, one per file."""

@@ -1,4 +1,4 @@
-"""Shared fixtures: seeds, and access to data that are not part of the project."""
+"""Fixtures and settings of all tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 import tests.support.cores  # isort: skip; sets variables that numba reads when it is loaded
 
-pytest.register_assert_rewrite("framework.testing")  # before the import of these modules
+pytest.register_assert_rewrite("framework.testing")  # before these modules are imported
 
 import tests.support.cached_lights  # noqa: E402, F401
 from framework.config import composition  # noqa: E402
@@ -28,7 +28,7 @@ hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("tests")
 CHECKOUT = Path(__file__).resolve().parent.parent
 
-# a process inherits ignored signals: SIGINT in a background job, and SIGHUP under nohup
+# ignored signals are inherited, e.g. SIGINT in a background job and SIGHUP under nohup
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
@@ -42,7 +42,7 @@ SLOW_UNIT_TEST = 2.0  # s, minimum duration of a unit test that is listed as slo
 
 @pytest.hookimpl(tryfirst=True)  # before -m deselects tests
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark every test without a marker: integration if it uses real data or is a benchmark, otherwise unit."""
+    """Mark tests without a marker as unit tests, or as integration tests if they use real data or are benchmarks."""
     for item in items:
         if not any(item.get_closest_marker(marker) for marker in MARKERS):
             fixtures = INTEGRATION_FIXTURES & set(getattr(item, "fixturenames", ()))
@@ -66,7 +66,7 @@ def seeded() -> None:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """Return the directory `shared` next to the checkout, with data and weights; skip the test if it is missing."""
+    """Return the directory `shared` next to the checkout, which contains data and weights. Skip the test without it."""
     directory = CHECKOUT.parent / "shared"
     if not directory.is_dir():
         pytest.skip(f"{directory} with data and weights does not exist")
@@ -75,7 +75,7 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def shared_data(shared: Path) -> Path:
-    """Return `shared/data`, which contains RGB-D folders."""
+    """Return the directory `shared/data` with RGB-D folders."""
     if not (shared / "data").is_dir():
         pytest.skip(f"{shared / 'data'} does not exist")
     return shared / "data"
@@ -83,7 +83,7 @@ def shared_data(shared: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def ready(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Any]:
-    """Return a function that builds an option with generated user files, or skips if a package is missing."""
+    """Return a function that builds a plugin with generated input files and skips the test if a package is missing."""
     from tests.support import option_files, registered
 
     made = functools.cache(lambda *option: option_files.overrides(*option, tmp_path_factory.mktemp(option[1])))
@@ -102,5 +102,5 @@ def room() -> CornerRoom:
 
 @pytest.fixture
 def fakes_registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Register the stages of tests/support/fake_conf, as --config-dir does."""
+    """Register the stages of tests/support/fake_conf, like the option --config-dir."""
     monkeypatch.setattr(composition, "_added", [CHECKOUT / "tests" / "support" / "fake_conf"])

@@ -1,10 +1,11 @@
-"""Compare the results of two folders of run directories, byte by byte, for changes that must not change any result.
+"""Comparison of the results in two folders of run directories, for changes that must not affect results.
 
     python -m tests.same_results BEFORE AFTER
 
-Runs are paired by their path below BEFORE and AFTER. Each pair is compared by its files, the arrays of its NPZ files,
-its metrics and its config. Metrics of the machine and of the code are ignored. Old config keys are translated to their
-new names. Keys that only one of the two configs has are listed and not compared. The exit status is 1 if a run differs.
+Runs with the same path below BEFORE and AFTER are compared byte by byte: their files, the arrays in NPZ files, the
+metrics and the config. Metrics that depend on the machine or on the code version are ignored. Old config keys are
+translated to their new names. Keys that only one of the two configs has are listed and not compared. The exit status is
+1 if a run differs.
 """
 
 from __future__ import annotations
@@ -35,14 +36,14 @@ NOT_RESULTS = (
     "time.",
     "code",
 )
-RENAMED = {  # old keys that have several new names in framework/config/renamed_keys.py
+RENAMED = {  # old keys with several new names in framework/config/renamed_keys.py
     "refiner.links.plane_removal.min_share": "refiner.links.plane_removal.min_frame_fraction",
     "refiner.links.connected.min_share": "refiner.links.connected.min_piece_ratio",
 }
 
 
 def results(directory: Path) -> dict[str, object]:
-    """Return the results of a run by file, array or metric."""
+    """Return the results of a run, keyed by file, array or metric."""
     found: dict[str, object] = {name: (directory / name).read_bytes() for name in FILES if (directory / name).exists()}
     for name in ARRAY_FILES:
         if (directory / name).exists():
@@ -56,14 +57,14 @@ def results(directory: Path) -> dict[str, object]:
 
 
 def settings(directory: Path, names: Collection[str] = ()) -> dict[str, object]:
-    """Return the values of a run's config by dotted key; keys that are not in `names` get their new name."""
+    """Return the values of a config, keyed by dotted key. Keys that are not in `names` get their new names."""
     config: Any = OmegaConf.to_container(OmegaConf.load(directory / "config.yaml"))
     named = {key if key in names else translated(key): value for key, value in leaves(config)}
     return {key: value for key, value in named.items() if key.partition(".")[0] not in WITHOUT_EFFECT}
 
 
 def translated(key: str) -> str:
-    """Return the new name of a config key, or the key itself if it was not renamed."""
+    """Return the new name of a config key, or the same key if there is none."""
     group, dot, name = key.rpartition(".")
     return RENAMED.get(key) or group + dot + (new_name(key) or name).rpartition(".")[2]
 

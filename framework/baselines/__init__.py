@@ -1,1 +1,1 @@
-"""Maps of baseline systems, re-implemented or off the shelf."""
+"""Maps of baseline systems."""

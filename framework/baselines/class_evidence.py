@@ -1,21 +1,20 @@
-"""Class evidence of the voxels of a semantic map, including the background, and its update from a frame.
+"""Class evidence in the voxels of a semantic map.
 
-The update follows SemanticFusion (McCormac et al. 2017, eq. 2). It is eq. (7) of docs/method.md with one distribution
-per pixel:
+The update follows SemanticFusion (McCormac et al., 2017, eq. 2). It is eq. (7) of docs/method.md, with one distribution
+per pixel over the background and all classes:
 
-    P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t),   c = background or a class
+    P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t)
 
 Here, I_t is image t, O_u is the label observed at the pixel u of the voxel, and Z normalizes the distribution.
 
-In log space, the update is a sum that starts from a uniform distribution. Only ratios matter, so a voxel stores the
-log ratio of each class to the background. If no log ratio is above 0, the voxel is background.
+In log space, the update is a sum. A voxel stores the log ratio of each class to the background. If no log ratio is
+above 0, the voxel is background.
 
-A voxel is *under a mask* if it projects to a pixel of the mask. It then gets the class distribution of the mask. All
-pixels outside the masks are equal evidence for the background, so a voxel only counts the frames in which it is not
-under a mask. Mask evidence is stored in rows of 512 voxels, one row for each block that was under a mask. A voxel in a
-row takes 14 bytes plus 5 bytes per class slot, at most 94 bytes.
+A voxel is *under a mask* if its pixel is inside the mask. It then gets the class distribution of the mask. All pixels
+outside the masks are equal evidence for the background, so a voxel only counts these frames. Blocks with voxels under a
+mask have a row of evidence.
 
-Each mask *names* its most likely classes. A voxel stores the CLASS_SLOTS most likely named classes; a newly named class
+Each mask *names* its most likely classes. A voxel stores the most likely CLASS_SLOTS named classes. A newly named class
 replaces the least likely one. The unnamed classes share one log ratio, `rest`, which is the initial value of a newly
 named class.
 """
@@ -42,7 +41,10 @@ MAX_EXPONENT = 700.0  # maximum log ratio of unnamed classes; float64 can repres
 
 
 class ClassEvidence(NamedTuple):
-    """Class evidence of all voxels, with R rows and T class slots. The best class of a voxel is in slot 0."""
+    """Class evidence of all voxels.
+
+    There are B blocks, R rows of evidence and T class slots per voxel. Slot 0 has the most likely class.
+    """
 
     unmasked: UInt16  # (B, 512) number of frames in which the voxel was outside all masks, for B blocks
     class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
@@ -58,7 +60,7 @@ NO_EVIDENCE = (NO_CLASS, 0, 0, 0, -1, -1)  # values of ROW_ARRAYS in a new row
 
 
 class MaskClasses(NamedTuple):
-    """Evidence of one frame's N masks for C classes."""
+    """Class evidence of the N masks of one frame."""
 
     cluster: Int32  # (H * W,) cluster with the highest score at each pixel, -1 = none
     log_ratio: Float32  # (N, C) log(P(class) / P(background))
@@ -69,9 +71,13 @@ class MaskClasses(NamedTuple):
 
 
 def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists, frame: int) -> MaskClasses:
-    """Return the evidence of a frame's clusters from `log_ratio` (N, C), log(P(class) / P(background)).
+    """Return the class evidence of the masks of a frame.
 
-    `points` lists the clusters at each pixel, and `frame` is the index of the frame.
+    Args:
+        log_ratio: The log ratio (N, C) of each class to the background.
+        clusters: The clusters of the masks.
+        points: The lists of clusters at the pixels.
+        frame: The index of the frame.
     """
     relative, named, bits = named_classes(log_ratio, logarithmic=True)
     best = best_clusters(points.offsets, points.clusters, clusters.scores)
@@ -86,7 +92,10 @@ def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists
 
 
 class ClassRows:
-    """Class evidence of a growing voxel grid. The kernels modify `self.evidence`."""
+    """The class evidence of a voxel grid.
+
+    The kernels modify its `evidence`.
+    """
 
     def __init__(self, voxels: VoxelGrid) -> None:
         self.voxels = voxels
@@ -105,13 +114,22 @@ class ClassRows:
         return sum(array.nbytes for array in self.saved().values())
 
     def begin(self, classes: int) -> None:
-        """Set the number of classes before the first update. Raises DataError if there are too many."""
+        """Set the number of classes before the first update.
+
+        Raises:
+            DataError: If there are too many classes.
+        """
         if classes > NO_CLASS:
             raise DataError(f"detector: expected at most {NO_CLASS} classes, got {classes}")
         self.evidence = _free_rows(min(classes, CLASS_SLOTS))
 
     def update(self, seen: SeenBlocks, masks: MaskClasses | None) -> None:
-        """Update the voxels near the measured surface. If the detector did not run (`masks` is None), do nothing."""
+        """Update the class evidence of the voxels near the measured surface.
+
+        Args:
+            seen: The blocks updated by the frame, and their voxels near the surface.
+            masks: The evidence of the masks, or None if the detector did not run.
+        """
         capacity = len(self.voxels.grid.block_coords)
         if len(self.evidence.unmasked) < capacity:
             self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, zeros=True))
@@ -125,12 +143,20 @@ class ClassRows:
         self.evicted += int(evicted.sum())
 
     def saved(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the arrays of a map file, without unused capacity, by name."""
+        """Return the arrays for a map file."""
         rows = {name: getattr(self.evidence, name)[: self.row_count] for name in ROW_ARRAYS}
         return {"unmasked": self.evidence.unmasked[: self.voxels.block_count], **rows}
 
     def fill(self, arrays: dict[str, npt.NDArray[Any]], classes: int) -> None:
-        """Load the arrays of a saved map with `classes` classes. Raises DataError if they are invalid."""
+        """Load the arrays of a map file.
+
+        Args:
+            arrays: The arrays of the file.
+            classes: The number of classes.
+
+        Raises:
+            DataError: If the arrays are invalid.
+        """
         free = self.evidence._asdict()
         check_like(arrays, {"unmasked": free.pop("unmasked")}, self.voxels.block_count)
         check_like(arrays, free, len(arrays["rest"]))
@@ -142,7 +168,6 @@ class ClassRows:
         self.row_count = len(self.evidence.rest)
 
     def _add_rows(self, blocks: Int32) -> None:
-        """Add a row for each of the blocks, in the given order."""
         needed = self.row_count + len(blocks)
         if needed > len(self.evidence.rest):
             capacity = max(needed, 2 * len(self.evidence.rest))
@@ -157,7 +182,7 @@ class ClassRows:
 
 
 def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: int) -> None:
-    """Raise DataError unless slot 0 has the best class, and `rest` is limited in voxels without unnamed classes."""
+    """Raise DataError unless slot 0 has the most likely class, and all log ratios are in range."""
     named = class_ids != NO_CLASS
     ratios = np.where(named, log_ratio, np.float32(-np.inf))
     best = ratios.max(axis=-1, initial=-np.inf)
@@ -175,7 +200,6 @@ def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: i
 
 
 def _free_rows(class_slots: int) -> ClassEvidence:
-    """Return evidence without rows, with `class_slots` slots per voxel."""
     voxels = (0, BLOCK_VOXELS)
     return ClassEvidence(
         unmasked=np.empty(voxels, np.uint16),

@@ -14,9 +14,14 @@ MAX_FRAMES = np.uint16(65535)  # maximum frame count of a voxel
 
 @njit(cache=True, nogil=True)
 def best_clusters(offsets, clusters, scores):
-    """Return the cluster (L,) with the highest score in each list of clusters, -1 = empty list.
+    """Return the cluster (L,) with the highest score in each list, -1 = empty list.
 
-    List i is clusters[offsets[i] : offsets[i + 1]]. Ties go to the smallest cluster index.
+    Ties go to the smallest cluster index.
+
+    Args:
+        offsets: The start (L + 1,) of each list in `clusters`.
+        clusters: The clusters of the lists.
+        scores: The score (N,) of each cluster.
     """
     best = np.full(offsets.shape[0] - 1, -1, np.int32)
     for i in range(best.shape[0]):
@@ -29,9 +34,9 @@ def best_clusters(offsets, clusters, scores):
 
 @device
 def best_class(grid, evidence, log_missed, block, n):
-    """Return the most likely class of voxel n of a block, -1 = background; ties go to the background.
+    """Return the most likely class of voxel n of a block, -1 = background.
 
-    `log_missed` is the log ratio of every class to the background for a frame in which the voxel is outside all masks.
+    `log_missed` is the log ratio of every class to the background for a frame outside all masks.
     """
     row = grid.label_row[block]
     if row < 0 or evidence.class_ids[row, n, 0] == NO_CLASS:
@@ -42,10 +47,9 @@ def best_class(grid, evidence, log_missed, block, n):
 
 @device
 def _add_class(labels, sums, label, total):
-    """Store a class with the log ratio `total` in a free slot of `labels` (T,) and `sums` (T,).
+    """Store a class in a free slot or in the slot of the least likely class.
 
-    If no slot is free, the class replaces the least likely class if that class has a smaller log ratio. Returns 1 if a
-    class was evicted or not stored, otherwise 0.
+    Returns 1 if a class was evicted or not stored, otherwise 0.
     """
     least = 0
     for s in range(len(labels)):
@@ -63,10 +67,7 @@ def _add_class(labels, sums, label, total):
 
 @device
 def observe_mask(evidence, row, n, masks, k):
-    """Apply the recursive update to voxel n of a row, which is under the mask of cluster k.
-
-    Returns the number of evictions.
-    """
+    """Add the evidence of mask k to voxel n of a row, and return the number of evicted classes."""
     labels, sums = evidence.class_ids[row, n], evidence.log_ratio[row, n]
     known = 0  # bits of the named classes with a slot
     for s in range(len(labels)):
@@ -93,7 +94,7 @@ def observe_mask(evidence, row, n, masks, k):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_blocks_under_masks(grid, seen, cluster, wants_row):
-    """Set wants_row (A,) to True where a seen block has no row, but a voxel near the surface under a mask."""
+    """Find the blocks (A,) that need a row, because a voxel near the surface is under a mask."""
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
         start = seen.near_start[a]
@@ -106,10 +107,10 @@ def find_blocks_under_masks(grid, seen, cluster, wants_row):
 
 @njit(cache=True, nogil=True, parallel=True)
 def update_classes(grid, seen, evidence, masks, evicted):
-    """Update the voxels near the measured surface in the seen blocks.
+    """Update the class evidence of the voxels near the measured surface.
 
-    Voxels at a pixel of a mask get the evidence of the mask, and all other voxels count the frame as unmasked. Sets
-    evicted (A,) to the number of evictions in each block.
+    Voxels outside all masks only count the frame. The number of evicted classes of each block is written to `evicted`
+    (A,).
     """
     unmasked = evidence.unmasked  # numba 0.68 drops assignments to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):

@@ -1,11 +1,11 @@
 """Map with one volume per object and a background volume of the whole scene.
 
-Fusion++ (McCormac et al. 2018) represents an object by 64^3 voxels, which are resampled as the object grows. It
-integrates every frame that shows the object, corrects object poses by loop closures, and tracks against a coarse
-background. MaskFusion (Runz et al. 2018) stores surfels only at the pixels of masks, and tracks moving objects.
+In Fusion++ (McCormac et al., 2018), an object has 64^3 voxels, which are resampled as the object grows. Fusion++
+integrates every frame that shows the object, and corrects object poses by loop closures. MaskFusion (Runz et al., 2018)
+stores surfels at the pixels of masks and tracks moving objects.
 
-Here, all volumes have voxels of the same size, objects are static, and a volume changes only in frames in which its
-object is detected.
+Here, all volumes have the same voxel size, objects are static, and an object is only updated in frames in which it is
+detected.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ FORMAT = "object_volumes 4"  # format of the map file; increment it when the mea
 OBJECT = "object_"  # prefix of the names of the arrays with the concatenated volumes of all objects
 
 Part = tuple[Float32, Int32, UInt8, Int32]
-"""Vertices (V, 3) m, triangles (F, 3), colors (V, 3) and instance ids (V,) of a part of the mesh."""
+"""Vertices (V, 3), m, triangles (F, 3), colors (V, 3) and instance ids (V,) of a part of the mesh."""
 
 
 class ObjectMap(InstanceTableMap):
-    """A map with a background volume, one volume per object, and an instance table.
+    """A map with a background volume, one volume per object and an instance table.
 
     The class distribution of an object is the mean over its detections.
     """
@@ -63,7 +63,7 @@ class ObjectMap(InstanceTableMap):
 
     @property
     def block_count(self) -> int:
-        """Number of blocks of the background and of all objects."""
+        """Number of blocks of all volumes."""
         return self.background.voxels.block_count + sum(volume.block_count for volume in self.volumes.values())
 
     @property
@@ -76,7 +76,7 @@ class ObjectMap(InstanceTableMap):
         return self.background.sensor.depth_range
 
     def create(self, frame_index: int) -> int:
-        """Create an object with an empty volume, first seen in frame `frame_index`, and return its id."""
+        """Create an object with an empty volume, and return its id."""
         record = self.table.create(len(self.classes), frame_index)
         self.volumes[record.id] = self._empty_volume()
         return record.id
@@ -90,10 +90,16 @@ class ObjectMap(InstanceTableMap):
         self.background.changed(NO_BLOCKS)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, masks: Mapping[int, Bool], band: float) -> None:
-        """Integrate `frame` into the background and into the volumes of the objects in `masks`.
+        """Integrate a frame into the background and into the detected objects.
 
-        `masks` maps object ids to masks (H, W). Each voxel within `band` m of the measured surface counts its
-        observations inside and outside the mask of the object. Raises MapFullError if the block budget is reached.
+        Args:
+            frame: The frame.
+            T_world_camera: The camera pose (4, 4).
+            masks: The mask (H, W) of each detected object by id.
+            band: The maximum distance from the measured surface of voxels that count observations, m.
+
+        Raises:
+            MapFullError: If the map needs too many blocks.
         """
         self.background.integrate(frame, T_world_camera, band)
         for instance_id, mask in masks.items():
@@ -108,7 +114,7 @@ class ObjectMap(InstanceTableMap):
     def _integrate_object(
         self, volume: ObjectVolume, frame: Frame, T_world_camera: Float64, mask: Bool, band: float
     ) -> None:
-        """Integrate the image region that contains the object's mask and the projection of its volume."""
+        """Integrate the part of the image that contains the object."""
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         u0, v0, u1, v1 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
         if volume.block_count:
@@ -119,15 +125,15 @@ class ObjectMap(InstanceTableMap):
         volume.integrate(_cropped(frame, u0, v0, u1, v1), T_world_camera, part, band)
 
     def _boxes(self, camera: Camera, T_world_camera: Float64, volumes: list[ObjectVolume]) -> Int32:
-        """Return the pixel windows (N, 4) of the volumes; see `boxes_in_view`."""
+        """Return the pixel window (N, 4) of each volume."""
         low, high = (np.array([getattr(volume, side) for volume in volumes]) for side in ("low", "high"))
         return boxes_in_view(camera, T_world_camera, low, high, float(self.background.sensor.min_depth))
 
     def instances_seen(self, camera: Camera, T_world_camera: Float64, depth: Float32, stride: int) -> Int32:
-        """Return the object ids (ceil(H / stride), ceil(W / stride)) at the measured surface, 0 = none.
+        """Return the object at the measured surface at every stride-th pixel of a depth image, 0 = none.
 
-        These are the objects at every stride-th depth reading of every stride-th row of `depth` (H, W), m. A reading in
-        several volumes belongs to the object with the highest foreground probability.
+        If several volumes contain a reading, the object with the highest foreground probability is returned. The result
+        has the shape (ceil(H / stride), ceil(W / stride)).
         """
         shape = tuple(-(-side // stride) for side in depth.shape)
         instance_ids, best = np.zeros(shape, np.int32), np.full(shape, np.float32(FOREGROUND))
@@ -143,7 +149,7 @@ class ObjectMap(InstanceTableMap):
         return instance_ids
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Return the view of the background surface, with the labels of the objects."""
+        """Return the view of the background with the labels of the objects."""
         surface = self.background.render(camera, T_world_camera)
         instance_ids = self.instances_seen(camera, T_world_camera, surface.depth, stride=1)
         return View(**vars(surface), instance_ids=instance_ids, class_ids=self.table.class_ids()[instance_ids])
@@ -157,12 +163,10 @@ class ObjectMap(InstanceTableMap):
         return self.background.mesh(self._labeled)
 
     def _labeled(self, background: UnlabeledMesh) -> InstanceMesh:
-        """Return the mesh of the background, labeled with the most probable objects, and the meshes of the objects.
+        """Return the labeled mesh of the background, together with the meshes of the objects.
 
-        Both surfaces come from the same depth readings and nearly coincide. Without labels on the background, the
-        nearest vertex to a ground-truth point could be unlabeled by chance. Without the background, there would be
-        seams, and holes where an object's volume has too few observations. If objects overlap, the mesh contains the
-        surface of each.
+        The surfaces nearly coincide. The background is labeled, because otherwise the nearest vertex to a ground-truth
+        point could be unlabeled by chance. The background also fills holes in the objects.
         """
         counts = self.confirmation.counts(self.table)
         instance_ids = np.zeros(len(background.vertices), np.int32)
@@ -241,9 +245,13 @@ class ObjectMap(InstanceTableMap):
 
 
 def _part(surface: UnlabeledMesh, voxels: VoxelGrid, chosen: Bool, instance_ids: Int32) -> Part:
-    """Return the part of a surface with the vertices marked in `chosen` (V,), and the triangles between them.
+    """Return the chosen vertices of a surface and the triangles between them.
 
-    `instance_ids` (V,) holds the instance of each vertex of the whole surface, and `voxels` provides the colors.
+    Args:
+        surface: The surface.
+        voxels: The voxel grid with the colors.
+        chosen: A Boolean array (V,), True for vertices to keep.
+        instance_ids: The instance (V,) of each vertex.
     """
     new_index = np.cumsum(chosen, dtype=np.int32) - np.int32(1)
     triangles = surface.triangles[chosen[surface.triangles].all(axis=1)]
@@ -254,7 +262,7 @@ def _part(surface: UnlabeledMesh, voxels: VoxelGrid, chosen: Bool, instance_ids:
 
 
 def _cropped(frame: Frame, u0: int, v0: int, u1: int, v1: int) -> Frame:
-    """Return the part of a frame from pixel (u0, v0), inclusive, to pixel (u1, v1), exclusive."""
+    """Return the part of a frame from (u0, v0) to (u1, v1), exclusive."""
     camera = frame.camera
     part = replace(camera, width=u1 - u0, height=v1 - v0, cx=camera.cx - u0, cy=camera.cy - v0)
     return Frame(

@@ -1,13 +1,11 @@
-"""Volume of one object: a TSDF that grows inside the masks of the object, and two observation counts per voxel.
+"""Volume of one object: a TSDF with foreground probabilities.
 
-As in Fusion++ (McCormac et al. 2018), a voxel counts its observations inside a mask of the object (foreground) and
-outside (background). Its foreground probability is the mean of Beta(1 + foreground, 1 + background). The surface of the
-object is the part of the TSDF surface with a probability above 1/2. Therefore, occasional mask errors average out, but
-systematic errors do not.
+As in Fusion++ (McCormac et al., 2018), a voxel counts its observations inside and outside the masks of the object. The
+foreground probability is the mean of a Beta distribution with these counts. The surface of the object is the part of
+the TSDF surface with a foreground probability above 1/2. Therefore, occasional mask errors average out.
 
-Every depth reading in the blocks of the volume is integrated, inside or outside the mask. Therefore, distances at the
-outline are as accurate as elsewhere. Blocks are aligned with the blocks of other volumes. Counts take 4 bytes per voxel
-in addition to the 8 bytes of the TSDF.
+New blocks are allocated only inside masks. All depth readings in these blocks are integrated, also outside the mask, so
+that distances at the outline are accurate.
 """
 
 from __future__ import annotations
@@ -24,13 +22,13 @@ from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.mapping.voxels.voxel_grid import grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, BLOCK_VOXELS
 
-FOREGROUND = 0.5  # exclusive minimum of the foreground probability of the surface of the object
+FOREGROUND = 0.5  # minimum foreground probability of the surface of the object, exclusive
 
 VOLUME_ARRAYS = (*(name for name in BLOCK_ARRAYS if name != "label_row"), *MaskCounts._fields)  # saved arrays
 
 
 class ObjectVolume:
-    """The TSDF and the mask counts of one object."""
+    """The TSDF and the foreground counts of one object."""
 
     def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int) -> None:
         self.volume = TsdfVolume(voxel_size, sensor, max_blocks)
@@ -52,10 +50,18 @@ class ObjectVolume:
         return self.voxels.byte_count + sum(counts[: self.block_count].nbytes for counts in self.counts)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> None:
-        """Integrate `frame` into the volume. New blocks are allocated only inside the object's `mask` (H, W).
+        """Integrate a frame into the volume.
 
-        Each voxel within `band` m of the measured surface counts its observations inside and outside the mask. Raises
-        MapFullError if the block budget is reached; in this case nothing is integrated.
+        New blocks are allocated only inside the mask.
+
+        Args:
+            frame: The frame.
+            T_world_camera: The camera pose (4, 4).
+            mask: The mask (H, W) of the object.
+            band: The maximum distance from the measured surface of voxels that count observations, m.
+
+        Raises:
+            MapFullError: If the map needs too many blocks. The frame is then not integrated.
         """
         seen = self.volume.integrator.integrate_object(frame, T_world_camera, band, mask)
         self._grow()
@@ -64,7 +70,7 @@ class ObjectVolume:
         self.volume.changed(seen.blocks)
 
     def _grow(self) -> None:
-        """Allocate the counts of new blocks, initially 0."""
+        """Allocate the counts of new blocks."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.counts.observed) < capacity:
             self.counts = MaskCounts(*(grown(counts, capacity, zeros=True) for counts in self.counts))
@@ -76,22 +82,22 @@ class ObjectVolume:
             self.low, self.high = coords.min(axis=0) * side, (coords.max(axis=0) + 1) * side
 
     def encloses(self, points_world: Float32) -> Bool:
-        """Return a Boolean array (P,), True where a world point (P, 3), m, is inside the bounding box of the blocks."""
+        """Return a Boolean array (P,), True for world points (P, 3), m, inside the bounding box of the blocks."""
         return np.asarray(((points_world >= self.low) & (points_world <= self.high)).all(axis=1))
 
     def foreground_at(self, points_world: Float32) -> Float32:
-        """Return the foreground probability (P,) at surface points (P, 3), m, in the world frame."""
+        """Return the foreground probability (P,) at surface points (P, 3), m."""
         probability = np.empty(len(points_world), np.float32)
         foreground_at(self.voxels.grid, self.counts, points_world, probability)
         return probability
 
     def arrays(self) -> dict[str, Array]:
-        """Return the arrays of a map file, by name."""
+        """Return the arrays for a map file."""
         arrays = self.volume.saved()[1] | {n: counts[: self.block_count] for n, counts in self.counts._asdict().items()}
         return {name: arrays[name] for name in VOLUME_ARRAYS}
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Fill this empty volume with the saved arrays of another volume."""
+        """Copy the arrays of a map file into this empty volume."""
         self.volume.fill(arrays)
         self._grow()
         for name, counts in self.counts._asdict().items():
@@ -100,16 +106,16 @@ class ObjectVolume:
 
 
 def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: Float64, near: float) -> Int32:
-    """Return the pixel windows (N, 4), u0, v0, u1, v1, of axis-aligned boxes in the world frame; u1, v1 are exclusive.
+    """Return the pixel window (N, 4) of each box: u0, v0, u1, v1, with exclusive u1 and v1.
 
-    A window contains all of its box, but may be too large. A box out of view has u1 <= u0 or v1 <= v0.
+    A window contains its box, but may be too large. If the box is out of view, the window is empty.
 
     Args:
         camera: The camera.
-        T_world_camera: Pose (4, 4) of the camera.
-        low: Minimum corners (N, 3) of the boxes, m.
-        high: Maximum corners (N, 3) of the boxes, m.
-        near: Minimum visible depth, m.
+        T_world_camera: The camera pose (4, 4).
+        low: The minimum corners (N, 3) of the boxes, m.
+        high: The maximum corners (N, 3) of the boxes, m.
+        near: The minimum visible depth, m.
     """
     T_camera_world = inverse(T_world_camera)
     center = (low + high) / 2 @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]

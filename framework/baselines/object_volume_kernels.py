@@ -16,7 +16,7 @@ from framework.mapping.voxels.voxel_grid_kernels import NO_LOOK_UP, device
 
 
 class MaskCounts(NamedTuple):
-    """Numbers of observations of each voxel, over the frames in which the object is detected."""
+    """Number of observations of each voxel in frames in which the object is detected."""
 
     foreground: UInt16  # (B, 512) number of observations inside a mask
     observed: UInt16  # (B, 512) number of all observations, at most 65535
@@ -24,14 +24,14 @@ class MaskCounts(NamedTuple):
 
 @device
 def _probability(foreground, observed):
-    """Return the mean of Beta(1 + foreground, 1 + observed - foreground)."""
-    one = np.float32(1.0)
+    """Return the foreground probability, given the numbers of observations."""
+    one = np.float32(1.0)  # mean of Beta(1 + foreground, 1 + observed - foreground)
     return (one + np.float32(foreground)) / (one + one + np.float32(observed))
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_masks(seen, mask, counts):
-    """Count the observations of the voxels near the measured surface, in total and inside `mask` (H, W)."""
+    """Count the observations of the voxels near the measured surface, in total and inside the mask."""
     foreground, observed = counts
     largest = np.uint16(65535)
     inside = mask.ravel()
@@ -57,11 +57,18 @@ def look_up_object(
     instance_ids: Int32,
     best: Float32,
 ) -> None:
-    """Assign depth readings to an object where its foreground probability is higher than `best` (h, w).
+    """Assign depth readings to an object where its foreground probability is the highest so far.
 
-    Updates instance_ids (h, w) and `best` at every stride-th depth reading of every stride-th row of `depth` (H, W), m.
-    Only samples inside `window` are updated: first row, first column, last row and last column of the samples, the last
-    ones exclusive. `view` contains T_world_camera.
+    Args:
+        grid: The voxel grid of the object.
+        counts: The numbers of observations of the object.
+        depth: The depth image (H, W), m.
+        view: The camera with the pose T_world_camera.
+        stride: The distance between the used readings, px.
+        window: The first row, first column, end row and end column of the samples to update.
+        instance_id: The id of the object.
+        instance_ids: The object (h, w) at each sample, modified in place.
+        best: The highest foreground probability (h, w) at each sample, modified in place.
     """
     top, left, bottom, right = window
     for row in prange(top, bottom):
@@ -79,7 +86,7 @@ def look_up_object(
 
 @njit(cache=True, nogil=True, parallel=True)
 def foreground_at(grid, counts, points, probability):
-    """Fill probability (P,) with the interpolated foreground probability at points (P, 3), m, in the world frame."""
+    """Interpolate the foreground probability (P,) at points (P, 3), m."""
     for chunk in prange(-(-len(points) // CHUNK)):
         blocks, voxels = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
         weights = np.empty(CORNERS, np.float32)

@@ -1,6 +1,6 @@
 """Open3D's VoxelBlockGrid, with workarounds for errors in Open3D 0.20.
 
-Dong et al. 2022, "ASH: A modern framework for parallel spatial hashing in 3D perception".
+See Dong et al., "ASH: A modern framework for parallel spatial hashing in 3D perception", 2022.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ ATTRIBUTES = {  # name: (type, channels) of a voxel; Open3D's `integrate` expect
 }
 FIRST_BLOCKS = 1000  # maximum initial capacity, blocks; Open3D allocates it immediately
 FIRST_VOXELS = 2**23  # maximum initial capacity, voxels; 0.2 GB
-METERS = 1.0  # Open3D's depth_scale: units of a float image per meter
-TOUCH_STRIDE = 4  # pixel stride of Open3D's block search, px
+METERS = 1.0  # depth_scale of Open3D: units of a float image per meter
+TOUCH_STRIDE = 4  # stride of the block search of Open3D, px
 NEAR = 0.05  # start depth of rays, m
-RANGE_TILE = 8  # px, side of the image tile with common depth bounds in the range map; Open3D's default
-FRAGMENTS = 2**18  # capacity of the range map; a view of 10,000 blocks has 20,000 fragments
-FRAGMENT = 16 * 16  # range map pixels per fragment
-MAX_RANGE_PIXELS = 2**24  # maximum number of pixels of the first range map; coarse voxels need fewer fragments
+RANGE_TILE = 8  # side of a tile with common depth bounds in the range map, px; the default of Open3D
+FRAGMENTS = 2**18  # capacity of the range map, fragments; a view of 10,000 blocks has 20,000 fragments
+FRAGMENT = 16 * 16  # number of range map pixels per fragment
+MAX_RANGE_PIXELS = 2**24  # maximum number of pixels of the first range map
 CPU = o3d.core.Device("CPU:0")
 
 
@@ -60,7 +60,12 @@ class BlockGridSettings:
 
     @classmethod
     def of(cls, saved: MapHeader) -> BlockGridSettings:
-        """Return the settings in the header of a map file. Raises DataError or ConfigError if they are invalid."""
+        """Return the settings in the header of a map file.
+
+        Raises:
+            DataError: If a value is missing or invalid.
+            ConfigError: If a parameter is outside its bounds.
+        """
         return cls(
             voxel_size=saved.number("voxel_size", BOUNDS["voxel_size"]),
             block_resolution=saved.whole("block_resolution"),
@@ -73,7 +78,10 @@ class BlockGridSettings:
 
 
 class BlockGrid:
-    """Voxel blocks with signed distances, colors and instance votes. Flat indices of voxels are indices into `flat`."""
+    """Voxel blocks with signed distances, colors and instance votes.
+
+    Flat indices of voxels are indices into the arrays of `flat`.
+    """
 
     def __init__(self, settings: BlockGridSettings) -> None:
         self.settings = settings
@@ -90,9 +98,9 @@ class BlockGrid:
         self._reserve_range_map()
 
     def _reserve_range_map(self) -> None:
-        """Ray-cast a large image first, because Open3D sizes the range map buffer by the first image.
+        """Allocate the range map of Open3D by ray casting a large image.
 
-        Views have holes if the buffer is too small.
+        Open3D allocates the range map for the first image. If it is too small, later views have holes.
         """
         side = int(np.ceil(np.sqrt(min(FRAGMENTS * FRAGMENT * self.settings.voxel_size, MAX_RANGE_PIXELS))))
         nowhere = Tensor(np.zeros((1, 3), np.int32))
@@ -110,16 +118,20 @@ class BlockGrid:
 
     @property
     def byte_count(self) -> int:
-        """Size of the blocks in use, bytes. Open3D's hash map may allocate up to twice as much."""
+        """Size of the blocks in use, bytes."""
         return self.voxel_count * sum(dtype.byte_size() * channels for dtype, channels in ATTRIBUTES.values())
 
     @property
     def min_weight(self) -> float:
-        """Minimum weight of surface voxels; it is lower in the first frames, as in Open3D's SLAM."""
+        """Minimum weight of surface voxels, reduced in the first frames."""
         return min(self.settings.min_weight, float(self.frames))
 
     def integrate(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Integrate `frame`. Raises MapFullError if the block budget is reached; in this case nothing is integrated."""
+        """Integrate one frame.
+
+        Raises:
+            MapFullError: If the map needs too many blocks. The frame is then not integrated.
+        """
         s = self.settings
         depth = self._usable(frame.depth)
         if not depth.any():
@@ -137,11 +149,9 @@ class BlockGrid:
         return np.where((depth >= s.min_depth) & (depth <= s.max_depth), depth, np.float32(0))
 
     def _touched(self, depth: Float32, camera: Camera, T_world_camera: Float64, band: float) -> Tensor:
-        """Return the block coordinates (B, 3) of the blocks within `band` voxels of the readings of `depth` (H, W), m.
-
-        Open3D samples every 4th pixel of every 4th row. If the samples are more than half a block apart, the image is
-        enlarged to avoid holes in the map.
-        """
+        """Return the coordinates (B, 3) of the blocks within `band` voxels of the depth readings."""
+        # Open3D samples every 4th pixel of every 4th row. Enlarge the image if the samples are more than half a block
+        # apart, because the map would have holes.
         s = self.settings
         distance = TOUCH_STRIDE * float(depth.max()) / min(camera.fx, camera.fy)
         scale = min(int(np.ceil(distance / (s.block_resolution * s.voxel_size / 2))), TOUCH_STRIDE)
@@ -154,9 +164,10 @@ class BlockGrid:
         return self.blocks.compute_unique_block_coordinates(_image(depth), *view, METERS, s.max_depth, band)
 
     def _make_room(self, blocks: Tensor) -> None:
-        """Grow the hash map so that it can store the blocks at the block coordinates `blocks` (B, 3).
+        """Grow the hash map so that it can store the given blocks.
 
-        Raises MapFullError if the block budget is exceeded. Open3D itself has no budget.
+        Raises:
+            MapFullError: If there are more than `max_blocks`. Open3D itself has no limit.
         """
         hashmap = self.blocks.hashmap()
         new = blocks.shape[0]
@@ -175,8 +186,13 @@ class BlockGrid:
     def voxels_seen(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> tuple[Int64, Int64]:
         """Return the flat indices (V,) of voxels near the measured surface, and the flat indices (V,) of their pixels.
 
-        A voxel is near if its depth is within `band` voxels of the reading at its pixel. Only pixels in `mask` (H, W)
-        are used. The method is from integrate_custom.py of Open3D's examples.
+        The method follows integrate_custom.py in the examples of Open3D.
+
+        Args:
+            frame: The frame.
+            T_world_camera: The camera pose (4, 4).
+            mask: The pixels (H, W) to use.
+            band: The maximum difference between the depth of a voxel and the reading at its pixel, voxels.
         """
         camera = frame.camera
         usable = self._usable(frame.depth)
@@ -199,7 +215,7 @@ class BlockGrid:
         return voxels.numpy().ravel()[inside[near]], pixels[near]
 
     def voxels_at(self, points_world: Float32) -> Int64:
-        """Return the flat indices (P,) of the voxels nearest to the world points (P, 3), m; -1 outside all blocks."""
+        """Return the flat index (P,) of the voxel nearest to each world point (P, 3), m, -1 = not allocated."""
         if not len(points_world) or not self.block_count:
             return np.full(len(points_world), -1)
         r = self.settings.block_resolution
@@ -210,11 +226,15 @@ class BlockGrid:
         return np.where(known, indices.astype(np.int64) * r**3 + (z * r + y) * r + x, -1)  # x varies fastest
 
     def flat(self, attribute: str) -> npt.NDArray[Any]:
-        """Return a writable, flat view of one attribute of all voxels, including the unused blocks of the hash map."""
+        """Return a writable, flat view of one attribute of all voxels, including unused blocks."""
         return np.asarray(self.blocks.attribute(attribute).numpy()).reshape(-1)
 
     def ray_cast(self, camera: Camera, T_world_camera: Float64) -> SurfaceView:
-        """Return the visible surface, without labels. Raises DataError if the camera or its pose is invalid."""
+        """Return the visible surface without labels.
+
+        Raises:
+            DataError: If the camera or its pose is invalid.
+        """
         check_view(camera, T_world_camera)
         depth, normals, color = _blank(camera)
         blocks, far = self._blocks_in_view(camera, T_world_camera)
@@ -230,11 +250,9 @@ class BlockGrid:
         return SurfaceView(camera, T_world_camera, depth, normals, color)
 
     def _cast(self, blocks: Int32, far: float, camera: Camera, T_world_camera: Float64) -> dict[str, npt.NDArray[Any]]:
-        """Return the results of Open3D's ray casting by name, each (H, W, channels).
-
-        The image is padded to multiples of RANGE_TILE, because the range map omits incomplete tiles.
-        """
+        """Return the results (H, W, channels) of Open3D's ray casting by name."""
         names = ("depth", "normal", "color", "index", "mask", "interp_ratio")
+        # the range map omits incomplete tiles
         width, height = (RANGE_TILE * int(np.ceil(side / RANGE_TILE)) for side in (camera.width, camera.height))
         hit = self.blocks.ray_cast(
             Tensor(blocks),
@@ -252,18 +270,21 @@ class BlockGrid:
         return {name: hit[name].numpy()[: camera.height, : camera.width] for name in names}
 
     def _distance(self, corners: Int64, weights: Float32) -> Float32:
-        """Return the signed distance (P,), m, interpolated between voxels with flat indices `corners` (P, 8).
+        """Return the signed distance (P,), m, interpolated between voxels.
 
-        `weights` (P, 8) are the interpolation weights, 0 = unobserved voxel. Open3D's rays sample the distance at
-        coordinates rounded down to voxels, and end half a voxel too far along each axis. The distance decreases by
-        about 1 m per m behind the surface, so adding it to the depth is a Newton step.
+        Rays of Open3D sample the distance at coordinates rounded down to voxels, and end half a voxel too far along
+        each axis. Adding this distance to the depth corrects the error.
+
+        Args:
+            corners: The flat indices (P, 8) of the voxels.
+            weights: The interpolation weights (P, 8), 0 = unobserved voxel.
         """
         total = np.maximum(weights.sum(axis=1), np.float32(1e-6))
         tsdf = (self.flat("tsdf")[corners] * weights).sum(axis=1) / total
         return np.asarray(tsdf * np.float32(self.settings.truncation * self.settings.voxel_size), np.float32)
 
     def _blocks_in_view(self, camera: Camera, T_world_camera: Float64) -> tuple[Int32, float]:
-        """Return the block coordinates (B, 3) of the blocks in view, and an upper bound of their depth, m."""
+        """Return the coordinates (B, 3) of the blocks in view, and an upper bound of their depth, m."""
         coords = self.block_coords()
         side = self.settings.block_resolution * self.settings.voxel_size
         radius = side * np.sqrt(3) / 2
@@ -282,14 +303,18 @@ class BlockGrid:
         return coords[seen], float(z[seen].max(initial=0) + radius)
 
     def block_coords(self) -> Int32:
-        """Return the block coordinates (B, 3) of the blocks in use, in Open3D's order, which differs between runs."""
+        """Return the coordinates (B, 3) of the blocks in use."""
         if not self.block_count:
             return np.zeros((0, 3), np.int32)
         hashmap = self.blocks.hashmap()
+        # the order differs between runs
         return np.asarray(hashmap.key_tensor().numpy()[hashmap.active_buf_indices().numpy()], np.int32)
 
     def extract(self) -> tuple[Float32, Int32, UInt8]:
-        """Return vertices (V, 3), m, triangles (F, 3) and colors (V, 3), RGB, of the mesh, in a deterministic order."""
+        """Return the vertices (V, 3), m, triangles (F, 3) and colors (V, 3), RGB, of the mesh.
+
+        Their order is deterministic.
+        """
         if self.block_count:
             # weights are integers; the threshold is exclusive in marching cubes and inclusive in ray casting
             mesh = self.blocks.extract_triangle_mesh(self.min_weight - 0.5)
@@ -299,10 +324,8 @@ class BlockGrid:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8)
 
     def arrays(self) -> dict[str, Array]:
-        """Return the coordinates of the blocks and the attributes of their voxels, in a deterministic order.
-
-        Open3D's `save` is not used, because it terminates the process if the disk is full.
-        """
+        """Return the arrays for a map file, in a deterministic order."""
+        # not Open3D's `save`, which terminates the process if the disk is full
         coords = self.block_coords()
         order = np.lexsort(coords.T)
         blocks = self.blocks.hashmap().active_buf_indices().numpy()[order] if len(coords) else order
@@ -310,7 +333,7 @@ class BlockGrid:
         return {"block_coords": coords[order], **values}
 
     def fill(self, arrays: Mapping[str, Array]) -> None:
-        """Copy the saved arrays of another grid into this empty grid."""
+        """Copy the arrays of a map file into this empty grid."""
         values = {name: self.blocks.attribute(name).numpy() for name in ATTRIBUTES}
         expected = {"block_coords": np.zeros((0, 3), np.int32), **values}
         check_like(arrays, expected, len(arrays["block_coords"]))
@@ -324,10 +347,10 @@ class BlockGrid:
 
 
 def _tensors(camera: Camera, T_world_camera: Float64, half: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Return the intrinsics (3, 3), px, and T_camera_world (4, 4), float64.
+    """Return the camera matrix (3, 3), px, and T_camera_world (4, 4) as tensors.
 
-    `half` is added to the principal point, px. Open3D's `integrate` truncates pixel coordinates instead of rounding
-    them; 0.5 px compensates for this.
+    `half` is added to the principal point. The integration of Open3D truncates pixel coordinates instead of rounding
+    them, so it needs 0.5 px.
     """
     K = camera.K
     K[:2, 2] += half
@@ -339,13 +362,12 @@ def _image(pixels: Float32) -> o3d.t.geometry.Image:
 
 
 def _blank(camera: Camera) -> tuple[Float32, Float32, UInt8]:
-    """Return depth (H, W), normals (H, W, 3) and color (H, W, 3), all 0."""
     shape = camera.shape
     return np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.uint8)
 
 
 def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
-    """Return the rays (H, W, 3) of the pixels in the world frame, m per m of depth."""
+    """Return the world-frame rays (H, W, 3) of the pixels, scaled to unit depth."""
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
     x, y = (u - np.float32(camera.cx)) / np.float32(camera.fx), (v - np.float32(camera.cy)) / np.float32(camera.fy)
     R = T_world_camera[:3, :3].astype(np.float32)
@@ -353,7 +375,7 @@ def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
 
 
 def points_of(surface: SurfaceView) -> Float32:
-    """Return the surface points (H, W, 3), m, in the world frame; the camera center where there is no surface."""
+    """Return the surface points (H, W, 3), m, or the camera center where there is no surface."""
     points = _rays(surface.camera, surface.T_world_camera)
     points *= surface.depth[..., None]
     points += surface.T_world_camera[:3, 3].astype(np.float32)
@@ -361,7 +383,7 @@ def points_of(surface: SurfaceView) -> Float32:
 
 
 def _towards(camera: Camera, T_world_camera: Float64, normals_camera: Float32) -> Float32:
-    """Return Open3D's camera-frame normals (H, W, 3) in the world frame, flipped to point toward the camera."""
+    """Return the normals (H, W, 3) in the world frame, flipped toward the camera."""
     normals = normals_camera @ T_world_camera[:3, :3].T.astype(np.float32)
     away = np.einsum("hwi,hwi->hw", normals, _rays(camera, T_world_camera)) > 0
     normals[away] *= -1
@@ -369,7 +391,7 @@ def _towards(camera: Camera, T_world_camera: Float64, normals_camera: Float32) -
 
 
 def _in_order(vertices: Float32, triangles: Int32, colors: UInt8) -> tuple[Float32, Int32, UInt8]:
-    """Merge equal vertices and return the mesh in a deterministic order; Open3D's order depends on its threads."""
+    """Merge equal vertices, and return the mesh in a deterministic order."""
     order = np.lexsort(vertices.T)
     sorted_vertices = vertices[order]
     is_new = np.ones(len(order), np.bool_)

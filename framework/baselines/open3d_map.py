@@ -1,4 +1,4 @@
-"""Map of object instances in Open3D's voxel blocks, with a majority vote for the instance of each voxel."""
+"""Map of object instances in Open3D's voxel blocks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ FORMAT = "open3d_vbg 5"  # format of the map file; increment it when the meaning
 
 
 class Open3DMap(InstanceTableMap):
-    """Open3D's voxel blocks and an instance table. All voxels of an instance have the class stored in the table."""
+    """A map of Open3D's voxel blocks with an instance table.
+
+    All voxels of an instance have the class of the instance in the table.
+    """
 
     def __init__(self, settings: BlockGridSettings, confirmation: Confirmation) -> None:
         self.classes: tuple[str, ...] = ()
@@ -48,17 +51,25 @@ class Open3DMap(InstanceTableMap):
         return self.grid.settings.min_depth, self.grid.settings.max_depth
 
     def integrate(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Integrate `frame`. Raises MapFullError if the block budget is reached; in this case nothing is integrated."""
+        """Integrate one frame.
+
+        Raises:
+            MapFullError: If the map needs too many blocks. The frame is then not integrated.
+        """
         self.grid.integrate(frame, T_world_camera)
         self.gravity_estimator.add_frame(T_world_camera, frame.up)
         self.changed()
 
     def vote(self, frame: Frame, T_world_camera: Float64, instance_ids: Int32, band: float) -> None:
-        """Vote for the instances `instance_ids` (H, W), 0 = no vote, in the voxels within `band` voxels of the depth.
+        """Add the votes of one frame for the instances of voxels.
 
-        A voxel stores one candidate and one counter. A label with more than half of the votes always wins (Boyer and
-        Moore, "MJRTY - a fast majority vote algorithm", 1981).
+        Args:
+            frame: The frame.
+            T_world_camera: The camera pose (4, 4).
+            instance_ids: The instance (H, W) at each pixel, 0 = no vote.
+            band: The maximum distance of voting voxels from the depth readings, voxels.
         """
+        # majority vote with one candidate and one counter per voxel (Boyer and Moore, 1981)
         voxels, pixels = self.grid.voxels_seen(frame, T_world_camera, instance_ids > 0, band)
         ids = instance_ids.ravel()[pixels]
         instance, votes = self.grid.flat("instance"), self.grid.flat("votes")
@@ -70,7 +81,7 @@ class Open3DMap(InstanceTableMap):
         self.changed()
 
     def merge(self, kept: int, dropped: int) -> None:
-        """Merge instance `dropped` into `kept`, in the table and in every voxel."""
+        """Merge instance `dropped` into instance `kept`."""
         self.table.merge(kept, dropped)
         instance = self.grid.flat("instance")
         instance[instance == dropped] = kept
@@ -81,12 +92,12 @@ class Open3DMap(InstanceTableMap):
         self.__dict__.pop("_mesh", None)
 
     def instances_at(self, points_world: Float32) -> Int32:
-        """Return the instance ids (P,), 0 = none, of the voxels nearest to the points (P, 3), m, in the world frame."""
+        """Return the instance (P,) of the voxel nearest to each point (P, 3), m, 0 = none."""
         voxels = self.grid.voxels_at(points_world)
         return np.where(voxels >= 0, self.grid.flat("instance")[voxels], 0).astype(np.int32)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """Return the most likely instance at every stride-th depth reading of every stride-th row of a frame, 0 = none.
+        """Return the most likely instance at every stride-th pixel of a frame, 0 = none.
 
         See `LabeledMap.instances_seen`.
         """
@@ -107,7 +118,10 @@ class Open3DMap(InstanceTableMap):
     def render_near(
         self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
     ) -> SurfaceView:
-        """Return the surface without labels. `depth` and `sensor` are ignored, because Open3D cannot use them."""
+        """Return the visible surface without labels.
+
+        Open3D cannot use the depth readings, so `depth` and `sensor` are ignored.
+        """
         return self.grid.ray_cast(camera, T_world_camera)
 
     def mesh(self) -> InstanceMesh:

@@ -1,4 +1,4 @@
-"""Semantic map. Voxels store classes only, and instances are the connected components of one class in the mesh."""
+"""Semantic map: voxels store classes, and instances are connected components of one class in the mesh."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FORMAT = "semantic 4"  # format of the map file; increment it when the meaning o
 
 
 class Elections(NamedTuple):
-    """Parameters for deriving classes and instances from the evidence."""
+    """Parameters for the classes and instances of the mesh."""
 
     missed: float  # likelihood ratio P(no mask | any class) / P(no mask | background)
     min_area: float  # minimum surface area of an instance, m^2
@@ -41,18 +41,21 @@ class Elections(NamedTuple):
 
 
 class ComponentStatistics(NamedTuple):
-    """Statistics of K instances, indexed by id, over the voxels nearest to their vertices; entry 0 is unused."""
+    """Statistics of K instances, indexed by id.
 
-    probability_sums: Float64  # (K + 1, C) sums of P(class) over the vertices; the remainder is P(background)
+    The statistics are over the voxels nearest to the vertices. Entry 0 is unused.
+    """
+
+    probability_sums: Float64  # (K + 1, C) sums of P(class) over the vertices
     masked: Int32  # (K + 1,) maximum, over the voxels, of the number of frames under a mask
     first_frame: Int32  # (K + 1,) first frame in which any of the voxels was under a mask, -1 = none
     last_frame: Int32  # (K + 1,) last frame in which any of the voxels was under a mask, -1 = none
 
 
 class SemanticMap(SceneMap):
-    """A TSDF with a distribution over the classes and the background in each voxel.
+    """A TSDF volume with a distribution over classes and background in each voxel.
 
-    Instance ids are valid for the current mesh only. After more frames, an object may have another id.
+    Instance ids are valid for the current mesh only.
     """
 
     def __init__(self, volume: TsdfVolume, elections: Elections) -> None:
@@ -62,7 +65,11 @@ class SemanticMap(SceneMap):
         self.labels = ClassRows(volume.voxels)
 
     def begin(self, classes: tuple[str, ...]) -> None:
-        """Set the label space in the first frame. Raises DataError if a later frame has a different label space."""
+        """Set the label space of the map.
+
+        Raises:
+            DataError: If the map has a different label space.
+        """
         if not self.classes:
             self.labels.begin(len(classes))
         self.classes = agreed_classes(self.classes, classes)
@@ -84,7 +91,10 @@ class SemanticMap(SceneMap):
         return np.float32(np.log(self.elections.missed))
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Return the view with classes. All instance ids are 0, because voxels have no instances."""
+        """Return the view with classes.
+
+        All instance ids are 0, because voxels have no instances.
+        """
         surface = self.volume.render(camera, T_world_camera)
         class_ids = np.empty(camera.shape, np.int32)
         view = pinhole(camera, T_world_camera)
@@ -100,7 +110,7 @@ class SemanticMap(SceneMap):
         return self.volume.mesh(self._labeled)
 
     def _labeled(self, surface: UnlabeledMesh) -> InstanceMesh:
-        """Return the mesh with instances and classes. The class of a vertex is a majority vote of its eight voxels."""
+        """Return the mesh with instances and classes."""
         colors, class_ids = np.empty((len(surface.voxels), 3), np.uint8), np.empty(len(surface.voxels), np.int32)
         label_classes(self.volume.voxels.grid, self.labels.evidence, self._log_missed, surface, colors, class_ids)
         if self.elections.smoothness > 0:
@@ -111,11 +121,8 @@ class SemanticMap(SceneMap):
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
     def _smooth(self, surface: UnlabeledMesh, class_ids: Int32) -> None:
-        """Regularize the classes (V,) in place by a Potts model over the edges of the mesh.
-
-        The unary term is the class evidence of the voxel nearest to the vertex. Iterated conditional modes (Besag 1986)
-        minimize the energy.
-        """
+        """Regularize the classes (V,) in place by a Potts model over the edges of the mesh."""
+        # iterated conditional modes (Besag, 1986)
         starts, neighbors = vertex_neighbors(surface.triangles, len(class_ids))
         grid, evidence = self.volume.voxels.grid, self.labels.evidence
         smoothness = np.float32(self.elections.smoothness)
@@ -129,9 +136,8 @@ class SemanticMap(SceneMap):
         """Return the connected components of the mesh as instances.
 
         The class distribution is the mean over the voxels nearest to the vertices, without the background. The
-        confidence is the mean probability of the class of the component over these voxels, in the distributions with
-        the background. The number of observations is the largest number of frames in which one of these voxels was
-        under a mask.
+        confidence is the mean probability of the class, including the background. The number of observations is the
+        maximum number of frames under a mask of any of these voxels.
         """
         mesh, up, instances = self.mesh(), self.gravity().up, {}
         found = self._sum_components(self.volume.surface().voxels, mesh.instance_ids)
@@ -186,10 +192,14 @@ class SemanticMap(SceneMap):
 
 
 def connected_components(triangles: Int32, class_ids: Int32, min_vertices: int) -> Int32:
-    """Return the component (V,) of each vertex. Components are numbered from 1 in the order of their first vertices.
+    """Return the component (V,) of each vertex, 0 = none.
 
-    A component contains the vertices of one class in `class_ids` (V,), -1 = none, that are connected by edges of
-    `triangles` (F, 3). 0 = no class, or a component with fewer than `min_vertices` vertices.
+    Components are numbered from 1 in the order of their first vertices.
+
+    Args:
+        triangles: The triangles (F, 3).
+        class_ids: The class (V,) of each vertex, -1 = none.
+        min_vertices: The minimum number of vertices of a component.
     """
     components = np.empty(len(class_ids), np.int32)
     connect_vertices(triangles, class_ids, components)
@@ -198,9 +208,10 @@ def connected_components(triangles: Int32, class_ids: Int32, min_vertices: int) 
 
 
 def vertex_neighbors(triangles: Int32, count: int) -> tuple[Int32, Int32]:
-    """Return the neighbors of V = `count` vertices along edges of triangles (F, 3), as starts (V + 1,) and indices.
+    """Return the neighbors of each vertex along the edges of triangles (F, 3).
 
-    The neighbors of vertex v are indices[starts[v] : starts[v + 1]].
+    The neighbors of vertex v are indices[starts[v] : starts[v + 1]], where `starts` (count + 1,) and `indices` are the
+    results.
     """
     a, b = (triangles[:, sides].ravel() for sides in ([0, 1, 2], [1, 2, 0]))
     both = np.concatenate([a, b]), np.concatenate([b, a])

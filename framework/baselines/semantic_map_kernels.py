@@ -15,9 +15,15 @@ from framework.refinement.segmentation.union_find import root, unite
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_view(grid, evidence, log_missed, view, depth, class_ids):
-    """Fill class_ids (H, W), -1 = none, with the classes of the voxels nearest to the surface at `depth` (H, W), m.
+    """Fill the class of each pixel from the voxel nearest to the surface.
 
-    `view` contains T_world_camera. See best_class() for `log_missed`.
+    Args:
+        grid: The voxel grid.
+        evidence: The class evidence.
+        log_missed: See best_class().
+        view: The camera with the pose T_world_camera.
+        depth: The depth (H, W) of the surface, m.
+        class_ids: The output (H, W), -1 = none.
     """
     for v in prange(depth.shape[0]):
         key, region = NO_LOOK_UP
@@ -41,7 +47,7 @@ def _elect(grid, evidence, log_missed, blocks, voxels, weights, labels):
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_classes(grid, evidence, log_missed, surface, colors, class_ids):
-    """Fill colors (V, 3) and class_ids (V,), -1 = background, of the vertices of an UnlabeledMesh."""
+    """Fill the color (V, 3) and the class (V,) of each vertex of a mesh, -1 = background."""
     vertices = surface.vertices
     for chunk in prange(-(-len(vertices) // CHUNK)):
         blocks, voxels = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
@@ -55,7 +61,7 @@ def label_classes(grid, evidence, log_missed, surface, colors, class_ids):
 
 @device
 def _log_ratio(grid, evidence, log_missed, block, n, label):
-    """Return the log ratio of class `label` to the background in voxel n of a block; label -1 = background, ratio 0."""
+    """Return the log ratio of a class to the background in voxel n of a block."""
     if label < 0:
         return np.float32(0)
     absent = log_missed * np.float32(evidence.unmasked[block, n])
@@ -70,19 +76,27 @@ def _log_ratio(grid, evidence, log_missed, block, n, label):
 
 @njit(cache=True, nogil=True)
 def smooth_classes(grid, evidence, log_missed, voxels, starts, neighbors, smoothness, class_ids):
-    """Set the class of each vertex in class_ids (V,), in order, to the class with the highest score.
+    """Set the class of each vertex to the class with the highest score, and return the number of changes.
 
-    The score is the log ratio of the class to the background, plus `smoothness` for each neighbor of this class.
-    Candidates are the background, the most likely class of the nearest voxel and the classes of the neighbors. Ties go
-    to the current class. The neighbors of vertex v are neighbors[starts[v] : starts[v + 1]]. Returns the number of
-    changes.
+    The score is the log ratio of the class to the background, plus `smoothness` for each neighbor of the same class.
+    Ties go to the current class.
+
+    Args:
+        grid: The voxel grid.
+        evidence: The class evidence.
+        log_missed: See best_class().
+        voxels: The voxel (V,) nearest to each vertex.
+        starts: The start (V + 1,) of the neighbors of each vertex in `neighbors`.
+        neighbors: The neighbors of the vertices.
+        smoothness: The log-odds for each neighbor of the same class.
+        class_ids: The class (V,) of each vertex, -1 = background, modified in place.
     """
     changes = 0
     for v in range(len(class_ids)):
         block, n = voxels[v] // BLOCK_VOXELS, voxels[v] % BLOCK_VOXELS
         around = neighbors[starts[v] : starts[v + 1]]
         best, largest = class_ids[v], np.float32(-np.inf)
-        for candidate in range(-3, len(around)):
+        for candidate in range(-3, len(around)):  # current class, background, best class of the voxel, neighbors
             label = class_ids[v]
             if candidate == -2:
                 label = np.int32(-1)
@@ -103,9 +117,9 @@ def smooth_classes(grid, evidence, log_missed, voxels, starts, neighbors, smooth
 
 @njit(cache=True, nogil=True)
 def connect_vertices(triangles, class_ids, components):
-    """Fill components (V,) with the first vertex of the connected component of each vertex.
+    """Set the component (V,) of each vertex to its first vertex.
 
-    Edges of `triangles` (F, 3) connect vertices with equal class_ids (V,).
+    Edges of triangles (F, 3) connect vertices of the same class.
     """
     for v in range(len(components)):
         components[v] = v
@@ -120,9 +134,15 @@ def connect_vertices(triangles, class_ids, components):
 
 @njit(cache=True, nogil=True)
 def sum_components(grid, evidence, log_missed, voxels, instance_ids, found):
-    """Add the evidence of the voxel nearest to each vertex to the ComponentStatistics `found`, which must be empty.
+    """Add the evidence of the voxel nearest to each vertex to the statistics of its component.
 
-    `voxels` (V,) are numbered as in an UnlabeledMesh, and `instance_ids` (V,) holds the component of each vertex.
+    Args:
+        grid: The voxel grid.
+        evidence: The class evidence.
+        log_missed: See best_class().
+        voxels: The voxel (V,) nearest to each vertex, numbered as in an UnlabeledMesh.
+        instance_ids: The component (V,) of each vertex, 0 = none.
+        found: The statistics, initially empty, modified in place.
     """
     sums, masked, first_frame, last_frame = found.probability_sums, found.masked, found.first_frame, found.last_frame
     classes = sums.shape[1]

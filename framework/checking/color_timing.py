@@ -17,7 +17,7 @@ SHORT = 0.003  # s, a shorter delay has no visible effect
 
 
 def check_color_delay(matcher: Matcher) -> Finding:
-    """Check the delay of color behind depth, estimated from the camera motion in parts of a sequence."""
+    """Check the delay of color images relative to depth images."""
     delay = matcher.sequence.constant_color_delay()
     if delay is not None:
         return Finding(Verdict.FINE, SUBJECT, f"{1e3 * delay:g} ms, as set; dataset.color_delay=AUTO estimates it")
@@ -37,9 +37,9 @@ def check_color_delay(matcher: Matcher) -> Finding:
 
 
 def estimate_delay(matcher: Matcher) -> DelayEstimate:
-    """Return the delay of color behind depth, estimated from parts of the matcher's sequence.
+    """Estimate the delay of color images relative to depth images from parts of a sequence.
 
-    For frames without a given pose, the camera motion is estimated from matched points.
+    For frames without a pose, the camera motion is estimated from matched points.
     """
     sequence, estimator = matcher.sequence, DelayEstimator()
     length = min(PART_FRAMES, len(sequence))

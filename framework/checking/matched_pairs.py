@@ -48,7 +48,10 @@ class Matcher:
         self._features = lru_cache(maxsize=4 * len(STEPS))(self._extract)
 
     def pairs(self, starts: Sequence[int], steps: Sequence[int] = STEPS) -> Iterator[MatchedPair]:
-        """Yield the pairs (k, k + step) for each k in `starts`. Steps increase until the overlap is too small."""
+        """Yield the pairs (k, k + step) for each k in `starts`.
+
+        The steps increase until the overlap is too small.
+        """
         for k in starts:
             for step in steps:
                 pair = self.pair(k, step)

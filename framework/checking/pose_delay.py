@@ -1,6 +1,6 @@
 """Detection of a delay between poses and images.
 
-A delay is only observable if the camera motion changes: the relative poses of frame pairs must depend on the delay.
+A delay is only observable if the camera motion changes, because the relative poses of frame pairs must depend on it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MIN_PAIRS = 5  # minimum number of counted pairs
 
 @dataclass(frozen=True)
 class PoseDelay:
-    """A delay of the poses."""
+    """A delay of the poses relative to the images."""
 
     frames: int  # delay in frames; negative = early
     error: float  # px, mean over the pairs with the stored poses
@@ -34,7 +34,12 @@ class PoseDelay:
     alike: tuple[int, ...]  # frames, other delays that fit equally well
 
     def finding(self, applied: int, step: float) -> Finding:
-        """Return the check result. `applied` is the configured delay in frames, and `step` the frame interval in s."""
+        """Return the check result.
+
+        Args:
+            applied: Configured delay, frames.
+            step: Frame interval, s.
+        """
         count, (when, where) = abs(self.frames), ("late", "later") if self.frames > 0 else ("early", "earlier")
         frames = f"{count} frame{'s' * (count > 1)}"
         text = (
@@ -50,10 +55,12 @@ class PoseDelay:
 def find_delay(
     pairs: Sequence[MatchedPair], poses: Sequence[Float64 | None], fits: Sequence[PoseFit]
 ) -> PoseDelay | None:
-    """Return the delay of the poses in the best-fitting convention; None = no significant delay.
+    """Return the delay of the poses, or None without a significant delay.
 
-    `poses` contains the stored poses (4, 4) of all frames by `Frame.index`, None = unknown. `fits` are the candidate
-    conventions.
+    Args:
+        pairs: Pairs of frames.
+        poses: Stored pose (4, 4) of each frame by `Frame.index`; None = unknown.
+        fits: Candidate pose conventions. The delay is that of the best-fitting convention.
     """
     known = {k: T for k, T in enumerate(poses) if T is not None}
     delays = range(-MAX_DELAY - 1, MAX_DELAY + 2)
@@ -88,7 +95,7 @@ def find_delay(
 
 
 def delayed(pair: MatchedPair, poses: Sequence[Float64 | None], delay: int) -> MatchedPair:
-    """Return the pair with the poses from `delay` frames later."""
+    """Return a pair with the poses from `delay` frames later."""
     stored = dict(enumerate(poses))
     first, second = (
         replace(frame, T_world_camera=stored.get(frame.index + delay)) for frame in (pair.first, pair.second)
@@ -97,6 +104,6 @@ def delayed(pair: MatchedPair, poses: Sequence[Float64 | None], delay: int) -> M
 
 
 def _error(pair: MatchedPair, poses: Mapping[int, Float64], fit: PoseFit, delay: int) -> float:
-    """Return the error of a pair in px with the poses from `delay` frames later."""
+    """Return the error of a pair with the poses from `delay` frames later, px."""
     T_second_first = motion_between(poses[pair.first.index + delay], poses[pair.second.index + delay], fit.reading)
     return error_of(pair, T_second_first, fit.depth_factor)

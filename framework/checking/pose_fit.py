@@ -1,4 +1,4 @@
-"""Fit of a recording's poses to its images, in each supported pose convention."""
+"""Fit of stored poses to the images, in each supported pose convention."""
 
 from __future__ import annotations
 
@@ -46,13 +46,19 @@ class PoseFit:
 
 
 def readings(pose_unit: float = 1.0) -> Iterator[PoseReading]:
-    """Yield all pose conventions with translations in `pose_unit` meters, starting with the default convention."""
+    """Yield all pose conventions, starting with the default convention.
+
+    Translations are in units of `pose_unit` meters.
+    """
     for order, kind, axes in product(QuaternionOrder, PoseKind, CameraAxes):
         yield PoseReading(kind, axes, order, pose_unit)
 
 
 def fit(pairs: Sequence[MatchedPair], reading: PoseReading, depth_factor: float | None = None) -> PoseFit:
-    """Return the fit of a pose convention to pairs with poses. The depth factor is estimated if it is None."""
+    """Return the fit of a pose convention to pairs of frames with poses.
+
+    The depth factor is estimated if it is None.
+    """
     motions = [motion_of(pair, reading) for pair in pairs]
     factor, within = (depth_factor, 1.0) if depth_factor else _depth_factor(pairs, motions)
     errors = np.array([error_of(pair, motion, factor) for pair, motion in zip(pairs, motions, strict=True)])
@@ -60,7 +66,7 @@ def fit(pairs: Sequence[MatchedPair], reading: PoseReading, depth_factor: float 
 
 
 def motion_of(pair: MatchedPair, reading: PoseReading) -> Float64:
-    """Return T_second_first (4, 4) from the poses of the two frames."""
+    """Return the camera motion T_second_first (4, 4) from the stored poses of a pair."""
     T_world_first, T_world_second = pair.first.T_world_camera, pair.second.T_world_camera
     assert T_world_first is not None
     assert T_world_second is not None
@@ -68,14 +74,14 @@ def motion_of(pair: MatchedPair, reading: PoseReading) -> Float64:
 
 
 def motion_between(T_world_first: Float64, T_world_second: Float64, reading: PoseReading) -> Float64:
-    """Return T_second_first (4, 4) from two stored poses (4, 4) in the convention `reading`."""
+    """Return the camera motion T_second_first (4, 4) from two stored poses in a pose convention."""
     return inverse(reading.pose(T_world_second)) @ reading.pose(T_world_first)
 
 
 def _depth_factor(pairs: Sequence[MatchedPair], motions: Sequence[Float64]) -> tuple[float, float]:
-    """Return the ratio of translations in the poses to translations in the images, and its uncertainty factor.
+    """Return the ratio of translations in the poses to translations in the images, and its uncertainty.
 
-    Both are 1 if unknown.
+    The uncertainty is also a ratio. Both values are 1 if unknown.
     """
     ratios = []
     for pair, T_second_first in zip(pairs, motions, strict=True):
@@ -90,7 +96,7 @@ def _depth_factor(pairs: Sequence[MatchedPair], motions: Sequence[Float64]) -> t
 
 
 def error_of(pair: MatchedPair, T_second_first: Float64, factor: float) -> float:
-    """Return the median reprojection error of a pair in px, with all depths multiplied by `factor`."""
+    """Return the median reprojection error of a pair, px, with all depths multiplied by `factor`."""
     moved = transform(T_second_first, pair.points_first.astype(np.float64) * factor)
     farthest = MAX_ERROR * pair.second.camera.width
     with np.errstate(all="ignore"):
@@ -100,7 +106,7 @@ def error_of(pair: MatchedPair, T_second_first: Float64, factor: float) -> float
 
 @dataclass(frozen=True)
 class PoseJudgment:
-    """Results of the checks of a recording's poses and units."""
+    """Results of the checks of poses and units."""
 
     findings: tuple[Finding, ...]
     given: PoseFit | None  # fit of the configured convention; None = too few informative pairs
@@ -111,7 +117,11 @@ class PoseJudgment:
 def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, median_depth: float) -> PoseJudgment:
     """Check the stored poses, and find the pose convention that fits the images best.
 
-    `given` is the configured convention, `depth_scale` is in units per meter, and `median_depth` is in m.
+    Args:
+        pairs: Pairs of frames.
+        given: Configured convention.
+        depth_scale: Configured depth scale, units per meter.
+        median_depth: Median depth of the recording, m.
     """
     informative = [pair for pair in pairs if pair.motion > MIN_MOTION * pair.first.camera.width]
     if len(informative) < MIN_PAIRS:
@@ -149,7 +159,10 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
 
 
 def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> PoseFit:
-    """Return the fit with depth as stored, or with an estimated factor if its error is clearly smaller."""
+    """Return the fit with the stored depth scale.
+
+    If an estimated scale has a clearly smaller error, return the fit with the estimated scale.
+    """
     as_stored, scaled = fit(pairs, reading, 1.0), fit(pairs, reading)
     far = not 1 / WRONG_SCALE < scaled.depth_factor < WRONG_SCALE
     needed = MAX_ERROR_INCREASE if far else MAX_OTHER_RATIO
@@ -180,8 +193,7 @@ def _named(reading: PoseReading) -> str:
 
 
 def _equal_to_best(fits: Sequence[PoseFit]) -> list[PoseFit]:
-    """Return all fits that are as good as the best fit. For a panning camera, several conventions fit equally well."""
-    least = min(one.error for one in fits)
+    least = min(one.error for one in fits)  # for a panning camera, several conventions fit equally well
     return [one for one in fits if one.error <= ALIKE * least + ALIKE_PX]
 
 

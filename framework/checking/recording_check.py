@@ -54,9 +54,14 @@ class RecordingCheck:
 
 
 def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
-    """Check some frames of a sequence and their neighbors. `farthest` is the mapped range in m.
+    """Check some frames of a sequence and their neighbors.
 
-    Raises DataError if no frame is readable.
+    Args:
+        sequence: Sequence.
+        farthest: Mapped range, m.
+
+    Raises:
+        DataError: No frame is readable.
     """
     given, depth_delay = PoseReading(), 0
     if isinstance(sequence, Recording):
@@ -113,7 +118,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
 def _judge_poses(
     sequence: RGBDSequence, pairs: Sequence[MatchedPair], given_reading: PoseReading, median_depth: float
 ) -> tuple[PoseJudgment, int]:
-    """Return the results of the pose checks, and the delay of the poses in frames; 0 = no delay."""
+    """Return the results of the pose checks, and the delay of the poses in frames."""
     given, scale = replace(given_reading, pose_delay=0), _scale_of(sequence)
     judgment = pose_fit.judge(pairs, given, scale, median_depth)
     if judgment.given is None or judgment.best is None:
@@ -133,12 +138,12 @@ def _judge_poses(
 
 
 def _stored_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
-    """Return the poses of all frames in a recording, independent of the frame selection."""
+    """Return the poses of all frames in a recording, including frames that are not selected."""
     return [recorded.T_world_camera for recorded in sequence.contents.frames] if isinstance(sequence, Recording) else []
 
 
 def warn_of_poses(sequence: RGBDVideo) -> None:
-    """Log a warning at the start of a run if the given poses do not fit the images of a few frames."""
+    """Log a warning if the given poses do not fit the images of a few frames."""
     if not isinstance(sequence, RGBDSequence) or not sequence.has_poses():
         return
     starts = [int(fraction * len(sequence)) for fraction in QUICK_STARTS]
@@ -202,9 +207,12 @@ def _read(sequence: RGBDSequence, chosen: Sequence[int]) -> tuple[list[Frame], l
 
 
 def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tuple[Finding, float]:
-    """Return the result of the depth check and the median depth in m.
+    """Check the depth images. Return the result and the median depth in m.
 
-    `farthest` is the mapped range in m, and `scale` the depth units per meter.
+    Args:
+        frames: Checked frames.
+        farthest: Mapped range, m.
+        scale: Depth units per meter.
     """
     readings = np.concatenate([frame.depth[frame.depth > 0] for frame in frames])
     if not len(readings):
@@ -229,8 +237,10 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
 def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
     """Check the image motion between neighboring frames.
 
-    `steps` contains the motion of each matched pair as a fraction of `width` (px). `neighbors` is the number of all
-    pairs.
+    Args:
+        steps: Motion of each matched pair, as a fraction of the image width.
+        neighbors: Number of all pairs.
+        width: Image width, px.
     """
     if not neighbors:
         return Finding(Verdict.UNKNOWN, "motion", "unknown with a single frame")
@@ -246,7 +256,7 @@ def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
 
 
 def _check_sharpness(frames: Sequence[Frame]) -> Finding:
-    """Check the image sharpness, measured by the width of color edges."""
+    """Check the image sharpness by the width of color edges."""
     widths = [_edge_width(frame) for frame in frames]
     text = f"median edge width of {np.median(widths):.1f} px, maximum of {max(widths):.1f} px in {len(frames)} frames"
     blurred = sum(width > MAX_EDGE_WIDTH * frames[0].camera.width for width in widths)
@@ -256,17 +266,18 @@ def _check_sharpness(frames: Sequence[Frame]) -> Finding:
 
 
 def _edge_width(frame: Frame) -> float:
-    """Return the median width in px of the strongest color edges: contrast divided by gradient."""
+    """Return the median width of the strongest color edges, px."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     window = np.ones((max(3, round(EDGE_WINDOW * frame.camera.width)),) * 2, np.uint8)
     contrast = cv2.subtract(cv2.dilate(gray, window), cv2.erode(gray, window)).astype(np.float32)
     slope = color_gradient(frame) / 8  # the weights of the Sobel filter add up to 8
     strong = slope >= max(float(np.quantile(slope, 0.95)), 1e-3)
+    # the width of an edge is its contrast divided by its gradient
     return float(np.median(contrast[strong] / slope[strong])) if strong.any() else float(len(window))
 
 
 def _check_times(sequence: RGBDSequence) -> list[Finding]:
-    """Check the timestamps of a recording. The result is empty for other sequences and fewer than 3 frames."""
+    """Check the timestamps of a recording. Other sequences and short recordings have no result."""
     if not isinstance(sequence, Recording) or len(sequence) < 3:
         return []
     times: Float64 = np.array([sequence.contents.frames[k].timestamp for k in sequence.chosen])

@@ -1,7 +1,7 @@
 """Check of the registration of color and depth in space and time.
 
-Depth edges must coincide with color edges. Shifted and scaled depth edges, and depth edges of nearby frames, are
-compared with color gradients.
+Depth edges must coincide with color edges. The check shifts and scales depth edges, and also uses depth edges of nearby
+frames, and compares them with color gradients.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ MIN_STRENGTH = 0.25  # standard deviations, minimum strength of a match that is 
 
 @dataclass(frozen=True)
 class EdgeAlignment:
-    """Agreement of color edges with scaled depth edges from `delay` frames later."""
+    """Agreement of color edges with depth edges at one delay and scale."""
 
-    delay: int  # frames
+    delay: int  # frames; positive = depth images from later frames
     zoom: float  # scale of the depth image
     strength: float  # mean gradient at the depth edges for the best shift, in standard deviations
     shift: tuple[float, float]  # best shift (x, y), as fractions of the image width
@@ -47,7 +47,10 @@ class EdgeAlignment:
 
 
 class EdgeComparison:
-    """Comparison of color and depth edges in selected frames of a sequence. Unreadable frames are skipped."""
+    """Comparison of color and depth edges in selected frames of a sequence.
+
+    Unreadable frames are skipped.
+    """
 
     def __init__(self, sequence: RGBDSequence, chosen: Sequence[int]) -> None:
         self.sequence = sequence
@@ -55,7 +58,7 @@ class EdgeComparison:
         self._edges = lru_cache(maxsize=None)(self._find_edges)
 
     def alignments(self, candidates: Iterable[tuple[int, float]]) -> list[EdgeAlignment]:
-        """Return the alignments of the candidates (delay in frames, zoom) with enough edges."""
+        """Return the alignment for each candidate (delay in frames, zoom) with enough edges."""
         found = []
         for delay, zoom in candidates:
             pairs = [(k, k + delay) for k in self.chosen if 0 <= k + delay < len(self.sequence)]
@@ -70,9 +73,9 @@ class EdgeComparison:
         return found
 
     def _correlation(self, of_color: int, of_depth: int, zoom: float) -> Float32 | None:
-        """Return the mean gradient (2 L + 1, 2 L + 1) at the depth edges for each shift of up to L = SEARCHED_SHIFT px.
+        """Return the mean color gradient at the depth edges for each shift, or None without usable edges.
 
-        `of_color` and `of_depth` are frame indices. None = unusable frames or too few edges.
+        The color and depth images are those of the frames `of_color` and `of_depth`.
         """
         color, depth = self._edges(of_color), self._edges(of_depth)
         if color is None or depth is None:
@@ -89,7 +92,7 @@ class EdgeComparison:
         return np.asarray(cv2.matchTemplate(padded, edges, cv2.TM_CCORR) / edges.sum(), np.float32)
 
     def _find_edges(self, k: int) -> tuple[Float32, Float32] | None:
-        """Return the normalized color gradient and the depth edges, both (h, WIDTH); None = unusable frame."""
+        """Return the normalized color gradient and the depth edges of a frame, or None for an unusable frame."""
         try:
             frame = self.sequence[k]
         except FrameError:
@@ -104,13 +107,14 @@ class EdgeComparison:
 
 
 def color_gradient(frame: Frame) -> Float32:
-    """Return the gradient magnitude (H, W) of the gray values: 8 times the difference per px (3x3 Sobel filter)."""
+    """Return the gradient magnitude (H, W) of the gray image, 8 times the difference per px."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+    # the weights of the 3x3 Sobel filter add up to 8
     return np.asarray(np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)), np.float32)
 
 
 def depth_edges(depth: Float32) -> Bool:
-    """Return the depth edges (H, W): pixels on the nearer side of a depth step."""
+    """Return the mask (H, W) of pixels on the nearer side of a depth step."""
     edges = np.zeros(depth.shape, np.bool_)
     for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         a, b = depth[one], depth[other]
@@ -122,11 +126,14 @@ def depth_edges(depth: Float32) -> Bool:
 def judge(
     by_delay: Sequence[EdgeAlignment], by_zoom: Sequence[EdgeAlignment], applied_delay: int, step: float
 ) -> tuple[Finding, int]:
-    """Return the check result and the delay of the depth images in frames; 0 = no detected delay.
+    """Return the check result, and the delay of the depth images in frames.
 
-    `by_zoom` contains the alignments at the best delay. `applied_delay` is the configured delay in frames. `step` is
-    the image motion per frame as a fraction of the width. A shift of at most half of `step` may be due to a time
-    offset.
+    Args:
+        by_delay: Alignments at each delay.
+        by_zoom: Alignments at each scale, with the best delay.
+        applied_delay: Configured delay, frames.
+        step: Image motion per frame, as a fraction of the image width. A shift of at most half of it may be due to a
+            time offset.
     """
     subject = "color and depth"
     here = next((alignment for alignment in by_delay if alignment.delay == 0), None)

@@ -1,4 +1,4 @@
-"""Commands of `instancemap`, one module each. Modules such as `command_line` are shared."""
+"""The commands of `instancemap`, one module each, and shared modules such as `command_line`."""
 
 from framework.runtime.process_settings import set_environment
 

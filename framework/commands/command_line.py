@@ -1,6 +1,6 @@
 """Arguments and errors of commands.
 
-An error prints one line on stderr and sets the exit status. `debug=true` adds the traceback.
+An error is printed as one line to stderr and sets the exit status. `debug=true` adds the traceback.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ OmegaConf.register_new_resolver("directory_name", directory_name, replace=True)
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Exit with an error status and print one line to stderr after a known error or Ctrl-C inside the context."""
+    """Print a known error or Ctrl-C in the `with` body as one line, and exit with an error status."""
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises its errors instead of printing them
     try:
         yield
@@ -73,7 +73,10 @@ def print_error(error: BaseException, prefix: str = "error: ") -> None:
 
 
 def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Parse the command line with `parser`, which gets the option --config-dir. `debug=true` is also accepted."""
+    """Parse the command line.
+
+    The option --config-dir is added to the parser. The argument `debug=true` is also accepted.
+    """
     for word in sys.argv[1:]:
         if word.startswith("debug=") and word not in ("debug=true", "debug=false"):
             parser.error(f"debug: expected true or false, got {word.partition('=')[2][:60]!r}")
@@ -108,12 +111,18 @@ def print_for_directories(description: str, directory_help: str, write: Callable
 
 @dataclass
 class Jobs:
-    """Error logging and exit status for the jobs of a run or sweep. An error does not stop the other jobs."""
+    """Error logging and exit status for the jobs of a run or sweep.
+
+    An error does not stop the other jobs.
+    """
 
     status: int = 0
 
     def reported(self, job: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
-        """Return `job` with error logging: one line per error, with a traceback for unknown errors or `debug=true`."""
+        """Return a job that logs its errors, one line per error.
+
+        The traceback is added for unknown errors and with `debug=true`.
+        """
 
         @wraps(job)
         def reported_job(config: DictConfig) -> Any:
@@ -133,7 +142,7 @@ class Jobs:
         return reported_job
 
     def run(self, command: Callable[[], None]) -> None:
-        """Run Hydra's `command`, and exit with an error status if a job has failed."""
+        """Run a Hydra command, and exit with an error status if a job has failed."""
         with one_line_errors():
             for folder in filter(Path.is_dir, _config_dirs(sys.argv[1:])):  # Hydra reports a missing folder
                 add_config_dir(folder)  # for steps after Hydra has finished, such as the figure of a sweep
@@ -156,7 +165,7 @@ def is_of_sweep(hydra_config: HydraConf) -> bool:
 
 
 def _config_dirs(words: list[str]) -> list[Path]:
-    """Return the folders given by --config-dir (or -cd) on Hydra's command line."""
+    """Return the folders given by --config-dir (or -cd) on the command line of Hydra."""
     folders = []
     for word, following in pairwise([*words, ""]):
         option, equals, value = word.partition("=")
@@ -166,18 +175,15 @@ def _config_dirs(words: list[str]) -> list[Path]:
 
 
 def _is_handled_by_sweep(config: DictConfig) -> bool:
-    """Return True for a job whose error the sweep handles.
-
-    These are the jobs in worker processes (all launchers except Hydra's basic one), because the process of the sweep
-    receives only the error, and the jobs with an objective, because the sweeper limits the number of failed jobs.
-    """
     hydra_config = HydraConfig.get()
+    # the process of the sweep receives only the error of a job that runs in a worker process
     with_workers = not str(hydra_config.launcher._target_).endswith(".BasicLauncher")
+    # with an objective, the sweeper limits the number of failed jobs
     return is_of_sweep(hydra_config) and (with_workers or config.get("objective") is not None)
 
 
 def _log_error(message: str, error: BaseException | None) -> None:
-    """Log an error to the console and the job's log file, or print it if logging is not configured."""
+    """Log an error, or print it if logging is not configured."""
     if logging.getLogger().handlers and not log.disabled:
         log.error("%s", message, exc_info=error)
         return

@@ -1,7 +1,7 @@
 """Compilation of kernels in advance, in parallel processes and with a progress bar.
 
 numba compiles a kernel at its first call with new argument types, and stores it in its cache. kernels.txt lists the
-argument types of these calls.
+argument types of each kernel.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SECONDS_EACH = 0.65  # s, compilation time of a kernel on one core (AMD EPYC, Ze
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel, and the argument types of one of its calls."""
+    """A kernel with the argument types of one call."""
 
     module: str
     name: str
@@ -51,7 +51,11 @@ class Kernel:
 
     @property
     def dispatcher(self) -> Any:
-        """The numba dispatcher. Raises DataError if kernels.txt is older than the code."""
+        """The numba dispatcher.
+
+        Raises:
+            DataError: kernels.txt is older than the code.
+        """
         found = getattr(import_module(self.module), self.name, None)
         if not isinstance(found, Dispatcher):
             raise DataError(
@@ -65,15 +69,16 @@ class Kernel:
         return tuple(map(_type_of, ast.parse(f"f({self.types})", mode="eval").body.args))  # type: ignore[attr-defined]
 
     def is_compiled(self) -> bool:
-        """Return True if numba's cache contains the kernel and is newer than the code of all called kernels."""
+        """Return True if the cache of numba contains the kernel for the current code."""
         cache = self.dispatcher._cache
         index = Path(cache._cache_file._index_path) if cache._enabled else None
         if index is None or not index.exists():
             return False
         written = index.stat().st_mtime
+        # numba checks only the file of the kernel itself, not the files of called kernels
         files = {kernel.py_func.__code__.co_filename for kernel in called_by(self.dispatcher)}
         if any(Path(path).stat().st_mtime > written for path in files):
-            cache.flush()  # numba checks only the kernel's own file
+            cache.flush()
             return False
         try:
             compiled = cache._cache_file._load_index()
@@ -87,7 +92,7 @@ class Kernel:
 
 
 def listed(*sections: str) -> list[Kernel]:
-    """Return the kernels in the given sections of kernels.txt, DEFAULT or OTHERS."""
+    """Return the kernels in sections of kernels.txt (DEFAULT or OTHERS)."""
     found, section = [], ""
     for line in LIST.read_text(encoding="utf-8").splitlines():
         if line.startswith("#"):
@@ -100,15 +105,15 @@ def listed(*sections: str) -> list[Kernel]:
 
 
 def line_of(dispatcher: Any, signature: Iterable[Any]) -> str:
-    """Return the line of kernels.txt for a call of a kernel with the argument types `signature`."""
+    """Return the line of kernels.txt for a kernel and its argument types."""
     function = dispatcher.py_func
     return f"{function.__module__}.{function.__name__}({', '.join(map(_text_of, signature))})"
 
 
 def compile_for_run() -> None:
-    """Compile the listed kernels of all imported modules. Logs a warning if a compilation fails.
+    """Compile the listed kernels of all imported modules. Failures are logged as warnings.
 
-    A run calls this function after building its stages, and again after opening its dataset.
+    A run calls this function after it builds its stages, and again after it opens its dataset.
     """
     loaded = [kernel for kernel in listed(DEFAULT, OTHERS) if kernel.module in sys.modules]
     missing = [kernel for kernel in loaded if not kernel.is_compiled()]
@@ -129,10 +134,11 @@ def compile_for_run() -> None:
 def compile_all(kernels: list[Kernel]) -> None:
     """Compile kernels in parallel processes, with a progress bar.
 
-    One process compiles all kernels of a module, which share functions. Raises DataError for the first error after all
-    other kernels are compiled.
+    Raises:
+        DataError: A kernel could not be compiled. All other kernels are compiled first.
     """
     in_order = sorted(kernels, key=attrgetter("module"))
+    # kernels of a module share functions, so one process compiles all of them
     by_module = {module: list(group) for module, group in groupby(in_order, attrgetter("module"))}
     # modules with the longest source first, because they take longest
     waiting: queue.SimpleQueue[list[Kernel]] = queue.SimpleQueue()
@@ -158,7 +164,7 @@ def _workers(kernels: list[Kernel]) -> int:
 
 
 def _worker() -> subprocess.Popen[str]:
-    """Start a process that compiles one kernel per input line, and prints an error or an empty line for each."""
+    """Start a worker process. It reads one kernel per line, and prints an error or an empty line."""
     path = os.pathsep.join(filter(None, [str(CHECKOUT), os.environ.get("PYTHONPATH")]))
     return subprocess.Popen(
         [sys.executable, "-P", "-m", "framework.compilation.worker"],  # -P: import nothing from the working directory
@@ -173,9 +179,9 @@ def _worker() -> subprocess.Popen[str]:
 def _feed(
     process: subprocess.Popen[str], waiting: queue.SimpleQueue[list[Kernel]], events: queue.SimpleQueue[tuple[str, str]]
 ) -> None:
-    """Send kernels to a worker, module by module.
+    """Send kernels to a worker, module by module, and report events.
 
-    Adds the events ("begun", kernel name) and ("done", error message) to `events`; message "" = success.
+    The events are ("begun", kernel name) and ("done", error message), with an empty message on success.
     """
     assert process.stdin is not None
     assert process.stdout is not None
@@ -198,10 +204,7 @@ def _feed(
 
 
 def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueue[tuple[str, str]]) -> list[str]:
-    """Report the number of remaining kernels until all are done, and return the error messages.
-
-    The report is a progress bar or, without a terminal, log lines.
-    """
+    """Show the progress until all kernels are done, and return the error messages."""
     left = count
     errors: list[str] = []
     with Progress(count, " kernels") as bar:
@@ -226,7 +229,7 @@ def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueu
 
 @contextmanager
 def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
-    """Serialize compilation across processes, because the jobs of a sweep start at the same time."""
+    """Let only one process at a time run the `with` body, because the jobs of a sweep start simultaneously."""
     folder = Path(kernels[0].dispatcher._cache.cache_path)
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / "compiling.lock")
@@ -248,7 +251,7 @@ def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
 
 
 def called_by(dispatcher: Any) -> set[Any]:
-    """Return a kernel and all kernels that it calls directly or indirectly."""
+    """Return a kernel and all kernels that it calls, directly or indirectly."""
     found: set[Any] = set()
     waiting = [dispatcher]
     while waiting:
@@ -268,7 +271,7 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _text_of(kind: Any) -> str:
-    """Return a numba type as a Python expression for _type_of()."""
+    """Return a numba type as a Python expression."""
     if isinstance(kind, types.Array):
         axes = [":"] * kind.ndim
         if kind.layout == "C":
@@ -291,7 +294,7 @@ def _text_of(kind: Any) -> str:
 
 
 def _type_of(node: ast.expr) -> Any:
-    """Return the numba type of an expression from _text_of()."""
+    """Return the numba type of a Python expression from `_text_of`."""
     if isinstance(node, ast.Name):
         return getattr(types, node.id)
     if isinstance(node, ast.Tuple):

@@ -1,11 +1,11 @@
-"""Worker process for compiling kernels without running them.
+"""Worker process that compiles kernels without running them.
 
-For each function that a kernel calls, numba generates machine code and wrappers for Python and C, although the kernel
-contains a copy of the function. Skipping this step saves a third of the time and results in the same cache.
+numba generates machine code and wrappers for each function that a kernel calls, although the kernel contains a copy of
+the function. This process skips that step. It saves a third of the time and results in the same cache.
 
-numba also optimizes each function separately, and again as part of each caller. Here, most functions are optimized
+numba also optimizes each function twice, separately and as part of each caller. This process optimizes most functions
 only as part of a kernel, which saves another fifth of the time. The kernels are equally fast. Functions with forced
-inlining are optimized first, because loops over a batch or a row are vectorized only in a separate function.
+inlining are still optimized separately, because otherwise their loops are not vectorized.
 """
 
 from __future__ import annotations
@@ -57,7 +57,10 @@ def work() -> None:
 
 
 def make_code_only_for(names: set[str]) -> None:
-    """Make numba generate machine code only for functions with these names, including all functions that they call."""
+    """Make numba generate machine code only for functions with the given names.
+
+    The code of such a function includes all functions that it calls.
+    """
     from numba.core.codegen import CPUCodeLibrary, JITCPUCodegen
     from numba.core.registry import cpu_target
 
@@ -81,7 +84,10 @@ def make_code_only_for(names: set[str]) -> None:
 
 
 def optimize_fully(names: set[str]) -> None:
-    """Make numba optimize only functions with these names; for all others, it only removes reference counts."""
+    """Make numba optimize only functions with the given names.
+
+    For all other functions, numba only removes reference counts.
+    """
     from numba.core.codegen import CPUCodeLibrary
 
     optimize = CPUCodeLibrary._optimize_final_module

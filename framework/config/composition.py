@@ -1,4 +1,4 @@
-"""Composition of configs as on the command line, with one-line errors."""
+"""Composition of configs as on the command line, with one-line error messages."""
 
 from __future__ import annotations
 
@@ -33,7 +33,11 @@ log = logging.getLogger(__name__)
 
 
 def composed(*overrides: str) -> DictConfig:
-    """Return the main config with these overrides. Raises ConfigError for an unknown name or an invalid value."""
+    """Return the main config with overrides.
+
+    Raises:
+        ConfigError: A name is unknown or a value is invalid.
+    """
     try:
         with config_loader() as loader:
             return loader.compose([*overrides])
@@ -42,7 +46,7 @@ def composed(*overrides: str) -> DictConfig:
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
-    """Return the keys and values of a config, with interpolations resolved."""
+    """Return the keys and values of a config, with resolved interpolations."""
     plain = OmegaConf.to_container(config, resolve=True)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
@@ -52,9 +56,10 @@ _added: list[Path] = []
 
 
 def add_config_dir(folder: Path) -> None:
-    """Register the config options in `folder` for this process, as --config-dir does.
+    """Add the config options in a folder for this process, as --config-dir does.
 
-    Raises ConfigError if the folder does not exist.
+    Raises:
+        ConfigError: The folder does not exist.
     """
     if not folder.is_dir():
         raise ConfigError(f"--config-dir: expected an existing folder, got {folder}; correct the path")
@@ -63,10 +68,10 @@ def add_config_dir(folder: Path) -> None:
 
 @cache
 def installed_config_dirs() -> dict[Path, str]:
-    """Return the name of the package of each config folder that an installed package registers.
+    """Return the config folders of installed packages, with the names of the packages.
 
-    A package registers a folder by an entry point in the group `instancemap.configs`, whose value is the dotted path of
-    the folder. No package is imported.
+    A package registers a folder by an entry point in the group `instancemap.configs`. The value of the entry point is
+    the dotted path of the folder. No package is imported.
     """
     folders = {}
     for entry in entry_points(group="instancemap.configs"):
@@ -115,10 +120,10 @@ class FileConfigSource(hydra_api.FileConfigSource):
 
 
 class HydraNodes(hydra_api.StructuredConfigSource):
-    """Config source with the structured configs of Hydra, without those of the host application.
+    """Config source with only the structured configs of Hydra.
 
-    Hydra adds its basic launcher and sweeper to the global config store only when it scans its plugins. This class adds
-    them to its own store instead, so that the store of the host application does not change.
+    Hydra adds its basic launcher and sweeper to the global config store when it scans its plugins. This class adds them
+    to its own store instead. The store of the host application does not change.
     """
 
     def __init__(self, provider: str, path: str) -> None:
@@ -134,7 +139,10 @@ HydraNodes.__name__ = "StructuredConfigSource"  # Hydra finds the source of the 
 
 
 class Repository(hydra_api.ConfigRepository):
-    """Repository of configs in folders, in packages and of Hydra's structured configs, without Hydra's registries."""
+    """Repository of configs in folders and packages, and of the structured configs of Hydra.
+
+    It does not use the process-wide registries of Hydra.
+    """
 
     def initialize_sources(self, config_search_path: ConfigSearchPath) -> None:
         kinds = (FileConfigSource, hydra_api.ImportlibResourcesConfigSource, HydraNodes)
@@ -146,7 +154,10 @@ class Repository(hydra_api.ConfigRepository):
 
 
 class ConfigLoader(hydra_api.ConfigLoaderImpl):
-    """Loader of InstanceMap's configs and of added folders, without Hydra's process-wide state."""
+    """Loader of the configs of InstanceMap and of added folders.
+
+    It does not use the process-wide state of Hydra.
+    """
 
     def __init__(self) -> None:
         path = hydra_api.ConfigSearchPathImpl()
@@ -163,9 +174,10 @@ class ConfigLoader(hydra_api.ConfigLoaderImpl):
         self.repository = Repository(path)
 
     def compose(self, overrides: list[str]) -> DictConfig:
-        """Return the main config, composed with `overrides`, without the node `hydra`.
+        """Return the main config with overrides, without the node `hydra`.
 
-        Raises HydraException for an invalid override.
+        Raises:
+            HydraException: An override is invalid.
         """
         config = self.load_configuration("config", overrides, RunMode.RUN, from_shell=False)
         with open_dict(config):
@@ -175,15 +187,15 @@ class ConfigLoader(hydra_api.ConfigLoaderImpl):
 
 @contextmanager
 def config_loader() -> Iterator[ConfigLoader]:
-    """Yield a loader of InstanceMap's configs. Inside the context, the version base of Hydra is 1.3."""
+    """Yield a config loader. In the `with` body, the version base of Hydra is 1.3."""
     with hydra_api.version_base("1.3"):
         yield ConfigLoader()
 
 
 def running_loader() -> Any | None:
-    """Return the config loader of the running Hydra application.
+    """Return the config loader of the running Hydra application, or None without an application.
 
-    None = no application runs, or InstanceMap's configs are not on its search path.
+    The result is also None if the application does not search the configs of InstanceMap.
     """
     hydra = hydra_api.running()
     if hydra is None:
@@ -193,7 +205,10 @@ def running_loader() -> Any | None:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the message of an error on one line. Messages of Hydra and OmegaConf are rewritten to include the fix."""
+    """Return the message of an error on one line.
+
+    Messages of Hydra and OmegaConf are rewritten to include the fix.
+    """
     return printable(_message_of(error))
 
 
@@ -222,7 +237,7 @@ _EXTRAS = {
     "hydra/launcher/ray": ("launcher=ray", "ray"),
     "hydra/sweeper/optuna": ("hydra/sweeper=optuna", "sweepers"),
 }
-"""The override and the extra to install, by the missing config of Hydra."""
+"""The override and the required extra for each config of Hydra that may be missing."""
 
 _OLD_SWEEPERS = ("ax", "nevergrad")
 """Sweepers whose latest release fails with Python 3.11: hydra-ax-sweeper 1.2 and hydra-nevergrad-sweeper 1.2."""
@@ -247,7 +262,7 @@ def _no_such_option(error: MissingConfigException) -> str:
 
 
 def _known_keys(error: OmegaConfBaseException) -> str:
-    """Return the error message for an unknown key, with its new name, a similar key or all keys of its parent."""
+    """Return the error message for an unknown key, with the most likely correct key or all known keys."""
     keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
     close = get_close_matches(str(error.key), keys, n=1)
     path = str(error.full_key or error.key)

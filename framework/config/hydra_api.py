@@ -1,6 +1,6 @@
 """Private APIs of Hydra. All other modules import them from here.
 
-Tested with the versions in TESTED; `hydra-core>=1.3.8,<1.4` in pyproject.toml has to match them.
+TESTED lists the tested versions. They must match `hydra-core>=1.3.8,<1.4` in pyproject.toml.
 """
 
 from __future__ import annotations
@@ -42,7 +42,10 @@ _composing = RLock()
 
 @contextmanager
 def version_base(version: str) -> Iterator[None]:
-    """Set Hydra's version base inside the context, and restore the value of the host application afterward."""
+    """Set the version base of Hydra in the `with` body.
+
+    The value of the host application is restored afterward.
+    """
     with _composing:
         before = Singleton._instances.pop(VersionBase, None)
         setbase(version)
@@ -55,9 +58,9 @@ def version_base(version: str) -> Iterator[None]:
 
 
 def running() -> Any | None:
-    """Return the Hydra application of this process; None = no application.
+    """Return the Hydra application of this process, or None without an application.
 
-    Unlike GlobalHydra.instance(), the function does not create an application.
+    Unlike GlobalHydra.instance(), this function does not create an application.
     """
     return getattr(Singleton._instances.get(GlobalHydra), "hydra", None)
 
@@ -69,6 +72,9 @@ def search_path_plugins() -> list[Any]:
 
 
 def replace_file_source(source: type[FileConfigSource]) -> None:
-    """Make Hydra read YAML files with the class `source` in this process. For command-line processes only."""
+    """Replace the class with which Hydra reads YAML files in this process.
+
+    Only command-line processes may call this function.
+    """
     Plugins.instance()  # registers Hydra's own sources
     SourcesRegistry.instance().types[source.scheme()] = source

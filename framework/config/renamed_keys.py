@@ -66,12 +66,12 @@ RENAMED = {
 
 
 def new_name(key: str) -> str | None:
-    """Return the new name of a dotted config key; None = not renamed."""
+    """Return the new name of a dotted config key, or None if it was not renamed."""
     parts = key.split(".")
     return RENAMED.get(key) or (RENAMED.get(f"{parts[0]}.{parts[-1]}") if len(parts) > 2 else None)
 
 
 def rename_hint(key: str) -> str:
-    """Return the fix for an unknown key, such as "set resume_from (new name of map)"; "" = not renamed."""
+    """Return the fix for a renamed key, such as "set resume_from (new name of map)", or "" for other keys."""
     found = new_name(key)
     return f"set {found} (new name of {key})" if found else ""

@@ -33,7 +33,7 @@ PHRASES: Mapping[Any, str] = {
 
 
 def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
-    """Check that parameters are in closed intervals. NaN is outside of every interval.
+    """Check that parameters are in closed intervals. NaN is in no interval.
 
     Args:
         plugin: The plugin, or a part of it, with the parameters as attributes.
@@ -48,7 +48,16 @@ def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
 
 
 def check_intervals(stage: str, plugin: object, **intervals: str) -> None:
-    """Raise ConfigError unless each parameter is in its interval, such as nms_iou="(0, 1]"; NaN never is."""
+    """Check that parameters are in intervals such as nms_iou="(0, 1]". NaN is in no interval.
+
+    Args:
+        stage: Config group of the plugin.
+        plugin: The plugin, or a part of it, with the parameters as attributes.
+        intervals: The interval of each parameter by name.
+
+    Raises:
+        ConfigError: A parameter is outside of its interval.
+    """
     for name, interval in intervals.items():
         low, high = map(float, interval[1:-1].split(","))
         value = getattr(plugin, name)
@@ -63,24 +72,31 @@ def require(holds: bool, name: str, value: object, allowed: str) -> None:
 
 
 def check_package(key: str, package: str, extra: str) -> None:
-    """Raise ConfigError, with the command that installs the extra, if the optional `package` is missing."""
+    """Raise ConfigError with the installation command if an optional package is missing."""
     if importlib.util.find_spec(package) is None:
         raise ConfigError(f"{key}: expected the package {package}, got none; run pip install instancemap[{extra}]")
 
 
 def checked_path(name: str, value: object) -> Path:
-    """Return the value of the config key `name` as an absolute path.
+    """Return the value of a config key as an absolute path.
 
-    Raises ConfigError unless the value is a nonempty string.
+    Raises:
+        ConfigError: The value is not a nonempty string.
     """
     require(isinstance(value, str) and value != "", name, repr(value), "a path (in quotes if it looks like a number)")
     return Path(str(value)).expanduser().absolute()
 
 
 def checked_file(name: str, value: object, suffix: str = "") -> Path:
-    """Return the value of the config key `name` as the absolute path of an output file.
+    """Return the value of a config key as the absolute path of an output file.
 
-    Raises ConfigError if the file name does not end with `suffix` ("" = any), or if its folder does not exist.
+    Args:
+        name: Config key.
+        value: Value of the key.
+        suffix: Required suffix of the file name; "" = any.
+
+    Raises:
+        ConfigError: The suffix is wrong or the folder does not exist.
     """
     path = checked_path(name, value)
     if suffix and path.suffix.lower() != suffix:
@@ -91,14 +107,15 @@ def checked_file(name: str, value: object, suffix: str = "") -> Path:
 
 
 def check_count(name: str, value: int, most: int) -> None:
-    """Raise ConfigError unless the count `value` is in [1, most]. The upper limit bounds memory use."""
+    """Raise ConfigError unless a count is in [1, most]."""
     require(1 <= value <= most, name, value, f"a value in [1, {most}]")
 
 
 def checked_rows(node: Any) -> dict[str, list[str]]:
-    """Return the overrides of each row by name; empty if `node`, the value of the config key `rows`, is None.
+    """Return the overrides of each row by name, from the value of the config key `rows`.
 
-    Raises ConfigError if the overrides of a row are not a list of strings.
+    Raises:
+        ConfigError: The overrides of a row are not a list of strings.
     """
     if node is not None and not isinstance(node, Mapping):
         raise ConfigError(
@@ -115,9 +132,15 @@ def checked_rows(node: Any) -> dict[str, list[str]]:
 
 
 def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:
-    """Return the keyword arguments of the dataclass `kind` from the config node `name`, with its defaults.
+    """Return the keyword arguments of a dataclass from a config node, with defaults for missing keys.
 
-    Raises ConfigError for an unknown key or a value of a wrong type.
+    Args:
+        kind: Dataclass.
+        name: Config key of the node, for error messages.
+        node: Config node.
+
+    Raises:
+        ConfigError: A key is unknown or a value has a wrong type.
     """
     if not isinstance(node, Mapping):
         raise ConfigError(f"{name}: expected keys and values, got {node!r}")
@@ -137,7 +160,7 @@ def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:
 
 
 def values_of(kind: Any) -> str:
-    """Return the valid values of a parameter of type `kind` as a phrase for error messages, such as "an integer"."""
+    """Return the valid values of a type for error messages, such as "an integer"."""
     if isinstance(kind, type) and issubclass(kind, Enum):
         return f"one of {', '.join(kind.__members__)}"
     if isinstance(kind, UnionType):

@@ -1,11 +1,13 @@
-"""Replica in NICE-SLAM's version (Straub et al., 2019; Zhu et al., CVPR 2022): rendered views of eight scanned rooms.
+"""Replica dataset as rendered for NICE-SLAM.
+
+References: Straub et al., 2019; Zhu et al., CVPR 2022.
 
     cam_params.json                     for all scenes: {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}
     room0/results/frame000000.jpg       8-bit color, numbered from 0
     room0/results/depth000000.png       uint16 along z, `scale` units per meter
     room0/traj.txt                      line k: T_world_camera of frame k, 16 numbers, row-major, m
 
-The camera axes are x right, y down, z forward. NICE-SLAM converts the poses to OpenGL's axes when it reads them.
+The camera axes are x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 
 @dataclass
 class ReplicaNiceSlam(Recording):
-    """A Replica scene in NICE-SLAM's layout, with exact depth and poses but without ground-truth instances."""
+    """A Replica scene rendered for NICE-SLAM, with exact depth and poses but without ground-truth instances."""
 
     def open(self) -> Contents:
         path = self.folder.absolute().parent / "cam_params.json"  # not resolved: the scene may be a symbolic link

@@ -1,4 +1,6 @@
-"""Folder of color and depth images: the format for your own data.
+"""RGB-D videos as folders of color and depth images.
+
+This is the format for your own data:
 
     camera.json         {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}; meters = value / depth_scale;
                         optional "distortion": [k1, k2, p1, p2, k3] of all images, which are undistorted on reading;
@@ -94,9 +96,9 @@ class RgbdFolder(Recording):
         return DeferredTruth(decode, self.camera.shape, self._class_names, origin, of_depth=False)
 
     def own_scene_truth(self) -> SceneTruth | None:
-        """Return the ground-truth points, fused from depth and instance ids of the selected frames.
+        """Return ground-truth points fused from the depth and instance images of the selected frames.
 
-        None = no instances or no poses. Unreadable frames are skipped. The points are as accurate as the depth images.
+        The result is None without instances or poses. Unreadable frames are skipped.
         """
         if not self._instances or not self._has_poses:
             return None
@@ -117,7 +119,7 @@ class RgbdFolder(Recording):
                 yield LabeledDepth(depth, ids, self.camera, recorded.T_world_camera)
 
     def _read_instances(self, color: dict[int, Path]) -> tuple[dict[int, str | None], list[Path]]:
-        """Return the class of each instance id and the instance-ID image of each frame.
+        """Return the class of each instance id and the path of each instance image.
 
         Both are empty if the folder has no ground truth or `ground_truth` is set.
         """
@@ -135,10 +137,13 @@ class RgbdFolder(Recording):
 def _recorded(
     images: StoredImages, index: int, line: TumLine | None, times: tuple[float, float] | None
 ) -> RecordedFrame:
-    """Return a frame with its pose and the timestamps of its images.
+    """Return a frame with its pose and timestamps.
 
-    `line` contains the pose, and `times` the timestamps of color and depth in s. A frame without a pose has the
-    timestamp of its color image.
+    Args:
+        images: The images of the frame.
+        index: The index of the frame.
+        line: The line of poses.txt; None = no poses.
+        times: The timestamps of color and depth, s; None = no timestamps.
     """
     color, depth = times or (None, None)
     if line is None:
@@ -149,7 +154,7 @@ def _recorded(
 
 
 def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
-    """Raise DataError that names the first unmatched frame if the frame numbers differ."""
+    """Raise DataError if two folders contain different frame numbers."""
     unmatched = sorted(color.keys() ^ other.keys())
     if not unmatched:
         return
@@ -163,7 +168,7 @@ def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
 
 
 def _read_optional(path: Path, read: Callable[[Path], list[Entry]], name: str, frames: int) -> list[Entry] | None:
-    """Return one entry per frame, parsed by `read`, or None if the file does not exist."""
+    """Return the entries of a file with one line per frame, or None if the file does not exist."""
     if not path_exists(path):
         return None
     entries = read(path)

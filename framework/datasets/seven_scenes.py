@@ -1,11 +1,13 @@
-"""7-Scenes (Shotton et al., CVPR 2013): handheld Kinect videos of seven scenes, with KinectFusion poses.
+"""7-Scenes dataset (Shotton et al., CVPR 2013).
+
+Handheld Kinect videos with KinectFusion poses:
 
     chess/seq-01/frame-000000.color.png     8-bit color
     chess/seq-01/frame-000000.depth.png     uint16, mm along z; 0 or 65535 = no reading
     chess/seq-01/frame-000000.pose.txt      T_world_depthcamera, four lines of four numbers, m
 
-Color and depth are published unregistered, and only with the intrinsics of the depth camera. Without registration,
-masks and depth are offset by 30 px or more.
+Color and depth are not registered in the published files. The offset is 30 px or more. Only the intrinsics of the depth
+camera are published.
 """
 
 from __future__ import annotations
@@ -57,17 +59,17 @@ def _recorded(folder: Path, number: int) -> RecordedFrame:
 
 
 def _color_pose(path: Path) -> Float64:
-    """Return T_world_camera (4, 4) of the color camera. Raises a DataError that names the file of an invalid pose."""
+    """Return the pose T_world_camera (4, 4) of the color camera."""
     T_depthcamera_camera = np.eye(4)
     T_depthcamera_camera[0, 3] = BASELINE
     return read_matrix(path).pose() @ T_depthcamera_camera
 
 
 def register(raw: UInt16) -> UInt16:
-    """Return the depth (H, W), mm, registered to the color camera. The nearest of several readings in a pixel is kept.
+    """Register a depth image (H, W), mm, to the color camera.
 
-    An image of another size is returned unchanged, so that the reader rejects its size. The color camera has a shorter
-    focal length and a wider field of view. The border therefore has no readings, and the interior has no holes.
+    The color camera has a wider field of view, so that the border of the result has no readings. An image of the wrong
+    size is returned unchanged, and the reader then rejects it.
     """
     if raw.shape != DEPTH_CAMERA.shape:
         return raw

@@ -10,11 +10,18 @@ from framework.datasets.calibration.raw_images import NO_READING
 
 @njit(cache=True, nogil=True)
 def register_depth(raw: UInt16, ratio: float, u_0: float, v_0: float, disparity_1: float, registered: UInt16) -> None:
-    """Copy the readings of `raw` (h, w), mm, to the pixels of another camera in `registered` (H, W), mm, initially 0.
+    """Copy depth readings to the pixels of another camera.
 
-    A reading z at the pixel (u, v) is copied to the pixel nearest to (ratio u + u_0 - disparity_1 / z, ratio v + v_0).
-    If several readings are copied to a pixel, the nearest reading is kept. `ratio` is the ratio of the focal lengths,
-    and `disparity_1` is the disparity at a depth of 1 mm, px. `u_0` and `v_0` are in px.
+    The pixel (u, v) with depth z is copied to (ratio u + u_0 - disparity_1 / z, ratio v + v_0). If several readings map
+    to the same pixel, the nearest reading is kept.
+
+    Args:
+        raw: The depth (h, w), mm.
+        ratio: The ratio of the focal lengths.
+        u_0: The horizontal offset, px.
+        v_0: The vertical offset, px.
+        disparity_1: The disparity at a depth of 1 mm, px.
+        registered: The output depth (H, W), mm, initially 0.
     """
     height, width = registered.shape
     for v in range(raw.shape[0]):

@@ -1,4 +1,6 @@
-"""TUM RGB-D (Sturm et al., IROS 2012): Kinect videos with motion-capture poses.
+"""TUM RGB-D dataset (Sturm et al., IROS 2012).
+
+Kinect videos with motion-capture poses:
 
     rgb.txt, depth.txt      one line per image: `timestamp filename`, timestamp in s; `#` begins a comment
     rgb/, depth/            8-bit color; uint16 depth along z, registered to color, 5000 units per m; 0 = no reading
@@ -6,9 +8,9 @@
     camera.json             for other recordings in this layout: intrinsics, depth scale and distortion, with the
                             same keys as in an RGB-D folder; read if the folder's name does not contain freiburg
 
-The published depth correction factors are already applied. Color and depth of freiburg1 and freiburg2 have the lens
-distortion of the color camera: 5 px or more in half of the pixels. The reader undistorts both images. freiburg3 was
-published undistorted.
+The published depth correction factors are already applied. The images of freiburg1 and freiburg2 have a lens distortion
+of 5 px or more in half of the pixels, which is corrected on reading. The images of freiburg3 were published
+undistorted.
 """
 
 from __future__ import annotations
@@ -67,7 +69,7 @@ PUBLISHED: Mapping[Intrinsics, StoredCamera] = {
 class TumRgbd(Recording):
     """A sequence of TUM RGB-D, or another recording in the same layout.
 
-    Color and depth images are associated by time: the closest pairs are matched first, and each image is used once. The
+    Color and depth images are associated by time. The closest pairs are matched first, and each image is used once. The
     ground-truth pose is interpolated at the time of the color image. It is unknown if no stored pose is within
     `max_time_difference`.
     """
@@ -104,7 +106,7 @@ class TumRgbd(Recording):
         return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None, sensor)
 
     def _stored_camera(self) -> tuple[StoredCamera, Path | str]:
-        """Return the camera and its source (file or parameter)."""
+        """Return the camera and the file or parameter that defines it."""
         intrinsics, own = self.intrinsics, self.folder / "camera.json"
         if intrinsics is Intrinsics.AUTO:
             named = re.search(r"freiburg[123]", self.name)
@@ -141,12 +143,19 @@ class Trajectory:
 
     @classmethod
     def of(cls, path: Path, lines: Sequence[TumLine], max_difference: float) -> Trajectory:
-        """Return the trajectory from the lines of a file. Only the first line of each timestamp is used."""
+        """Return the trajectory in a file.
+
+        If a timestamp is repeated, only its first line is used.
+        """
         ordered = sorted(_first_of_each(path, lines, "poses"), key=lambda line: line.timestamp)
         return cls(ordered, np.array([line.timestamp for line in ordered]), max_difference)
 
     def at(self, timestamp: float) -> Float64 | None:
-        """Return T_world_camera (4, 4) at a time in s, None = unknown. Raises DataError for an invalid stored pose."""
+        """Return the interpolated pose T_world_camera (4, 4) at a time in s, or None if unknown.
+
+        Raises:
+            DataError: A stored pose is invalid.
+        """
         after = int(np.searchsorted(self.timestamps, timestamp, side="right"))
         around = range(max(after - 1, 0), min(after + 1, len(self.lines)))
         if not any(abs(self.timestamps[k] - timestamp) <= self.max_time_difference for k in around):
@@ -158,9 +167,9 @@ class Trajectory:
 
 
 def associate(first: Sequence[float], second: Sequence[float], max_difference: float) -> list[tuple[int, int]]:
-    """Return index pairs of times (s) that differ by at most `max_difference` s, sorted by the time in `first`.
+    """Return index pairs of timestamps that differ by at most `max_difference`.
 
-    The closest pairs are matched first, as in the benchmark's own associate.py.
+    The timestamps are in s. The closest pairs are matched first, as in associate.py of the benchmark.
     """
     order = np.argsort(second, kind="stable")
     times = np.asarray(second, np.float64)[order]
@@ -181,8 +190,8 @@ def associate(first: Sequence[float], second: Sequence[float], max_difference: f
 
 
 def _first_of_each(path: Path, items: Sequence[Timed], name: str) -> list[Timed]:
-    """Return the first item of each timestamp, because association is quadratic in the number of duplicates."""
-    at: dict[float, Timed] = {}
+    """Return the first item of each timestamp."""
+    at: dict[float, Timed] = {}  # association is quadratic in the number of duplicates
     for item in items:
         at.setdefault(item.timestamp, item)
     if len(at) < len(items):
@@ -197,7 +206,7 @@ def _first_of_each(path: Path, items: Sequence[Timed], name: str) -> list[Timed]
 
 
 def _read_list(path: Path) -> list[ListedImage]:
-    """Read a list of images. Raises DataError for a line that is not `timestamp filename`."""
+    """Read a list of images, with lines of `timestamp filename`."""
     lines = read_lines(path, missing="expected lines of `timestamp filename`, got no such file")
     numbered = [(n, line.strip()) for n, line in enumerate(lines, start=1)]
     images = [_listed(path, n, line) for n, line in numbered if line and not line.startswith("#")]

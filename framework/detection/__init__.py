@@ -1,1 +1,1 @@
-"""Numerical code shared by detectors: box arithmetic, non-maximum suppression, RoIAlign and masks."""
+"""Components shared by detectors."""

@@ -1,6 +1,6 @@
-"""Box candidates: the output layouts of common box detectors, and the selection of the best candidates.
+"""Decoding of the outputs of common box detectors, and selection of the best boxes.
 
-A box is x1 y1 x2 y2, in px of the network's input. The left border of the first pixel is at 0.
+A box is x1 y1 x2 y2 in px of the network's input. The left border of the first pixel is at 0.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows
 
 
 class OutputLayout(Enum):
-    """The outputs of a box detector for K candidates and C classes; arrays may have a leading axis of length 1.
+    """Output format of a box detector with K candidates and C classes.
 
-    For the SSD layouts, scores and labels are (K,), and class scores are (K, C) or, with the background first, (K, C +
-    1).
+    Arrays may have a leading axis of length 1. In the SSD layouts, scores and labels have the shape (K,). Class scores
+    have the shape (K, C), or (K, C + 1) with the background first.
     """
 
     yolox = "yolox"  # (K, 5 + C): center offset dx, dy and log w, log h, in cells; objectness; C class scores
@@ -35,15 +35,24 @@ class OutputLayout(Enum):
 
 @dataclass(frozen=True)
 class Candidates:
-    """K boxes with scores for C classes; the score of a candidate is its largest class score."""
+    """K candidate boxes with scores for C classes.
+
+    The score of a candidate is its largest class score.
+    """
 
     boxes: Float32  # (K, 4) px
     class_scores: Float32  # (K, C) in [0, 1], multiplied by the objectness
 
     def best(self, threshold: float, nms: float, limit: int) -> Int32:
-        """Return the indices of at most `limit` candidates with scores above `threshold`, best first.
+        """Select candidates by score and non-maximum suppression.
 
-        A candidate is suppressed if its IoU with a better candidate of the same best class exceeds `nms`.
+        Args:
+            threshold: The minimum score.
+            nms: The IoU above which the worse of two candidates of a class is removed.
+            limit: The maximum number of candidates.
+
+        Returns:
+            The indices of the selected candidates, best first.
         """
         scores = self.class_scores.max(axis=1)
         x1, y1, x2, y2 = self.boxes.T
@@ -54,10 +63,16 @@ class Candidates:
 
 
 def decode(layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int) -> Candidates:
-    """Return the candidates in the outputs of a network.
+    """Decode the outputs of a network to candidate boxes.
 
-    `outputs`: the arrays by name. `shape`: (height, width) px of the input. `classes`: the number of classes, C.
-    Raises DataError if the outputs do not have the layout.
+    Args:
+        layout: The output format of the network.
+        outputs: The output arrays by name.
+        shape: The size of the input (height, width), px.
+        classes: The number of classes.
+
+    Raises:
+        DataError: The outputs do not have this layout.
     """
     if layout not in (OutputLayout.yolox, OutputLayout.yolo, OutputLayout.yolo_objectness):
         return _decode_ssd(layout, outputs, shape, classes)
@@ -78,10 +93,14 @@ def _checked(boxes: Float32, class_scores: Float32) -> Candidates:
 
 
 def check_scores(class_scores: Float32, key: str = "detector.layout", fix: str = "choose another layout, or ") -> None:
-    """Raise DataError unless all scores are in [0, 1], with a tolerance of 0.001.
+    """Raise DataError unless all scores are in [0, 1].
 
-    Networks exported without their sigmoid or softmax have other scores. `key` and the optional first part of the `fix`
-    appear in the error.
+    Scores are outside of this range if a network was exported without its sigmoid or softmax.
+
+    Args:
+        class_scores: The scores, of any shape.
+        key: The config key at the beginning of the message.
+        fix: The first part of the fix in the message.
     """
     if class_scores.size and (class_scores.min() < -1e-3 or class_scores.max() > 1 + 1e-3):
         raise DataError(
@@ -91,15 +110,12 @@ def check_scores(class_scores: Float32, key: str = "detector.layout", fix: str =
 
 
 def described(outputs: Mapping[str, Float32]) -> str:
-    """Format the names and shapes of outputs for messages."""
+    """Format the names and shapes of network outputs for messages."""
     return ", ".join(f"{name} {array.shape}" for name, array in outputs.items())
 
 
 def _rows(output: Float32, columns: int, other_layout: str) -> Float32:
-    """Return the candidates (K, columns) of an output (K, columns) or (columns, K).
-
-    The output may have a leading axis of length 1. `other_layout`: the layout named in the error; "" = none.
-    """
+    """Return the candidates as rows (K, columns), transposed if necessary."""
     table = output[0] if output.ndim == 3 and output.shape[0] == 1 else output
     if table.ndim == 2 and table.shape[1] == columns:
         return table
@@ -113,15 +129,14 @@ def _rows(output: Float32, columns: int, other_layout: str) -> Float32:
 
 
 def corners(boxes: Float32) -> Float32:
-    """Convert boxes (K, 4) from center x, y, width, height to x1 y1 x2 y2."""
+    """Convert boxes (N, 4) from center x, center y, width, height to x1 y1 x2 y2."""
     half = boxes[:, 2:] / 2
     return np.concatenate([boxes[:, :2] - half, boxes[:, :2] + half], axis=1)
 
 
 def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
-    """Return the boxes (K, 4), center x, y, width, height in px, of the rows (K, 5 + C) of a YOLOX output.
+    """Decode the boxes (K, 4) of a YOLOX output, as center x, center y, width and height in px.
 
-    `shape`: (height, width) px of the input. Raises DataError unless K is the number of cells of this input.
     Source: Ge et al., "YOLOX", 2021; github.com/Megvii-BaseDetection/YOLOX, yolox/utils/demo_utils.py.
     """
     cells, strides = [], []
@@ -143,12 +158,10 @@ def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
 def _decode_ssd(
     layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int
 ) -> Candidates:
-    """Return the candidates of an SSD; the arguments are those of `decode`.
+    """Decode the outputs of an SSD.
 
-    The class scores are outputs of the network or are derived from one score and one label per box. Outputs are
-    identified by name. TensorFlow's object detection API uses detection_boxes, detection_classes, detection_scores and
-    detection_multiclass_scores. torchvision's models.detection uses boxes, labels and scores. Label 0 and the first of
-    C + 1 scores are the background.
+    The outputs are identified by name. TensorFlow's object detection API uses detection_boxes, detection_classes,
+    detection_scores and detection_multiclass_scores. torchvision uses boxes, labels and scores.
     """
     # "raw" outputs are the candidates before TensorFlow's non-maximum suppression
     tables = {name: array for name, array in outputs.items() if "raw" not in name and "num" not in name}
@@ -156,6 +169,7 @@ def _decode_ssd(
     if len(boxes) == 1:
         if boxes[0].ndim == 3:
             tables = {name: array[0] for name, array in tables.items() if array.ndim > 1}
+        # label 0 and the first of C + 1 class scores are the background
         by_class = [t for name, t in tables.items() if "score" in name and t.shape[1:] in ((classes,), (classes + 1,))]
         scores = [t for name, t in tables.items() if "score" in name and t.ndim == 1]
         labels = [t for name, t in tables.items() if ("label" in name or "class" in name) and t.ndim == 1]
@@ -179,10 +193,10 @@ def _ssd_boxes(layout: OutputLayout, boxes: Float32, shape: tuple[int, int]) -> 
 
 
 def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
-    """Return the class scores (K, C) of K boxes with one score and one label each.
+    """Return class scores (K, C) for boxes with one score and one label each.
 
-    Label 0 is the background, and label k is class k - 1. The remainder, 1 - score, is distributed evenly over the
-    other classes, but each gets at most the score. Rows of the background and rows with score 0 (padding) are 0.
+    The remainder 1 - score is distributed evenly over the other classes, but each gets at most the score. Label 0 is
+    the background, and label k is class k - 1. Background and padding (score 0) get 0 for all classes.
     """
     column = np.rint(labels).astype(np.int64) - 1
     used = (column != -1) & (scores > 0)
@@ -199,10 +213,15 @@ def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
 
 
 def spread_rest(one_hot: Float32, scores: Float32, spread: float) -> Float32:
-    """Return the class distributions (N, C) for one-hot labels (N, C) and scores (N,).
+    """Return class distributions (N, C) for detections with one label and one score each.
 
-    The label gets 1 - spread * (1 - score), but at least 1 / C. The other classes share the remainder equally. `spread`
-    is in [0, 1]: with 1, the probability of the label is its score; with 0, the label is certain.
+    The label gets the probability 1 - spread * (1 - score), but at least 1 / C. The other classes share the remainder
+    equally.
+
+    Args:
+        one_hot: The one-hot labels (N, C).
+        scores: The scores (N,).
+        spread: A factor in [0, 1]. With 1, the probability of the label is its score. With 0, it is 1.
     """
     c = one_hot.shape[1]
     if c == 1:

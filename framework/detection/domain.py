@@ -1,4 +1,7 @@
-"""Image domains: a detector trained only on rendered images is unreliable on photographs, even at high confidence."""
+"""Image domains, i.e. the kinds of images that a detector was trained on.
+
+A detector that was trained only on rendered images is unreliable on photographs.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,10 @@ RENDERED_ROOMS = "rendered rooms"
 
 
 def warn_outside_domain(detector: Detector, video: RGBDVideo | None) -> None:
-    """Log a warning if the images of `video` are outside the detector's training domain; None = unknown images."""
+    """Log a warning if a video does not belong to the detector's training domain.
+
+    `video` is None for frames of unknown origin.
+    """
     if detector.domain in ("", video.domain if video else ""):
         return
     log.warning(

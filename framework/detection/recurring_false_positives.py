@@ -1,4 +1,4 @@
-"""Locations of recurring false positives, which appear in every frame that shows the location."""
+"""Simulation of false positives that recur at the same locations of a scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ KEYS = 2**30  # number of keys; negated keys serve as instance ids, which are ot
 
 @dataclass(frozen=True)
 class FalsePositiveCell:
-    """A visible cell of a grid in the world frame, with the mean position of its depth readings in the image."""
+    """A visible grid cell in the world, with the mean position of its depth readings in the image."""
 
     key: int  # hash of the cell, in [1, KEYS]; cells are sorted by key
     u: float  # px, mean column of the readings
@@ -26,10 +26,14 @@ class FalsePositiveCell:
 
 
 def false_positive_cells(frame: Frame, seed: int, count: int) -> list[FalsePositiveCell]:
-    """Return at most `count` visible cells outside of objects of known class, sorted by key.
+    """Return the visible grid cells at which false positives are simulated.
 
-    `seed` determines the keys of the cells, and thus the order in which locations are chosen in all frames. The list is
-    empty if the frame has no pose or no ground truth.
+    Cells with objects of known class are excluded. The result is empty if the frame has no pose or no ground truth.
+
+    Args:
+        frame: The frame.
+        seed: The seed of the random order in which cells are selected.
+        count: The maximum number of cells.
     """
     if count == 0 or frame.T_world_camera is None or frame.truth is None:
         return []
@@ -49,8 +53,8 @@ def false_positive_cells(frame: Frame, seed: int, count: int) -> list[FalsePosit
 
 
 def _keys(cells: Int64, seed: int) -> Int64:
-    """Hash cells (N, 3) to keys (N,) in [1, KEYS] with the finalizer of SplitMix64 (Steele et al. 2014)."""
-    mixed = np.zeros(len(cells), np.uint64)
+    """Hash grid cells (N, 3) to keys (N,) in [1, KEYS]."""
+    mixed = np.zeros(len(cells), np.uint64)  # finalizer of SplitMix64 (Steele et al. 2014)
     for number in (np.full(len(cells), seed), *cells.T):
         mixed += number.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
         mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

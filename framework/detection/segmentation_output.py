@@ -1,7 +1,7 @@
-"""Output layouts of segmentation networks with prototypes, as in exports of the YOLO family.
+"""Decoding of segmentation networks with mask prototypes, such as exports of the YOLO family.
 
-A network has two outputs: mask prototypes and a table of candidates. Usually the table has a row with C class scores
-for every cell. If the network contains non-maximum suppression, the table has a row with one class for each detection.
+A network has two outputs: mask prototypes and a table of candidates. Usually, the table has one row with C class scores
+for each cell. If the network contains non-maximum suppression, the table has one row with one class for each detection.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SCORE, LABEL, COEFFICIENTS = 4, 5, 6  # columns of a table with suppression, aft
 
 
 class BoxKind(Enum):
-    """Meaning of the four numbers of a box in the outputs."""
+    """Meaning of the four numbers of a box."""
 
     AUTO = "detected from the outputs for a black image"
     CENTER = "center x, y, width, height"
@@ -36,7 +36,7 @@ class BoxKind(Enum):
 
 @dataclass(frozen=True)
 class SegmentationOutput:
-    """K candidates with M mask coefficients each."""
+    """K candidates with mask coefficients, and the mask prototypes."""
 
     candidates: Candidates
     coefficients: Float32  # (K, M)
@@ -45,7 +45,7 @@ class SegmentationOutput:
 
 @dataclass(frozen=True)
 class SegmentationLayout:
-    """The layout of a network's two outputs; None = undetermined by the outputs for a black image."""
+    """Layout of the two outputs of a network."""
 
     classes: int  # C
     objectness: bool  # True = the class scores follow an objectness score
@@ -53,13 +53,14 @@ class SegmentationLayout:
     suppressed: bool  # True = one row per detection: x1 y1 x2 y2, score, label, coefficients
     rows_first: bool  # True = the table is (1, K, columns), False = (1, columns, K)
     channels_last: bool  # True = prototypes are (1, h, w, M), False = (1, M, h, w)
-    boxes: BoxKind | None = None  # CENTER or CORNER
-    unit: bool | None = None  # True = boxes are in 0..1 of the input's sides, False = in px
+    boxes: BoxKind | None = None  # CENTER or CORNER; None = undetermined
+    unit: bool | None = None  # True = boxes are in 0..1 of the input's sides, False = in px; None = undetermined
 
     def read(self, outputs: Outputs) -> SegmentationOutput:
-        """Return the candidates with their mask coefficients, and the prototypes.
+        """Decode the outputs of a network.
 
-        Raises DataError if the outputs contradict this layout.
+        Raises:
+            DataError: The outputs do not have this layout.
         """
         table, prototypes = _table_and_prototypes(outputs)
         rows = self._rows(table)
@@ -75,9 +76,12 @@ class SegmentationLayout:
         return SegmentationOutput(Candidates(self._boxes_px(rows, class_scores), class_scores), coefficients, maps)
 
     def determined_by(self, outputs: Outputs) -> SegmentationLayout:
-        """Return the layout with `boxes` and `unit` determined from outputs.
+        """Return the layout with the kind and unit of the boxes, detected from their values.
 
-        A given `boxes` is kept. Raises DataError if the boxes of cells are ambiguous.
+        If the kind is already known, it is not changed.
+
+        Raises:
+            DataError: The kind or unit of the boxes is ambiguous.
         """
         table, _ = _table_and_prototypes(outputs)
         rows = self._rows(table)
@@ -90,7 +94,7 @@ class SegmentationLayout:
         return rows
 
     def _one_class_scores(self, rows: Float32) -> Float32:
-        """Return the class scores (K, C): the score of each row at its label, 0 elsewhere."""
+        """Return class scores (K, C) that contain the score of each detection at its label, and 0 elsewhere."""
         labels = rows[:, LABEL]
         if not _are_labels(labels, self.classes):
             raise DataError(
@@ -102,7 +106,7 @@ class SegmentationLayout:
         return class_scores
 
     def _boxes_px(self, rows: Float32, class_scores: Float32) -> Float32:
-        """Return the boxes (K, 4) x1 y1 x2 y2, px of the input, of table rows (K, columns) and their class scores."""
+        """Return the boxes (K, 4) x1 y1 x2 y2, px of the input."""
         boxes = rows[:, :4]
         unit = _is_unit(boxes[rows[:, SCORE] > 0], self.shape, self.suppressed) if self.unit is None else self.unit
         confident = class_scores.max(axis=1, initial=0.0) >= CONFIDENT
@@ -126,12 +130,19 @@ def detect_layout(
     input_channels_last: bool,
     metadata: ExportMetadata,
 ) -> SegmentationLayout:
-    """Return the layout of a network from its outputs for a black image. Raises DataError if no layout matches.
+    """Detect the layout of a network from its outputs for a black image.
 
-    `shape`: (height, width) px of the input. `boxes`: AUTO = determined from the values of the boxes. The shapes of the
-    outputs determine everything else except the unit of the boxes. The values of the boxes determine their kind,
-    because cells cover the image. So most centers are larger than the sizes of their boxes, and few of these boxes
-    could be corners.
+    Args:
+        outputs: The outputs by name.
+        classes: The number of classes.
+        objectness: True = the class scores follow an objectness score.
+        boxes: The meaning of the box numbers; AUTO = detected from their values.
+        shape: The size of the input (height, width), px.
+        input_channels_last: True = the input of the network is (1, H, W, 3).
+        metadata: The metadata of the ONNX file.
+
+    Raises:
+        DataError: The outputs do not match any layout.
     """
     table, prototypes = _table_and_prototypes(outputs)
     channels_last = _is_channels_last(prototypes, shape, input_channels_last, metadata)
@@ -164,10 +175,8 @@ def _table_and_prototypes(outputs: Outputs) -> tuple[Float32, Float32]:
 def _is_channels_last(
     prototypes: Float32, shape: tuple[int, int], input_channels_last: bool, metadata: ExportMetadata
 ) -> bool:
-    """Return True if the channels of the prototypes are last; `shape`: (height, width) px of the input.
-
-    Cells are square, so the prototypes have the input's aspect ratio in only one order of the axes.
-    """
+    """Return True if the channels of the prototypes are the last axis."""
+    # cells are square, so the prototypes have the aspect ratio of the input in only one order of the axes
     _, a, b, c = prototypes.shape
     height, width = shape
     first, last = (abs(rows * width - columns * height) < max(shape) for rows, columns in ((b, c), (a, b)))
@@ -188,11 +197,8 @@ def _are_labels(column: Float32, classes: int) -> bool:
 
 
 def _looks_suppressed(rows: Float32, classes: int, shape: tuple[int, int]) -> bool:
-    """Return True if a table that could contain cells or detections contains detections.
-
-    Detections have integer labels, and their number differs from the number of cells. Labels alone are not sufficient
-    in 8-bit networks, where most scores are 0 and so resemble labels.
-    """
+    """Return True if the rows of a table are detections, False if they are cells."""
+    # labels alone are not sufficient in 8-bit networks, where most scores are 0 and resemble labels
     cells = [-(-shape[0] // stride) * -(-shape[1] // stride) for stride in STRIDES]
     counts = {boxes * sum(cells[:levels]) for boxes in BOXES_PER_CELL for levels in (3, 4)}
     return _are_labels(rows[:, LABEL], classes) and len(rows) not in counts
@@ -214,12 +220,13 @@ def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness:
 
 
 def _box_kind(boxes: Float32, suppressed: bool) -> BoxKind | None:
-    """Return CENTER or CORNER for boxes (K, 4), None if the boxes of detections (`suppressed`) are ambiguous.
+    """Detect if boxes (K, 4) are corners or centers and sizes.
 
-    Raises DataError if the boxes of cells are ambiguous.
+    The result is None if the boxes of detections are ambiguous. The boxes of cells must not be ambiguous.
     """
     if suppressed and len(boxes) < MIN_ROWS:
         return None
+    # cells cover the image, so most centers are larger than the sizes of their boxes and few would be valid corners
     ordered = (boxes[:, 2:] >= boxes[:, :2]).all(axis=1).mean()
     if ordered >= MIN_ORDERED_CORNERS:
         return BoxKind.CORNER
@@ -234,10 +241,7 @@ def _box_kind(boxes: Float32, suppressed: bool) -> BoxKind | None:
 
 
 def _is_unit(boxes: Float32, shape: tuple[int, int], suppressed: bool) -> bool | None:
-    """Return True if boxes (K, 4) are in 0..1, False if they are in px, None if there are no boxes.
-
-    Raises DataError for other units.
-    """
+    """Return True if boxes (K, 4) are in 0..1, False if they are in px, and None without boxes."""
     if not len(boxes):
         return None
     if float(np.abs(boxes).max()) <= LARGEST_UNIT:

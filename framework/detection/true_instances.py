@@ -13,7 +13,10 @@ from framework.errors import DataError
 
 @dataclass(frozen=True)
 class TrueInstances:
-    """The N visible ground-truth instances of known class, sorted by decreasing number of pixels, then by id."""
+    """The N visible ground-truth instances of known class.
+
+    They are sorted by decreasing number of pixels, then by id.
+    """
 
     ids: Int32  # (N,)
     class_ids: Int32  # (N,) index into the detector's classes
@@ -24,9 +27,15 @@ class TrueInstances:
 
 
 def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) -> TrueInstances:
-    """Return the ground-truth instances of `frame` with a known class and at least `min_pixels` pixels.
+    """Return the visible ground-truth instances of a frame.
 
-    Raises DataError if the sequence has no instance ground truth, or if one of its classes is missing in `classes`.
+    Args:
+        frame: The frame.
+        classes: The class names of the detector.
+        min_pixels: The minimum number of pixels of an instance.
+
+    Raises:
+        DataError: The sequence has no instance ground truth, or a class is missing in `classes`.
     """
     if frame.truth is None:
         raise DataError(

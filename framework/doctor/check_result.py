@@ -54,7 +54,7 @@ def one_line(error: BaseException) -> str:
 
 
 def anonymous(text: str | Path) -> str:
-    """Return the text with the home folder replaced by ~ and the user name by USER, for pasting into an issue."""
+    """Return a text without the home folder and user name, for pasting into an issue."""
     home, text = str(Path.home()), str(text)
     if home != "/":
         text = text.replace(home, "~")

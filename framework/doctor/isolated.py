@@ -1,4 +1,7 @@
-"""Imports and probes in separate processes, because a broken library can end the process that loads it."""
+"""Imports and probes in separate processes.
+
+A broken library can end the process that loads it.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,7 @@ def _run(code: str) -> tuple[str, str]:
 
 
 def acceleration() -> None:
-    """Print JSON: `gpus`, the name and memory size of each GPU; `int8`, True if the CPU has 8-bit kernels."""
+    """Print, as JSON, the GPUs and the support of 8-bit kernels by the CPU."""
     import torch
 
     from framework.detection.runtimes.caffe2_network import has_int8_kernels
@@ -55,7 +58,7 @@ def acceleration() -> None:
 
 
 def kernels() -> None:
-    """Print JSON with `folder`, the kernel cache, and `counts`, (compiled, all) kernels of default and other stages."""
+    """Print, as JSON, the folder of the kernel cache and the numbers of compiled and all kernels."""
     from framework.compilation.catalog import DEFAULT, OTHERS, listed
 
     sections = [listed(DEFAULT), listed(OTHERS)]

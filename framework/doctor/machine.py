@@ -41,7 +41,10 @@ def hardware() -> Iterator[Check]:
 
 
 def disk() -> Iterator[Check]:
-    """Check that the folders for outputs, caches and temporary files are writable and have enough free space."""
+    """Check the folders for outputs, caches and temporary files.
+
+    They must be writable and have enough free space.
+    """
     import platformdirs
 
     for name, folder, fix in (
@@ -56,7 +59,7 @@ def disk() -> Iterator[Check]:
 
 
 def writable_parent(folder: Path) -> tuple[Path, bool]:
-    """Return the folder or its nearest existing parent, and True if it is writable."""
+    """Return a folder or its nearest existing parent, and True if it is writable."""
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     return existing, os.access(existing, os.W_OK)
 

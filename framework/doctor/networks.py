@@ -1,4 +1,4 @@
-"""Checks of detector weights: included in the project, or downloaded on first use."""
+"""Checks of detector weights, which are included in the project or downloaded on first use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODEL_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")  # id of a model on hugging
 
 
 def included_and_hub() -> Iterator[Check]:
-    """Check the weights included in the project, and the download of the options' models from huggingface.co."""
+    """Check the weights included in the project, and the weights downloaded from huggingface.co."""
     from framework.detection.hub.hub_model import forbidden_by
 
     choices = _content(CONF / "config.yaml")["defaults"]
@@ -40,7 +40,7 @@ def included_and_hub() -> Iterator[Check]:
 
 
 def published() -> Iterator[Check]:
-    """Check the download of the published networks of detector=mask_rcnn."""
+    """Check the downloaded weights of detector=mask_rcnn."""
     from framework.detection.mask_rcnn.published_weights import OFFLINE, PUBLISHED
 
     offline = f", but {OFFLINE} is set" if os.environ.get(OFFLINE) else ""
@@ -54,14 +54,11 @@ def published() -> Iterator[Check]:
 
 
 def _named() -> Iterator[tuple[str, str]]:
-    """Yield a name, and the path or model id, of the weights of each detector option.
-
-    The name is OPTION, or OPTION.PARAMETER if several parameters of the option name weights.
-    """
+    """Yield the name and the path or model id of the weights of each detector option."""
     for path in sorted((CONF / "detector").glob("*.yaml")):
         content = _content(path).items()
         values = {key: value for key, value in content if isinstance(value, str) and MODEL_ID.match(value)}
-        for key, value in values.items():
+        for key, value in values.items():  # OPTION, or OPTION.PARAMETER if the option has several weights
             yield path.stem if len(values) == 1 else f"{path.stem}.{key}", value
 
 
@@ -70,7 +67,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _hub_cache() -> Path:
-    """Return the model folder of huggingface_hub, as selected by its environment variables."""
+    """Return the model folder of huggingface_hub."""
     if given := os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE"):
         return Path(given)
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -78,13 +75,13 @@ def _hub_cache() -> Path:
 
 
 def _complete_size(snapshot: Path) -> int:
-    """Return the size of a complete download in bytes; 0 if its config or weights are missing."""
+    """Return the size of a complete download in bytes, or 0 if its config or weights are missing."""
     names = {file.name for file in snapshot.iterdir() if file.exists()}
     complete = "config.json" in names and any(name.endswith((".safetensors", ".bin")) for name in names)
     return _size(snapshot) if complete else 0
 
 
 def _size(path: Path) -> int:
-    """Return the size of a file or folder in bytes; 0 if it is missing."""
+    """Return the size of a file or folder in bytes, or 0 if it is missing."""
     files = path.rglob("*") if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files if file.is_file())

@@ -1,4 +1,4 @@
-"""Checks of the required Python packages and of the extras, as declared in the project metadata."""
+"""Checks of required Python packages and of extras."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def import_statement(package: str) -> str:
 
 
 def libraries(outcomes: Outcomes) -> Iterator[Check]:
-    """Check the version of every required package, and the outcome of its import."""
+    """Check the version and the import of every required package."""
     for line in declared()[1]:
         fits, detail = _installed(line)
         fix = f"pip install '{line.name}{line.specifier}'"

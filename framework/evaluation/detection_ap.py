@@ -1,4 +1,7 @@
-"""COCO AP of masks and boxes (Lin et al. 2014), by pycocotools for all areas and at most 100 detections per image."""
+"""COCO average precision (AP) of masks and boxes, computed by pycocotools.
+
+AP is computed over objects of all areas, with at most 100 detections per image (Lin et al. 2014).
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ UNDEFINED = -1.0  # precision of a class without objects in pycocotools
 
 @dataclass(frozen=True)
 class AveragePrecision:
-    """AP in [0, 1]; NaN without objects."""
+    """Average precision (AP), in [0, 1]. Values are NaN without objects."""
 
     ap: float  # mean over IoU 0.5, 0.55, ..., 0.95 and over the classes
     ap50: float  # mean over the classes, at IoU 0.5
@@ -30,7 +33,7 @@ class AveragePrecision:
 
 @dataclass(frozen=True)
 class DetectionAp:
-    """AP by the IoU of masks, and by the IoU of boxes."""
+    """Average precision of masks and of boxes."""
 
     masks: AveragePrecision
     boxes: AveragePrecision
@@ -39,14 +42,14 @@ class DetectionAp:
 def detection_ap(
     pictures: Iterable[tuple[Bool, Sequence[str | None], Detections]], classes: Sequence[str], min_pixels: int = 1
 ) -> DetectionAp:
-    """Return the AP over images and the given classes.
+    """Return the average precision of detections over images and classes.
 
-    The class of a detection is its most likely class. Objects of unknown class and objects with fewer than `min_pixels`
-    pixels count neither for nor against a detection (COCO's `iscrowd`). The box of an object is that of its mask. A box
-    in `Detections` ends at the last pixel inside, so that its width in COCO is x2 - x1 + 1.
+    The class of a detection is its most likely class. Objects of unknown class and objects smaller than `min_pixels`
+    are ignored, as with `iscrowd` in COCO. The box of a ground-truth object is the bounding box of its mask.
 
     Args:
-        pictures: Ground-truth masks (N, H, W), their class names (N,), None = unknown, and detections of each image.
+        pictures: Ground truth and detections of each image. The ground truth consists of masks (N, H, W) and class
+            names (N,), None = unknown.
         classes: Names of the evaluated classes. Objects and detections of other classes are omitted.
         min_pixels: Minimum area of an evaluated object, px.
     """
@@ -71,6 +74,7 @@ def detection_ap(
         ):
             name = detections.classes[int(probabilities.argmax())]
             if name in category:
+                # x2 and y2 are the last column and row inside the box
                 box = {"bbox": [x1, y1, x2 - x1 + 1, y2 - y1 + 1], "score": score}
                 found.append(_annotation(k, category[name], mask) | box)
                 detected.add(category[name])
@@ -97,7 +101,6 @@ def detection_ap(
 
 
 def _annotation(image: int, category: int, mask: Bool) -> dict[str, Any]:
-    """Return the COCO fields of a mask (H, W), run-length encoded, and its box."""
     segmentation = rle.encode(np.asfortranarray(mask, np.uint8))
     return {
         "image_id": image,
@@ -109,7 +112,10 @@ def _annotation(image: int, category: int, mask: Bool) -> dict[str, Any]:
 
 
 def _precision(truth: dict[str, Any], found: list[dict[str, Any]], kind: str) -> np.ndarray:
-    """Return the precision (IoU, recall, class) by the IoU of masks ("segm") or boxes ("bbox")."""
+    """Return the precision by IoU threshold, recall and class.
+
+    `kind` selects the IoU of masks ("segm") or of boxes ("bbox").
+    """
     with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints progress
         coco = COCO()
         coco.dataset = truth

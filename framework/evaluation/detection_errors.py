@@ -1,8 +1,8 @@
-"""Statistics of a detector's errors over a video with ground-truth instances.
+"""Statistics of the errors of a detector over a video with ground-truth instances.
 
 Averages over images, such as mask AP, do not show errors that repeat in all frames of an object. Such errors do not
-average out in a map. The appearances of each object are therefore evaluated together. The presets of
-`detector=simulated` were fitted to these statistics.
+average out in a map. All appearances of an object are therefore evaluated together. The presets of `detector=simulated`
+were fitted to these statistics.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ ON_ONE = 0.6  # minimum fraction of a false detection's pixels on one object of 
 
 
 class Appearance(NamedTuple):
-    """One object of a known class in one frame, with its best detection if any."""
+    """An object of known class in one frame, with its best detection."""
 
     instance: int  # id of the object
     side: float  # px, square root of the area
     parts: int  # number of detections mostly on the object; see PART_INSIDE and PART_COVERS
-    iou: float = 0.0  # of the object and its best detection; the other values are 0 without a detection
+    iou: float = 0.0  # of the object and its best detection; 0 without a detection
     inside: float = 0.0  # fraction of the detection's pixels on the object
     covered: float = 0.0  # fraction of the object's pixels in the detection
     score: float = 0.0
@@ -40,7 +40,10 @@ class Appearance(NamedTuple):
 
 
 class FalseDetection(NamedTuple):
-    """A detection that is best for no object, with at most half of its pixels on objects of known classes."""
+    """A detection that does not match an object of known class.
+
+    It is not the best detection of any object, and at most half of its pixels are on objects of known classes.
+    """
 
     score: float
     side: float  # px, square root of the area
@@ -56,7 +59,10 @@ class DetectionErrors:
     false_detections: list[FalseDetection] = field(default_factory=list)
 
     def add(self, truth: FrameTruth, detections: Detections) -> None:
-        """Compare the detections of one frame with its ground-truth instances; masks have the size of the image."""
+        """Add one frame, and compare its detections with its ground-truth instances.
+
+        The masks have the size of the image.
+        """
         self.frames += 1
         ids, shared = overlaps(truth, detections.masks)
         areas, shared = shared[0], shared[1:]
@@ -91,7 +97,7 @@ class DetectionErrors:
                 )
 
     def table(self) -> dict[str, float]:
-        """Return all statistics by name, in the order of the presets' model cards; NaN = no data."""
+        """Return all statistics by name. Statistics without data are NaN."""
         hits = [one for one in self.appearances if one.iou >= FOUND_IOU]
         scores = [one.score for one in hits]
         of_objects = _by_object(self.appearances)
@@ -132,9 +138,11 @@ def _by_object(appearances: Iterable[Appearance]) -> list[list[Appearance]]:
 
 
 def overlaps(truth: FrameTruth, masks: Bool) -> tuple[Int64, Int64]:
-    """Return the instance ids (M,) in a frame, and their pixel counts (1 + N, M).
+    """Return the ids of all instances in a frame, and their overlaps with masks (N, H, W).
 
-    Row 0 counts the pixels in the frame, and row 1 + k counts the pixels in mask k of `masks` (N, H, W).
+    Returns:
+        The ids (M,) and pixel counts (1 + N, M). Row 0 counts the pixels of the frame. Row 1 + k counts the pixels in
+        mask k.
     """
     ids, index = np.unique(truth.instance_ids.ravel(), return_inverse=True)
     counts = [np.bincount(index, minlength=len(ids))]

@@ -1,18 +1,18 @@
-"""Metrics of 3D instance segmentation: average precision and overlap with the ground-truth instances.
+"""Metrics of 3D instance segmentation: average precision, and overlap with ground-truth instances.
 
-Labels are transferred between map vertices and ground-truth surface points by nearest neighbor. Predictions are matched
-to ground-truth instances greedily in order of confidence. AP is the area under a class's precision-recall curve with
-all-point interpolation (Pascal VOC from 2010 on). It is averaged over the classes with a ground-truth instance.
+Labels are transferred between map vertices and ground-truth points by nearest neighbor. Predictions are matched to
+ground-truth instances greedily, in order of confidence. AP is the area under the precision-recall curve of a class,
+with all-point interpolation (Pascal VOC from 2010 on). It is averaged over the classes with a ground-truth instance.
 
 A ground-truth instance is evaluated if its class is known and it has at least `min_points` points. All other
-ground-truth instances are *ignored*. A prediction without a match is ignored (neither right nor wrong) if
+ground-truth instances are *ignored*. A prediction without a match is ignored in one of three cases:
 
-1. its best overlap with an ignored instance reaches the IoU threshold, or
-2. more than half of its points are on ignored instances, or
-3. its class was not annotated (`SceneTruth.classes`).
+1. Its best overlap with an ignored instance reaches the IoU threshold.
+2. More than half of its points are on ignored instances.
+3. Its class was not annotated (`SceneTruth.classes`).
 
-Every other prediction without a match is wrong. This includes predictions on points of instance 0 (no instance) and
-predictions far from the ground truth.
+All other predictions without a match are wrong. This includes predictions on points without an instance and predictions
+far from the ground truth.
 """
 
 from __future__ import annotations
@@ -71,7 +71,10 @@ class PredictedInstances:
     def of_map(
         cls, mesh: InstanceMesh, instances: Mapping[int, Instance], classes: Sequence[str]
     ) -> PredictedInstances:
-        """Return all instances of a map; `classes` name the columns of their class probabilities."""
+        """Return all instances of a map.
+
+        `classes` are the names of the columns of the class probabilities.
+        """
         ids = sorted(instances)
         names = [classes[int(instances[key].class_probabilities.argmax())] for key in ids]
         return cls.on_mesh(mesh, ids, [instances[key].confidence for key in ids], names)
@@ -80,7 +83,7 @@ class PredictedInstances:
     def on_mesh(
         cls, mesh: InstanceMesh, ids: Sequence[int], confidences: Sequence[float], class_names: Sequence[str]
     ) -> PredictedInstances:
-        """Return the instances `ids` of a mesh. Vertices of all other (tentative) instances get the id 0."""
+        """Return the instances of a mesh with the given ids. Vertices of other instances get the id 0."""
         listed = np.array(ids, np.int64)
         return cls(
             points_world=mesh.vertices,
@@ -93,7 +96,7 @@ class PredictedInstances:
 
 @dataclass(frozen=True)
 class Score:
-    """The result of one class, or of all classes together, at one IoU threshold."""
+    """The result of one class or of all classes together, at one IoU threshold."""
 
     ap: float  # area under the precision-recall curve
     true_positives: int
@@ -104,7 +107,7 @@ class Score:
 
     @property
     def panoptic_quality(self) -> float:
-        """Panoptic quality (Kirillov et al. 2019): matched IoU divided by TP + FP/2 + FN/2."""
+        """Panoptic quality (Kirillov et al. 2019)."""
         missed = self.truths - self.true_positives
         return self.matched_iou / (self.true_positives + 0.5 * self.false_positives + 0.5 * missed)
 
@@ -120,7 +123,7 @@ class Outcome(Enum):
 
 @dataclass(frozen=True)
 class MatchResult:
-    """One prediction compared with the ground truth."""
+    """The comparison of one prediction with the ground truth."""
 
     id: int
     outcome: Outcome
@@ -131,7 +134,7 @@ class MatchResult:
 
 @dataclass(frozen=True)
 class InstanceEvaluation:
-    """The result of `evaluate`; empty without evaluated ground-truth instances."""
+    """The result of `evaluate`. It is empty without evaluated ground-truth instances."""
 
     by_class: Mapping[float, Mapping[str, Score]]  # IoU threshold -> class with a ground-truth instance -> score
     agnostic: Mapping[float, Score]  # IoU threshold -> class-agnostic score
@@ -140,18 +143,21 @@ class InstanceEvaluation:
     best_ids: Mapping[int, int]  # evaluated ground-truth instance -> prediction with the best IoU, 0 = none
 
     def ap(self, threshold: float) -> float:
-        """Return the class-averaged AP at one IoU threshold, NaN without ground truth."""
+        """Return the AP at one IoU threshold, averaged over classes, or NaN without ground truth."""
         scores = self.by_class.get(threshold, {})
         return float(np.mean([score.ap for score in scores.values()])) if scores else float("nan")
 
     def metrics(self) -> dict[str, float]:
-        """Return the metrics by their names in metrics.json; empty without evaluated ground-truth instances.
+        """Return the metrics by their names in metrics.json.
 
-        - `instances.ap50`, `ap25`: AP at IoU 0.5 and 0.25; `ap`: the mean over IOU_THRESHOLDS. Also for each class with
-          a ground-truth instance, as `instances.ap50.<class>`.
-        - `ap50_agnostic`, `ap25_agnostic`: class-agnostic AP.
-        - `mean_iou`: mean, over the ground-truth instances, of the best IoU with a prediction of any class.
-        - `precision50`, `recall50`, `f1_50`: at IoU 0.5, over all predictions and ground-truth instances.
+        The result is empty without evaluated ground-truth instances.
+
+        - `instances.ap50` and `ap25`: AP at IoU 0.5 and 0.25.
+        - `ap`: mean AP over IOU_THRESHOLDS.
+        - `ap50.<class>`, `ap25.<class>` and `ap.<class>`: AP of each class with a ground-truth instance.
+        - `ap50_agnostic` and `ap25_agnostic`: class-agnostic AP.
+        - `mean_iou`: mean of the best IoU of each ground-truth instance with a prediction of any class.
+        - `precision50`, `recall50` and `f1_50`: at IoU 0.5, over all predictions and ground-truth instances.
         - `pq50`: panoptic quality at IoU 0.5, averaged over classes.
         - `true_count`: number of evaluated ground-truth instances, also for each class.
         - `ignored_count`: number of ignored predictions at IoU 0.5.
@@ -189,11 +195,16 @@ def evaluate(
     max_distance: float = MAX_DISTANCE,
     min_points: int = MIN_POINTS,
 ) -> InstanceEvaluation:
-    """Return the evaluation of the instances of a map by the rules in the docstring of this module.
+    """Evaluate the instances of a map by the rules in the docstring of this module.
 
-    `transfer` and `max_distance`, m, define the label transfer; ground-truth instances with fewer than `min_points`
-    points are ignored. The result does not depend on the order of points or predictions. Ties in confidence are ranked
-    by id.
+    The result does not depend on the order of points or predictions. Predictions of equal confidence are ranked by id.
+
+    Args:
+        predictions: Instances of the map.
+        truth: Ground truth.
+        transfer: Direction of the label transfer.
+        max_distance: Maximum distance of the label transfer, m.
+        min_points: Minimum number of points of an evaluated ground-truth instance.
     """
     overlaps = _Overlaps.between(predictions, truth, transfer, max_distance, min_points)
     names = sorted(set(overlaps.truth_classes[overlaps.evaluated]))
@@ -214,10 +225,13 @@ def evaluate(
 def judge(
     predictions: PredictedInstances, truth: SceneTruth, threshold: float = 0.5
 ) -> tuple[list[MatchResult], dict[int, str]]:
-    """Return the outcome of each prediction at an IoU threshold, and the class of each missed instance by id.
+    """Compare each prediction with the ground truth at one IoU threshold.
 
-    Missed instances are evaluated ground-truth instances without a correct prediction. Predictions are in order of
-    decreasing confidence. They are matched as for `InstanceEvaluation.overall`.
+    Predictions are matched as for `InstanceEvaluation.overall`.
+
+    Returns:
+        The result of each prediction, in order of decreasing confidence. The class of each evaluated ground-truth
+        instance without a correct prediction, by id.
     """
     overlaps = _Overlaps.between(predictions, truth, Transfer.TO_TRUTH, MAX_DISTANCE, MIN_POINTS)
     everything = np.ones(len(overlaps.predicted_ids), np.bool_)
@@ -229,12 +243,15 @@ def judge(
     return judged, {key: name for key, name, counts in counted if counts and key not in found}
 
 
-IGNORED, NO_MATCH = -2, -1  # results of a prediction that is not matched with a column of `_Overlaps.iou`
+IGNORED, NO_MATCH = -2, -1  # results of a prediction without a matched ground-truth instance
 
 
 @dataclass(frozen=True)
 class _Overlaps:
-    """The overlaps of K predictions, in order of decreasing confidence, with T ground-truth instances."""
+    """The overlaps of K predictions with T ground-truth instances.
+
+    Predictions are in order of decreasing confidence.
+    """
 
     iou: Float64  # (K, T)
     ignorable: Bool  # (K,) True where most points are on ignored instances, or the class was not annotated
@@ -248,7 +265,7 @@ class _Overlaps:
     def between(
         cls, predictions: PredictedInstances, truth: SceneTruth, transfer: Transfer, reach: float, min_points: int
     ) -> _Overlaps:
-        """Return the overlaps of predictions and ground truth after a label transfer over at most `reach` m."""
+        """Return the overlaps after a label transfer with the maximum distance `reach`, m."""
         truth_ids, truth_sizes = np.unique(truth.instance_ids[truth.instance_ids > 0], return_counts=True)
         ranks = np.lexsort((predictions.ids, -predictions.confidences))
         ids = predictions.ids[ranks]
@@ -276,9 +293,13 @@ class _Overlaps:
         )
 
     def score(self, threshold: float, predicted: Bool, truths: Bool, allowed: Bool) -> Score:
-        """Return the score of the predictions in `predicted` (K,) for the ground-truth instances in `truths` (T,).
+        """Return the score of selected predictions and ground-truth instances.
 
-        `allowed` (K, T) is True for the pairs that may match.
+        Args:
+            threshold: IoU threshold.
+            predicted: Mask (K,) of the selected predictions.
+            truths: Mask (T,) of the selected ground-truth instances.
+            allowed: Mask (K, T) of the pairs that may match.
         """
         matches = self.matches(threshold, predicted, allowed)
         hits = [match >= 0 for _, match in matches if match != IGNORED]  # evaluated predictions
@@ -293,9 +314,9 @@ class _Overlaps:
         )
 
     def matches(self, threshold: float, predicted: Bool, allowed: Bool) -> list[tuple[int, int]]:
-        """Return (row, match) pairs of the predictions in `predicted` (K,), in order of decreasing confidence.
+        """Return the index of each selected prediction and of its matched ground-truth instance.
 
-        A match is a column of `allowed` (K, T), NO_MATCH or IGNORED.
+        The second index is NO_MATCH or IGNORED for predictions without a match. The arguments are described in `score`.
         """
         ignored_iou = self.iou[:, ~self.evaluated].max(axis=1, initial=0.0)
         unknown = self.ignorable | (ignored_iou >= threshold)
@@ -312,10 +333,7 @@ class _Overlaps:
         return found
 
     def match_result(self, k: int, match: int, threshold: float) -> MatchResult:
-        """Return the match result of prediction k: its outcome, ground-truth instance and IoU.
-
-        `match` is from `matches`; `threshold` is the IoU threshold.
-        """
+        """Return the result of prediction `k`, given its match and the IoU threshold."""
         t = match if match >= 0 else int(self.iou[k].argmax()) if len(self.truth_ids) else -1
         iou = float(self.iou[k, t]) if t >= 0 else 0.0
         truth_id, truth_class = (int(self.truth_ids[t]), self.truth_classes[t]) if iou > 0 else (0, None)
@@ -325,7 +343,10 @@ class _Overlaps:
         return MatchResult(int(self.predicted_ids[k]), outcome, truth_id, truth_class, iou)
 
     def best(self) -> tuple[dict[int, float], dict[int, int]]:
-        """Return the best IoU, and the prediction with it (0 = none), of each evaluated ground-truth instance by id."""
+        """Return the best IoU and the best prediction of each evaluated ground-truth instance, by id.
+
+        The best prediction is 0 for instances without overlap.
+        """
         columns = {int(self.truth_ids[t]): self.iou[:, t] for t in np.flatnonzero(self.evaluated)}
         ious = {key: float(column.max(initial=0.0)) for key, column in columns.items()}
         ids = {key: int(self.predicted_ids[columns[key].argmax()]) if iou > 0 else 0 for key, iou in ious.items()}
@@ -333,20 +354,28 @@ class _Overlaps:
 
 
 def average_precision(hits: Bool, truths: int) -> float:
-    """Return the area under the precision-recall curve of ranked predictions `hits` (K,), True = correct.
+    """Return the area under the precision-recall curve, with all-point interpolation.
 
-    `truths` is the number of ground-truth instances. All-point interpolation: each hit contributes the maximum
-    precision at its own or a later position in the ranking, divided by `truths`.
+    Args:
+        hits: Ranked predictions (K,), True = correct.
+        truths: Number of ground-truth instances, at least 1.
     """
     if truths == 0:
         raise ValueError("average precision: expected at least one ground-truth instance, got none")
     precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
-    envelope = np.maximum.accumulate(precision[::-1])[::-1]
+    envelope = np.maximum.accumulate(precision[::-1])[::-1]  # best precision at the same or a higher recall
     return float(envelope[hits].sum() / truths)
 
 
 def transfer_labels(points: Float32, labels: Int32, targets: Float32, max_distance: float) -> Int32:
-    """Return the label (T,) of the point (P, 3) nearest to each target (T, 3), m; 0 = none within `max_distance`, m."""
+    """Return the label (T,) of the nearest point for each target.
+
+    Args:
+        points: Labeled points (P, 3), m.
+        labels: Label of each point (P,).
+        targets: Points without labels (T, 3), m.
+        max_distance: Maximum distance, m. Targets without a point within this distance get the label 0.
+    """
     if not len(points) or not len(targets):
         return np.zeros(len(targets), np.int32)
     import numba  # imported here to keep commands that only read metrics fast
@@ -362,14 +391,17 @@ def transfer_labels(points: Float32, labels: Int32, targets: Float32, max_distan
 
 
 def _contingency(predicted: Int32, true: Int32, predicted_ids: Int64, truth_ids: Array) -> Int64:
-    """Return the number of points (1 + K, 1 + T) with each pair of labels; row 0 and column 0 are for no instance."""
+    """Return the number of points (1 + K, 1 + T) with each pair of labels.
+
+    Row 0 and column 0 are for points without an instance.
+    """
     rows, columns = _positions(predicted, predicted_ids), _positions(true, truth_ids)
     shape = 1 + len(predicted_ids), 1 + len(truth_ids)
     return np.bincount(rows * shape[1] + columns, minlength=shape[0] * shape[1]).reshape(shape)
 
 
 def _positions(labels: Int32, ids: Array) -> Int64:
-    """Return 1 + the index of each label in `ids`, 0 for label 0."""
+    """Return 1 + the index of each label in `ids`, and 0 for the label 0."""
     values, inverse = np.unique(labels, return_inverse=True)
     index = {value: k for k, value in enumerate(ids.tolist(), start=1)}
     return np.array([index.get(value, 0) for value in values.tolist()], np.int64)[inverse]

@@ -1,4 +1,4 @@
-"""The effect of a refiner on the point clusters of one frame: point counts and fit to the ground-truth masks."""
+"""Evaluation of a refiner on one frame: point counts and fit to the ground-truth masks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ TIMED_CALLS = 5  # number of timed calls for the median; an untimed call before 
 
 @dataclass(frozen=True)
 class Refinement:
-    """The N clusters of one frame before refinement and the M clusters after it. Refiners may split clusters."""
+    """The N point clusters of one frame before refinement and the M clusters after it.
+
+    Refiners may split clusters.
+    """
 
     frame: Frame
     before: PointClusters
@@ -31,7 +34,7 @@ class Refinement:
     def of(cls, refiner: ClusterRefiner, detections: Detections, frame: Frame) -> Refinement:
         """Return the clusters of detections before and after refinement.
 
-        The points are in the world frame, or in the camera frame if the frame has no ground-truth pose.
+        Points are in the world frame, or in the camera frame for a frame without a ground-truth pose.
         """
         pose = Pose(np.eye(4) if frame.T_world_camera is None else frame.T_world_camera)
         before = lift(detections, frame, pose)
@@ -45,11 +48,10 @@ class Refinement:
 
     @cached_property
     def origin(self) -> Int32:
-        """Index (M,) of the original cluster of each refined cluster, -1 = none.
+        """Index (M,) of the original cluster of each refined cluster, or -1 for none.
 
-        If the refiner does not change the number of clusters, refined cluster k comes from original cluster k.
-        Otherwise, a refined cluster is assigned to the original cluster with which it shares the most pixels. Ties go
-        to the smallest index.
+        If the number of clusters does not change, refined cluster k comes from original cluster k. Otherwise, each
+        refined cluster comes from the original cluster with the most common pixels.
         """
         n, m = len(self.before), len(self.after)
         if n == m or n == 0:
@@ -59,7 +61,7 @@ class Refinement:
 
     @cached_property
     def main_part(self) -> Int32:
-        """Index (N,) of the largest refined cluster of each original cluster, -1 = none."""
+        """Index (N,) of the largest refined cluster of each original cluster, or -1 for none."""
         sizes = point_counts(self.after)
         largest_last = np.argsort(sizes, kind="stable")
         main = np.full(len(self.before), -1, np.int32)
@@ -74,30 +76,33 @@ class Refinement:
 
     @cached_property
     def points_after(self) -> Int32:
-        """Point count (N,) of each original cluster after refinement, summed over its refined clusters."""
+        """Point count (N,) after refinement, summed over the refined clusters of each original cluster."""
         known = self.origin >= 0
         sums = np.bincount(self.origin[known], point_counts(self.after)[known], minlength=len(self.before))
         return sums.astype(np.int32)
 
     @cached_property
     def fit_before(self) -> TrueFit | None:
-        """Fit of the N clusters; None without ground-truth instances."""
+        """Fit of the original clusters, or None without ground-truth instances."""
         return None if self.frame.truth is None else true_fit(self.before, self.frame, self.frame.truth)
 
     @cached_property
     def fit_after(self) -> TrueFit | None:
-        """Fit of the M clusters; None without ground-truth instances."""
+        """Fit of the refined clusters, or None without ground-truth instances."""
         return None if self.frame.truth is None else true_fit(self.after, self.frame, self.frame.truth)
 
     @cached_property
     def judged_before(self) -> Bool:
-        """Boolean array (N,), True where no object of unknown class fits best; all False without ground truth."""
+        """Mask (N,) of the evaluated original clusters, all False without ground truth.
+
+        A cluster is not evaluated if an object of unknown class fits best.
+        """
         fit = self.fit_before
         return np.zeros(len(self.before), np.bool_) if fit is None else ~fit.unknown
 
     @cached_property
     def judged_after(self) -> Bool:
-        """Boolean array (M,), True where the original cluster is evaluated; all False without ground truth."""
+        """Mask (M,) of the refined clusters with an evaluated original cluster, all False without ground truth."""
         fit = self.fit_after
         if fit is None:
             return np.zeros(len(self.after), np.bool_)
@@ -106,7 +111,7 @@ class Refinement:
 
 @dataclass(frozen=True)
 class TrueFit:
-    """The fit of N clusters to their best-fitting ground-truth objects of known class, as seen in the frame."""
+    """The fit of N clusters to the best-fitting ground-truth objects of known class."""
 
     iou: Float64  # (N,) intersection over union with the object; 0 for an empty cluster
     points_inside: Int32  # (N,) number of the cluster's points on the object
@@ -124,16 +129,16 @@ def pixel_index(clusters: PointClusters, frame: Frame) -> Int32:
 
 
 def _membership(clusters: PointClusters, frame: Frame) -> csr_array:
-    """Return the indicator matrix (N, H * W): 1 where a cluster has a point at a pixel."""
+    """Return a sparse matrix (N, H * W) that is 1 where a cluster has a point at a pixel."""
     held = clusters.cluster >= 0
     entries = clusters.cluster[held], pixel_index(clusters, frame)[held]
     return csr_array((np.ones(held.sum(), np.int32), entries), (len(clusters), frame.depth.size))
 
 
 def true_fit(clusters: PointClusters, frame: Frame, truth: FrameTruth) -> TrueFit:
-    """Return the fit of each cluster to its best-fitting ground-truth object.
+    """Return the fit of each cluster to the best-fitting ground-truth object.
 
-    Only pixels with a depth reading are compared, because clusters contain no other pixels.
+    Pixels without depth are ignored, because clusters contain no such pixels.
     """
     ids = np.where(frame.depth > 0, truth.instance_ids, 0).ravel()
     objects, of_pixel, areas = np.unique(ids, return_inverse=True, return_counts=True)

@@ -1,13 +1,13 @@
-"""Trajectory errors ATE and RPE, in the notation of evo and with the same results as evo.
+"""Absolute trajectory error (ATE) and relative pose error (RPE), with the same results as evo.
 
 Q_i and P_i are the ground-truth and the estimated T_world_camera of frame i.
 
-- ATE (absolute trajectory error, Sturm et al. 2012): the RMSE of |trans E_i| with E_i = Q_i^-1 S P_i, where the rigid
-  transform S aligns the positions in the least-squares sense (Umeyama 1991, without scale).
-- RPE (relative pose error) with delta = 1 frame: the RMSE of |trans E_i| and of the angle of rot E_i with
+- ATE (Sturm et al. 2012): the RMSE of |trans E_i| with E_i = Q_i^-1 S P_i. The rigid transform S aligns the positions
+  in the least-squares sense (Umeyama 1991, without scale).
+- RPE with delta = 1 frame: the RMSE of |trans E_i| and of the angle of rot E_i, with
   E_i = (Q_i^-1 Q_{i+1})^-1 (P_i^-1 P_{i+1}).
 
-Frames with a lost pose or an unknown ground-truth pose are omitted. The RPE also omits pairs that contain such a frame.
+Frames with a lost pose or an unknown ground-truth pose are omitted. The RPE also omits pairs with such a frame.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ from framework.errors import DataError
 
 @dataclass(frozen=True)
 class TrajectoryError:
-    """Errors of one trajectory. The ATE is NaN without evaluated frames, the RPE without evaluated frame pairs."""
+    """The errors of one trajectory.
+
+    The ATE is NaN without evaluated frames, and the RPE is NaN without evaluated frame pairs.
+    """
 
     ate_rmse_m: float
     rpe_rmse_m: float
@@ -32,7 +35,7 @@ class TrajectoryError:
     pairs: int  # number of frame pairs in the RPE
 
     def metrics(self) -> dict[str, float]:
-        """Return the errors that are not NaN, by their names in metrics.json."""
+        """Return the errors by their names in metrics.json. NaN values are omitted."""
         flat: dict[str, float] = {}
         if self.frames:
             flat["trajectory.ate_rmse_m"] = self.ate_rmse_m
@@ -43,9 +46,14 @@ class TrajectoryError:
 
 
 def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> TrajectoryError:
-    """Return the errors of estimated poses. `reference` lists T_world_camera (4, 4) of each frame, None = unknown.
+    """Return the errors of an estimated trajectory.
 
-    Raises DataError if the numbers of poses differ.
+    Args:
+        reference: Ground-truth pose (4, 4) of each frame; None = unknown.
+        estimated: Estimated pose of each frame.
+
+    Raises:
+        DataError: The numbers of poses differ.
     """
     if len(reference) != len(estimated):
         raise DataError(
@@ -73,10 +81,13 @@ def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> 
 
 
 def umeyama(x: Float64, y: Float64) -> tuple[Float64, Float64]:
-    """Return the rotation R (3, 3) and translation t (3,) that minimize sum |y_i - (R x_i + t)|^2.
+    """Return the rigid transform that best aligns the points x (n, 3) with y (n, 3).
 
-    The points x and y are (n, 3). The method is Umeyama 1991, eqs. (40) to (43). For fewer than three points, or points
-    on a line, R is one of several solutions.
+    The transform minimizes the sum of |y_i - (R x_i + t)|^2 (Umeyama 1991, eqs. (40) to (43)). R is not unique for
+    fewer than three points or for points on a line.
+
+    Returns:
+        The rotation R (3, 3) and the translation t (3,).
     """
     mu_x, mu_y = x.mean(axis=0), y.mean(axis=0)
     U, _, Vt = np.linalg.svd((y - mu_y).T @ (x - mu_x) / len(x))
@@ -86,25 +97,24 @@ def umeyama(x: Float64, y: Float64) -> tuple[Float64, Float64]:
 
 
 def align(P: Float64, Q: Float64) -> Float64:
-    """Return the rigid transform T (4, 4) that best aligns the poses P (n, 4, 4) with Q (n, 4, 4), n >= 1.
+    """Return the rigid transform (4, 4) that best aligns the poses P (n, 4, 4) with Q (n, 4, 4).
 
-    `umeyama` is applied to the positions and the points 1 m along each camera's axes. The additional points determine
-    the rotation of a camera that only rotates.
+    At least one pose is required. The rotation is also determined if the camera only rotates.
     """
-    R, t = umeyama(_axis_points(P), _axis_points(Q))
+    R, t = umeyama(_axis_points(P), _axis_points(Q))  # points off the camera centers determine the rotation
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     return T
 
 
 def _axis_points(P: Float64) -> Float64:
-    """Return the positions of poses (n, 4, 4) and the points 1 m along their axes, (4n, 3)."""
+    """Return the camera centers and the points 1 m along the axes of each pose, (4n, 3)."""
     positions = P[:, None, :3, 3]
     return np.concatenate([positions, positions + P[:, :3, :3].transpose(0, 2, 1)], axis=1).reshape(-1, 3)
 
 
 def _inverse(T: Float64) -> Float64:
-    """Return the inverses of rigid transforms (n, 4, 4)."""
+    """Invert rigid transforms (n, 4, 4)."""
     inverse = np.zeros_like(T)
     inverse[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
     inverse[:, :3, 3] = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
@@ -113,8 +123,9 @@ def _inverse(T: Float64) -> Float64:
 
 
 def _angles(R: Float64) -> Float64:
-    """Return the angles (n,) of rotations (n, 3, 3) in rad, accurate for small angles; see geometry.rotation_angle."""
+    """Return the angles (n,) of rotations (n, 3, 3), rad."""
     axis = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    # unlike arccos, arctan2 is accurate for small angles
     return np.asarray(np.arctan2(np.linalg.norm(axis, axis=1) / 2, (np.trace(R, axis1=1, axis2=2) - 1) / 2))
 
 

@@ -15,15 +15,15 @@ SAME_POSE = 1e-6  # maximum difference between the entries of equal poses; files
 
 
 def in_map_world(truth: SceneTruth, timestamps: Float64, poses: Float64) -> SceneTruth:
-    """Return the ground truth in the world frame of the map whose trajectory is `poses`.
+    """Return the ground truth in the world frame of a map.
 
-    If the ground-truth poses are available to the run, and the first common pose is equal in both trajectories, they
-    share one world frame. Otherwise, the ground truth is aligned rigidly to the map by the poses at common times.
+    Both share one world frame if the run can read the ground-truth poses and the first common pose is equal. Otherwise,
+    the ground truth is rigidly aligned with the map by the poses at common times.
 
     Args:
-        truth: The ground truth.
-        timestamps: (F,) timestamps of the map's frames, s.
-        poses: (F, 4, 4) T_map_camera of these frames.
+        truth: Ground truth.
+        timestamps: Timestamps (F,) of the frames of the map, s.
+        poses: Poses (F, 4, 4) of these frames in the map.
 
     Raises:
         DataError: The two trajectories have no common time.

@@ -1,1 +1,1 @@
-"""Export of a stored run: meshes, scenes for simulators, floor plans and a scene graph."""
+"""Export of stored runs to 3D formats, floor plans and scene graphs."""

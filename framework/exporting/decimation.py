@@ -1,6 +1,6 @@
-"""Cutting, joining and decimation of meshes.
+"""Mesh decimation, and functions to split and join meshes.
 
-Decimation preserves the texture of flat surfaces and is fast for huge maps.
+Decimation preserves the texture of flat surfaces and is fast for large meshes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from framework.data import Bool, Float32, Float64, InstanceMesh, Int32, Int64
 
 OBJECTS_FRACTION = 0.5  # minimum fraction of the triangle limit that is reserved for objects
 MIN_TRIANGLES = 4  # minimum number of triangles of a closed surface
-QUADRIC_STEP = 2.5  # maximum reduction by quadric decimation alone, as a factor; its time is quadratic in the factor
+QUADRIC_STEP = 2.5  # maximum reduction factor of quadric decimation; its run time is quadratic in the factor
 LEFT_TO_QUADRIC = 1.8  # ratio of the triangles after clustering to the triangles after quadric decimation
 MIN_CLUSTERED = 20_000  # minimum number of triangles after clustering; with fewer, cells would be as large as objects
 RELIEF = 0.03  # m, offset of white vertices relative to black vertices along the normal
@@ -25,10 +25,10 @@ COARSER = 1.3  # ratio of successive cell sizes
 
 
 def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Return the mesh with at most the given number of triangles (at least MIN_TRIANGLES).
+    """Decimate a mesh to at most `triangles` triangles.
 
-    Method: quadric decimation by Open3D (Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics",
-    SIGGRAPH 1997), after vertex clustering of much larger meshes.
+    Large meshes are first simplified by vertex clustering. Quadric decimation follows (Garland and Heckbert, "Surface
+    Simplification Using Quadric Error Metrics", SIGGRAPH 1997).
     """
     most = max(triangles, MIN_TRIANGLES)
     wanted = max(most, MIN_CLUSTERED)
@@ -43,9 +43,10 @@ def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Decimate a mesh to approximately `triangles` triangles in total. Objects are finer than the background.
+    """Decimate a mesh to about `triangles` triangles, with finer objects than background.
 
-    Objects and background are decimated separately to preserve their border. Vertices outside objects get the label 0.
+    Objects and background are decimated separately, which preserves the border between them. Background vertices get
+    the label 0.
     """
     owners = triangle_labels(mesh.triangles, mesh.instance_ids)
     of_object = owners > 0
@@ -61,10 +62,15 @@ def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_of_triangle: int) -> InstanceMesh:
-    """Cluster the vertices of a mesh until its stored size is at most `most_bytes` bytes.
+    """Simplify a mesh by vertex clustering until its stored size is small enough.
 
-    `bytes_of_vertex` and `bytes_of_triangle` are the stored sizes of one vertex and one triangle. Unlike edge collapse,
-    clustering also merges triangles without a common edge.
+    Unlike edge collapse, vertex clustering also merges triangles without a common edge.
+
+    Args:
+        mesh: Input mesh.
+        most_bytes: Maximum stored size of the result, bytes.
+        bytes_of_vertex: Stored size of one vertex, bytes.
+        bytes_of_triangle: Stored size of one triangle, bytes.
     """
     cell = 0.5 * _cell(mesh, max(1, len(mesh.triangles)))
     while bytes_of_vertex * len(mesh.vertices) + bytes_of_triangle * len(mesh.triangles) > most_bytes:
@@ -74,22 +80,23 @@ def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_o
 
 
 def triangle_labels(triangles: Int32, labels: Int32) -> Int32:
-    """Return the majority label (F,) of the corners of each triangle; if all differ, the label of the first corner.
+    """Return the majority label (F,) of the vertices of each triangle.
 
-    `triangles` (F, 3) contains vertex indices, and `labels` (V,) the label of each vertex.
+    If all three labels differ, the first one is used.
+
+    Args:
+        triangles: Vertex indices (F, 3).
+        labels: Vertex labels (V,).
     """
     corners = labels[triangles]
     return np.where(corners[:, 1] == corners[:, 2], corners[:, 1], corners[:, 0])
 
 
 def _collapsed(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Return the mesh with at most `triangles` triangles, after edge collapse by quadrics.
-
-    A brightness relief preserves the texture of flat surfaces. Each remaining vertex is replaced by the nearest
-    original vertex with its color and labels.
-    """
+    """Simplify a mesh to at most `triangles` triangles by quadric decimation."""
     model = _open3d(mesh)
     model.compute_vertex_normals()
+    # bright vertices are moved along their normals, so that decimation preserves the texture of flat surfaces
     brightness = mesh.colors @ BRIGHTNESS / 255
     relief = mesh.vertices + RELIEF * brightness[:, None] * np.asarray(model.vertex_normals)
     model.vertices = _vectors(relief)
@@ -107,10 +114,10 @@ def _collapsed(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def _cell(mesh: InstanceMesh, count: int) -> float:
-    """Return the cell size, m, for about `count` triangles: two triangles per square cell of the surface."""
+    """Return the cell size for about `count` triangles after vertex clustering, m."""
     a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
     area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-    return max(float(np.sqrt(2 * area / count)), 1e-4)
+    return max(float(np.sqrt(2 * area / count)), 1e-4)  # two triangles per square cell of the surface
 
 
 def _open3d(mesh: InstanceMesh) -> Any:
@@ -128,7 +135,7 @@ def _vectors(rows: Float32 | Float64) -> Any:
 
 
 def _relabeled(model: Any, mesh: InstanceMesh) -> InstanceMesh:
-    """Return an Open3D mesh as an InstanceMesh. Each vertex gets the labels of the nearest vertex of `mesh`."""
+    """Convert an Open3D mesh. Each vertex gets the labels of the nearest vertex of `mesh`."""
     model.remove_unreferenced_vertices()
     kept = np.asarray(model.vertices).astype(np.float32).reshape(-1, 3)
     nearest = _nearest(mesh.vertices, kept)
@@ -137,17 +144,20 @@ def _relabeled(model: Any, mesh: InstanceMesh) -> InstanceMesh:
     return InstanceMesh(kept, triangles, colors, mesh.instance_ids[nearest], mesh.class_ids[nearest], mesh.classes)
 
 
-def _nearest(places: Float32 | Float64, queries: Float32 | Float64) -> Int64:
-    """Return the indices (N,) of the positions (M, 3) that are nearest to the query positions (N, 3)."""
+def _nearest(points: Float32 | Float64, queries: Float32 | Float64) -> Int64:
+    """Return the index (N,) of the point nearest to each query point (N, 3)."""
     if not len(queries):
         return np.zeros(0, np.int64)
-    return np.asarray(cKDTree(places, balanced_tree=False).query(queries)[1])
+    return np.asarray(cKDTree(points, balanced_tree=False).query(queries)[1])
 
 
 def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> InstanceMesh:
-    """Return the part of a mesh with the vertices in the mask `kept` (V,).
+    """Return the part of a mesh with the selected vertices and triangles.
 
-    `triangles` is the mask (F,) of its triangles; None = all triangles between these vertices.
+    Args:
+        mesh: Input mesh.
+        kept: Mask (V,) of the selected vertices.
+        triangles: Mask (F,) of the selected triangles; None = all triangles between selected vertices.
     """
     number = np.cumsum(kept, dtype=np.int32) - 1
     chosen = kept[mesh.triangles].all(axis=1) if triangles is None else triangles
@@ -162,14 +172,14 @@ def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> In
 
 
 def corners_of(mesh: InstanceMesh, triangles: Bool) -> Bool:
-    """Return the mask (V,) of the corners of the triangles in the mask `triangles` (F,)."""
+    """Return the mask (V,) of the vertices of the triangles in a mask (F,)."""
     used = np.zeros(len(mesh.vertices), np.bool_)
     used[mesh.triangles[triangles]] = True
     return used
 
 
 def joined(meshes: Sequence[InstanceMesh]) -> InstanceMesh:
-    """Return the union of one or more meshes with the same classes."""
+    """Concatenate one or more meshes with the same classes."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     return InstanceMesh(
         np.concatenate([mesh.vertices for mesh in meshes]),

@@ -53,7 +53,7 @@ class Chosen:
     """Options of an export."""
 
     objects: Sequence[str] = ()  # ids or classes; () = the whole room
-    min_confidence: float = LIKELY  # minimum confidence of an object, in [0, 1]; LIKELY = as in figures
+    min_confidence: float = LIKELY  # minimum confidence of an object, in [0, 1]
     triangles: int | None = None  # maximum triangle count of the scene and of each object file, >= 4; None = no limit
     coloring: Coloring = Coloring.APPEARANCE  # vertex colors
     collision: Collision = Collision.HULL  # collision shape of objects in USD files
@@ -69,9 +69,10 @@ class Chosen:
 
     @classmethod
     def named(cls, objects: Sequence[str | int] = (), **choices: Any) -> Chosen:
-        """Return the options. Enumeration members are given by value, such as `coloring="class"`.
+        """Return the options, with enumeration members given by value, such as `coloring="class"`.
 
-        Raises ConfigError for unknown options or values.
+        Raises:
+            ConfigError: An option or its value is unknown.
         """
         for name, kind in (("coloring", Coloring), ("collision", Collision)):
             if name in choices:
@@ -86,7 +87,11 @@ Option = TypeVar("Option", bound=Enum)
 
 
 def one_of(kind: type[Option], name: str, value: object) -> Option:
-    """Return the enumeration member with this value. Raises ConfigError with a list of all values."""
+    """Return the enumeration member with the given value.
+
+    Raises:
+        ConfigError: The enumeration has no such value.
+    """
     found = next((option for option in kind if option.value == value), None)
     if found is None:
         known = ", ".join(option.value for option in kind)
@@ -102,14 +107,16 @@ def export(
     up: Sequence[float] | None = None,
     floor: float | None = None,
 ) -> list[Path]:
-    """Export a run to standard 3D and map formats. The files are deterministic and written atomically.
+    """Export a run to standard 3D and map formats.
+
+    The files are deterministic and written atomically.
 
     Args:
         run: Run directory.
         formats: File formats.
         out: Output folder; None = `export` in the run directory.
         chosen: Options; None = defaults.
-        up: (3,) up direction in the world frame; None = stored direction.
+        up: Up direction (3,) in the world frame; None = stored direction.
         floor: Floor height along the up direction, m; None = stored height.
 
     Returns:
@@ -142,7 +149,7 @@ def export(
 
 
 def _check_known(run: Path, room: UprightRoom, formats: Sequence[ExportFormat]) -> None:
-    """Raise DataError if a run lacks the up direction or floor height required by a format."""
+    """Check that the up direction and floor height are known if a format requires them."""
     flat = [one.value for one in formats if one not in MESHES]
     if not room.up_known and flat:
         raise DataError(f"{run}: expected an up direction for {flat[0]}, got none; set --up X Y Z --floor M")
@@ -155,7 +162,7 @@ def _check_known(run: Path, room: UprightRoom, formats: Sequence[ExportFormat]) 
 
 
 def _write_surfaces(room: UprightRoom, formats: Sequence[ExportFormat], directory: Path, chosen: Chosen) -> list[Path]:
-    """Write one file per object and format, and one file of the scene per format if no objects are selected."""
+    """Write one file per object and format, and the whole scene if no objects are selected."""
     files: dict[str, list[Part]] = {}
     if not chosen.objects:
         if not len(room.mesh.triangles):
@@ -186,7 +193,7 @@ def _write_parts(path: Path, kind: ExportFormat, shown: Sequence[Part], chosen: 
 
 
 def _placed(shown: Sequence[Part], coloring: Coloring) -> dict[str, InstanceMesh]:
-    """Return the meshes of the parts by name, in the room frame and with the colors of `coloring`."""
+    """Return the colored meshes of the parts by name, in the room frame."""
     meshes = {}
     for part, colors in zip(shown, part_colors(shown, coloring), strict=True):
         vertices = transform(part.T_room_part, part.mesh.vertices.astype(np.float64)).astype(np.float32)
@@ -195,7 +202,7 @@ def _placed(shown: Sequence[Part], coloring: Coloring) -> dict[str, InstanceMesh
 
 
 def _obj(meshes: Mapping[str, InstanceMesh]) -> str:
-    """Return an OBJ file with named meshes. Its `v` lines contain x y z (m) and r g b (sRGB, in [0, 1])."""
+    """Return the content of an OBJ file with named meshes and vertex colors."""
     scene = trimesh.Scene()
     for name, mesh in meshes.items():
         if len(mesh.triangles):

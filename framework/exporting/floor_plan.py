@@ -1,4 +1,4 @@
-"""Floor plans: an image with object outlines, names and a scale bar, and the outlines as GeoJSON."""
+"""Floor plans as PNG images and as GeoJSON."""
 
 from __future__ import annotations
 
@@ -47,14 +47,17 @@ DIGITS = 4  # decimal places, of meters
 
 
 def write_floor_plan(path: Path, room: UprightRoom, plan: Plan, robot_height: float) -> None:
-    """Draw the plan as a PNG file. `robot_height` (m) is for the legend. The file is deterministic."""
+    """Draw a floor plan and save it as a PNG file.
+
+    `robot_height` (m) is only shown in the legend. The file is deterministic.
+    """
     with warnings.catch_warnings(), atomic_write(path) as temporary:
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)  # drawn as boxes
         _drawn(room, plan, robot_height).savefig(temporary, dpi=DPI)
 
 
 def tones(plan: Plan) -> UInt8:
-    """Return the RGB colors (H, W, 3) of the cells, uint8; row 0 has the lowest y."""
+    """Return the RGB color (H, W, 3) of each cell. Row 0 has the lowest y."""
     image = np.tile(np.array(UNSEEN, np.uint8), (*plan.shape, 1))
     for chosen, tone in ((plan.floor, FLOOR), (plan.free, FREE), (plan.occupied, OCCUPIED), (plan.wall, WALL)):
         image[chosen] = tone
@@ -84,21 +87,21 @@ def _drawn(room: UprightRoom, plan: Plan, robot_height: float) -> Figure:
 
 
 def _draw_outlines(axes: Axes, room: UprightRoom) -> None:
-    """Draw the outlines of the objects in ascending order of height, so that upper objects stay visible."""
+    """Draw the outlines of the objects, the highest object last."""
     for one in sorted(room.objects, key=lambda one: (one.top, one.id)):
         dark = _unit_rgb([round(DARKER * channel) for channel in one.color.tolist()])
         axes.add_patch(Polygon(outline(room, one), fill=False, edgecolor=dark, linewidth=1.0, joinstyle="round"))
 
 
 def _draw_names(axes: Axes, objects: Sequence[RoomObject]) -> None:
-    """Write class and id at each object, large objects first. If they do not fit, write only the id, or nothing."""
+    """Write the class and id at each object, large objects first."""
     figure = axes.figure
     assert isinstance(figure, Figure)
     renderer = FigureCanvasAgg(figure).get_renderer()
     taken: list[Bbox] = []
     inside = axes.get_window_extent(renderer)
     for one in sorted(objects, key=lambda one: (-float(np.prod(one.box.extent[:2])), one.id)):
-        words = (f"{one.class_name} {one.id}", str(one.id))
+        words = (f"{one.class_name} {one.id}", str(one.id))  # only the id if the class does not fit
         for text, moves in zip(words, (MOVES, ((0, 0), *MOVES[1:5])), strict=True):
             center_x, center_y, _ = one.box.center.tolist()
             label = axes.text(
@@ -164,7 +167,7 @@ def _draw_foot(figure: Figure, page: tuple[float, float], plan: Plan, robot_heig
 
 
 def _unit_rgb(color: Sequence[int]) -> tuple[float, float, float]:
-    """Return an RGB color in [0, 1] for matplotlib."""
+    """Convert an 8-bit RGB color to the range [0, 1] of matplotlib."""
     red, green, blue = (channel / 255 for channel in color)
     return red, green, blue
 
@@ -172,7 +175,7 @@ def _unit_rgb(color: Sequence[int]) -> tuple[float, float, float]:
 def write_geojson(path: Path, room: UprightRoom) -> None:
     """Write the outline of each object as a counterclockwise GeoJSON polygon.
 
-    RFC 7946 defines coordinates as longitude and latitude. This file states that its coordinates are meters.
+    The coordinates are in meters, as stated in the file. GeoJSON readers may expect longitude and latitude (RFC 7946).
     """
     write_json(
         path,
@@ -186,9 +189,9 @@ def write_geojson(path: Path, room: UprightRoom) -> None:
 
 
 def outline(room: UprightRoom, one: RoomObject) -> Float64:
-    """Return the counterclockwise outline (N, 2), m, of an object in top view, in the room frame.
+    """Return the counterclockwise outline (N, 2) of an object in top view, m.
 
-    The outline is the convex hull of the vertices, or the footprint of the box if the hull has no area.
+    The outline is the convex hull of the vertices. If the hull has no area, it is the footprint of the box.
     """
     points = room.mesh.vertices[one.vertices, :2]
     hull = cv2.convexHull(np.ascontiguousarray(points), clockwise=False)[:, 0].astype(np.float64)

@@ -1,7 +1,7 @@
-"""Binary glTF 2.0: one node per object, with its data in `extras`, and one node for the rest of the room.
+"""Binary glTF 2.0 files with one node per object and one node for the rest of the room.
 
-y is up. Colors are linear. Image colors are unlit (KHR_materials_unlit), because they already contain the lighting.
-Instance and class colors are lit. The rest of the room is one-sided, so that its inside is visible from outside.
+The y axis points up, and colors are linear. Image colors are unlit (KHR_materials_unlit), because they already contain
+the lighting. Instance and class colors are lit. The room is one-sided, so that its interior is visible from outside.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ UNSIGNED_SHORT = 5123
 
 @dataclass(frozen=True)
 class Node:
-    """A named surface of V vertices and F triangles. A node without triangles has no mesh."""
+    """A named mesh of a glTF scene. A node without triangles contains only metadata."""
 
     name: str  # unique
     vertices: Float32  # (V, 3) m, in the node's frame
-    triangles: Int32  # (F, 3)
+    triangles: Int32  # (F, 3) vertex indices
     colors: UInt8  # (V, 3) sRGB
     T_gltf_node: Float64  # (4, 4)
     one_sided: bool  # visible only from the front
-    extras: Mapping[str, Any]
-    attributes: Mapping[str, Float32] = field(default_factory=dict)  # (V,) by name; names start with _
+    extras: Mapping[str, Any]  # metadata
+    attributes: Mapping[str, Float32] = field(default_factory=dict)  # vertex attributes (V,); names start with _
 
 
 def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> bytes:
-    """Return the content of a GLB file with parts of a room. The result is deterministic."""
+    """Return the content of a GLB file with the given parts. The result is deterministic."""
     return glb_of(
         [_node(part, colors) for part, colors in zip(shown, part_colors(shown, coloring), strict=True)],
         lit=coloring is not Coloring.APPEARANCE,
@@ -46,7 +46,7 @@ def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> byte
 
 
 def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
-    """Return the content of a GLB file with lit or unlit materials. The result is deterministic."""
+    """Return the content of a GLB file with the given nodes. The result is deterministic."""
     scene: Any = trimesh.Scene(base_frame="world")
     for node in nodes:
         extras = dict(node.extras)
@@ -68,14 +68,14 @@ def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
 
 
 def _node(part: Part, colors: UInt8) -> Node:
-    """Return a part as a node. In the node's own frame, y is also up."""
+    """Convert a part to a node whose own frame has y up."""
     vertices = (part.mesh.vertices @ T_GLTF_ROOM[:3, :3].T).astype(np.float32)
     T_gltf_part = T_GLTF_ROOM @ part.T_room_part @ T_GLTF_ROOM.T
     return Node(part.name, vertices, part.mesh.triangles, colors, T_gltf_part, part.object is None, extras(part))
 
 
 def extras(part: Part) -> dict[str, Any]:
-    """Return the id, class, probability and confidence of an object; empty for the rest of the room."""
+    """Return the metadata of an object. The rest of the room has no metadata."""
     one = part.object
     if one is None:
         return {}
@@ -83,19 +83,19 @@ def extras(part: Part) -> dict[str, Any]:
 
 
 def _unit(normals: Float32) -> Float32:
-    """Return normals (V, 3) with (0, 1, 0) in place of the zero normals of degenerate triangles. glTF forbids zeros."""
+    """Replace zero normals (V, 3) by (0, 1, 0), because glTF forbids zero normals."""
     return np.where(np.abs(normals).max(axis=1, keepdims=True) > 0.1, normals, np.array([0, 1, 0], np.float32))
 
 
 def _shorts(colors: UInt8) -> UInt16:
-    """Return sRGB colors (V, 3) as linear 16-bit RGBA (V, 4)."""
+    """Convert sRGB colors (V, 3) to linear 16-bit RGBA colors (V, 4)."""
     full = np.full((len(colors), 4), np.iinfo(np.uint16).max, np.uint16)
     full[:, :3] = np.rint(linear(colors) * np.float32(np.iinfo(np.uint16).max))
     return full
 
 
 def _with_materials(tree: dict[str, Any], lit: bool, one_sided: set[str]) -> None:
-    """Declare COLOR as the vertex color of each mesh in the glTF `tree`, and add the materials."""
+    """Add vertex colors and materials to the meshes of a glTF tree."""
     plain: dict[str, Any] = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
     if not lit:
         plain["extensions"] = {UNLIT: {}}

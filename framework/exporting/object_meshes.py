@@ -1,4 +1,7 @@
-"""Object meshes, upright at the origin of their own frames, and the mesh of the rest of the room."""
+"""Meshes of the objects and of the rest of the room.
+
+Each object is upright at the origin of its own frame.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ REST = "room"  # name of the rest of the room
 
 @dataclass(frozen=True)
 class Part:
-    """An object, or the rest of the room."""
+    """The mesh of one object, or of the rest of the room."""
 
     mesh: InstanceMesh  # in the part's own frame
     T_room_part: Float64  # (4, 4)
@@ -31,12 +34,17 @@ class Part:
 
     @property
     def alone(self) -> Part:
-        """The part at the origin."""
+        """The part, moved to the origin."""
         return replace(self, T_room_part=np.eye(4))
 
 
 def parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
-    """Return the rest of the room and its objects, decimated to about `triangles` triangles in total; None = all."""
+    """Return the rest of the room and its objects.
+
+    Args:
+        room: Room.
+        triangles: Approximate number of triangles of all parts together; None = no decimation.
+    """
     found = [rest(room), *(object_part(room, one) for one in room.objects)]
     total = sum(len(part.mesh.triangles) for part in found)
     if triangles is None or total <= triangles:
@@ -45,13 +53,21 @@ def parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
 
 
 def object_parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
-    """Return the objects, each in its own frame and decimated to about `triangles` triangles; None = no decimation."""
+    """Return the objects of a room, each in its own frame.
+
+    Args:
+        room: Room.
+        triangles: Maximum number of triangles of each object; None = no decimation.
+    """
     found = [object_part(room, one) for one in room.objects]
     return found if triangles is None else _decimated(found, [triangles] * len(found))
 
 
 def object_part(room: UprightRoom, one: RoomObject) -> Part:
-    """Return an object in its own frame: upright, aligned with its box, with the center of its base at the origin."""
+    """Return an object in its own frame.
+
+    The frame is upright and aligned with the box. Its origin is the center of the base.
+    """
     T_room_part = np.eye(4)
     T_room_part[:3, :3] = one.box.rotation
     T_room_part[:3, 3] = one.box.center - (0.0, 0.0, one.box.extent[2] / 2)
@@ -61,15 +77,16 @@ def object_part(room: UprightRoom, one: RoomObject) -> Part:
 
 
 def rest(room: UprightRoom) -> Part:
-    """Return the rest of the room. It includes the triangles between objects, to avoid gaps."""
+    """Return the part of the room outside of objects."""
     owner = _marked(room.mesh, room.objects)
     corners = owner[room.mesh.triangles]
+    # triangles between two objects are included to avoid gaps
     outside = (corners[:, 0] == 0) | (corners != corners[:, :1]).any(axis=1)
     return Part(submesh(room.mesh, corners_of(room.mesh, outside) | (owner == 0), outside), np.eye(4), None)
 
 
 def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
-    """Return for each vertex (V,) the 1-based position of its object in `objects`; 0 = no object."""
+    """Return the index (V,) of the object of each vertex, starting at 1, or 0 for no object."""
     owner = np.zeros(len(mesh.vertices), np.int32)
     for number, one in enumerate(objects, start=1):
         owner[one.vertices] = number
@@ -77,13 +94,10 @@ def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
 
 
 def _decimated(found: Sequence[Part], most: Sequence[int]) -> list[Part]:
-    """Return each part, decimated to at most the number of triangles in `most` (at least MIN_TRIANGLES).
-
-    A progress bar is shown, because a million triangles take 10 s.
-    """
+    """Decimate each part to the number of triangles in `most`."""
     fewer = []
     total = sum(len(part.mesh.triangles) for part in found)
-    with Progress(total, " triangles", unit_scale=True, leave=False) as bar:
+    with Progress(total, " triangles", unit_scale=True, leave=False) as bar:  # 10 s per million triangles
         for part, triangles in zip(found, most, strict=True):
             bar.set_description(f"decimating {part.name}")
             fewer.append(replace(part, mesh=decimated(part.mesh, triangles)))
@@ -95,7 +109,7 @@ GRAY = (176, 176, 172)  # color of the rest of the room, sRGB
 
 
 class Coloring(Enum):
-    """The coloring of vertices."""
+    """The color mode of exported meshes."""
 
     APPEARANCE = "appearance"  # colors of the camera images
     INSTANCE = "instance"
@@ -103,7 +117,7 @@ class Coloring(Enum):
 
 
 def part_colors(parts: Sequence[Part], coloring: Coloring) -> list[UInt8]:
-    """Return the vertex colors (V, 3) of each part, sRGB."""
+    """Return the sRGB vertex colors (V, 3) of each part."""
     if coloring is Coloring.APPEARANCE:
         return [part.mesh.colors for part in parts]
     gray = np.array(GRAY, np.uint8)
@@ -116,7 +130,8 @@ def part_colors(parts: Sequence[Part], coloring: Coloring) -> list[UInt8]:
 
 
 def linear(colors: UInt8) -> Float32:
-    """Convert sRGB (IEC 61966-2-1) to linear colors in [0, 1] for glTF and USD."""
+    """Convert 8-bit sRGB colors to linear colors in [0, 1]."""
     encoded = np.arange(256) / 255
+    # IEC 61966-2-1
     table = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
     return np.asarray(table[colors])

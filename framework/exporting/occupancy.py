@@ -1,15 +1,14 @@
-"""Occupancy of the floor for robots: free, occupied or unknown.
+"""Occupancy grids of the floor for mobile robots.
 
-A map stores only voxels near surfaces and omits most of the free space. The surface is therefore rendered from poses
-along the whole trajectory. A cell is free if
+A map stores voxels only near surfaces, so most of the free space is not stored. Free space is therefore computed by
+rendering the surface from camera poses along the trajectory.
 
-- the floor was observed in the cell,
-- no surface is between `CLEARANCE` and the robot's height,
-- all space between these heights was observed as free.
+- A cell is free if its floor was observed and all space up to the height of the robot was observed as free.
+- A cell is occupied if there is a surface in this space. Surfaces below CLEARANCE are ignored.
+- All other cells are unknown.
 
-A cell with a surface between these heights is occupied. All other cells are unknown. A run does not store the field of
-view of its camera, so the field of view of a Kinect is used (`queries.changes.EYE`). Depth cameras do not observe glass
-and mirrors, which may therefore be classified as free.
+Runs do not store the field of view of the camera. The field of view of a Kinect is assumed (`queries.changes.EYE`).
+Depth cameras do not observe glass and mirrors, which may therefore be classified as free.
 """
 
 from __future__ import annotations
@@ -28,17 +27,17 @@ from framework.geometry import inverse, project, transform
 from framework.queries.changes import EYE, LOOKS
 from framework.rendering.rasterizer import Rasterizer
 
-CLEARANCE = 0.08  # ignored height above the floor, m: floors are noisy
+CLEARANCE = 0.08  # ignored height above the floor, m, because floors are noisy
 LEVEL_STEP = 0.1  # vertical sampling of free space, m
 SLACK = 0.03  # minimum distance of a surface behind free space, m
-FARTHEST = 5.0  # range of the camera, m: the default of fuser.max_depth
+FARTHEST = 5.0  # range of the camera, m; default of fuser.max_depth
 WALL_SPAN = 1.0  # minimum height of a wall, m
 MAX_CELLS = 2**24  # maximum number of cells of a floor plan
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A grid over the floor, seen from above. Row 0 has the lowest y, column 0 the lowest x."""
+    """A grid over the floor in top view. Row 0 has the lowest y, column 0 the lowest x."""
 
     resolution: float  # m, > 0, side of a cell
     origin: Float64  # (2,) m, lower left corner of the first cell
@@ -53,22 +52,31 @@ class Plan:
         return self.free.shape[0], self.free.shape[1]
 
     def cells(self, xy: Float64) -> Int64:
-        """Return the row and column (P, 2) of points (P, 2), m, room frame. Points outside get the nearest cell."""
+        """Return the row and column (P, 2) of points (P, 2), m, in the room frame.
+
+        Points outside the grid get the nearest cell.
+        """
         columns, rows = np.floor((xy - self.origin) / self.resolution).astype(np.int64).T
         return np.stack([np.clip(rows, 0, self.shape[0] - 1), np.clip(columns, 0, self.shape[1] - 1)], axis=1)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Lowest and highest x, lowest and highest y, m."""
+        """Bounds of the grid: lowest x, highest x, lowest y, highest y, m."""
         rows, columns = self.shape
         x, y = self.origin.tolist()
         return x, x + columns * self.resolution, y, y + rows * self.resolution
 
 
 def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
-    """Return the plan of a room with a known floor height. `resolution` (cell size) and `robot_height` are in m.
+    """Return the floor plan of a room.
 
-    Raises DataError for an empty map or more than MAX_CELLS cells.
+    Args:
+        room: Room with a known floor height.
+        resolution: Cell size, m.
+        robot_height: Height of the robot, m.
+
+    Raises:
+        DataError: The map is empty, or the plan has more than MAX_CELLS cells.
     """
     found = surface_points(room, resolution / 2)
     if not len(found.points):
@@ -95,7 +103,7 @@ def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
 
 
 def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
-    """Return the mask (H, W) of the free cells of a floor plan whose `free` is not yet known."""
+    """Return the mask (H, W) of the free cells."""
     free = drawn.floor & ~drawn.occupied
     rows, columns = np.nonzero(free)
     levels = np.arange(CLEARANCE, robot_height, LEVEL_STEP) + LEVEL_STEP / 2
@@ -107,7 +115,10 @@ def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
 
 
 def looked_through(room: UprightRoom, places: Float64) -> Bool:
-    """Return a mask (P,), True where the points `places` (P, 3), m, room frame, were observed as free space."""
+    """Return the mask (P,) of the points (P, 3), m, that were observed as free space.
+
+    The points are in the room frame.
+    """
     through = np.zeros(len(places), np.bool_)
     rasterizer = Rasterizer(room.mesh.vertices, room.mesh.triangles)
     for k in np.unique(np.linspace(0, len(room.poses) - 1, LOOKS).round().astype(int)) if len(room.poses) else []:
@@ -126,9 +137,9 @@ def looked_through(room: UprightRoom, places: Float64) -> Bool:
 
 
 def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
-    """Return the mask (cells,) of cells with vertical surfaces of at least WALL_SPAN in height, outside of objects.
+    """Return the mask (C,) of the cells with walls, given the cell (P,) of each point.
 
-    `number` (P,) is the cell of each point.
+    A wall is a vertical surface with a height of at least WALL_SPAN that is not part of an object.
     """
     chosen = found.upright & (found.owner == 0)
     step = np.floor(found.points[chosen, 2] / LEVEL_STEP).astype(np.int64)
@@ -138,7 +149,7 @@ def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
 
 
 def _highest(found: SurfacePoints, number: Int64, cells: int) -> Int32:
-    """Return the id (cells,) of the object with the highest surface in each cell, 0 = none.
+    """Return the id (C,) of the highest object in each cell, or 0 for a cell without objects.
 
     `number` (P,) is the cell of each point.
     """
@@ -154,7 +165,7 @@ OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # limits of (255 - level) / 25
 
 
 def write_ros_map(directory: Path, found: Plan) -> list[Path]:
-    """Write map.pgm and map.yaml, in the room frame, for ROS (map_server and nav2_map_server)."""
+    """Write map.pgm and map.yaml, in the room frame, for the map servers of ROS and ROS 2."""
     image, yaml = directory / "map.pgm", directory / "map.yaml"
     with atomic_write(image) as temporary:
         Image.fromarray(levels(found)).save(temporary)
@@ -174,6 +185,6 @@ def write_ros_map(directory: Path, found: Plan) -> list[Path]:
 
 
 def levels(found: Plan) -> UInt8:
-    """Return the gray levels (H, W) of map.pgm; the first row has the highest y."""
+    """Return the gray levels (H, W) of map.pgm. The first row has the highest y."""
     gray = np.where(found.occupied, OCCUPIED, np.where(found.free, FREE, UNKNOWN)).astype(np.uint8)
     return np.ascontiguousarray(gray[::-1])

@@ -1,7 +1,8 @@
-"""Spatial relations between objects, from geometry alone: on, in, next to, attached to a wall.
+"""Spatial relations between objects: on, in, next to, and attached to a wall.
 
-Contact surfaces are occluded: the table under a cup is not in the map. An object A is therefore on an object B in two
-cases: the top of B is at the height of A's base, or B has a level surface at this height around the foot of A.
+The relations are computed from geometry alone. Contact surfaces are occluded, such as the table top under a cup. An
+object A is therefore on an object B in one of two cases. The top of B is at the height of the base of A, or B has a
+level surface at this height around A.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from framework.exporting.upright_room import RoomObject, UprightRoom, surface_po
 
 SPACING = 0.02  # spacing of surface points, m
 CELL = 0.03  # cell size of footprints, m
-TOUCHING = 0.05  # maximum distance of a base from its support, m: depth is noisy at edges
+TOUCHING = 0.05  # maximum distance of a base from its support, m; depth is noisy at edges
 ON_FLOOR = 0.10  # maximum height of the observed part of an object above the floor, m; thin legs are incomplete
 FOOT = 0.10  # height of the foot above the base, m
 AROUND = 2  # width of the border around a foot, cells
@@ -39,16 +40,19 @@ MAX_POINTS = 3000  # approximate maximum number of points of an object for dista
 
 @dataclass(frozen=True)
 class Relation:
-    """A relation of the object with id `source` to `target`, which is an object id, "floor" or "walls"."""
+    """A relation of an object to another object, the floor or the walls."""
 
-    source: int
+    source: int  # object id
     name: str  # "on", "in", "next_to", "attached_to"
-    target: int | str
+    target: int | str  # object id, "floor" or "walls"
     measures: Mapping[str, float] = field(default_factory=dict)  # "height" or "distance", m
 
 
 def relations(room: UprightRoom, plan: Plan | None) -> list[Relation]:
-    """Return all relations of a room's objects. Relations to floor and walls are omitted if `plan` is None."""
+    """Return all relations between the objects of a room.
+
+    Without a plan, relations to the floor and the walls are omitted.
+    """
     found = surface_points(room, SPACING)
     things = []
     for one in room.objects:
@@ -69,7 +73,7 @@ def relations(room: UprightRoom, plan: Plan | None) -> list[Relation]:
 
 @dataclass(frozen=True)
 class _Thing:
-    """An object with cached geometry."""
+    """An object with cached geometric properties."""
 
     id: int
     box: RoomObject
@@ -103,7 +107,7 @@ class _Thing:
 
 
 def _standing(thing: _Thing, things: list[_Thing], plan: Plan | None) -> Relation | None:
-    """Return the relation of an object to its support, container or wall; None = unknown."""
+    """Return the relation of an object to its support, container or wall, or None if unknown."""
     others = [other for other in things if other.id != thing.id]
     holder = next((other for other in others if _is_in(thing, other)), None)
     if holder is not None:
@@ -123,7 +127,7 @@ def _standing(thing: _Thing, things: list[_Thing], plan: Plan | None) -> Relatio
 
 
 def _carries(below: _Thing, above: _Thing) -> float:
-    """Return a score, in [0, 1], for `below` as the support of `above`; 0 = no support."""
+    """Return a score in [0, 1] for `below` as the support of `above`, where 0 means no support."""
     if below.base >= above.base or below.tree.n < 1:
         return 0.0
     near = below.level & (np.abs(below.points[:, 2] - above.base) <= TOUCHING)
@@ -137,7 +141,7 @@ def _carries(below: _Thing, above: _Thing) -> float:
 
 
 def _is_in(inner: _Thing, outer: _Thing) -> bool:
-    """Return True if `inner` is in the box of `outer` and surrounded or covered by the surface of `outer`."""
+    """Return True if `inner` is in the box of `outer` and enclosed by its surface."""
     box = outer.box.box
     local = np.abs((inner.points - box.center) @ box.rotation)
     if float(np.mean((local <= box.extent / 2 + SPACING).all(axis=1))) < WITHIN:
@@ -155,11 +159,8 @@ def _is_in(inner: _Thing, outer: _Thing) -> bool:
 
 
 def _gap(a: _Thing, b: _Thing) -> float:
-    """Return the distance between the surfaces of two objects, m.
-
-    The distance is infinite if their height ranges are disjoint or if it exceeds MAX_NEIGHBOR_DISTANCE.
-    """
-    if min(a.top, b.top) < max(a.base, b.base):
+    """Return the distance between two neighboring objects in m, or infinity for other objects."""
+    if min(a.top, b.top) < max(a.base, b.base):  # no common height
         return float("inf")
     fewer, more = sorted((a, b), key=lambda thing: thing.tree.n)
     distance, _ = more.tree.query(fewer.tree.data, distance_upper_bound=MAX_NEIGHBOR_DISTANCE)
@@ -175,6 +176,6 @@ def _hangs(thing: _Thing, plan: Plan) -> bool:
 
 
 def _cells(xy: Float32 | Float64) -> set[tuple[int, int]]:
-    """Return the grid cells, with sides of CELL, that contain points (P, 2), m."""
+    """Return the grid cells that contain points (P, 2), m."""
     numbers: Int64 = np.unique(np.floor(xy / CELL).astype(np.int64), axis=0)
     return set(map(tuple, numbers.tolist()))

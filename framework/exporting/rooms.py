@@ -1,8 +1,9 @@
-"""Rooms of a floor plan: parts of its known floor that are separated by walls or by openings of at most a door width.
+"""Division of a floor plan into rooms.
 
-Areas farther than half a door width from every wall are the interiors of rooms. The interiors are grown until they meet
-in the doors. Only walls separate rooms, not furniture or unobserved areas: without observed walls, the plan has one
-room.
+A room is a part of the known floor. Rooms are separated by walls and connected by doors, i.e. openings of at most the
+width DOOR. The interior of a room consists of all cells farther than half a door width from every wall. The interiors
+are then grown until they meet in the doors. Furniture and unobserved areas do not separate rooms. A plan without
+observed walls has one room.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ MIN_INSIDE = 0.5  # minimum interior area of a room, m^2
 
 @dataclass(frozen=True)
 class Door:
-    """The opening between two rooms."""
+    """An opening between two rooms."""
 
     rooms: tuple[int, int]  # numbers of the two rooms
     place: Float64  # (2,) m, center of the opening in the room frame
@@ -47,11 +48,11 @@ class Rooms:
         return float(np.count_nonzero(self.labels == room)) * self.plan.resolution**2
 
     def center(self, room: int) -> Float64:
-        """Return the mean position (2,) of the cells of a room, m, in the room frame."""
+        """Return the center (2,) of a room, i.e. the mean position of its cells, m."""
         return _place(self.plan, self.labels == room)
 
     def of(self, xy: Float64) -> int:
-        """Return the number of the room nearest to most of the points (P, 2), m, room frame, P > 0; 0 = no rooms."""
+        """Return the number of the room nearest to most of the points (P, 2), m, or 0 without rooms."""
         if not self.count:
             return 0
         nearest = ndimage.distance_transform_edt(self.labels == 0, return_distances=False, return_indices=True)
@@ -82,7 +83,7 @@ def rooms(plan: Plan) -> Rooms:
 
 
 def _grown(labels: Int32, domain: Bool) -> Int32:
-    """Return the labels (H, W), grown over the domain (H, W) cell by cell until they meet."""
+    """Grow the labels (H, W) within the mask `domain` (H, W) until they meet."""
     cross = ndimage.generate_binary_structure(2, 1)
     while True:
         spread = np.where((labels == 0) & domain, ndimage.maximum_filter(labels, footprint=cross), labels)
@@ -92,7 +93,7 @@ def _grown(labels: Int32, domain: Bool) -> Int32:
 
 
 def _doors(labels: Int32, plan: Plan) -> tuple[Door, ...]:
-    """Return a door for each connected border between two rooms."""
+    """Return one door for each connected border between two rooms."""
     doors = []
     every = np.ones((3, 3), np.bool_)
     for a, b in combinations(range(1, int(labels.max()) + 1), 2):
@@ -106,7 +107,7 @@ def _doors(labels: Int32, plan: Plan) -> tuple[Door, ...]:
 
 
 def _place(plan: Plan, cells: Bool) -> Float64:
-    """Return the mean position (2,), m, room frame, of the cells in the mask `cells` (H, W)."""
+    """Return the mean position (2,) of the cells in a mask (H, W), m, in the room frame."""
     rows, columns = np.nonzero(cells)
     return np.asarray((np.array([columns.mean(), rows.mean()]) + 0.5) * plan.resolution + plan.origin)
 

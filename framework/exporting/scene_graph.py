@@ -1,4 +1,7 @@
-"""scene_graph.json: objects, surfaces and rooms with their relations; see scene_graph.schema.json."""
+"""Scene graphs with objects, rooms and their relations.
+
+The file format is defined by scene_graph.schema.json.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ DIGITS = 4  # decimal places of meters
 def write_scene_graph(path: Path, room: UprightRoom, plan: Plan | None) -> None:
     """Write the scene graph of a room.
 
-    Without a floor plan (unknown floor height), floor, walls and rooms are omitted.
+    Without a floor plan, the floor, walls and rooms are omitted.
     """
     write_json(path, scene_graph(room, plan))
 
@@ -77,7 +80,7 @@ def _edges(room: UprightRoom, found: list[Relation]) -> list[dict[str, Any]]:
 
 
 def _room_edges(room: UprightRoom, divided: Rooms) -> list[dict[str, Any]]:
-    """Return the edges from objects to rooms, and the doors between rooms."""
+    """Return the edges between objects and rooms, and the doors between rooms."""
     inside = [(one, divided.of(room.mesh.vertices[one.vertices, :2].astype(np.float64))) for one in room.objects]
     placed = [{"source": one.name, "relation": "in", "target": f"room_{k}"} for one, k in inside if k]
     doors = [

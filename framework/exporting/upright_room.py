@@ -1,7 +1,7 @@
-"""A stored run in an upright frame on the floor: its surface, its objects, and points on the surface.
+"""Stored runs in an upright coordinate frame.
 
-The room frame is in meters, z up, with the floor at z = 0. It is the world frame, rotated upright by the smallest angle
-and translated along z. If the world's z axis is up, x and y are equal in both frames.
+The room frame has z up and the floor at z = 0. It is the world frame, rotated upright by the smallest angle and
+translated along z. If z is already up in the world frame, x and y do not change.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ SHORTEST_UP = 1e-6  # minimum length of an up direction
 
 @dataclass(frozen=True)
 class RoomObject:
-    """One object of a room."""
+    """An object of a room."""
 
     id: int
     class_name: str
@@ -52,7 +52,7 @@ class RoomObject:
     probability: float | None  # of the class, in [0, 1]; None = unknown
     vertices: Int32  # (M,) indices into the room's mesh, M > 0, without small components
     box: Box  # upright, in the room frame
-    color: UInt8  # (3,) sRGB, as in overview.png
+    color: UInt8  # (3,) sRGB, also used in overview.png
     class_color: UInt8  # (3,) sRGB
 
     @property
@@ -81,24 +81,28 @@ class RoomObject:
 
 @dataclass(frozen=True)
 class UprightRoom:
-    """The surface and objects of a stored run."""
+    """The surface and the objects of a stored run, in the room frame."""
 
     mesh: InstanceMesh  # in the room frame; labels of all objects of the run, including those not in `objects`
     objects: tuple[RoomObject, ...]  # sorted by id
     poses: Float64  # (F, 4, 4) T_room_camera of the mapped frames
     T_room_world: Float64  # (4, 4)
-    up_known: bool  # False = unknown; the world's z axis is used
-    floor_known: bool  # False = unknown; z = 0 as in the world frame
+    up_known: bool  # False = unknown; the z axis of the world frame is used
+    floor_known: bool  # False = unknown; z = 0 is the origin of the world frame
 
     @cached_property
     def surface(self) -> Surface:
         return Surface(self.mesh.vertices, self.mesh.triangles)
 
     def chosen(self, selection: Sequence[str], min_confidence: float) -> UprightRoom:
-        """Return the room with the objects of the given ids or classes; () = all classes.
+        """Return the room with only the selected objects.
 
-        Objects below the minimum confidence are omitted, except objects selected by id. Raises DataError for an unknown
-        id or class.
+        Args:
+            selection: Ids or classes of the objects; () = all objects.
+            min_confidence: Minimum confidence of objects that are not selected by id, in [0, 1].
+
+        Raises:
+            DataError: An id or class is unknown, or all objects of a class are below the minimum confidence.
         """
         likely = [one for one in self.objects if one.confidence >= min_confidence]
         if not selection:
@@ -121,16 +125,24 @@ class UprightRoom:
 
 
 def plain_name(class_name: str, key: int) -> str:
-    """Return a name for files, nodes and prims, such as `chair_7`: ASCII letters, digits and underscores."""
+    """Return a name for files, nodes and prims, such as `chair_7`.
+
+    The name contains only ASCII letters, digits and underscores.
+    """
     plain = re.sub(r"[^A-Za-z0-9]+", "_", class_name).strip("_")[:LONGEST_NAME]
     return f"{plain if plain[:1].isalpha() else f'object_{plain}'.rstrip('_')}_{key}"
 
 
 def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None = None) -> UprightRoom:
-    """Read the room of a completed or partial run.
+    """Read a completed or partial run.
 
-    `up` (3,), in the world frame, and `floor`, the floor height along `up` in m, override the stored values. Raises
-    DataError for missing, invalid or inconsistent files.
+    Args:
+        run: Run directory.
+        up: Up direction (3,) in the world frame; None = stored direction.
+        floor: Floor height along the up direction, m; None = stored height.
+
+    Raises:
+        DataError: Files are missing, invalid or inconsistent.
     """
     figures = read_metrics(run)
     instances: Sequence[StoredInstance] = []
@@ -154,7 +166,7 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
 
 
 def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple[RoomObject, ...]:
-    """Return the objects of a room's mesh, sorted by id, without small connected components (see SPECK)."""
+    """Return the objects of a mesh, sorted by id and without small connected components."""
     pieces = _pieces(mesh)
     order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
     ids = mesh.instance_ids[order]
@@ -163,13 +175,14 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
     }
     seen = sorted((one for one in instances if len(owned[one.id])), key=lambda one: one.id)
     likely = {one.id for one in seen if one.confidence >= LIKELY}
-    colors = object_colors({one.id: mesh.vertices[owned[one.id]].mean(axis=0) for one in seen}, likely)
+    centers = {one.id: mesh.vertices[owned[one.id]].mean(axis=0).astype(np.float64) for one in seen}
+    colors = object_colors(centers, likely)
     of_class = class_colors([(one.class_name, one.confidence) for one in seen])
     found = []
     for one in seen:
         own = owned[one.id]
         _, piece, sizes = np.unique(pieces[own], return_inverse=True, return_counts=True)
-        own = own[(sizes >= min(SPECK * len(own), sizes.max()))[piece]]
+        own = own[(sizes >= min(SPECK * len(own), int(sizes.max())))[piece]]
         found.append(
             RoomObject(
                 id=one.id,
@@ -188,16 +201,16 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
 
 
 def _pieces(mesh: InstanceMesh) -> Int32:
-    """Return the connected component (V,) of each vertex; only triangles within one object connect vertices."""
+    """Return the connected component (V,) of each vertex."""
     ids = mesh.instance_ids[mesh.triangles]
-    joined = mesh.triangles[(ids > 0).all(axis=1) & (ids == ids[:, :1]).all(axis=1)]
+    joined = mesh.triangles[(ids > 0).all(axis=1) & (ids == ids[:, :1]).all(axis=1)]  # triangles within one object
     edges = np.concatenate([joined[:, :2], joined[:, 1:]]).T
     graph = coo_array((np.ones(edges.shape[1], np.bool_), tuple(edges)), shape=(len(mesh.vertices),) * 2)
     return np.asarray(connected_components(graph, directed=False)[1], np.int32)
 
 
 def facing(box: Box) -> Box:
-    """Return the upright box with permuted axes, so that its first axis is nearest to the room's x axis."""
+    """Permute the axes of an upright box, so that the first axis is nearest to the x axis."""
     angle = float(np.arctan2(box.rotation[1, 0], box.rotation[0, 0]))
     turns = round(angle / (np.pi / 2))
     yaw = angle - turns * np.pi / 2
@@ -209,11 +222,14 @@ def facing(box: Box) -> Box:
 
 
 def upright(up: Float64, floor: float) -> Float64:
-    """Return T_room_world (4, 4) for an up direction and a floor height in the world frame.
+    """Return the transform T_room_world (4, 4).
 
-    It rotates `up` (unit vector) to z by the smallest angle and moves the floor from height `floor` (m) to z = 0.
+    Args:
+        up: Up direction (3,) in the world frame, a unit vector.
+        floor: Floor height along `up`, m.
     """
     T = np.eye(4)
+    # smallest rotation from `up` to z
     across, cosine = skew(np.cross(up, UP)), float(up @ UP)
     T[:3, :3] += across + across @ across / (1 + cosine) if cosine > -1 + 1e-9 else np.diag([0.0, -2.0, -2.0])
     T[2, 3] = -floor
@@ -249,7 +265,7 @@ def _hint(word: str, objects: Sequence[RoomObject]) -> str:
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """P points on a room's surface, evenly spaced regardless of triangle sizes."""
+    """Points on the surface of a room, evenly spaced regardless of the triangle sizes."""
 
     points: Float32  # (P, 3) m, in the room frame
     normal_z: Float32  # (P,) z component of the unit normal
@@ -267,9 +283,13 @@ class SurfacePoints:
 
 
 def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
-    """Return the centers of a room's triangles, after subdivision until no side is longer than `spacing` m.
+    """Sample points on the surface of a room.
 
-    Raises DataError for more than MAX_POINTS points.
+    Triangles are subdivided until no side is longer than `spacing`, m. The points are the centers of the resulting
+    triangles.
+
+    Raises:
+        DataError: There are more than MAX_POINTS points.
     """
     vertices, triangles = room.mesh.vertices, room.mesh.triangles
     corners = vertices[triangles]  # (F, 3, 3)

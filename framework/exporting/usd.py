@@ -1,4 +1,6 @@
-"""Universal Scene Description for simulators: visible meshes, collision shapes and semantic labels.
+"""Export to Universal Scene Description (USD) for simulators.
+
+The stage contains visible meshes, collision shapes and semantic labels:
 
     /World                      kind = assembly, z up, meters
       PhysicsScene              gravity
@@ -7,7 +9,7 @@
         visual                  Mesh with linear displayColor
         collision               Mesh (convex hull) or Cube, purpose = guide
 
-Each object is at the origin of its prim and static until `physics:rigidBodyEnabled` is set.
+Each object is at the origin of its prim. It is static until `physics:rigidBodyEnabled` is set.
 """
 
 from __future__ import annotations
@@ -32,14 +34,18 @@ GRAVITY = 9.81  # m/s^2
 
 
 class Collision(Enum):
-    """The collision shape of an object."""
+    """The collision shape of objects."""
 
     HULL = "hull"  # convex hull, or the box of a flat object
     BOX = "box"
 
 
 def check_usd() -> None:
-    """Raise DataError with the installation command if USD is not installed."""
+    """Check that USD is installed.
+
+    Raises:
+        DataError: USD is not installed. The message contains the installation command.
+    """
     try:
         import pxr  # noqa: F401
     except ImportError as error:
@@ -49,7 +55,11 @@ def check_usd() -> None:
 def write_usd(
     path: Path, parts: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE, collision: Collision = Collision.HULL
 ) -> None:
-    """Write parts as one stage in the room frame. The file is deterministic. Raises DataError without usd-core."""
+    """Write parts as a USD stage in the room frame. The file is deterministic.
+
+    Raises:
+        DataError: The package usd-core is not installed.
+    """
     check_usd()
     from pxr import Gf, Kind, Tf, Usd, UsdGeom, UsdPhysics
 
@@ -109,7 +119,7 @@ def _add_object(stage: Any, part: Part, colors: UInt8, collision: Collision) -> 
 
 
 def _add_proxy(stage: Any, path: str, vertices: Float32, collision: Collision) -> None:
-    """Add the invisible collision shape of an object with vertices (M, 3), m, at the prim path `path`."""
+    """Add the invisible collision shape of an object at the prim path `path`."""
     from pxr import Gf, UsdGeom, UsdPhysics
 
     hull = convex_hull(vertices) if collision is Collision.HULL else None
@@ -147,7 +157,11 @@ def _color(mesh: Any, colors: UInt8) -> None:
 
 
 def convex_hull(vertices: Float32) -> tuple[Float32, Int32] | None:
-    """Return the convex hull of points (M, 3), m: vertices (H, 3) and outward triangles (F, 3). None = no volume."""
+    """Return the convex hull of points (M, 3), m, or None if the hull has no volume.
+
+    Returns:
+        The vertices (H, 3), m, and the triangles (F, 3) with outward normals.
+    """
     try:
         hull = ConvexHull(vertices.astype(np.float64))
     except (QhullError, ValueError):

@@ -1,1 +1,1 @@
-"""File formats and atomic writing."""
+"""File formats and file access."""

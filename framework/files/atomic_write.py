@@ -1,4 +1,4 @@
-"""Atomic writes and size-limited reads."""
+"""Atomic file writing, and reading of files with limited size."""
 
 from __future__ import annotations
 
@@ -18,10 +18,14 @@ _TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.partial(\..*)?")  # names of te
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield a temporary path next to `path`. The file replaces `path` on success and is deleted on failure.
+    """Write a file atomically.
 
-    The temporary name has the same suffix, because image and mesh writers derive the format from the suffix. If `path`
-    is a symbolic link, its target is replaced. Raises DataError if writing fails or `path` is not a regular file.
+    The context manager yields a temporary path with the same suffix. At the end of the block, the temporary file
+    replaces `path`. If an exception is raised, the temporary file is deleted. If `path` is a symbolic link, the target
+    of the link is replaced.
+
+    Raises:
+        DataError: Writing fails, or `path` exists and is not a regular file.
     """
     path = Path(os.path.realpath(path))
     if path.exists():
@@ -42,19 +46,26 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def path_exists(path: Path) -> bool:
-    """Return True if an optional file exists, or if it is a broken symbolic link, so that reading it then fails."""
+    """Return True if a path exists, including broken symbolic links."""
     return os.path.lexists(path)
 
 
 def remove_left_over(directory: Path) -> None:
-    """Remove the temporary files of killed processes. No other process may write to `directory`."""
+    """Remove the temporary files of killed processes.
+
+    No other process may write to the directory.
+    """
     for path in directory.glob(".*.partial*"):
         if _TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)
 
 
 def check_regular(path: Path) -> os.stat_result:
-    """Return the status of a regular file. Raises DataError for other types, because reading a pipe may block."""
+    """Return the status of a regular file.
+
+    Raises:
+        DataError: The path does not exist, or it is a folder, a pipe or a device.
+    """
     try:
         found = path.stat()
     except (OSError, ValueError) as error:
@@ -67,7 +78,11 @@ def check_regular(path: Path) -> os.stat_result:
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """Read a file of at most `most` bytes. Raises DataError if it is larger or cannot be read."""
+    """Read a file.
+
+    Raises:
+        DataError: The file is larger than `most` bytes or cannot be read.
+    """
     size = check_regular(path).st_size
     if size > most:
         raise DataError(f"{path}: expected at most {most} bytes, got {size}")
@@ -78,7 +93,11 @@ def read_bytes(path: Path, most: int) -> bytes:
 
 
 def read_text(path: Path, most: int = MAX_TEXT) -> str:
-    """Read UTF-8 text of at most `most` bytes without its byte order mark. Raises a DataError that names the file."""
+    """Read a UTF-8 text file, without the byte order mark.
+
+    Raises:
+        DataError: The file is larger than `most` bytes, is not UTF-8, or cannot be read.
+    """
     try:
         return read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:

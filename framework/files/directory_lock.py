@@ -1,4 +1,4 @@
-"""Locks on directories, and creation of new directories."""
+"""Creation and locking of directories."""
 
 from __future__ import annotations
 
@@ -21,9 +21,12 @@ log = logging.getLogger(__name__)
 
 
 def new_directory(wanted: str) -> str:
-    """Create a directory with the first unused path among `wanted`, `wanted`_2, ..., and return this path.
+    """Create a new directory and return its path.
 
-    Raises DataError if the directory cannot be created.
+    The path is `wanted` if unused, otherwise `wanted`_2, `wanted`_3, and so on.
+
+    Raises:
+        DataError: The directory cannot be created.
     """
     path, number = Path(wanted), 1
     try:
@@ -41,11 +44,17 @@ def new_directory(wanted: str) -> str:
 
 @contextmanager
 def locked(directory: Path, wait: bool = False) -> Iterator[None]:
-    """Lock `directory` while the body of the `with` statement runs.
+    """Lock a directory within a context.
 
-    The lock is released when the process ends, even after `kill -9`. If another process holds the lock, this function
-    waits for that process if `wait` is True, and raises DataError otherwise. On file systems without locks, a warning
-    is logged and the directory is not locked.
+    The lock is released when the process ends, even if the process is killed. On file systems without locks, a warning
+    is logged instead.
+
+    Args:
+        directory: The directory.
+        wait: True = wait until other processes release the lock.
+
+    Raises:
+        DataError: Another process holds the lock, and `wait` is False.
     """
     directory.mkdir(parents=True, exist_ok=True)
     lock = FileLock(directory / LOCK, fallback_to_soft=False)
@@ -76,7 +85,7 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
 
 
 def is_locked(directory: Path) -> bool:
-    """Return True if a process holds the lock of `directory`."""
+    """Return True if a process has locked the directory."""
     if not (directory / LOCK).exists():
         return False
     lock = FileLock(directory / LOCK, fallback_to_soft=False)
@@ -91,7 +100,7 @@ def is_locked(directory: Path) -> bool:
 
 
 def holder(directory: Path) -> str:
-    """Return the name of the current or last owner of the lock; "" = unknown."""
+    """Return the name of the process that holds the lock or held it last, or "" if unknown."""
     try:
         return read_text(directory / HOLDER).strip()
     except DataError:
@@ -99,5 +108,5 @@ def holder(directory: Path) -> str:
 
 
 def holder_name(process: int | None) -> str:
-    """Return the name of the process with this id, in the format of `holder`."""
+    """Return the name of a process, in the format of `holder`."""
     return f"process {process} on {socket.gethostname()}"

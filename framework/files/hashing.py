@@ -12,20 +12,21 @@ from framework.files.atomic_write import check_regular
 
 
 def add_values(digest: hashlib._Hash, array: Array) -> None:
-    """Update `digest` with the bytes of an array in C order."""
+    """Add the values of an array to a hash."""
     digest.update(np.ascontiguousarray(array).data)
 
 
 def add_array(digest: hashlib._Hash, array: Array) -> None:
-    """Update `digest` with the type, shape and bytes of an array in C order."""
+    """Add the type, shape and values of an array to a hash."""
     digest.update(f"{array.dtype.str}{array.shape};".encode())
     add_values(digest, array)
 
 
 def path_hash(path: Path) -> str:
-    """Return the SHA-256 (hex) of a file, or of the names and contents of all files in a folder.
+    """Return the SHA-256 of a file, or of all files in a folder.
 
-    Raises DataError if a file cannot be read.
+    Raises:
+        DataError: A file cannot be read.
     """
     if path.is_dir():
         digest = hashlib.sha256()

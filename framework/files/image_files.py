@@ -1,7 +1,7 @@
-"""Strict image readers that reject damaged files.
+"""Image readers that reject damaged files.
 
-Pillow checks headers and PNG checksums, but accepts truncated files. The end marker is therefore checked here. libjpeg
-fills in undecodable regions with only a warning, which OpenCV does not report. simplejpeg raises an error.
+Pillow accepts truncated files, so that the end marker is checked here. JPEG files are decoded with simplejpeg, which
+raises an error for damaged data. OpenCV fills the damaged regions without an error.
 """
 
 from __future__ import annotations
@@ -27,15 +27,20 @@ LARGEST_FILE = 2**28  # bytes, size of MAX_PIXELS with four 16-bit channels
 
 
 def read_color(path: Path) -> UInt8:
-    """Return the color (H, W, 3), uint8 RGB, of a JPEG or PNG file.
+    """Read an 8-bit color image (H, W, 3), RGB, from a JPEG or PNG file.
 
-    Raises FrameError if the file is damaged or not 8-bit.
+    Raises:
+        FrameError: The file is damaged or not 8-bit.
     """
     return decode_color(path, read_image_file(path))
 
 
 def decode_color(name: Path | str, data: bytes) -> UInt8:
-    """Return the color (H, W, 3), uint8 RGB, of the content of an image file. Raises a FrameError that names `name`."""
+    """Decode an 8-bit color image (H, W, 3), RGB, from the content of a JPEG or PNG file.
+
+    Raises:
+        FrameError: The content is damaged or not 8-bit. The message contains `name`.
+    """
     check_image(name, data)
     if data.startswith(JPEG_START):
         try:
@@ -49,17 +54,29 @@ def decode_color(name: Path | str, data: bytes) -> UInt8:
 
 
 def read_uint16(path: Path) -> UInt16:
-    """Return the uint16 values (H, W) of a PNG file. Raises FrameError if the file is damaged or has another type."""
+    """Read a 16-bit image (H, W) from a PNG file.
+
+    Raises:
+        FrameError: The file is damaged or has another type.
+    """
     return decode_uint16(path, read_image_file(path))
 
 
 def decode_uint16(name: Path | str, data: bytes) -> UInt16:
-    """Return the uint16 values (H, W) of the content of a PNG file. Raises a FrameError that names `name`."""
+    """Decode a 16-bit image (H, W) from the content of a PNG file.
+
+    Raises:
+        FrameError: The content is damaged or has another type. The message contains `name`.
+    """
     return np.asarray(_decode_channel(name, data, np.uint16), np.uint16)
 
 
 def read_uint8(path: Path) -> UInt8:
-    """Return the uint8 values (H, W) of a PNG file. Raises FrameError if the file is damaged or has another type."""
+    """Read an 8-bit image (H, W) from a PNG file.
+
+    Raises:
+        FrameError: The file is damaged or has another type.
+    """
     return np.asarray(_decode_channel(path, read_image_file(path), np.uint8), np.uint8)
 
 
@@ -73,7 +90,11 @@ def _decode_channel(name: Path | str, data: bytes, dtype: type[np.generic]) -> A
 
 
 def read_image_file(path: Path) -> bytes:
-    """Return the content of an image file. Raises FrameError if it cannot be read."""
+    """Return the content of an image file.
+
+    Raises:
+        FrameError: The file cannot be read.
+    """
     try:
         return read_bytes(path, LARGEST_FILE)
     except DataError as error:
@@ -91,9 +112,9 @@ def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
 
 
 def check_image(name: Path | str, data: bytes) -> None:
-    """Raise FrameError if `data` is not a complete PNG or JPEG file with an image of at most MAX_PIXELS.
+    """Raise FrameError unless `data` is a complete PNG or JPEG image of at most MAX_PIXELS.
 
-    Decoders allocate memory for the size in the header, which may be 10^10 px in a damaged file.
+    Without this check, decoders allocate memory for the size in the header, which may be 10^10 px in a damaged file.
     """
     if not data:
         raise FrameError(f"{name}: expected an image, got an empty file")

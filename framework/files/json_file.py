@@ -1,4 +1,4 @@
-"""Strict JSON files of limited size and depth."""
+"""JSON files of limited size and depth."""
 
 from __future__ import annotations
 
@@ -17,18 +17,29 @@ MAX_BITS = 63  # maximum size of an integer, bits; libraries have this limit; ti
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write `content` atomically, with floats in full precision; NaN and infinity become null."""
+    """Write an object to a JSON file atomically.
+
+    NaN and infinity are written as null.
+    """
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path, most: int = MAX_TEXT) -> Any:
-    """Read a JSON file of at most `most` bytes. Raises a DataError that names the file."""
+    """Read a JSON file.
+
+    Raises:
+        DataError: The file is invalid or larger than `most` bytes.
+    """
     return parse_json(path, read_bytes(path, most))
 
 
 def parse_json(where: object, content: bytes | str) -> Any:
-    """Parse JSON with or without a byte order mark. Raises a DataError that names `where`."""
+    """Parse JSON.
+
+    Raises:
+        DataError: The JSON is invalid. The message contains `where`.
+    """
     try:
         with errors_of(where):
             found = json.loads(content, parse_int=_whole, object_pairs_hook=_once)
@@ -48,8 +59,8 @@ def _whole(digits: str) -> int:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the pairs as a dict. Raises DataError for duplicate keys, because JSON does not define their meaning."""
-    found = dict(pairs)
+    """Return the pairs as a dictionary, and raise DataError for duplicate keys."""
+    found = dict(pairs)  # JSON does not define the meaning of duplicate keys
     if len(found) < len(pairs):
         twice = next(key for k, (key, _) in enumerate(pairs) if key in {before for before, _ in pairs[:k]})
         raise DataError(f"expected unique keys, got {twice!r} twice")
@@ -57,7 +68,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _is_shallow(content: Any) -> bool:
-    """Return True if the nesting depth is at most MAX_DEPTH. Does not use recursion."""
+    """Return True if the nesting depth is at most MAX_DEPTH."""
     level = [content] if isinstance(content, list | dict) else []
     for _ in range(MAX_DEPTH):
         nodes = [node.values() if isinstance(node, dict) else node for node in level]
@@ -68,10 +79,7 @@ def _is_shallow(content: Any) -> bool:
 
 
 def _finite(content: Any) -> Any:
-    """Return the content with None (null in JSON) for NaN and infinity.
-
-    JSON does not support NaN, which is the value of undefined metrics such as the AP of an absent class.
-    """
+    """Return the content with None instead of NaN and infinity, which JSON does not support."""
     if isinstance(content, Mapping):
         return {key: _finite(value) for key, value in content.items()}
     if isinstance(content, list):

@@ -1,6 +1,6 @@
-"""Text files of numbers: up directions, timestamps of images, 4x4 matrices, and helpers for other formats.
+"""Text files with lines of numbers.
 
-np.loadtxt does not parse the NaN of Microsoft's C library and does not report line numbers.
+np.loadtxt is not used, because it does not parse the NaN of Microsoft's C library and does not report line numbers.
 """
 
 from __future__ import annotations
@@ -28,21 +28,38 @@ _NO_NUMBER = re.compile(r"[+-]?(1\.#\w+|nan\(\w+\))", re.ASCII | re.IGNORECASE)
 
 
 def read_lines(path: Path, missing: str = "expected a text file, got no such file") -> list[str]:
-    """Return the lines of a text file. Raises DataError, with the message `missing` if the file does not exist."""
+    """Return the lines of a text file.
+
+    Raises:
+        DataError: The file cannot be read. The message is `missing` if the file does not exist.
+    """
     if not path.exists():
         raise DataError(f"{path}: {missing}")
     return read_text(path).splitlines()
 
 
 def number(word: str) -> float:
-    """Parse a number. Special values of Microsoft's C library (-1.#IND, 1.#INF) become NaN. Raises ValueError."""
+    """Parse a number.
+
+    Special values of Microsoft's C library (-1.#IND, 1.#INF) become NaN.
+
+    Raises:
+        ValueError: The word is not a number.
+    """
     return math.nan if _NO_NUMBER.fullmatch(word) else float(word)
 
 
 def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> list[float]:
-    """Parse the words of a line as `count` numbers. NaN is valid.
+    """Parse the words of a line as numbers, possibly NaN.
 
-    Raises a DataError that names `where` (file and line) and `names` (the columns).
+    Args:
+        where: The file and the line, for messages.
+        words: The words.
+        count: The expected number of words.
+        names: The names of the columns, for messages.
+
+    Raises:
+        DataError: There are more or fewer words, or a word is not a number.
     """
     expected = f"{where}: expected {count} numbers{f' ({names})' if names else ''}"
     if len(words) != count:
@@ -57,27 +74,31 @@ def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> li
 
 
 def read_gravity(path: Path) -> list[Float64 | None]:
-    """Return the unit up vector (3,) of each frame in the camera frame; None = unknown.
+    """Read the up direction of each frame as a unit vector (3,) in the camera frame, or None if unknown.
 
-    A line contains `x y z`, or `nan nan nan` if unknown. Empty lines, and comments after `#`, are skipped. Raises
-    DataError that names the line.
+    A line contains `x y z`, or `nan nan nan` if unknown. Empty lines and comments after `#` are skipped.
+
+    Raises:
+        DataError: A line is invalid.
     """
     words = [COMMENT.sub("", line).split() for line in read_lines(path)]
     return [_direction(f"{path}, line {n}", found) for n, found in enumerate(words, start=1) if found]
 
 
 def write_gravity(path: Path, ups: Sequence[Float64 | None]) -> None:
-    """Write the up direction (3,) of each frame in the format of `read_gravity`; None = unknown."""
+    """Write the up direction (3,) of each frame in the format of `read_gravity`."""
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for up in ups:
             file.write("nan nan nan\n" if up is None else " ".join(f"{value:.9f}" for value in up) + "\n")
 
 
 def read_image_times(path: Path) -> list[tuple[float, float]]:
-    """Return the timestamps of color and depth of each frame, s.
+    """Read the timestamps of color and depth of each frame, s.
 
-    A line contains `color depth`. Empty lines, and comments after `#`, are skipped. Raises a DataError that names the
-    line.
+    A line contains `color depth`. Empty lines and comments after `#` are skipped.
+
+    Raises:
+        DataError: A line is invalid.
     """
     words = [(n, COMMENT.sub("", line).split()) for n, line in enumerate(read_lines(path), start=1)]
     times = []
@@ -112,20 +133,28 @@ def _direction(where: str, words: Sequence[str]) -> Float64 | None:
 
 @dataclass(frozen=True)
 class PrintedMatrix:
-    """A matrix from a file, validated on conversion to a pose or camera."""
+    """A 4x4 matrix from a text file.
+
+    The matrix is validated on conversion to a pose or camera.
+    """
 
     where: str  # file, and line in a file with several matrices
     values: Float64  # (4, 4), may be NaN
 
     def pose(self) -> Float64:
-        """Return the transform (4, 4), exactly rigid. Raises DataError if the matrix is not rigid."""
+        """Return the nearest rigid transform (4, 4).
+
+        Raises:
+            DataError: The matrix is not a rigid transform.
+        """
         with errors_of(self.where):
             return nearest_rigid(self.values)
 
     def camera(self, width: int, height: int) -> Camera:
-        """Return the camera with these intrinsics, px, and an image of `width` x `height` px.
+        """Return the camera with this intrinsic matrix and the given image size, px.
 
-        Raises DataError if the matrix is not an intrinsic matrix.
+        Raises:
+            DataError: The matrix is not an intrinsic matrix.
         """
         (fx, _, cx, _), (_, fy, cy, _) = self.values[:2].tolist()
         if not np.allclose(self.values, [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]]):
@@ -137,7 +166,11 @@ class PrintedMatrix:
 
 
 def read_matrix(path: Path) -> PrintedMatrix:
-    """Read a 4x4 matrix from a file with four lines of four numbers. Raises a DataError that names the line."""
+    """Read a 4x4 matrix from a file with four lines of four numbers.
+
+    Raises:
+        DataError: A line is invalid.
+    """
     lines = _numbered_lines(path)
     if len(lines) != 4:
         raise DataError(f"{path}: expected 4 lines of 4 numbers, got {len(lines)} lines")
@@ -145,11 +178,15 @@ def read_matrix(path: Path) -> PrintedMatrix:
 
 
 def read_matrix_lines(path: Path) -> list[PrintedMatrix]:
-    """Read a file with one 4x4 matrix (16 numbers, row-major) per line. Raises a DataError that names the line."""
+    """Read 4x4 matrices from a file with one matrix (16 numbers, row-major) per line.
+
+    Raises:
+        DataError: A line is invalid.
+    """
     lines = _numbered_lines(path)
     return [PrintedMatrix(where, np.array(numbers(where, words, 16)).reshape(4, 4)) for where, words in lines]
 
 
 def _numbered_lines(path: Path) -> list[tuple[str, list[str]]]:
-    """Return "FILE, line N", for messages, and the words of each nonempty line."""
+    """Return the location, for messages, and the words of each nonempty line."""
     return [(f"{path}, line {n}", line.split()) for n, line in enumerate(read_lines(path), start=1) if line.strip()]

@@ -1,6 +1,7 @@
-"""Triangle meshes as PLY files. Reads all three encodings and writes little-endian binary.
+"""Triangle meshes in PLY files.
 
-The format is implemented here because Open3D crashes on some malformed files and plyfile has a GPL license.
+All three encodings are read, and little-endian binary is written. Open3D is not used because it crashes on some
+malformed files. plyfile has a GPL license.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ TYPE_NAMES = {code: name for name, code in reversed(TYPES.items())}  # tradition
 
 @dataclass(frozen=True)
 class PlyMesh:
-    """Mesh in a PLY file."""
+    """A mesh with vertex properties."""
 
     vertices: Float32  # (V, 3) m
     triangles: Int32  # (F, 3) vertex indices
@@ -35,9 +36,9 @@ class PlyMesh:
 
 
 def found_property(mesh: PlyMesh, values: Array | None) -> str:
-    """Return the type of a vertex property with the wrong type, or the existing properties if `values` is None.
+    """Describe the type of a vertex property, or list the existing properties if `values` is None.
 
-    The result is the part of an error message after "got".
+    The text is used in messages after "got".
     """
     if values is not None:
         return str(values.dtype)
@@ -45,10 +46,12 @@ def found_property(mesh: PlyMesh, values: Array | None) -> str:
 
 
 def read_ply(path: Path) -> PlyMesh:
-    """Read the vertices, faces and vertex properties of a mesh. Polygons become triangle fans.
+    """Read a mesh.
 
-    Other elements, and list properties of vertices, are ignored. Raises a DataError that names the line or byte for a
-    damaged file, vertices that are not finite, or invalid vertex indices.
+    Polygons are converted to triangles. Other elements and list properties of vertices are ignored.
+
+    Raises:
+        DataError: The file is damaged, a vertex is not finite, or a vertex index is invalid.
     """
     header, elements = read_elements(path, read_bytes(path, LARGEST_FILE))
     if "vertex" not in elements:
@@ -62,9 +65,17 @@ def read_ply(path: Path) -> PlyMesh:
 def write_ply(
     path: Path, vertices: Float32, triangles: Int32, properties: Mapping[str, Array], comments: Sequence[str] = ()
 ) -> None:
-    """Write vertices (V, 3) in m, triangles (F, 3) and vertex properties (V,) by name, atomically.
+    """Write a mesh atomically.
 
-    Raises DataError for a mesh that `read_ply` would reject, or for a failed write.
+    Args:
+        path: The output file.
+        vertices: The vertices (V, 3), m.
+        triangles: The vertex indices (F, 3) of the triangles.
+        properties: The vertex properties (V,) by name.
+        comments: The comments of the header.
+
+    Raises:
+        DataError: The mesh is invalid, or the file cannot be written.
     """
     _check_mesh(path, vertices, triangles)
     row = _vertex_dtype(path, len(vertices), properties)
@@ -128,9 +139,11 @@ def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
 
 
 def _fans(corners: Int32, lengths: Int64) -> Int32:
-    """Return the triangles (F, 3) of P polygons: the corners 0 1 2, 0 2 3, ... of each polygon.
+    """Split P polygons into triangles (F, 3).
 
-    `corners` contains the vertex indices of all polygons in order, and `lengths` (P,) their numbers of corners.
+    Args:
+        corners: The vertex indices of all polygons, concatenated.
+        lengths: The number of corners (P,) of each polygon.
     """
     if (lengths == 3).all():
         return corners.reshape(-1, 3)

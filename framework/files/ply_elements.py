@@ -1,4 +1,4 @@
-"""Elements of a PLY file: the tables declared in the header, in any of the three encodings."""
+"""Elements of a PLY file, i.e. the tables that are declared in the header."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ MAX_DIGITS = 18  # maximum number of digits of a row count
 
 @dataclass(frozen=True)
 class Property:
-    """A column of an element, with one number or a list of numbers per row."""
+    """A column of an element.
+
+    A row contains one number or a list of numbers.
+    """
 
     name: str
     dtype: np.dtype[Any]  # type of the numbers, in native byte order
@@ -35,7 +38,10 @@ class Property:
 
 @dataclass(frozen=True)
 class Element:
-    """A table with N rows. The arrays are empty until the rows are read."""
+    """A table with N rows.
+
+    The arrays are empty until the rows are read.
+    """
 
     name: str
     rows: int
@@ -57,10 +63,17 @@ class Header:
 
 
 def read_elements(path: Path, data: bytes) -> tuple[Header, dict[str, Element]]:
-    """Return the header of a PLY file, and the elements by name with their rows.
+    """Parse the header and the elements of a PLY file.
 
-    `data` is the content of the file. Raises a DataError that names the line or byte if the file is damaged or does not
-    match its header.
+    Args:
+        path: The file, for messages.
+        data: The content of the file.
+
+    Returns:
+        The header, and the elements by name.
+
+    Raises:
+        DataError: The file is damaged or does not match its header.
     """
     header = _parse_header(path, data)
     body = _Body(path, data, header)
@@ -108,7 +121,7 @@ def _parse_header(path: Path, data: bytes) -> Header:
 
 
 def _header_lines(path: Path, data: bytes) -> list[bytes]:
-    """Return the lines up to `end_header`, including line breaks."""
+    """Return the lines of the header, up to `end_header`."""
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
         raise DataError(f"{path}, line 1: expected a PLY file, got {shown(data[:16].decode('latin-1'))}")
     lines = data[:LARGEST_HEADER].splitlines(keepends=True)
@@ -145,7 +158,10 @@ def _dtype(name: str) -> np.dtype[Any]:
 
 
 def _check_size(path: Path, header: Header, body: int) -> None:
-    """Raise DataError if the rows do not fit into the `body` bytes after the header. This limits memory use."""
+    """Raise DataError if the file is too short for the declared rows.
+
+    This limits the allocated memory.
+    """
     least = 0
     for element in header.elements:
         if element.rows and not element.properties:
@@ -165,10 +181,10 @@ def _check_size(path: Path, header: Header, body: int) -> None:
 
 
 class _Body:
-    """The numbers after the header: the bytes of a binary file, or the words of a text file as float64.
+    """The part of a PLY file after the header.
 
-    Positions and sizes are in bytes for binary files, and in words for text files. float64 represents all PLY types
-    exactly.
+    Positions and sizes are in bytes for binary files, and in numbers for text files. Numbers of text files are stored
+    as float64, which represents all PLY types exactly.
     """
 
     def __init__(self, path: Path, data: bytes, header: Header) -> None:
@@ -185,7 +201,7 @@ class _Body:
             self._split_lines(data[header.size :].splitlines(), header.lines)
 
     def read(self, element: Element) -> Element:
-        """Return the element with its rows, starting at the current position."""
+        """Read the rows of an element from the current position."""
         sizes = [0] * len(element.properties)
         if element.rows:
             sizes = self._row(element, 0, self._position)
@@ -194,7 +210,7 @@ class _Body:
         return self._ragged(element)
 
     def check_end(self) -> None:
-        """Raise DataError if numbers follow the last declared row."""
+        """Raise DataError if data follow the last declared row."""
         if self._position < self._end and (self._text or bytes(self._data[self._position :]).strip()):
             count = self._end - self._position
             raise DataError(
@@ -231,10 +247,7 @@ class _Body:
         return 1 if self._text else dtype.itemsize
 
     def _row(self, element: Element, row: int, start: int) -> list[int]:
-        """Return the number of values of each column in a row.
-
-        The row has the index `row` and begins at the position `start`. Raises DataError for an incomplete row.
-        """
+        """Return the number of values of each column in a row that begins at the position `start`."""
         position, lengths = start, []
         where = f"{shown(element.name)} {row}"
         for column in element.properties:
@@ -263,9 +276,9 @@ class _Body:
         return lengths
 
     def _view(self, dtype: np.dtype[Any], start: int, rows: int, length: int, stride: int) -> npt.NDArray[Any]:
-        """Return the numbers (rows, length) from the position `start`, with `stride` between rows.
+        """Return a strided view (rows, length) of the numbers from the position `start`.
 
-        The result is empty if a row exceeds the end of the file.
+        The view is empty if a row exceeds the end of the file.
         """
         if start + (rows - 1) * stride + length * self._size(dtype) > self._end:
             return np.empty((0, 0))
@@ -274,7 +287,7 @@ class _Body:
         return np.ndarray((rows, length), stored, self._data, start * unit, (stride * unit, stored.itemsize))
 
     def _rows_are_alike(self, element: Element, lengths: list[int]) -> bool:
-        """Return True if the lists of all rows have the same lengths as those of the first row, `lengths`."""
+        """Return True if the lists of all rows have the same lengths as those of the first row."""
         stride = self._stride(element, lengths)
         end = self._position + element.rows * stride
         if not element.rows or end > self._end:
@@ -297,7 +310,7 @@ class _Body:
         return counts + sum(n * self._size(c.dtype) for c, n in zip(element.properties, lengths, strict=True))
 
     def _uniform(self, element: Element, lengths: list[int]) -> Element:
-        """Return the element with rows of equal length, read as strided views."""
+        """Read the rows of an element that all have the same size."""
         stride, start, position = self._stride(element, lengths), self._position, self._position
         scalars: dict[str, Array] = {}
         lists: dict[str, tuple[Array, Int64]] = {}
@@ -317,7 +330,7 @@ class _Body:
         return replace(element, scalars=scalars, lists=lists, place=lambda row: self._place(start + row * stride))
 
     def _ragged(self, element: Element) -> Element:
-        """Return the element with rows of different lengths, read one after the other."""
+        """Read the rows of an element that have different sizes, one after the other."""
         lengths = np.empty((len(element.properties), element.rows), np.int64)
         starts = np.empty(element.rows, np.int64)
         for row in range(element.rows):
@@ -346,10 +359,7 @@ class _Body:
         return replace(element, scalars=scalars, lists=lists, place=lambda row: self._place(int(starts[row])))
 
     def _native(self, column: Property, stored: npt.NDArray[Any], positions: Int64 | None) -> Array:
-        """Return the flattened numbers in the type of the column. Scalar columns are copied.
-
-        Raises DataError if a number of a text file is out of range for the type.
-        """
+        """Convert the stored numbers to the type of a column, and return them flattened."""
         if self._text and positions is not None and column.dtype.kind != "f":
             limits = np.iinfo(column.dtype)
             wrong = ~((stored == np.rint(stored)) & (stored >= limits.min) & (stored <= limits.max))
@@ -362,5 +372,5 @@ class _Body:
 
 
 def shown(text: str) -> str:
-    """Return text from the file, quoted and shortened for a one-line error message."""
+    """Quote and shorten a text from the file for messages."""
     return repr(text if len(text) <= 40 else text[:37] + "...")

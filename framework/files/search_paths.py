@@ -1,4 +1,4 @@
-"""Search paths for files in parameters, and the config folder."""
+"""Search paths of files, and the config folder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else PROJECT_ROOT / "co
 
 
 def candidates(path: Path) -> tuple[Path, ...]:
-    """Return the candidates for a path.
+    """Return the paths at which a file is searched.
 
     A relative path is searched in the working directory, then in the project directory. `~` is expanded.
     """
@@ -24,19 +24,22 @@ def candidates(path: Path) -> tuple[Path, ...]:
 
 
 def folder_of(path: Path) -> Path:
-    """Return the folder at a path, found in the working directory or the project directory.
+    """Return the first existing folder among the search paths.
 
     Args:
-        path: Path of a folder, absolute or relative; `~` is expanded.
+        path: The path of a folder, absolute or relative. `~` is expanded.
 
     Returns:
-        The first existing folder, or the expanded path if none exists.
+        The folder, or the expanded path if there is no such folder.
     """
     return next((place for place in candidates(path) if place.is_dir()), expanded(path))
 
 
 def expanded(path: Path) -> Path:
-    """Return the path with `~` expanded, or the path itself for an unknown user."""
+    """Expand `~` in a path.
+
+    For an unknown user, the path is unchanged.
+    """
     try:
         return path.expanduser()
     except RuntimeError:

@@ -1,6 +1,7 @@
-"""Trajectories in the TUM format: one pose T_world_camera per line, `timestamp tx ty tz qx qy qz qw`, in s and m.
+"""Trajectories in the TUM format.
 
-The format is implemented here because evo has a GPL license.
+A line contains one pose T_world_camera: `timestamp tx ty tz qx qy qz qw`, in s and m. evo is not used because of its
+GPL license.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ QUATERNION_TOLERANCE = 1e-2  # maximum | |q| - 1 | due to rounding
 
 @dataclass(frozen=True)
 class TumLine:
-    """One line of a TUM file, validated on conversion to a pose."""
+    """A line of a TUM file.
+
+    The line is validated on conversion to a pose.
+    """
 
     path: Path
     number: int  # line number in the file, from 1
@@ -34,7 +38,11 @@ class TumLine:
     quat_xyzw: tuple[float, ...]  # (4,), may be NaN
 
     def pose(self) -> Float64:
-        """Return the rigid T_world_camera (4, 4). Raises DataError for an invalid pose."""
+        """Return the pose T_world_camera (4, 4).
+
+        Raises:
+            DataError: The pose is not finite, or the quaternion does not have unit length.
+        """
         return rigid_pose(self._place, self.position, self.quat_xyzw)
 
     def error(self, message: str) -> DataError:
@@ -46,7 +54,16 @@ class TumLine:
 
 
 def rigid_pose(place: str, position: Sequence[float], quat_xyzw: Sequence[float]) -> Float64:
-    """Return T_world_camera (4, 4) from a position (3,), m, and a quaternion. Raises a DataError that names `place`."""
+    """Return the pose (4, 4) with a given position and orientation.
+
+    Args:
+        place: The location in the file, for messages.
+        position: The position (3,), m.
+        quat_xyzw: The orientation (4,), a unit quaternion.
+
+    Raises:
+        DataError: The pose is not finite, or the quaternion does not have unit length.
+    """
     norm = math.hypot(*quat_xyzw)
     if not all(map(math.isfinite, (*position, norm))):
         found = " ".join(f"{value:g}" for value in (*position, *quat_xyzw))
@@ -60,10 +77,10 @@ def rigid_pose(place: str, position: Sequence[float], quat_xyzw: Sequence[float]
 
 
 def read_tum(path: Path) -> tuple[Float64, Float64]:
-    """Return the timestamps (F,) in s and the poses T_world_camera (F, 4, 4) of a TUM file.
+    """Read the timestamps (F,), s, and the poses T_world_camera (F, 4, 4) in a TUM file.
 
-    Raises DataError for a line without eight finite numbers and a unit quaternion, or for timestamps that do not
-    increase.
+    Raises:
+        DataError: A line is invalid, or the timestamps do not increase.
     """
     lines = read_tum_lines(path)
     for before, line in pairwise(lines):
@@ -74,17 +91,26 @@ def read_tum(path: Path) -> tuple[Float64, Float64]:
 
 
 def read_tum_lines(path: Path) -> list[TumLine]:
-    """Return the lines of a TUM file, except comments. Raises DataError for a line without eight numbers."""
+    """Read the lines of a TUM file, except comments.
+
+    Raises:
+        DataError: A line does not contain eight numbers.
+    """
     lines = read_lines(path, missing="expected a trajectory in TUM format, got no such file")
     words = [COMMENT.sub("", line).split() for line in lines]
     return [_line(path, number, found) for number, found in enumerate(words, start=1) if found]
 
 
 def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence[Float64] | Float64) -> None:
-    """Write timestamps in s and poses T_world_camera (4, 4) atomically.
+    """Write a trajectory in the TUM format atomically.
 
-    `read_tum` returns these values with an absolute error of at most 1e-9. Raises DataError for different lengths, a
-    pose that is not rigid, or a failed write.
+    Args:
+        path: The output file.
+        timestamps: The timestamps (F,), s.
+        poses: The poses T_world_camera (F, 4, 4).
+
+    Raises:
+        DataError: The lengths differ, a pose is not rigid, or the file cannot be written.
     """
     if len(timestamps) != len(poses):
         raise DataError(f"{path}: expected a timestamp for each pose, got {len(timestamps)} for {len(poses)} poses")

@@ -1,4 +1,7 @@
-"""Reader of YAML files, which are validated before loading: a few lines of aliases can expand to gigabytes."""
+"""YAML files of limited size and depth.
+
+A file is validated before loading, because a few lines of aliases can expand to gigabytes.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,11 @@ _EventLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled loa
 
 
 def load_yaml(path: Path) -> Any:
-    """Return the DictConfig or ListConfig of a YAML file. Raises a DataError that names the file."""
+    """Load a YAML file as a DictConfig or ListConfig.
+
+    Raises:
+        DataError: The file is invalid or exceeds a limit.
+    """
     text = read_text(path, LARGEST_FILE)
     with yaml_errors(path):
         check_yaml(path, text)
@@ -32,7 +39,7 @@ def load_yaml(path: Path) -> Any:
 
 @contextmanager
 def yaml_errors(path: Path) -> Iterator[None]:
-    """Convert errors of loading a file to a DataError that names the file."""
+    """Convert YAML errors within a context to DataError."""
     try:
         yield
     except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError, OverflowError) as error:
@@ -40,7 +47,7 @@ def yaml_errors(path: Path) -> Iterator[None]:
 
 
 def _events(where: object, text: str) -> Iterator[Any]:
-    """Yield the parser events. Raises DataError at the nesting limit of PyYAML 6.0.4 and later."""
+    """Yield the parser events of a YAML text."""
     try:
         yield from yaml.parse(text, _EventLoader)
     except yaml.YAMLError as error:
@@ -50,7 +57,12 @@ def _events(where: object, text: str) -> Iterator[Any]:
 
 
 def check_yaml(where: object, text: str) -> None:
-    """Raise DataError for YAML above MAX_VALUES values or MAX_DEPTH levels, and YAMLError if it is invalid."""
+    """Check a YAML text without loading it.
+
+    Raises:
+        DataError: There are more than MAX_VALUES values or MAX_DEPTH levels.
+        YAMLError: The text is not valid YAML.
+    """
     counts = [0]  # number of values of each open mapping and list, outermost first
     open_anchors: list[Hashable] = []
     anchors: dict[Hashable, int] = {}

@@ -1,1 +1,1 @@
-"""Import of phone and sensor recordings as RGB-D folders."""
+"""Import of recordings from phones and sensors as RGB-D folders."""

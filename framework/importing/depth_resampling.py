@@ -1,4 +1,4 @@
-"""Resampling of depth from another camera or a lower resolution to the pixels of a color image."""
+"""Resampling of depth images to the pixels of a color camera."""
 
 from __future__ import annotations
 
@@ -16,10 +16,7 @@ FINEST = 0.9
 
 @dataclass(frozen=True)
 class DepthRegistration:
-    """Registration of depth to a color camera with another pose.
-
-    If several readings project to a pixel, the nearest reading is kept.
-    """
+    """Registration of depth images to a color camera with another pose."""
 
     depth: Camera
     color: Camera
@@ -31,21 +28,28 @@ class DepthRegistration:
         return self.color.scaled(min(1.0, FINEST * min(self.depth.fx / self.color.fx, self.depth.fy / self.color.fy)))
 
     def apply(self, depth: Float32) -> Float32:
-        """Return the depth (H, W) of `target` in m from the depth (h, w) of the depth camera in m, 0 = no reading."""
+        """Register a depth image (h, w), m, and return the depth (H, W), m, of the camera `target`."""
         registered = np.zeros(self.target.shape, np.float32)
         move_readings(depth, self.depth.K, self.target.K, self.T_color_depth, registered)
         return registered
 
 
 def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, target_color: UInt8) -> Float32:
-    """Return the depth (H, W), m, of the camera `target`, resampled from `depth` (h, w), m; 0 = no reading.
+    """Resample a depth image to the resolution of a color image, guided by the colors.
 
-    `color` and `target_color` are the RGB images of `camera` and `target`, which have the same pose.
-    `depth` has the field of view of `camera`. If the four depth readings around a pixel belong to one surface, their
-    inverses are interpolated, which is exact for a plane. Otherwise, the pixel gets the reading with the largest
-    weight, which decreases with the distance in the image and in color. No depth therefore lies between two surfaces.
-    The weights are those of joint bilateral upsampling (Kopf et al., SIGGRAPH 2007). If the nearest pixel of `depth`
-    has no reading, the result has none either.
+    Depth is interpolated if the four readings around a pixel belong to one surface. Otherwise, the pixel gets the
+    reading with the largest weight, so that no depth lies between two surfaces. The weights are those of joint
+    bilateral upsampling (Kopf et al., SIGGRAPH 2007). Pixels without a reading stay empty.
+
+    Args:
+        depth: The depth (h, w), m, with the field of view of `camera`, 0 = no reading.
+        color: The color image of `camera`, RGB.
+        camera: The camera of the recording.
+        target: The output camera, with the same pose.
+        target_color: The color image (H, W, 3) of `target`, RGB.
+
+    Returns:
+        The depth (H, W), m, of `target`.
     """
     height, width = depth.shape
     guide = np.asarray(cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
@@ -57,10 +61,15 @@ def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, targ
 
 
 def _coordinates(size: int, f_target: float, c_target: float, f: float, c: float, scale: float) -> Float64:
-    """Return the coordinates (size,), px, in the depth image for the pixels of a row or column of the target.
+    """Return the coordinates (size,), px, in the depth image for a row or column of the target.
 
-    `f_target`, `c_target`, `f` and `c` are the focal lengths and principal points of the target and color cameras, px.
-    `scale` is the size of the depth image relative to the color image.
+    Args:
+        size: The number of pixels.
+        f_target: The focal length of the target camera, px.
+        c_target: The principal point of the target camera, px.
+        f: The focal length of the color camera, px.
+        c: The principal point of the color camera, px.
+        scale: The size of the depth image relative to the color image.
     """
     in_color = (np.arange(size) - c_target) * (f / f_target) + c
     return np.asarray((in_color + 0.5) * scale - 0.5, np.float64)

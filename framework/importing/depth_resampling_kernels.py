@@ -13,10 +13,16 @@ COLOR_SIGMA = 15.0  # standard deviation of RGB distances within one object, for
 
 @njit(cache=True, nogil=True)
 def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, registered: Float32) -> None:
-    """Fill `registered` (H, W), m, with the readings of `depth` (h, w), m, in the target camera; 0 = no reading.
+    """Project depth readings to another camera.
 
-    `registered` must be 0. `K` and `K_target` (3, 3) are the intrinsics, px. `T` (4, 4) maps coordinates in the depth
-    camera to coordinates in the target camera. If several readings project to a pixel, the nearest reading is kept.
+    If several readings project to a pixel, the nearest reading is kept.
+
+    Args:
+        depth: The depth (h, w), m, 0 = no reading.
+        K: The intrinsic matrix (3, 3) of the depth camera, px.
+        K_target: The intrinsic matrix (3, 3) of the target camera, px.
+        T: The transform (4, 4) from the depth camera to the target camera.
+        registered: The output depth (H, W), m, initially 0.
     """
     height, width = registered.shape
     for v in range(depth.shape[0]):
@@ -41,10 +47,17 @@ def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, reg
 
 @njit(cache=True, nogil=True)
 def upsample(depth: Float32, guide: UInt8, u: Float64, v: Float64, color: UInt8, found: Float32) -> None:
-    """Fill `found` (H, W), m, with `depth` (h, w), m, resampled as described in `upsampled`; 0 = no reading.
+    """Resample a depth image to the resolution of a color image.
 
-    The pixel (row, column) of `found` has the coordinates (u[column], v[row]), px, in `depth`. `guide` (h, w, 3) is the
-    color (RGB) at the resolution of `depth`, and `color` (H, W, 3) is the color of the target.
+    The method is described in `upsampled`.
+
+    Args:
+        depth: The depth (h, w), m, 0 = no reading.
+        guide: The color image (h, w, 3) at the resolution of `depth`, RGB.
+        u: The coordinate (W,) in `depth` of each column of the target, px.
+        v: The coordinate (H,) in `depth` of each row of the target, px.
+        color: The color image (H, W, 3) of the target, RGB.
+        found: The output depth (H, W), m, initially 0.
     """
     height, width = depth.shape
     for row in range(len(v)):

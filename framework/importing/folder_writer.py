@@ -32,7 +32,7 @@ ODOMETRY = "odometry.txt"  # file for dataset.odometry, which is not read by def
 
 @dataclass(frozen=True)
 class Writing:
-    """Options of the RGB-D folder writer."""
+    """Options for writing an RGB-D folder."""
 
     width: int = 0  # px, before rotation, at most the stored width; 0 = LONGER_SIDE for the longer side
     stride: int = 1  # step between frames; 1 = every frame
@@ -51,14 +51,14 @@ class Writing:
         return Turn(self.rotate // QUARTER)
 
     def camera(self, stored: Camera) -> Camera:
-        """Return the camera of the written images before rotation, for the camera of the stored images."""
+        """Return the camera of the resized images before rotation."""
         factor = self.width / stored.width if self.width else LONGER_SIDE / max(stored.width, stored.height)
         return stored.scaled(min(1.0, factor))
 
 
 @dataclass
 class Written:
-    """Result of writing a source."""
+    """Frames and errors of a written RGB-D folder."""
 
     timestamps: list[float] = field(default_factory=list)  # s, of the written frames
     poses: list[Float64] = field(default_factory=list)  # T_world_camera (4, 4) of these frames; empty without poses
@@ -81,10 +81,12 @@ def check_new(directory: Path) -> None:
 
 
 def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
-    """Write the images, poses, timestamps and up directions of the frames, and finally camera.json.
+    """Write the frames of a recording as an RGB-D folder.
 
-    Unusable frames are skipped. Raises DataError if `directory` is not empty, no frame is usable, or a file cannot be
-    written.
+    Unusable frames are skipped.
+
+    Raises:
+        DataError: `directory` is not empty, no frame is usable, or a file cannot be written.
     """
     check_new(directory)
     written = Written()
@@ -132,7 +134,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
 
 
 def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int, DeviceFrame]]:
-    """Yield the number and content of each usable frame, and add the errors of unusable frames to `written`."""
+    """Yield the number and content of each usable frame, and collect the errors of the others."""
     chosen = islice(enumerate(source.frames), 0, None, stride)
     for number, stored in tqdm(chosen, total=-(-source.count // stride), unit=" frames", disable=None):
         try:

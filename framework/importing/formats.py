@@ -1,4 +1,4 @@
-"""Supported import formats and their detection."""
+"""Supported recording formats."""
 
 from __future__ import annotations
 
@@ -21,9 +21,15 @@ FORMATS = (
 
 
 def open_source(path: Path, topics: Topics | None = None) -> Source:
-    """Open the recording at `path`. Raises DataError for an unknown format or an unreadable recording.
+    """Open a recording in any supported format.
 
-    `topics` are topics of a ROS bag; only those that cannot be selected by type and name are required.
+    Args:
+        path: The file or folder of the recording.
+        topics: The topics of a ROS bag; None = selected by type and name.
+
+    Raises:
+        DataError: The format is unknown, or the recording is unreadable.
+        ConfigError: The topics are invalid, or they are set for another format.
     """
     if not path.exists():
         raise DataError(f"{path}: expected a recording, got no such file or folder")
@@ -40,5 +46,8 @@ def open_source(path: Path, topics: Topics | None = None) -> Source:
             if topics and topics.given:
                 raise ConfigError(f"{', '.join(topics.given)}: expected a ROS bag, got {path}; omit these options")
             return kind.open(place)
+    if (path / "camera.json").exists() and (path / "depth").is_dir():
+        command = f"instancemap dataset=rgbd_folder dataset.root={path}"
+        raise DataError(f"{path}: expected a recording, got an RGB-D folder; run {command}")
     known = "; ".join(f"{kind.name}: {kind.needs}" for kind in FORMATS)
     raise DataError(f"{path}: expected a supported format, got an unknown format; supported: {known}")

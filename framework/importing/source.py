@@ -1,4 +1,4 @@
-"""Recordings of phones and sensors for import. Depth often has a lower resolution than color."""
+"""Recordings of phones and sensors for import."""
 
 from __future__ import annotations
 
@@ -24,7 +24,13 @@ _ARKIT = PoseReading(camera_axes=CameraAxes.OPENGL)
 
 @dataclass(frozen=True)
 class DeviceFrame:
-    """One stored frame. Raises FrameError for inconsistent images."""
+    """One frame of a recording.
+
+    Depth may have a lower resolution than color.
+
+    Raises:
+        FrameError: The images are inconsistent.
+    """
 
     name: Path | str  # file of the frame, for messages
     timestamp: float  # s
@@ -64,7 +70,10 @@ StoredFrame = Callable[[], DeviceFrame]  # reads a frame; raises DataError if th
 
 @dataclass(frozen=True)
 class Source:
-    """A recording for import. Frames must be read in order, but may be skipped."""
+    """A recording for import.
+
+    Frames must be read in order, but may be skipped.
+    """
 
     format: str  # name for messages
     frames: Iterable[StoredFrame]  # in chronological order
@@ -87,27 +96,27 @@ class Format:
 
 
 def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
-    """Return T_world_camera (4, 4) from a pose (4, 4) with ARKit's camera axes.
+    """Convert a pose (4, 4) from ARKit's camera axes to T_world_camera (4, 4).
 
-    Raises a DataError that names `where` if the pose is invalid.
+    Raises:
+        DataError: The pose is invalid. The message contains `where`.
     """
     with errors_of(where):
         return _ARKIT.pose(nearest_rigid(T_world_arkit))
 
 
 def arkit_up(T_world_camera: Float64) -> Float64:
-    """Return the up direction (3,) in the camera frame for a pose (4, 4) in ARKit's world frame.
-
-    The y axis of this world frame points against gravity, as in ARConfiguration.WorldAlignment.gravity, the default.
-    """
+    """Return the up direction (3,) in the camera frame for a pose (4, 4) in ARKit's world frame."""
+    # the y axis points against gravity with the default ARConfiguration.WorldAlignment.gravity
     return np.array(T_world_camera[1, :3])
 
 
 def meters(raw: NDArray[np.uint16]) -> Float32:
-    """Convert depth (h, w) from mm to m. The value 65535 (no reading in some sensors) becomes 0."""
+    """Convert depth (h, w) from mm to m."""
+    # some sensors write 65535 for pixels without a reading
     return np.where(raw == np.iinfo(np.uint16).max, 0, raw).astype(np.float32) / np.float32(1000)
 
 
 def readings(depth: NDArray[np.floating]) -> Float32:
-    """Return depth (h, w) in m as float32. Values that are not positive and finite become 0."""
+    """Convert depth (h, w), m, to float32 and replace invalid values by 0."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

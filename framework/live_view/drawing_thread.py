@@ -1,8 +1,8 @@
-"""A thread that draws a run without blocking the pipeline.
+"""Thread that draws a run without blocking the pipeline.
 
-The poses and times of all frames are drawn, but only the newest image and the newest map. The fuser may write the map
-at any time, so the pipeline's thread takes snapshots of it between two frames. The time for snapshots and drawing is
-limited to fixed fractions of the run time, regardless of the size of the map.
+The poses and times of all frames are drawn, but only the newest image and the newest map. The fuser may change the map
+at any time, so the thread of the pipeline takes snapshots between two frames. Snapshots and drawing take at most fixed
+fractions of the run time, regardless of the size of the map.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LAST_S = 30.0  # maximum wait for the last drawing at the end of a run
 
 @dataclass(frozen=True)
 class FrameNote:
-    """The data drawn for every frame."""
+    """The data that is drawn for every frame."""
 
     index: int  # Frame.index
     timestamp: float  # s
@@ -61,10 +61,16 @@ class MapSnapshot:
 
 
 class Drawing(Protocol):
-    """Receiver of updates, called from one thread only."""
+    """Receiver of updates. All methods are called from one thread."""
 
     def draw_frames(self, notes: Sequence[FrameNote], skipped: Sequence[str], picture: FrameUpdate | None) -> None:
-        """Draw the frames since the last call, the reasons for skipped frames, and a new image; None = no image."""
+        """Draw all frames since the last call.
+
+        Args:
+            notes: Data of the frames.
+            skipped: Reasons for skipped frames.
+            picture: New image; None = no image.
+        """
 
     def draw_map(self, snapshot: MapSnapshot) -> None:
         """Draw the current map."""
@@ -84,7 +90,10 @@ class _Pending:
 
 
 class DrawingThread:
-    """Thread that draws every `frame_interval`-th image, and `scene` at intervals of at least `map_interval` s."""
+    """Thread that draws the images and the map of a run.
+
+    It draws every `frame_interval`-th image. The map is drawn at intervals of at least `map_interval`, s.
+    """
 
     def __init__(self, scene: SceneMap, drawing: Drawing, frame_interval: int, map_interval: float) -> None:
         self._scene, self._drawing, self._frame_interval = scene, drawing, frame_interval
@@ -103,7 +112,7 @@ class DrawingThread:
         self._thread.start()
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
-        """Add a frame. Call this method only from the thread that writes the map."""
+        """Add a frame. Only the thread that changes the map may call this method."""
         note = FrameNote(frame.index, frame.timestamp, pose, stage_ms)
         if not pose.lost:
             self._last = note
@@ -120,7 +129,7 @@ class DrawingThread:
             self._wanted.set()
 
     def skip(self, reason: str) -> None:
-        """Add an unusable frame with the reason for skipping it."""
+        """Add a skipped frame, with the reason."""
         with self._lock:
             if not self._failed:
                 self._pending.skipped.append(reason)
@@ -178,7 +187,7 @@ class DrawingThread:
                 self._drawing.draw_map(pending.snapshot)
 
     def _give_up(self, error: Exception) -> None:
-        """Disable the viewer; the run continues."""
+        """Disable the viewer without ending the run."""
         if not self._failed:
             log.warning("viewer: disabled after an error; the run continues: %s", in_one_line(error))
         with self._lock:
@@ -187,7 +196,10 @@ class DrawingThread:
 
 
 class Pace:
-    """Rate limiter of an operation: at most once per `interval` s, and at most `fraction` of the time of `clock`."""
+    """Rate limiter of an operation.
+
+    The operation may run once per interval, and may take a fraction of the time of the clock.
+    """
 
     def __init__(self, interval: float, fraction: float, clock: Callable[[], float] = time.perf_counter) -> None:
         self.interval = interval  # s
@@ -200,7 +212,7 @@ class Pace:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Measure the time of the operation inside the context, and delay the next operation accordingly."""
+        """Measure the duration of the operation in the `with` body, and delay the next operation accordingly."""
         began, before = time.perf_counter(), self.clock()
         self._next = began + self.interval
         yield

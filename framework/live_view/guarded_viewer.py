@@ -26,7 +26,10 @@ class RunOutcome:
 
 @contextmanager
 def watched_run(viewer: Viewer, directory: Path, config: Mapping[str, Any]) -> Iterator[RunOutcome]:
-    """Start a run of the viewer, and end it after the body, also after an error. The body sets the yielded outcome."""
+    """Begin a run of the viewer, and end it after the `with` body, also after an error.
+
+    The body sets the yielded outcome.
+    """
     outcome = RunOutcome()
     viewer.begin_run(directory, config)
     try:
@@ -41,7 +44,7 @@ def watched_run(viewer: Viewer, directory: Path, config: Mapping[str, Any]) -> I
 class GuardedViewer(Viewer):
     """Wrapper that disables a viewer after its first error.
 
-    Errors of `begin_run` and `begin` are raised; `end` and `end_run` are always called.
+    Errors of `begin_run` and `begin` are raised. The methods `end` and `end_run` are always called.
     """
 
     def __init__(self, viewer: Viewer) -> None:

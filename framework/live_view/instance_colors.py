@@ -14,14 +14,14 @@ TINT = 0.6  # fraction of the instance color in a vertex color; the rest is the 
 
 
 class InstanceColors:
-    """Colors of the instances by id, from the palette of overview.png."""
+    """Instance colors by id, from the palette of overview.png."""
 
     def __init__(self) -> None:
         self._centroids: dict[int, Float64] = {}  # (3,) m, at the first observation
         self._colors: dict[int, UInt8] = {}  # (3,) RGB
 
     def add(self, centroids: Mapping[int, Float64]) -> None:
-        """Assign colors to new instances, given the centroid (3,), m, world frame, of each instance by id."""
+        """Assign colors to new instances, given the centroid (3,) of each instance by id, m."""
         new = {key: centroids[key] for key in sorted(centroids.keys() - self._centroids.keys())}
         if new:
             self._centroids |= new
@@ -35,7 +35,7 @@ class InstanceColors:
         return self._colors.get(instance_id, default)
 
     def painted(self, mesh: InstanceMesh) -> UInt8:
-        """Return the RGB colors (V, 3) of a mesh. Vertices of instances are tinted with the color of their instance."""
+        """Return the RGB vertex colors (V, 3) of a mesh, tinted with the instance colors."""
         palette = np.zeros((int(mesh.instance_ids.max(initial=0)) + 1, 3), np.float32)
         for key in np.unique(mesh.instance_ids[mesh.instance_ids > 0]).tolist():
             palette[key] = self._colors[key]
@@ -52,10 +52,10 @@ MIN_FRACTION = 0.3  # minimum fraction of the points in a mask that belong to it
 
 
 def seen_instances(masks: Bool, frame: Frame, T_world_camera: Float64, mesh: InstanceMesh) -> Int32:
-    """Return the id (N,) of the instance with the most mesh vertices in each mask (N, H, W); 0 = no instance.
+    """Return the id (N,) of the instance in each mask (N, H, W), or 0 for no instance.
 
-    A vertex is in a mask if its projection from T_world_camera (4, 4) is in the mask and its depth agrees with
-    `frame.depth`. The instance needs more than MIN_FRACTION of all vertices in the mask.
+    Mesh vertices are projected into the frame and compared with its depth. The instance of a mask has the most vertices
+    in the mask, and more than MIN_FRACTION of all vertices in the mask.
     """
     chosen = slice(None, None, -(-len(mesh.vertices) // MAX_POINTS) or 1)
     points_camera = transform(inverse(T_world_camera), mesh.vertices[chosen])

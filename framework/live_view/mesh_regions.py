@@ -16,7 +16,7 @@ Region = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class MeshPart:
-    """The triangles whose first vertex is in a region, with all of their vertices."""
+    """The triangles whose first vertex is in a region, with their vertices."""
 
     vertices: Float32  # (V, 3) m, in the world frame
     triangles: Int32  # (F, 3) vertex indices; no vertices and no triangles = removed part
@@ -24,16 +24,19 @@ class MeshPart:
 
 
 class MeshRegions:
-    """Partition of a mesh into cubes of side `side`, m, that detects the parts that change."""
+    """Partition of a growing mesh into cubes, to find the parts that change."""
 
     def __init__(self, side: float) -> None:
-        self.side = side
+        self.side = side  # m
         self._digests: dict[Region, bytes] = {}
 
     def changed(self, vertices: Float32, triangles: Int32, colors: UInt8) -> Iterator[tuple[Region, MeshPart]]:
-        """Yield the parts of a mesh that changed or were removed since the last call, with their regions.
+        """Yield the regions and parts of a mesh that changed or were removed since the last call.
 
-        The mesh consists of vertices (V, 3), m, in the world frame, triangles (F, 3) and RGB colors (V, 3).
+        Args:
+            vertices: Vertices (V, 3) in the world frame, m.
+            triangles: Vertex indices (F, 3).
+            colors: RGB vertex colors (V, 3).
         """
         gone = set(self._digests)
         for region, chosen in _by_region(vertices, triangles, self.side):
@@ -52,7 +55,7 @@ class MeshRegions:
 
 
 def _by_region(vertices: Float32, triangles: Int32, side: float) -> Iterator[tuple[Region, Int64]]:
-    """Yield the triangle indices (M,) of each nonempty region, in ascending order of the regions."""
+    """Yield each nonempty region with its triangle indices (M,), in ascending order."""
     if not len(triangles):
         return
     cubes = np.floor(vertices[triangles[:, 0]] / np.float32(side)).astype(np.int64)

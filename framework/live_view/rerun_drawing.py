@@ -35,7 +35,7 @@ MIN_TURN = 0.01  # minimum change of a component of the up direction (unit vecto
 
 
 class RerunDrawing:
-    """Drawing into a rerun recording stream, with the parameters of `RerunViewer`; `region` is `region_size`."""
+    """Drawing into a rerun recording stream. The parameters are described in `RerunViewer`."""
 
     def __init__(
         self, recording: rr.RecordingStream, stride: int, jpeg_quality: int, region: float, min_confidence: float
@@ -103,13 +103,13 @@ class RerunDrawing:
         return timestamp - self._first_s
 
     def _turn(self, up: Float64) -> None:
-        """Rotate the world frame so that `up` (3,), a unit vector in the world frame, is the z axis of the view."""
+        """Rotate the world frame, so that `up` (3,) is the z axis of the view."""
         if self._up is None or not np.allclose(self._up, up, atol=MIN_TURN):
             self._up = up
             self._recording.log(at.WORLD, self._rr.Transform3D(mat3x3=turned(up, self._forward)))
 
     def _begin_world(self, T_world_camera: Float64) -> None:
-        """Orient the world frame and the view by the first camera until the map provides the up direction."""
+        """Orient the world frame by the first camera, until the up direction of the map is known."""
         up, self._forward = -T_world_camera[:3, 1], T_world_camera[:3, 2]
         self._turn(up)
         T_view_camera = T_world_camera.copy()
@@ -240,10 +240,11 @@ class RerunDrawing:
 
 
 def turned(up: Float64, forward: Float64) -> Float64:
-    """Return the rotation R_view_world (3, 3) for a view with z up.
+    """Return the rotation R_view_world (3, 3) of a view with z up.
 
-    It maps the unit vector `up` (3,) to z, and the horizontal component of `forward` (3,) to y; both are in the world
-    frame.
+    Args:
+        up: Unit vector (3,) in the world frame that becomes the z axis.
+        forward: Vector (3,) in the world frame. Its horizontal component becomes the y axis.
     """
     across = np.cross(forward, up)
     across = across / np.linalg.norm(across) if across.any() else np.linalg.svd(up[None])[2][1]

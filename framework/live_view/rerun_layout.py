@@ -1,4 +1,4 @@
-"""Entity paths of a rerun recording, and the layout of its views."""
+"""Entity paths of a rerun recording, and layout of its views."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STAGE_COLORS = {
     "integration": (181, 131, 10),
     "fusion": (125, 102, 8),
 }
-"""RGB color of the run time of each stage, as in reports."""
+"""RGB color of each stage, the same as in reports."""
 
 TIMES_SHOWN = 300  # number of displayed stage times before the current frame, in frames
 EYE_BACK, EYE_ABOVE = 1.2, 0.8  # m, from the first camera to the view's position
@@ -41,9 +41,10 @@ AIM_FORWARD, AIM_BELOW = 1.5, 0.4  # m, from the first camera to the view's targ
 
 
 def layout(T_view_camera: Float64 | None = None) -> rrb.Blueprint:
-    """Return the layout: map and stage times on the left, frame and depth on the right.
+    """Return the layout of the views.
 
-    The 3D view starts behind the first camera at `T_view_camera` (4, 4), with z up; None = unknown.
+    The map and the stage times are on the left, frame and depth on the right. The 3D view starts behind the first
+    camera at `T_view_camera` (4, 4), with z up; None = unknown.
     """
     import rerun.blueprint as rrb
 

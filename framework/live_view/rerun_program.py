@@ -1,4 +1,7 @@
-"""rerun's executable (rerun-sdk 0.41), bound to 127.0.0.1 instead of its default 0.0.0.0."""
+"""Control of the rerun executable (rerun-sdk 0.41).
+
+The executable listens on 127.0.0.1 instead of its default 0.0.0.0.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,12 @@ POLL_S = 0.05  # s, interval between connection attempts
 
 
 def program() -> str:
-    """Return the path of rerun's executable. Raises OSError if it is missing.
+    """Return the path of the rerun executable.
 
-    The `rerun` script in Python's bin folder is only a launcher: stopping it does not stop the executable.
+    The `rerun` script in the bin folder of Python is only a launcher. Stopping the script does not stop the executable.
+
+    Raises:
+        OSError: The executable is missing.
     """
     found = importlib.util.find_spec("rerun_cli")
     places = [Path(place) for place in (found and found.submodule_search_locations) or ()]
@@ -33,9 +39,17 @@ def program() -> str:
 
 
 def open_window(port: int, memory_limit: str) -> None:
-    """Open rerun's viewer without usage statistics, unless a program already listens on `port`.
+    """Open the viewer of rerun, unless a program already listens on the port.
 
-    `memory_limit` is a size or fraction, such as 2GB or 25%. Raises OSError or SubprocessError on failure.
+    Usage statistics are disabled.
+
+    Args:
+        port: TCP port of the viewer.
+        memory_limit: Maximum memory, such as 2GB or 25%.
+
+    Raises:
+        OSError: The viewer did not start.
+        SubprocessError: The usage statistics could not be disabled.
     """
     subprocess.run([program(), "analytics", "disable"], check=True, capture_output=True, timeout=TIMEOUT_S)
     if listens(port):
@@ -53,12 +67,14 @@ def open_window(port: int, memory_limit: str) -> None:
 
 @contextmanager
 def page_server() -> Iterator[str]:
-    """Run rerun's web server inside the context, and yield its address. Raises OSError on failure.
+    """Run the web server of rerun in the `with` body, and yield its address.
 
-    Each call uses a new home folder, because rerun sends usage statistics from the second start in a home folder.
+    Raises:
+        OSError: The server did not start.
     """
     port = free_port()
     ports = ["--port", str(free_port()), "--web-viewer-port", str(port)]
+    # rerun sends usage statistics from the second start in a home folder, so each start gets a new one
     with tempfile.TemporaryDirectory(prefix="instancemap-rerun-") as home:
         homes = dict.fromkeys(("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME"), home)
         with subprocess.Popen(

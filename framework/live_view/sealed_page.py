@@ -1,8 +1,8 @@
-"""rerun's web viewer on 127.0.0.1, with a Content-Security-Policy that blocks requests to other hosts.
+"""Server of the web viewer of rerun that blocks requests to other hosts.
 
 In rerun-sdk 0.41, `rr.serve_web_viewer` has no bind address and listens on 0.0.0.0. `rerun --serve-web --bind` listens
-on 127.0.0.1 but sends no policy. Its page sends usage statistics and requests news, examples and fonts. This module
-downloads the page's files once from rerun's server, stops the server, and serves the files with a policy.
+on 127.0.0.1, but its page sends usage statistics and requests news, examples and fonts. This module therefore downloads
+the files of the page from the server of rerun. It serves them on 127.0.0.1 with a Content-Security-Policy.
 """
 
 from __future__ import annotations
@@ -20,9 +20,12 @@ SOURCE_TIMEOUT_S = 30.0  # s, maximum wait for a file from rerun's server
 
 
 class SealedPage:
-    """HTTP server of rerun's web page at 127.0.0.1:`port`. The page may connect only to `data_port` of this machine.
+    """HTTP server of the web page of rerun on 127.0.0.1.
 
-    `close` stops the server. Raises OSError if the port is in use or the page is not available.
+    The page may connect only to `data_port` of this machine. `close` stops the server.
+
+    Raises:
+        OSError: The port is in use or the page is not available.
     """
 
     def __init__(self, port: int, data_port: int) -> None:
@@ -65,7 +68,11 @@ class SealedPage:
 
 
 def page_files() -> dict[str, tuple[bytes, str]]:
-    """Return the content and content type of each file of the page by path. Raises OSError if rerun's server fails."""
+    """Return the content and content type of each file of the page, by path.
+
+    Raises:
+        OSError: The server of rerun failed.
+    """
     opener = build_opener(ProxyHandler({}))  # no proxy for 127.0.0.1
     files = {}
     with page_server() as address:

@@ -1,1 +1,1 @@
-"""The voxel-hashed map: storage, integration, evidence, association, ray casting, meshing."""
+"""Voxel map with object instances: storage, integration, label evidence, association, ray casting and meshing."""

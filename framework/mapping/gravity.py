@@ -1,9 +1,8 @@
-"""Direction of gravity and height of the floor.
+"""Gravity direction and floor height.
 
-If the sensor measures the direction of gravity, the mean over all frames is used. Otherwise, the direction is estimated
-from the surface, because most of a room's surface is level (perpendicular to the up direction) or upright (parallel to
-it). In a box-shaped room, three perpendicular axes fit equally well. Two cues select the up direction among them: the
-mean direction toward the upper image edge, and the area of the surfaces that face up.
+If the sensor measures gravity, the mean over all frames is used. Otherwise, the up direction is estimated from the
+surface. Most surfaces in a room are horizontal or vertical. In a box-shaped room, all three axes fit equally well. The
+camera orientation and the area of upward-facing surfaces select the up axis.
 """
 
 from __future__ import annotations
@@ -19,19 +18,19 @@ from framework.interfaces import Gravity
 from framework.mapping.storage.map_header import MapHeader
 
 MAX_FRAMES = 1e9  # maximum number of frames of a map, and thus maximum length of a sum of unit vectors
-AGREED = 0.95  # minimum length of the mean of the measured unit vectors; 0.95 if each is 18 degrees from the mean
-DIGITS = 6  # number of decimals of each added vector; the last digits of float64 depend on the memory layout
+AGREED = 0.95  # minimum length of the mean measured unit vector, e.g. if each vector is 18 degrees from the mean
+DIGITS = 6  # number of decimals of each added vector; further digits depend on the memory layout
 SAMPLED = 20_000  # approximate number of triangles sampled to refine the direction
 VOTING = 5  # every VOTING-th sampled triangle votes for the candidate directions
 DIRECTIONS = 3000  # number of candidate directions on a hemisphere, about 2.6 degrees apart
-SPREAD = np.radians(4.0)  # standard deviation of the normals of level and upright surfaces, rad
-NEAR = np.radians(10.0)  # maximum deviation from level or upright of a triangle used to refine the direction, rad
+SPREAD = np.radians(4.0)  # standard deviation of the normals of horizontal and vertical surfaces, rad
+NEAR = np.radians(10.0)  # maximum angle to horizontal or vertical of a triangle that refines the direction, rad
 MAX_CAMERA_TILT = np.radians(50.0)  # maximum angle between up and the mean direction toward the upper image edge, rad
-FACING_UP = 2.0  # weight of level surfaces that face up; with 1, all axes of a box-shaped room would get equal votes
-MIN_FRACTION = 0.15  # minimum fraction of the surface area that is level or upright; a heap of objects has less
+FACING_UP = 2.0  # weight of horizontal surfaces that face up; 1 = all axes of a box-shaped room get equal votes
+MIN_FRACTION = 0.15  # minimum fraction of the surface area that is horizontal or vertical; a heap of objects has less
 LEVEL = np.cos(np.radians(18.0))  # minimum dot product of up and the normal of a floor
 STEP = 0.05  # bin size of heights, m
-FLOOR_FRACTION = 0.05  # minimum area at the height of the floor, as a fraction of the area of all level surfaces
+FLOOR_FRACTION = 0.05  # minimum area of the floor, as a fraction of the area of all horizontal surfaces
 BELOW_FLOOR = 0.02  # maximum fraction of the surface area below the floor; caused by noise, windows and mirrors
 
 
@@ -39,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 class GravityEstimator:
-    """Accumulator of camera orientations and of measured gravity directions over frames."""
+    """Estimator of the gravity direction from camera orientations, gravity measurements and the surface."""
 
     def __init__(self) -> None:
         self.camera_up: Float64 = np.zeros(3)  # (3,) sum of unit vectors toward the upper image edge, world frame
@@ -48,9 +47,12 @@ class GravityEstimator:
         self._warned = False
 
     def add_frame(self, T_world_camera: Float64, up_camera: Float64 | None = None) -> None:
-        """Add the camera orientation of one frame, and its gravity direction if it was measured.
+        """Add the orientation and the measured gravity of one frame.
 
-        `up_camera` is the measured unit vector (3,) opposite to gravity, in the camera frame; None = not measured.
+        Args:
+            T_world_camera: The camera pose (4, 4).
+            up_camera: The unit vector (3,) opposite to gravity in the camera frame, or None if the sensor does not
+                measure gravity.
         """
         self.camera_up -= np.round(T_world_camera[:3, 1], DIGITS)
         if up_camera is not None:
@@ -67,7 +69,11 @@ class GravityEstimator:
 
     @classmethod
     def of(cls, header: MapHeader) -> GravityEstimator:
-        """Return the estimator saved in the header of a map file. Raises DataError if the entries are invalid."""
+        """Return the estimator saved in the header of a map file.
+
+        Raises:
+            DataError: If the entries are invalid.
+        """
         found = cls()
         found.camera_up = _vector(header, "camera_up")
         found.sensed_up = _vector(header, "sensed_up")
@@ -81,9 +87,9 @@ class GravityEstimator:
         return found
 
     def sensed(self) -> Float64 | None:
-        """Return the mean of the measured unit vectors (3,) opposite to gravity, normalized, in the world frame.
+        """Return the measured up direction, a unit vector (3,) in the world frame.
 
-        Return None without measurements, or if the mean is shorter than AGREED.
+        Return None if gravity was not measured or if the measurements disagree.
         """
         length = float(np.linalg.norm(self.sensed_up))
         if not self.sensed_frames:
@@ -99,10 +105,13 @@ class GravityEstimator:
         return self.sensed_up / length
 
     def estimate(self, vertices: Float32, triangles: Int32) -> Gravity:
-        """Return the measured direction of gravity; without a usable measurement, an estimate from the surface.
+        """Return the measured gravity direction, or an estimate from the surface if there is no usable measurement.
 
-        The surface consists of `vertices` (V, 3), m, in the world frame and `triangles` (F, 3). The direction is
-        unknown if too little of the surface is level or upright.
+        The direction is unknown if too little of the surface is horizontal or vertical.
+
+        Args:
+            vertices: The vertices (V, 3) of the surface in the world frame, m.
+            triangles: The triangles (F, 3) of the surface.
         """
         sensed = self.sensed()
         if sensed is not None:
@@ -138,9 +147,13 @@ def _vector(header: MapHeader, key: str) -> Float64:
 
 
 def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float64]:
-    """Return the unit normals (N, 3), areas (N,), m^2, and centers (N, 3), m, of the N triangles with nonzero area.
+    """Return the unit normals (N, 3), areas (N,), m^2, and centers (N, 3), m, of the triangles.
 
-    `vertices` (V, 3) are in m, and `triangles` (F, 3) contains vertex indices.
+    Triangles with zero area are omitted.
+
+    Args:
+        vertices: The vertices (V, 3), m.
+        triangles: The vertex indices (F, 3) of the triangles.
     """
     a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
     normals = np.cross(b - a, c - a)
@@ -150,33 +163,34 @@ def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float6
 
 
 def half_sphere(count: int) -> Float64:
-    """Return unit vectors (count, 3) evenly distributed over the hemisphere z > 0, on a golden-angle spiral."""
-    k = np.arange(count) + 0.5
+    """Return unit vectors (count, 3) evenly distributed over the hemisphere z > 0."""
+    k = np.arange(count) + 0.5  # golden-angle spiral
     z = 1 - k / count
     turn, radius = np.pi * (1 + np.sqrt(5)) * k, np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
 
 
 def level_or_upright(normals: Float64, areas: Float64, directions: Float64, facing_up: float = 1.0) -> Float64:
-    """Return the fraction (D,) of the surface that is level or upright, for each candidate in `directions` (D, 3).
+    """Return the fraction (D,) of the surface that is horizontal or vertical if each direction is up.
 
-    Each candidate is a unit vector, assumed to point up. The surface is given by the unit normals (N, 3) and areas (N,)
-    of its triangles. A triangle counts in part, by a Gaussian of its deviation from level or upright with standard
-    deviation SPREAD. Level triangles that face the candidate direction have the weight `facing_up`.
+    The contribution of a triangle decreases with its angle to horizontal or vertical.
+
+    Args:
+        normals: The unit normals (N, 3) of the triangles.
+        areas: The areas (N,) of the triangles, m^2.
+        directions: The candidate up directions (D, 3), unit vectors.
+        facing_up: The weight of horizontal triangles that face up.
     """
     signed = normals.astype(np.float32) @ directions.T.astype(np.float32)
     cosines = np.abs(signed)
-    # for small angles: 1 - cos(a) = a^2 / 2, and for upright surfaces cos(90 deg - a) = a
+    # Gaussian of the angle a to horizontal or vertical: 1 - cos(a) = a^2 / 2, and cos(90 deg - a) = a, for small angles
     level = np.exp((cosines - 1) / np.float32(SPREAD**2)) * np.where(signed > 0, np.float32(facing_up), np.float32(1))
     votes = level + np.exp(-0.5 * (cosines / np.float32(SPREAD)) ** 2)
     return np.asarray(areas @ votes.astype(np.float64) / areas.sum())
 
 
 def _refined(up: Float64, normals: Float64, areas: Float64) -> Float64:
-    """Return the unit vector (3,) near `up` that best fits the triangles that are level or upright within NEAR.
-
-    The fit is an iterated least-squares fit to the unit `normals` (N, 3), weighted by `areas` (N,).
-    """
+    """Refine the up direction by an iterative least-squares fit to the nearly horizontal and vertical triangles."""
     for _ in range(5):
         cosines = normals @ up
         level, upright = np.abs(cosines) > np.cos(NEAR), np.abs(cosines) < np.sin(NEAR)
@@ -187,10 +201,14 @@ def _refined(up: Float64, normals: Float64, areas: Float64) -> Float64:
 
 
 def floor_height(vertices: Float32, triangles: Int32, up: Float64) -> float | None:
-    """Return the height of the floor above the world origin along the unit vector `up` (3,), m; None if not seen.
+    """Return the height of the floor above the world origin, m, or None if the floor was not seen.
 
-    The floor is the lowest large level surface, with almost no surface below it. `vertices` (V, 3), m, and `up` are in
-    the world frame; `triangles` (F, 3) contains vertex indices.
+    The floor is the lowest large horizontal surface. Almost no surface may be below it.
+
+    Args:
+        vertices: The vertices (V, 3) in the world frame, m.
+        triangles: The triangles (F, 3).
+        up: The up direction (3,), a unit vector in the world frame.
     """
     normals, areas, centers = faces(vertices, triangles)
     heights = centers @ up

@@ -1,4 +1,4 @@
-"""Map of object instances: voxels, label evidence and the instance table in one SceneMap."""
+"""Voxel map of object instances."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ LARGEST_SCALE = 2**40  # maximum score_scale of a map file (quantized class scor
 
 
 class InstanceMap(InstanceTableMap):
-    """A TSDF with instance and class evidence in its voxels. Only fusers modify its parts."""
+    """A TSDF volume with instance and class evidence in its voxels.
+
+    Only fusers modify its parts.
+    """
 
     def __init__(
         self,
@@ -71,7 +74,7 @@ class InstanceMap(InstanceTableMap):
         super().begin(classes)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """Return the most likely instance at every stride-th depth reading of every stride-th row of a frame, 0 = none.
+        """Return the most likely instance at every stride-th pixel of a frame, 0 = none.
 
         See `LabeledMap.instances_seen`.
         """
@@ -81,7 +84,10 @@ class InstanceMap(InstanceTableMap):
         return instance_ids
 
     def class_evidence(self) -> dict[int, Float64]:
-        """Return the class evidence (C,) of each confirmed instance by id, from the source set by `instance_class`."""
+        """Return the class evidence (C,) of each confirmed instance by id.
+
+        The source of the evidence is set by `instance_class`.
+        """
         if self.instance_class is InstanceClass.DETECTIONS:
             return super().class_evidence()
         counts = self.confirmation.counts(self.table)
@@ -89,7 +95,7 @@ class InstanceMap(InstanceTableMap):
         return {int(k): evidence[k] for k in np.flatnonzero(counts)}
 
     def merge(self, kept: int, dropped: int) -> None:
-        """Merge instance `dropped` into `kept`, in the table and in every voxel."""
+        """Merge instance `dropped` into instance `kept`."""
         self.table.merge(kept, dropped)
         self.labels.merge_instances(kept, dropped)
         self.volume.changed(NO_BLOCKS)

@@ -1,9 +1,10 @@
-"""Changes between two visits of a scene: appeared, vanished or moved objects, with probabilities.
+"""Detection of appeared, vanished and moved objects between two visits of a scene.
 
 The map of each visit is rendered from its camera poses. An object of the other visit is absent if the camera observed
 free space at its surface. It is present if the camera observed a surface and the same object. It is unobserved if it
-was occluded or outside of all views. Both maps must share one world frame: map the second visit with `localize_in=` of
-the first, or both visits with given poses.
+was occluded or outside of all views.
+
+Both maps must share one world frame. Map the second visit with `localize_in=` of the first, or both with given poses.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Change:
-    """The change of an object that exists in the first visit, the second visit, or both."""
+    """The change of an object between the first and the second visit."""
 
     kind: Kind
     name: str  # name of its class
@@ -58,10 +59,10 @@ class Change:
 
 @dataclass(frozen=True)
 class Visit:
-    """A map, and the poses T_world_camera (F, 4, 4) of its frames."""
+    """A map with the camera poses of its frames."""
 
     scene: SceneMap
-    poses: Float64
+    poses: Float64  # (F, 4, 4) T_world_camera
 
     def __post_init__(self) -> None:
         if not len(self.poses):
@@ -70,7 +71,7 @@ class Visit:
 
 @dataclass(frozen=True)
 class _Object:
-    """An object of one visit, and its observation in the other visit."""
+    """An object of one visit, with its observation in the other visit."""
 
     instance: Instance
     name: str  # name of its class
@@ -89,7 +90,10 @@ class _Object:
 
 
 def changes(before: Visit, after: Visit) -> list[Change]:
-    """Return all objects of both visits: changed objects first, then by decreasing probability."""
+    """Return the changes of all objects of both visits.
+
+    Moved, vanished and appeared objects come first. Both groups are sorted by decreasing probability.
+    """
     old, new = _observe(before, after), _observe(after, before)
     pairs = _moved(old, new) if before.scene.classes == after.scene.classes else []
     found = []
@@ -107,7 +111,7 @@ def changes(before: Visit, after: Visit) -> list[Change]:
 
 
 def _observe(visit: Visit, other: Visit) -> list[_Object]:
-    """Return each object of a visit with its observation in the other visit."""
+    """Return the objects of a visit, with their observations in the other visit."""
     mesh, instances, classes = visit.scene.mesh(), visit.scene.instances(), visit.scene.classes
     if not instances:
         return []
@@ -129,9 +133,13 @@ def _observe(visit: Visit, other: Visit) -> list[_Object]:
 
 
 def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
-    """Return two masks (P,) of world points (P, 3), m: points on an observed surface, and in observed free space.
+    """Return two masks (P,): points on an observed surface, and points in observed free space.
 
-    A point is in free space if it is observed as free from at least one pose, regardless of the other poses.
+    A point is in free space if it was observed as free from at least one pose.
+
+    Args:
+        visit: Visit with the observations.
+        points: World points (P, 3), m.
     """
     there, through = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
     for k in np.unique(np.linspace(0, len(visit.poses) - 1, LOOKS).round().astype(int)):
@@ -150,15 +158,15 @@ def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
 
 
 def probability_gone(confidence: float, there: Bool, through: Bool, matched: bool) -> float:
-    """Return the probability that an object is absent, by Bayes' rule.
+    """Return the probability that an object is absent in the other visit, by Bayes' rule.
 
-    A present object has a surface and is detected as often as before. An absent object has a surface and a detection
-    only by clutter.
+    A present object has a surface and is detected as often as before. At the position of an absent object, surfaces and
+    detections are only due to clutter.
 
     Args:
         confidence: Confidence of the object, in [0, 1].
-        there: (M,) True where the other visit has an observed surface at the sampled vertex.
-        through: (M,) True where the other visit has observed free space at the sampled vertex.
+        there: Mask (M,) of the sampled vertices where the other visit has a surface.
+        through: Mask (M,) of the sampled vertices where the other visit has free space.
         matched: True if the other visit has an object at the same position.
     """
     observed = int(np.count_nonzero(there | through))
@@ -173,7 +181,7 @@ def probability_gone(confidence: float, there: Bool, through: Bool, matched: boo
 
 
 def _nearest_labels(mesh: InstanceMesh, points: Float32) -> Int32:
-    """Return the object ids (P,) of the vertices nearest to points (P, 3) m; 0 = none within MAX_DISTANCE."""
+    """Return the object id (P,) of the vertex nearest to each point (P, 3), m, or 0 for none nearby."""
     if not len(mesh.vertices):
         return np.zeros(len(points), np.int32)
     distance, nearest = KDTree(mesh.vertices).query(points, distance_upper_bound=MAX_DISTANCE)
@@ -182,7 +190,7 @@ def _nearest_labels(mesh: InstanceMesh, points: Float32) -> Int32:
 
 
 def _match(labels: Int32) -> int | None:
-    """Return the most frequent nonzero label of the vertices (M,); None if its fraction is below SAME_THING."""
+    """Return the most frequent nonzero label, or None if it is too rare."""
     ids, counts = np.unique(labels[labels > 0], return_counts=True)
     if not len(ids) or counts.max() < SAME_THING * len(labels):
         return None
@@ -190,7 +198,7 @@ def _match(labels: Int32) -> int | None:
 
 
 def _moved(old: Sequence[_Object], new: Sequence[_Object]) -> list[tuple[_Object, _Object, float]]:
-    """Return pairs of a vanished and an appeared object of similar class and size, with the probability of a move."""
+    """Return pairs of a vanished and a similar appeared object, with the probability of a move."""
     vanished, appeared = [one for one in old if one.is_gone], [one for one in new if one.is_gone]
     if not vanished or not appeared:
         return []
@@ -205,15 +213,18 @@ def _moved(old: Sequence[_Object], new: Sequence[_Object]) -> list[tuple[_Object
 
 
 def _similarity(a: Instance, b: Instance) -> float:
-    """Return the similarity, in [0, 1], of two objects: Bhattacharyya coefficient of the classes times size ratio."""
-    same_class = float(np.sqrt(a.class_probabilities * b.class_probabilities).sum())
+    """Return the similarity of two objects in class and size, in [0, 1]."""
+    same_class = float(np.sqrt(a.class_probabilities * b.class_probabilities).sum())  # Bhattacharyya coefficient
     sizes = np.sort(a.obb.extent), np.sort(b.obb.extent)
     ratio = float(np.abs(np.log(np.maximum(sizes[0], 0.02) / np.maximum(sizes[1], 0.02))).mean())
     return same_class * float(np.exp(-ratio))
 
 
 def _change(one: _Object, kind: Kind) -> Change:
-    """Return the change of an unmoved object: STAYED, NOT_SEEN, or `kind` (VANISHED or APPEARED)."""
+    """Return the change of an object that did not move.
+
+    `kind` is VANISHED for an object of the first visit and APPEARED for an object of the second visit.
+    """
     found, probability, match = Kind.NOT_SEEN, one.confidence, None
     if one.seen >= MIN_SEEN and one.gone < MIN_GONE:
         found, probability, match = Kind.STAYED, probability * (1 - one.gone), one.match

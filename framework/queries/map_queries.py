@@ -1,4 +1,4 @@
-"""Queries of a map: its objects, their positions, and views."""
+"""Queries for the objects and views of a map."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Map:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """The class names; empty before the first frame."""
+        """The class names, empty before the first frame."""
         return self.scene.classes
 
     def instances(self, class_: str | None = None) -> Mapping[int, Instance]:
@@ -59,7 +59,7 @@ class Map:
             return {key: instance for key, instance in found.items() if self.name(instance) == class_}
 
     def name(self, instance: Instance) -> str:
-        """Return the name of an object's most likely class; "object" in a map without classes."""
+        """Return the most likely class of an object, or "object" in a map without classes."""
         probabilities = instance.class_probabilities
         return self.classes[int(probabilities.argmax())] if len(probabilities) else "object"
 
@@ -67,7 +67,7 @@ class Map:
         """Return the object whose surface is nearest to a point.
 
         Args:
-            point: (3,) m, in the world frame.
+            point: Point (3,) in the world frame, m.
             class_: Most likely class of the object; None = all classes.
 
         Returns:
@@ -93,10 +93,10 @@ class Map:
 
         Args:
             camera: Camera of the view.
-            T_world_camera: (4, 4) pose.
+            T_world_camera: Camera pose (4, 4).
 
         Returns:
-            The view, in which pixels of instances that are not in `instances` have instance 0 and class -1.
+            The view. Pixels of unconfirmed instances have instance 0 and class -1.
         """
         with self.lock:
             view = self.scene.render(camera, T_world_camera)
@@ -114,7 +114,7 @@ class Map:
             u: Column, px.
             v: Row, px.
             camera: Camera of the view.
-            T_world_camera: (4, 4) pose.
+            T_world_camera: Camera pose (4, 4).
 
         Returns:
             The object; None = no object at the pixel.
@@ -128,10 +128,10 @@ class Map:
             return self.scene.instances().get(int(self.view(camera, T_world_camera).instance_ids[int(v), int(u)]))
 
     def up(self) -> Float64 | None:
-        """Return the up direction (3,), a unit vector in the world frame; None if unknown.
+        """Return the up direction (3,), a unit vector in the world frame, or None if unknown.
 
-        The direction is measured by a sensor if frames have `up`. Otherwise it is estimated from floor, walls and
-        camera orientation. It is also the vertical axis of the boxes (`obb`).
+        If frames have `up`, the direction is measured by a sensor. Otherwise it is estimated from the floor, the walls
+        and the camera orientation. The vertical axes of the boxes (`obb`) have this direction.
         """
         with self.lock:
             return self.scene.gravity().up
@@ -142,7 +142,7 @@ class Map:
             return self.scene.gravity().source
 
     def floor(self) -> float | None:
-        """Return the floor height, m along `up`; None if the floor was not observed.
+        """Return the floor height along `up` in m, or None if the floor was not observed.
 
         The height of a point above the floor is `point @ up - floor`.
         """

@@ -45,7 +45,11 @@ class QueryResult:
 
 @dataclass(frozen=True)
 class TextQuery:
-    """A text query. Raises ConfigError for invalid values."""
+    """A text query.
+
+    Raises:
+        ConfigError: A value is invalid.
+    """
 
     words: str  # text of 1 to 1000 characters
     by: str | None = None  # embeddings or names; None = embeddings if the map has any or `model` is set, else names
@@ -69,7 +73,7 @@ def search(scene: Map, query: TextQuery, run: Path | None = None) -> QueryResult
         run: Run directory of the map, if any.
 
     Raises:
-        DataError: A word is unknown, or embeddings are missing or of another model.
+        DataError: A word is unknown, or the embeddings are missing or were computed by another model.
     """
     space = scene.scene.embedding_space
     by = query.by or ("embeddings" if space or query.model is not None else "names")
@@ -82,7 +86,7 @@ def search(scene: Map, query: TextQuery, run: Path | None = None) -> QueryResult
 
 
 def _embedded(query: TextQuery, space: str, run: Path | None) -> Float32:
-    """Return the text embedding (D,) of the query. Raises DataError if the model differs from the map's model."""
+    """Return the text embedding (D,) of a query."""
     from framework.detection.hub.image_text import ImageTextModel
 
     name, revision = _model_of(run) if query.model is None else (query.model, "main")
@@ -94,7 +98,7 @@ def _embedded(query: TextQuery, space: str, run: Path | None) -> Float32:
 
 
 def _model_of(run: Path | None) -> tuple[str, str]:
-    """Return the model and revision of a run's detector. Raises DataError if its config has no model."""
+    """Return the model and revision of the detector of a run."""
     if run is None:
         raise DataError(f"model: expected the model of the map's embeddings, got none; {NAME_IT}, or query its run")
     node = read_yaml(run / CONFIG).get("detector") if path_exists(run / CONFIG) else None
@@ -104,9 +108,12 @@ def _model_of(run: Path | None) -> tuple[str, str]:
 
 
 def by_embedding(scene: Map, text: Float32) -> list[Match]:
-    """Return the objects with an embedding, ranked by the cosine similarity to a text embedding (D,), largest first.
+    """Return all objects with an embedding, most similar to the text embedding (D,) first.
 
-    Raises DataError if the map's embeddings have another length.
+    The similarity is the cosine of both embeddings.
+
+    Raises:
+        DataError: The embeddings of the map have another length.
     """
     with scene.lock:
         known = {k: i.embedding for k, i in scene.instances().items() if i.embedding is not None}
@@ -117,9 +124,12 @@ def by_embedding(scene: Map, text: Float32) -> list[Match]:
 
 
 def by_names(scene: Map, query: str) -> list[Match]:
-    """Return the objects ranked by the probability of the query's classes times the fit of its colors.
+    """Return the objects that match the classes and colors of a query, best match first.
 
-    Ties are ranked by confidence. Raises DataError for a query with an unknown word, or without a class and color.
+    The similarity is the probability of the classes times the fit of the colors.
+
+    Raises:
+        DataError: A word is unknown, or the query has neither a class nor a color.
     """
     with scene.lock:
         words = object_words(query, scene.classes)
@@ -141,18 +151,18 @@ def by_names(scene: Map, query: str) -> list[Match]:
 
 
 def color_fit(mesh: InstanceMesh, instance: Instance, colors: Sequence[str]) -> float:
-    """Return the mean fit, in [0, 1], of the vertex colors of an object to the best-fitting name in `colors`."""
+    """Return the fit of the vertex colors of an object to the best-fitting name, in [0, 1]."""
     observed = _colors(mesh, instance)
     return max((float(fits(observed, name).mean()) for name in colors), default=0.0) if len(observed) else 0.0
 
 
 def _colors(mesh: InstanceMesh, instance: Instance) -> Float32:
-    """Return the sRGB colors (M, 3), in [0, 1], of an object's vertices."""
+    """Return the sRGB vertex colors (M, 3) of an object, in [0, 1]."""
     return np.asarray(mesh.colors[instance.vertices].astype(np.float32) / np.float32(255), np.float32)
 
 
 def _found(scene: Map, similarities: dict[int, float]) -> list[Match]:
-    """Return the objects with the given similarities by id, best first; ties are ranked by confidence."""
+    """Return the matches of objects with known similarities, best first."""
     instances, mesh = scene.instances(), scene.mesh()
     return [
         Match(

@@ -1,1 +1,1 @@
-"""Lifting of masks to point clusters, and the algorithms of the cluster refiners."""
+"""Lifting of masks to point clusters, and algorithms of the cluster refiners."""

@@ -1,7 +1,6 @@
-"""Connected components of a cluster, in the image and in depth.
+"""Connected components of a cluster in the image and in depth.
 
-A custom kernel is used, because OpenCV and SciPy label binary images. They ignore depth and connect only adjacent
-pixels. A graph over all pairs of nearby pixels would have 12 edges per point.
+OpenCV and SciPy label binary images: they ignore depth and connect only adjacent pixels.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ LARGEST_ONLY = 2.0  # min_ratio that only the largest component satisfies
 
 
 def in_largest_piece(clusters: PointClusters, frame: Frame, connection: Connection) -> Bool:
-    """Return an array (P,), True for points in the largest connected component of their cluster.
+    """Return a Boolean array (P,), True for the points in the largest connected component of their cluster.
 
-    Ties go to the component that starts first in row order. Points that belong to no cluster are True.
+    If two components are equally large, the first in row order is used. Points that belong to no cluster are True.
     """
     return in_near_pieces(clusters, frame, connection, min_ratio=LARGEST_ONLY, max_slope=0.0)
 
@@ -26,12 +25,17 @@ def in_largest_piece(clusters: PointClusters, frame: Frame, connection: Connecti
 def in_near_pieces(
     clusters: PointClusters, frame: Frame, connection: Connection, min_ratio: float, max_slope: float
 ) -> Bool:
-    """Return an array (P,), True for points in their cluster's largest component, or in one at a similar depth.
+    """Return a Boolean array (P,), True for the points in the components of their cluster that are kept.
 
-    Candidates are components with at least `min_ratio` times the points of the largest component, largest first. A
-    candidate is kept if most of its points agree in depth with the nearest kept point. The allowed difference is the
-    gap of `connection` plus `max_slope` (m per m) times the lateral distance. Large components are subsampled. Points
-    that belong to no cluster are True.
+    The largest component is kept, and so are components at a similar depth. A component is at a similar depth if most
+    of its points agree in depth with the nearest kept point. Points that belong to no cluster are True.
+
+    Args:
+        clusters: The clusters.
+        frame: The frame.
+        connection: The limits of the distance between connected points.
+        min_ratio: The minimum size of a kept component, relative to the largest component.
+        max_slope: The allowed change of depth with lateral distance between components, m per m.
     """
     order, firsts = members(clusters)
     stays = np.empty(firsts[-1], np.bool_)

@@ -12,7 +12,7 @@ from framework.refinement.neighborhood_kernels import ThreadSchedule, bounding_b
 from framework.refinement.segmentation.union_find import root, unite
 
 CHUNK = 512  # number of cells compared at once
-CANDIDATE_SAMPLES, KEPT_SAMPLES = 32, 256  # maximum number of samples of a candidate and of each kept component
+CANDIDATE_SAMPLES, KEPT_SAMPLES = 32, 256  # maximum number of sampled pixels of a candidate and a kept component
 
 
 class Connection(NamedTuple):
@@ -28,10 +28,17 @@ def find_pieces(
     pixels: Int32, firsts: Int64, depth: Float32, connection: Connection, min_ratio: np.float32, max_slope: np.float32,
     schedule: ThreadSchedule, stays: Bool,
 ) -> None:  # fmt: skip
-    """Set `stays` (M,) to True for the points that `in_near_pieces` keeps, and to False for the others.
+    """Find the points that in_near_pieces() keeps.
 
-    `pixels`: the u, v (M, 2) of the points, cluster by cluster. `firsts`: the start (N + 1,) of each cluster.
-    `max_slope`: the maximum slope, m per m, divided by the focal length, so 1 / px.
+    Args:
+        pixels: The pixels (M, 2), u and v, of the points, cluster by cluster.
+        firsts: The start (N + 1,) of each cluster.
+        depth: The depth image (H, W), m.
+        connection: The limits of the distance between connected points.
+        min_ratio: The minimum size of a kept component, relative to the largest component.
+        max_slope: The maximum slope, m per m, divided by the focal length, px.
+        schedule: The clusters of each thread.
+        stays: The output (M,), True for points to keep.
     """
     for thread in prange(len(schedule.starts) - 1):
         for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:
@@ -44,11 +51,9 @@ def find_pieces(
 def _find_pieces_of(
     pixels: Int32, depth: Float32, connection: Connection, min_ratio: np.float32, max_slope: np.float32, stays: Bool
 ) -> None:
-    """Set `stays` for one cluster, with components found by union-find over runs of connected pixels in each row.
-
-    Cells are in flat arrays, row by row, with empty cells at the end of each row. Therefore, offsets to neighbors are
-    constant, and no run continues in the next row.
-    """
+    """Find the kept points of one cluster by union-find over runs of connected pixels."""
+    # Cells are in flat arrays, row by row, with empty cells at the end of each row. Therefore, offsets to neighbors are
+    # constant, and no run continues in the next row.
     u0, v0, u1, v1 = bounding_box(pixels)
     reach = connection.radius
     stride = u1 - u0 + 1 + reach
@@ -88,11 +93,7 @@ def _keep_near(
     pixels: Int32, piece: Int32, sizes: Int32, largest: int, min_ratio: np.float32, depth: Float32,
     connection: Connection, max_slope: np.float32, stays: Bool,
 ) -> None:  # fmt: skip
-    """Set `stays` to True for each component at a similar depth to the kept components, largest component first.
-
-    `piece`: the component of each pixel. `sizes`: the number of pixels of each component. `largest`: the index of the
-    largest component. Components with fewer than min_ratio * sizes[largest] pixels are not considered.
-    """
+    """Mark the components at a similar depth to the kept components, in order of decreasing size."""
     least = min_ratio * np.float32(sizes[largest])
     candidates, waiting, count = np.empty(len(sizes), np.int64), np.zeros(len(sizes), np.bool_), 0
     for other in range(len(sizes)):
@@ -114,12 +115,9 @@ def _keep_near(
 
 @njit(cache=True, nogil=True)
 def _largest(pieces: Int64, sizes: Int32, waiting: Bool) -> int:
-    """Return the largest component of `pieces` that is still `waiting`; ties go to the first.
-
-    A scan avoids np.argsort, which compiles slowly.
-    """
+    """Return the largest component that is still waiting."""
     largest = -1
-    for piece in pieces:
+    for piece in pieces:  # np.argsort compiles slowly
         if waiting[piece] and (largest < 0 or sizes[piece] > sizes[largest]):
             largest = piece
     return largest
@@ -127,7 +125,7 @@ def _largest(pieces: Int64, sizes: Int32, waiting: Bool) -> int:
 
 @njit(cache=True, nogil=True)
 def _sample(pixels: Int32, piece: Int32, wanted: int, most: int, samples: Int32) -> int:
-    """Write up to `most` evenly spaced pixels of the component `wanted` to `samples`; return their number."""
+    """Write at most `most` evenly spaced pixels of a component to `samples`, and return their number."""
     size = 0
     for i in range(len(pixels)):
         size += piece[i] == wanted
@@ -144,7 +142,7 @@ def _sample(pixels: Int32, piece: Int32, wanted: int, most: int, samples: Int32)
 
 @njit(cache=True, nogil=True)
 def _is_near(samples: Int32, kept: Int32, depth: Float32, connection: Connection, max_slope: np.float32) -> bool:
-    """Return True if most samples agree in depth with the nearest kept pixel, within the gap and the maximum slope."""
+    """Return True if most samples agree in depth with the nearest kept pixel."""
     near = 0
     for k in range(len(samples)):
         u, v = samples[k, 0], samples[k, 1]
@@ -167,7 +165,7 @@ def _name_by_roots(parents: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _find_runs(readings: Float32, connection: Connection, runs: Int32, parents: Int32, sizes: Int32) -> int:
-    """Label each run as a component, from 1 on, and empty cells as 0; return the number of labels, including 0."""
+    """Label each run of connected pixels from 1 on, and return the number of labels, including 0 for empty cells."""
     run, begin = 0, 0
     parents[0], sizes[0] = 0, 0
     previous = np.float32(np.nan)
@@ -192,7 +190,7 @@ def _connected(a: np.float32, b: np.float32, connection: Connection) -> bool:
 def _unite_near(
     readings: Float32, runs: Int32, cells: int, offset: int, connection: Connection, parents: Int32
 ) -> None:
-    """Unite the run of each cell with the run `offset` cells after it if both cells are connected in depth."""
+    """Unite the runs of all connected cells with the given offset between them."""
     for begin in range(0, cells, CHUNK):
         end = min(begin + CHUNK, cells)
         here, there = slice(begin, end), slice(begin + offset, end + offset)

@@ -1,4 +1,4 @@
-"""Lifting of detected masks to 3D point clusters (eq. (5) of docs/method.md)."""
+"""Lifting of detected masks to 3D point clusters."""
 
 from __future__ import annotations
 
@@ -12,13 +12,19 @@ from framework.refinement.lifting_kernels import count_readings, gather_readings
 
 
 def lift(detections: Detections, frame: Frame, pose: Pose, color_pixels: Int32 | None = None) -> PointClusters:
-    """Return the depth readings in each mask as points, m, in the world frame.
+    """Return the depth readings in each mask as world points.
 
-    `color_pixels` (H, W) is the flat index of the color pixel of each depth reading, -1 = none. None = color and depth
-    have the same pixels. `color_pixels` is not applied to exact masks of the depth image.
+    Masks may overlap. Cluster k always belongs to detection k, and is empty if its mask has no depth readings.
 
-    Masks may overlap. A mask without depth readings becomes an empty cluster, so that cluster k is always detection k.
-    Raises DataError if the mask size differs from the frame size or if `detections` has another type.
+    Args:
+        detections: The detections.
+        frame: The frame.
+        pose: The camera pose.
+        color_pixels: The flat index (H, W) of the color pixel of each depth pixel, -1 = none. If None, color and depth
+            have the same pixels. Ignored for exact masks of the depth image.
+
+    Raises:
+        DataError: If `detections` has another type, or if its masks have another size than the frame.
     """
     if not isinstance(cast(object, detections), Detections):
         raise DataError(f"frame {frame.index}: expected Detections from the detector, got {type(detections).__name__}")
@@ -32,6 +38,7 @@ def lift(detections: Detections, frame: Frame, pose: Pose, color_pixels: Int32 |
     if color_pixels is not None and not of_depth:
         masks = np.empty_like(masks)
         move_masks(detections.masks, color_pixels, masks)
+    # eq. (5) of docs/method.md
     starts = np.zeros(len(detections) * height + 1, np.int64)  # first point of each row of each mask
     count_readings(masks, frame.depth, starts)
     np.cumsum(starts, out=starts)

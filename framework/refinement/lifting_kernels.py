@@ -9,7 +9,13 @@ from framework.data import Bool, Float32, Float64, Int32, Int64
 
 @njit(cache=True, nogil=True, parallel=True)
 def move_masks(masks: Bool, color_pixels: Int32, moved: Bool) -> None:
-    """Set moved (N, H, W) to the values of masks (N, H, W) at the flat indices color_pixels (H, W); False at -1."""
+    """Resample masks to the pixels of the depth image.
+
+    Args:
+        masks: The masks (N, H, W) of the color image.
+        color_pixels: The flat index (H, W) of the color pixel of each depth pixel, -1 = none.
+        moved: The output (N, H, W), False where there is no color pixel.
+    """
     count, height, width = masks.shape
     for v in prange(height):
         for k in range(count):
@@ -21,7 +27,7 @@ def move_masks(masks: Bool, color_pixels: Int32, moved: Bool) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_readings(masks: Bool, depth: Float32, counts: Int64) -> None:
-    """Set counts[1:] (N * H,) to the number of depth readings in each row of each mask."""
+    """Write the number of depth readings in each row of each mask to counts[1:] (N * H,)."""
     height = depth.shape[0]
     for row in prange(masks.shape[0] * height):
         k, v = row // height, row % height
@@ -36,10 +42,17 @@ def gather_readings(
     masks: Bool, depth: Float32, camera: tuple[float, float, float, float], T: Float64, starts: Int64,
     points_world: Float32, pixels: Int32, cluster: Int32,
 ) -> None:  # fmt: skip
-    """Set points_world (P, 3), m, pixels (P, 2), u and v, and cluster (P,) from the depth readings in the masks.
+    """Collect the depth readings in the masks as points, mask by mask and row by row.
 
-    Points are in the order of the masks, and row by row. `camera`: fx, fy, cx, cy, px. `T`: T_world_camera. `starts`:
-    the index (N * H + 1,) of the first point of each row of each mask.
+    Args:
+        masks: The masks (N, H, W).
+        depth: The depth image (H, W), m.
+        camera: The intrinsics fx, fy, cx, cy, px.
+        T: The camera pose T_world_camera (4, 4).
+        starts: The index (N * H + 1,) of the first point of each row of each mask.
+        points_world: The output (P, 3), m.
+        pixels: The output (P, 2), u and v.
+        cluster: The output (P,), the mask of each point.
     """
     height = depth.shape[0]
     fx, fy, cx, cy = camera

@@ -1,7 +1,7 @@
-"""Points of each mask and of a ring around it, which contains the object's surroundings.
+"""Points of each mask and of a ring around it.
 
-A custom kernel computes the distances to a mask's border. OpenCV's distance transform would need two passes over each
-mask, one for the inside and one for the outside.
+The ring contains the surroundings of the object. A custom kernel computes the distances to the border of a mask,
+because OpenCV would need two passes per mask.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ MAX_RING_WIDTH = 80  # maximum width of a ring, px; wider rings add no informati
 
 @dataclass(frozen=True)
 class Neighborhoods:
-    """Points of N masks in one flat array of S points, each mask followed by its ring.
+    """Points of N masks and their rings.
 
-    Neighborhood k is `points_camera[starts[k]:starts[k + 1]]`. Its first `mask_counts[k]` points belong to the mask.
+    Neighborhood k is `points_camera[starts[k]:starts[k + 1]]`. Its first `mask_counts[k]` points belong to the mask,
+    and the others belong to the ring.
     """
 
     points_camera: Float32  # (S, 3) m, camera frame
-    depth_in_mask: Float32  # (S,) distance to the mask's border, px, positive in the mask, negative in the ring
+    depth_in_mask: Float32  # (S,) distance to the border of the mask, px, positive in the mask, negative in the ring
     starts: Int64  # (N + 1,) start of each neighborhood
     mask_counts: Int64  # (N,) number of points of each mask
     ring_widths: Int64  # (N,) width of each ring, px
@@ -52,16 +53,20 @@ class Neighborhoods:
 
     @property
     def of_ring(self) -> Bool:
-        """An array (S,), True for points in a ring."""
+        """Boolean array (S,), True for points in a ring."""
         parts = np.stack([self.mask_counts, self.ring_counts], axis=1).ravel()
         return np.repeat(np.arange(len(parts)) % 2 == 1, parts)
 
     def mask_log_odds(self, largest: float, expected_bleed: float) -> Float32:
-        """Return the log-odds (S,) that a point is on the object: `largest` deep in the mask, -`largest` far outside.
+        """Return the log-odds (S,) of each point for the object, from its distance to the border of the mask.
 
-        The linear ramp in between is 0 at a distance of `expected_bleed` ring widths inside the mask's border. It ends
-        (1 - 2 * `expected_bleed`) ring widths outside the border. A thin mask gets a shorter ramp, so that its center
-        gets `largest`.
+        The log-odds change linearly from `largest` inside the mask to -`largest` outside. They are 0 inside the border,
+        because masks often extend beyond the object. Thin masks get a shorter ramp, so that their center reaches
+        `largest`.
+
+        Args:
+            largest: The maximum log-odds.
+            expected_bleed: The distance of the zero from the border, in ring widths.
         """
         reach = np.maximum(np.minimum(self.ring_widths, self.mask_radii), 1).astype(np.float32)
         log_odds, widths = np.empty_like(self.depth_in_mask), reach * np.float32(1 - expected_bleed)
@@ -71,7 +76,7 @@ class Neighborhoods:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The clusters of one frame and their rings, with methods to gather points."""
+    """The clusters of one frame and their rings."""
 
     clusters: PointClusters
     frame: Frame
@@ -88,29 +93,30 @@ class Surroundings:
         return np.diff(self.windows.firsts)
 
     def of_at_least(self, min_points: int) -> Bool:
-        """Return an array (N,), True for clusters with at least `min_points` points in the mask and in the ring.
+        """Return a Boolean array (N,), True for clusters with at least `min_points` points in the mask and in the ring.
 
-        A ring of width 0 is not required to have points.
+        If the width of the ring is 0, only the mask is checked.
         """
         return np.asarray(
             (self.mask_counts >= min_points) & ((self.ring_counts >= min_points) | (self.ring_widths == 0))
         )
 
     def sampled(self, max_points: int) -> Neighborhoods:
-        """Return every n-th point of each neighborhood, with n chosen to keep at most `max_points`."""
+        """Return the neighborhoods with at most `max_points` evenly sampled points each."""
         counts = self.mask_counts + self.ring_counts
         nth = np.maximum(-(-counts // max_points), 1)
         return self._gathered(-(-counts // nth), -(-self.mask_counts // nth), nth)
 
     def own(self) -> Neighborhoods:
-        """Return the neighborhoods with all M points of the clusters, and with empty rings."""
+        """Return the neighborhoods with all points of the clusters and with empty rings."""
         return self._gathered(self.mask_counts, self.mask_counts, np.ones_like(self.ring_counts))
 
     def kept(self, good: Bool, judged: Bool) -> Bool:
-        """Return an array (P,), True for the points of `clusters` to keep.
+        """Return a Boolean array (P,), True for the points of all clusters to keep.
 
-        A cluster for which `judged` (N,) is True keeps those of its points for which `good` (M,), in the order of
-        `own()`, is True. Points of other clusters and of no cluster are kept.
+        Args:
+            good: A Boolean array (M,) in the order of own(), True for points to keep.
+            judged: A Boolean array (N,), True for the clusters that `good` applies to. Other clusters keep all points.
         """
         kept = np.ones(len(self.clusters.cluster), np.bool_)
         kept[self.order] = good | np.repeat(~judged, self.mask_counts)
@@ -128,7 +134,7 @@ class Surroundings:
 
 @dataclass
 class Ring:
-    """The ring around a mask, and limits on the points of mask and ring."""
+    """Parameters of the ring around a mask, and limits on the number of points."""
 
     ring_fraction: float = 0.25  # ratio of the ring's width to the square root of the mask's area, >= 0; 0 = no ring
     min_ring: int = 4  # minimum width of the ring, px, >= 1
@@ -148,11 +154,10 @@ class Ring:
 
 
 def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundings:
-    """Return the N clusters of one frame with their rings.
+    """Return the clusters of one frame with their rings.
 
-    A ring contains the pixels with a depth reading around the cluster. Its width is `ring_fraction` * sqrt(points in
-    the cluster) px, clipped to [`min_ring`, `max_ring`] px. With `ring_fraction=0` the ring is empty. A ring may
-    contain pixels of other clusters. Pixels of known structure, such as floors, count as pixels without a reading,
+    A ring contains the depth readings around the mask, including those of other clusters. Its width is proportional to
+    the square root of the number of points of the cluster. Readings of known structure, such as floors, are omitted,
     because they are already separated from the object.
     """
     order, firsts = members(clusters)
@@ -162,7 +167,7 @@ def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundi
     if ring.ring_fraction == 0:
         widths[:] = 0
     bounds = np.zeros((len(clusters), 4), np.int64)
-    bound(pixels, firsts, np.maximum(widths, 1), *frame.camera.shape, bounds)  # the mask's border needs a neighbor
+    bound(pixels, firsts, np.maximum(widths, 1), *frame.camera.shape, bounds)  # the border of a mask needs a neighbor
     cells = np.concatenate([[0], np.cumsum((bounds[:, 2] - bounds[:, 0]) * (bounds[:, 3] - bounds[:, 1]))])
     windows, steps = Windows(pixels, firsts, bounds, cells), np.empty(cells[-1], np.int16)
     ring_counts, radii = np.zeros(len(widths), np.int64), np.zeros(len(widths), np.float32)
@@ -171,12 +176,11 @@ def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundi
 
 
 def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
-    """Return the indices (M,) of the points of all clusters, cluster by cluster, and the cluster starts (N + 1,).
+    """Return the indices (M,) of the points sorted by cluster, and the start (N + 1,) of each cluster.
 
-    Points of a cluster keep their order. Points of no cluster (-1) are omitted. For points already in this order, such
-    as the result of `lift`, the indices are a slice to avoid a copy.
+    Points that belong to no cluster are omitted.
     """
-    if (clusters.cluster[:-1] <= clusters.cluster[1:]).all():
+    if (clusters.cluster[:-1] <= clusters.cluster[1:]).all():  # as returned by lift(); a slice avoids a copy
         firsts = np.searchsorted(clusters.cluster, np.arange(len(clusters) + 1))
         return slice(int(firsts[0]), int(firsts[-1])), firsts - firsts[0]
     order, firsts = grouped(clusters.cluster, len(clusters))
@@ -184,15 +188,15 @@ def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
 
 
 def thread_schedule(costs: Int64) -> ThreadSchedule:
-    """Return the clusters of each thread, assigned by decreasing cost to the least busy thread (Graham 1969).
+    """Assign each cluster to the thread with the least work, in order of decreasing cost.
 
-    `costs`: the number of points (N,) of each cluster. Numba divides a parallel loop into parts of equal length, but a
-    few large clusters contain most of the points.
+    `costs` (N,) is the number of points of each cluster. Numba would assign equal numbers of clusters, but a few large
+    clusters contain most of the points.
     """
     longest_first = np.argsort(-costs, kind="stable")
     return ThreadSchedule(*share_among_threads(costs, longest_first, numba.get_num_threads()))
 
 
 def pinhole(camera: Camera) -> Float32:
-    """Return fx, fy, cx, cy (4,), px, for kernels, in the precision of geometry.back_project."""
+    """Return the intrinsics fx, fy, cx, cy, px, in single precision."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)

@@ -12,14 +12,14 @@ from framework.data import Bool, Float32, Int32, Int64
 
 Int16 = npt.NDArray[np.int16]
 
-# 3-4 chamfer distance (Borgefors 1986) in thirds of a pixel, within 8 % of the Euclidean distance
+# 3-4 chamfer distance (Borgefors, 1986) in thirds of a pixel; within 8 % of the Euclidean distance
 CHAMFER_STEP, CHAMFER_DIAGONAL = np.int16(3), np.int16(4)
 FAR = np.int16(30000)  # 10,000 px; two more steps do not overflow
 PX_PER_STEP = np.float32(1) / np.float32(CHAMFER_STEP)
 
 
 class Windows(NamedTuple):
-    """Pixels of N clusters, and the image window of each cluster with its ring."""
+    """The pixels of N clusters, and the image window of each cluster and its ring."""
 
     pixels: Int32  # (M, 2) (u, v), cluster by cluster
     firsts: Int64  # (N + 1,) start of each cluster in `pixels`
@@ -28,7 +28,10 @@ class Windows(NamedTuple):
 
 
 class ThreadSchedule(NamedTuple):
-    """The clusters of each thread: thread t processes order[starts[t]:starts[t + 1]]."""
+    """The clusters of each thread.
+
+    Thread t processes order[starts[t]:starts[t + 1]].
+    """
 
     order: Int64  # (N,)
     starts: Int64  # (threads + 1,)
@@ -36,9 +39,9 @@ class ThreadSchedule(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
-    """Return the indices (M,) of the points sorted stably by `cluster` (P,), and the start (n + 1,) of each cluster.
+    """Return the indices (M,) of the points sorted by cluster, and the start (n + 1,) of each cluster.
 
-    Points of no cluster (-1) are omitted, so M <= P.
+    The sort is stable. Points that belong to no cluster are omitted.
     """
     firsts = np.zeros(n + 1, np.int64)
     for k in cluster:
@@ -57,9 +60,9 @@ def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
 
 @njit(cache=True, nogil=True)
 def share_among_threads(costs: Int64, longest_first: Int64, threads: int) -> tuple[Int64, Int64]:
-    """Return the clusters (N,) in the order of their threads, and the start (threads + 1,) of each thread.
+    """Return the clusters (N,) sorted by thread, and the start (threads + 1,) of each thread.
 
-    Each cluster of `longest_first` (N,), sorted by decreasing `costs` (N,), is assigned to the least busy thread.
+    Each cluster is assigned to the thread with the least work, in the order of `longest_first`.
     """
     loads, owners, starts = np.zeros(threads, np.int64), np.empty(len(costs), np.int64), np.zeros(threads + 1, np.int64)
     for k in longest_first:
@@ -81,10 +84,15 @@ def share_among_threads(costs: Int64, longest_first: Int64, threads: int) -> tup
 
 @njit(cache=True, nogil=True)
 def bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, bounds: Int64) -> None:
-    """Set `bounds` (N, 4) v0 u0 v1 u1, px, to the box around each cluster and its ring; v1 and u1 are exclusive.
+    """Compute the image window of each cluster and its ring.
 
-    `pixels`: (M, 2) u, v, cluster by cluster. `firsts`: the start (N + 1,) of each cluster. `widths`: ring widths (N,),
-    px. The boxes are clipped to the image of `height` x `width` px.
+    Args:
+        pixels: The pixels (M, 2), u and v, of the points, cluster by cluster.
+        firsts: The start (N + 1,) of each cluster.
+        widths: The width (N,) of each ring, px.
+        height: The height of the image, px.
+        width: The width of the image, px.
+        bounds: The output (N, 4): v0, u0, v1, u1, with exclusive v1 and u1.
     """
     for k in range(len(widths)):
         if firsts[k] < firsts[k + 1]:
@@ -95,7 +103,7 @@ def bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, 
 
 @njit(cache=True, nogil=True)
 def bounding_box(pixels: Int32) -> tuple[int, int, int, int]:
-    """Return the minimum u and v and the maximum u and v of one or more pixels."""
+    """Return the minimum u and v and the maximum u and v of the pixels."""
     u0, v0 = pixels[0, 0], pixels[0, 1]
     u1, v1 = u0, v0
     for i in range(len(pixels)):
@@ -112,12 +120,20 @@ def signed_distances(
     windows: Windows, widths: Int64, depth: Float32, schedule: ThreadSchedule, steps: Int16, ring_counts: Int64,
     radii: Float32,
 ) -> None:  # fmt: skip
-    """Set the signed distance of each pixel, `steps`, and for each cluster `ring_counts` (N,) and `radii` (N,).
+    """Compute the distance of each pixel to the border of the mask, and the size of the ring.
 
-    `steps` (cells,) is in thirds of a pixel: above 0 in the mask (to the nearest reading outside), below 0 in the ring
-    (to the mask), and 0 elsewhere. `ring_counts` is the number of readings in the ring, and `radii` is the largest
-    distance in the mask, px. `widths`: ring widths (N,), px. Pixels without a reading are not a border of the mask,
-    because the depth of objects often has holes.
+    The border is next to depth readings outside the mask. Pixels without a reading are no border, because the depth of
+    objects often has holes.
+
+    Args:
+        windows: The windows of the clusters.
+        widths: The width (N,) of each ring, px.
+        depth: The depth image (H, W), m.
+        schedule: The clusters of each thread.
+        steps: The output (cells,), the distance in thirds of a pixel; positive in the mask, negative in the ring,
+            otherwise 0.
+        ring_counts: The output (N,), the number of readings in each ring.
+        radii: The output (N,), the largest distance in each mask, px.
     """
     firsts, cells = windows.firsts, windows.cells
     for thread in prange(len(schedule.starts) - 1):
@@ -133,13 +149,10 @@ def signed_distances(
 def _signed_distances_of(
     pixels: Int32, ring: np.int16, bounds: Int64, depth: Float32, steps: Int16
 ) -> tuple[int, np.float32]:
-    """Set `steps` for the window of one cluster; return the number of readings in the ring and the mask's radius, px.
-
-    `ring`: the width of the ring in thirds of a pixel. One grid holds the distances to the mask and to the readings
-    outside it side by side, each surrounded by FAR cells. A shortest path may take its horizontal steps first, in the
-    row of its source. Therefore, each row is first filled with the distances along the row. Two vectorized sweeps, down
-    and up, then add the vertical and diagonal steps.
-    """
+    """Compute the distances for one cluster, and return the size of its ring and the radius of its mask, px."""
+    # One grid holds the distances to the mask and to the readings outside it side by side, each surrounded by FAR
+    # cells. Each row is first filled with the distances along the row, because a shortest path may take its horizontal
+    # steps first. Two vectorized sweeps, down and up, then add the vertical and diagonal steps.
     v0, u0 = bounds[0], bounds[1]
     rows, columns = bounds[2] - v0, bounds[3] - u0
     middle = columns + 1  # FAR cell between the two distances
@@ -177,10 +190,7 @@ def _mark_rest(in_mask: Bool, depth: Float32, in_rest: Bool) -> None:
 
 @njit(cache=True, nogil=True)
 def _sign(in_mask: Bool, to_mask: Int16, to_rest: Int16, depth: Float32, ring: np.int16, steps: Int16) -> int:
-    """Set the signed distances `steps` of one row from the distances to the mask and to the readings outside it.
-
-    Returns the number of readings in the ring.
-    """
+    """Set the signed distances of one row, and return the number of readings in the ring."""
     count = np.int32(0)
     for c in range(len(steps)):
         in_ring = (not in_mask[c]) & (to_mask[c] <= ring) & (depth[c] > 0)
@@ -200,7 +210,7 @@ def _highest(steps: Int16) -> np.int16:
 
 @njit(cache=True, nogil=True)
 def _distances_along(sources: Bool, row: Int16) -> None:
-    """Set each cell of `row` to its distance to the nearest source in the row; FAR if the row has no source."""
+    """Set each cell of a row to its distance to the nearest source in the row, FAR = no source."""
     columns = len(row)
     row[:] = 0
     begin = 0
@@ -234,11 +244,7 @@ def _spread_across(neighbors: Int16, row: Int16, middle: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _lower(row: Int16, before: Int16, across: Int16, behind: Int16) -> None:
-    """Update `row` of the chamfer distance transform from the cells of an adjacent row, in vectorizable code.
-
-    `across` are the vertical neighbors, at a distance of CHAMFER_STEP. `before` and `behind` are the diagonal
-    neighbors, at CHAMFER_DIAGONAL.
-    """
+    """Update one row of the chamfer distance transform from an adjacent row."""
     for i in range(len(row)):
         diagonal = np.int16((before[i] if before[i] < behind[i] else behind[i]) + CHAMFER_DIAGONAL)
         straight = np.int16(across[i] + CHAMFER_STEP)
@@ -251,10 +257,19 @@ def gather(
     windows: Windows, steps: Int16, depth: Float32, pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64,
     schedule: ThreadSchedule, points: Float32, depth_in_mask: Float32,
 ) -> None:  # fmt: skip
-    """Set the camera-frame `points` (S, 3), m, as in geometry.back_project, and their `depth_in_mask` (S,), px.
+    """Gather the points of the neighborhoods in the camera frame.
 
-    They are every nth[k]-th point of neighborhood k: first `mask_counts[k]` points of the mask, then those of the ring,
-    from index `starts[k]` on.
+    Args:
+        windows: The windows of the clusters.
+        steps: The distances of the pixels, from signed_distances().
+        depth: The depth image (H, W), m.
+        pinhole: The intrinsics fx, fy, cx, cy, px.
+        starts: The start (N + 1,) of each neighborhood in `points`.
+        mask_counts: The number of gathered points (N,) of each mask.
+        nth: The sampling step (N,) of each neighborhood.
+        schedule: The clusters of each thread.
+        points: The output (S, 3), m.
+        depth_in_mask: The output (S,), the distance to the border of the mask, px.
     """
     firsts, cells = windows.firsts, windows.cells
     for thread in prange(len(schedule.starts) - 1):
@@ -313,10 +328,15 @@ def _back_project(u: int, v: int, z: np.float32, pinhole: Float32, points: Float
 def ramps(
     depth_in_mask: Float32, starts: Int64, widths: Float32, expected_bleed: float, largest: float, log_odds: Float32
 ) -> None:
-    """Set `log_odds` (S,) of each neighborhood k to a ramp over the distance from the mask's border, `depth_in_mask`.
+    """Compute the log-odds of Neighborhoods.mask_log_odds().
 
-    The slope of the ramp is `largest` per `widths[k]` px. It is 0 at widths[k] * expected_bleed / (1 - expected_bleed)
-    px inside the mask, and is limited to [-`largest`, `largest`].
+    Args:
+        depth_in_mask: The distance (S,) of each point to the border of the mask, px.
+        starts: The start (N + 1,) of each neighborhood.
+        widths: The distance (N,) over which the log-odds change by `largest`, px.
+        expected_bleed: The distance of the zero from the border, in ring widths.
+        largest: The maximum log-odds.
+        log_odds: The output (S,).
     """
     zero = np.float32(expected_bleed / (1 - expected_bleed))
     for k in range(len(widths)):

@@ -1,4 +1,4 @@
-"""Refinement of the clusters of one frame, shared by all refiners."""
+"""Refinement of the clusters of one frame."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from framework.refinement.refine_kernels import compress, part_starts
 def refine(refiner: ClusterRefiner, clusters: PointClusters, frame: Frame) -> PointClusters:
     """Return the refined clusters.
 
-    Exact clusters from ground-truth masks, and clusters of frames without a detector run, remain unchanged. Raises
-    DataError if the refiner does not return PointClusters or returns pixels outside the image. Later stages index the
-    frame with these pixels without another check.
+    Clusters from exact masks, and of frames without a detector run, are returned unchanged.
+
+    Raises:
+        DataError: If the refiner does not return PointClusters, or if it returns pixels outside the image.
     """
     if clusters.exact or not clusters.detected:
         return clusters
     refined = refiner.refine(clusters, frame)
     if not isinstance(cast(object, refined), PointClusters):
         raise DataError(f"frame {frame.index}: expected PointClusters from the refiner, got {type(refined).__name__}")
-    require_pixels_inside(refined, frame.depth.shape)
+    require_pixels_inside(refined, frame.depth.shape)  # later stages use them as indices
     return refined
 
 
 def keep_points(clusters: PointClusters, kept: Bool) -> PointClusters:
     """Return the clusters with only the points for which `kept` (P,) is True.
 
-    Clusters keep their index, scores and classes, so that cluster k is detection k even without points.
+    All clusters remain, even if they have no points, so that cluster k always belongs to detection k.
     """
     starts = part_starts(kept)
     points_world = np.empty((starts[-1], 3), np.float32)

@@ -12,10 +12,7 @@ PART = 8192  # number of rows that a thread processes at once
 
 @njit(cache=True, nogil=True)
 def part_starts(kept: Bool) -> Int64:
-    """Return, for each part of PART rows, the number of kept rows before it; the last entry (parts + 1,) is the total.
-
-    `kept`: (P,), True for rows to keep.
-    """
+    """Return the number of kept rows (parts + 1,) before each part of PART rows, and in total."""
     parts = (len(kept) + PART - 1) // PART
     starts = np.zeros(parts + 1, np.int64)
     for part in range(parts):
@@ -33,7 +30,7 @@ def compress(
 ) -> None:  # fmt: skip
     """Copy the kept rows of three arrays to `kept_points`, `kept_pixels` and `kept_cluster`.
 
-    `starts`: from `part_starts`. This is faster than Boolean indexing.
+    `starts` comes from part_starts(). This is faster than Boolean indexing.
     """
     for part in prange(len(starts) - 1):
         k = starts[part]

@@ -1,1 +1,1 @@
-"""Rendering of surfaces: rasterizer, lighting, viewpoints, and the overview of a map."""
+"""Rendering of surfaces: rasterizer, lighting, viewpoints and the overview image of a map."""

@@ -1,6 +1,6 @@
 """Screen-space ambient occlusion.
 
-Rays around each point are traced in the depth image: Ritschel, Grosch and Seidel, "Approximating Dynamic Global
+Rays from each surface point are traced in the depth image, as in Ritschel et al., "Approximating Dynamic Global
 Illumination in Image Space", I3D 2009.
 """
 
@@ -12,17 +12,17 @@ import numpy as np
 from framework.data import Camera, Float32
 from framework.rendering.ambient_occlusion_kernels import RAYS, STEPS, TILE, trace_occlusion
 
-RANGE_M = 0.35  # maximum distance of occluders
+RANGE_M = 0.35  # maximum distance of occluders, m
 DEPTH = 0.75  # relative darkening of a point whose rays are all occluded
 
 
 def openness(camera: Camera, depth: Float32, normals_camera: Float32) -> Float32:
-    """Return the fraction (H, W), in (0, 1], of the ambient light that reaches each pixel's surface point.
+    """Return the fraction (H, W) of ambient light that reaches the surface at each pixel.
 
     Args:
-        camera: Camera of the depth image.
-        depth: (H, W) m along z, 0 = no surface.
-        normals_camera: (H, W, 3) unit vectors, camera frame.
+        camera: The camera of the depth image.
+        depth: The depth image (H, W), m, 0 = no surface.
+        normals_camera: The unit normals (H, W, 3) in the camera frame.
     """
     occluded = np.zeros(depth.shape, np.float32)
     trace_occlusion(depth, normals_camera, camera.K.astype(np.float32), _directions(), _reaches(), occluded)
@@ -33,9 +33,9 @@ def openness(camera: Camera, depth: Float32, normals_camera: Float32) -> Float32
 
 
 def _directions() -> Float32:
-    """Return the ray directions (TILE^2, RAYS, 3) of each pixel in a tile.
+    """Return the ray directions (TILE^2, RAYS, 3) for each pixel of a tile.
 
-    The directions are cosine-weighted unit vectors; their components are along two tangents and the normal.
+    The directions are cosine-weighted unit vectors. Their components are along two tangents and the normal.
     """
     pixel, ray = np.arange(TILE**2)[:, None], np.arange(RAYS)
     angle = 2 * np.pi / RAYS * (ray + (pixel * 7 % TILE**2) / TILE**2)
@@ -44,9 +44,9 @@ def _directions() -> Float32:
 
 
 def _reaches() -> Float32:
-    """Return the distances (TILE^2, STEPS), m, of the samples along a ray, for each pixel in a tile.
+    """Return the distances (TILE^2, STEPS) of the samples along a ray for each pixel of a tile, m.
 
-    The distances are jittered, except for the last one, which is RANGE_M.
+    The distances are jittered, except for the last one.
     """
     pixel = np.arange(TILE**2)
     shift = (pixel * 5 % TILE**2 + 0.5) / TILE**2

@@ -1,4 +1,4 @@
-"""Numba kernels of ambient_occlusion.py."""
+"""Kernels of ambient_occlusion.py."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ HALF = np.float32(0.5)  # px, distance from the border of a pixel to its center
 def trace_occlusion(
     depth: Float32, normals: Float32, K: Float32, directions: Float32, reaches: Float32, occluded: Float32
 ) -> None:
-    """Write the fraction of occluded rays of each pixel with depth to `occluded` (H, W).
+    """Compute the fraction of occluded rays at each pixel.
 
     Args:
-        depth: (H, W) m along z, 0 = no surface.
-        normals: (H, W, 3) unit vectors, camera frame.
-        K: (3, 3) camera matrix, px.
-        directions: (TILE^2, RAYS, 3) unit vectors, components along two tangents and the normal.
-        reaches: (TILE^2, STEPS) m, distances of the samples along a ray.
-        occluded: (H, W) output in [0, 1].
+        depth: The depth image (H, W), m, 0 = no surface.
+        normals: The unit normals (H, W, 3) in the camera frame.
+        K: The camera matrix (3, 3), px.
+        directions: The unit ray directions (TILE^2, RAYS, 3) along two tangents and the normal.
+        reaches: The distances (TILE^2, STEPS) of the samples along a ray, m.
+        occluded: The output (H, W) in [0, 1].
     """
     height, width = depth.shape
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -65,8 +65,8 @@ def trace_occlusion(
 
 @njit(cache=True, nogil=True, inline="always")
 def _tangents(n):
-    """Return two orthonormal tangents of the unit vector n (Duff et al., JCGT 6(1), 2017)."""
-    sign = np.float32(1) if n[2] >= 0 else np.float32(-1)
+    """Return two orthonormal tangents of a unit normal."""
+    sign = np.float32(1) if n[2] >= 0 else np.float32(-1)  # Duff et al., JCGT 6(1), 2017
     a = -1 / (sign + n[2])
     b = n[0] * n[1] * a
     return (1 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]), (b, sign + n[1] * n[1] * a, -n[1])

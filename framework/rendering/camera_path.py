@@ -1,4 +1,4 @@
-"""Drawing of the camera path into the image of a map."""
+"""Camera path in the image of a map."""
 
 from __future__ import annotations
 
@@ -17,20 +17,22 @@ PATH_START, PATH_END = (40, 110, 220), (235, 90, 40)  # RGB at the ends of the p
 
 @dataclass(frozen=True)
 class ProjectedPath:
-    """The P camera positions in front of another camera, projected into its image."""
+    """The camera positions of a path, projected into an image."""
 
     pixels: Float64  # (P, 2) u v, px
-    hidden: Bool  # (P,) True = occluded by the surface
+    hidden: Bool  # (P,) True for positions behind the surface
 
     @classmethod
     def of(cls, poses: Float64, camera: Camera, T_world_camera: Float64, hits: Hits) -> ProjectedPath:
-        """Project the camera positions of `poses` into an image.
+        """Project the camera positions into an image.
+
+        Positions behind the camera of the image are omitted.
 
         Args:
-            poses: (F, 4, 4) poses of the mapping camera in the world frame.
-            camera: Camera of the image.
-            T_world_camera: (4, 4) pose of the image's camera.
-            hits: Visible surface points of the image.
+            poses: The camera poses (F, 4, 4) of the path.
+            camera: The camera of the image.
+            T_world_camera: The pose (4, 4) of this camera.
+            hits: The visible surface of the image.
         """
         positions = poses[:, :3, 3]
         points = transform(inverse(T_world_camera), positions)
@@ -43,13 +45,16 @@ class ProjectedPath:
         return cls(np.asarray(pixels, np.float64), (depth > 0) & (depth < points[:, 2]))
 
     def shades(self) -> UInt8:
-        """Return the RGB colors (P, 3) of the positions, from blue (start) to orange (end)."""
+        """Return the colors (P, 3), RGB, of the positions, from blue at the start to orange at the end."""
         fraction = np.linspace(0, 1, max(2, len(self.pixels)))[: len(self.pixels), None]
         mixed = (1 - fraction) * np.array(PATH_START) + fraction * np.array(PATH_END)
         return np.asarray(np.rint(mixed), np.uint8)
 
     def draw(self, image: Image.Image) -> None:
-        """Draw the path into `image`, as a line with a dot at each end; occluded segments are thin."""
+        """Draw the path as a line with a dot at each end.
+
+        Hidden segments are thin.
+        """
         canvas = ImageDraw.Draw(image)
         points = [tuple(pixel) for pixel in self.pixels.tolist()]
         shades = [tuple(shade) for shade in self.shades().tolist()]

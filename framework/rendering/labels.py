@@ -1,4 +1,7 @@
-"""Placement of object names in an image: on large objects, or next to small objects with a leader line."""
+"""Placement of object names in an image.
+
+Names are on large objects. Names of small objects are next to the object, with a leader line.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +17,15 @@ from framework.data import Bool, Int32
 from framework.rendering.palette import INK, PAPER
 
 MIN_PIXELS = 60  # px, minimum area of an object with a name
-ROOM = 0.75  # minimum distance from the center of a name to the border of its object, relative to the name's height
+ROOM = 0.75  # minimum distance from the center of a name to the border of its object, relative to the text height
 NEAREST, FARTHEST, STEP = 24, 160, 8  # px, start, end (exclusive) and step of the distances from an object to its name
 DIRECTIONS = 32  # number of directions from an object to its name
-ABOUT = 0.9  # minimum distance of a candidate point from the object's border, relative to the largest distance
-ON_OTHERS = 0.1  # maximum fraction of a name's area over other objects, for a name on its object
+ABOUT = 0.9  # minimum distance of a candidate point from the border of the object, relative to the largest distance
+ON_OTHERS = 0.1  # maximum fraction of the area of a name over other objects, for a name on its object
 COVERING = 150.0  # px, cost of a name whose whole area is over objects
 CROSSING = 100.0  # px, cost of a leader line whose whole length is over other objects
 SAMPLES = 24  # number of sampled points of a leader line
-DOT = 2.5  # px, radius of the dot at the object's end of a leader line
+DOT = 2.5  # px, radius of the dot at the end of a leader line
 AROUND = 3  # px, margin around a name
 HALO = 3  # px, width of the halo around the letters of a name
 
@@ -31,7 +34,7 @@ Box = tuple[float, float, float, float]  # left, top, right, bottom, px
 
 @dataclass(frozen=True)
 class Label:
-    """A name with its position."""
+    """A name and its position."""
 
     text: str
     u: float  # px, column of the center
@@ -42,12 +45,12 @@ class Label:
 def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tuple[float, float]]) -> list[Label]:
     """Return the labels of the objects in an image, largest object first.
 
-    Labels do not overlap and are inside the image. Names that do not fit are omitted.
+    Labels do not overlap. Names that do not fit are omitted.
 
     Args:
-        ids: (H, W) object id of each pixel, 0 = none.
-        names: Name by object id.
-        size: Function that returns the width and height of a text, px.
+        ids: The object (H, W) at each pixel, 0 = none.
+        names: The name of each object by id.
+        size: A function that returns the width and height of a text, px.
     """
     pixels = np.bincount(ids.ravel(), minlength=max([0, *names]) + 1)
     shown = sorted((key for key in names if pixels[key] >= MIN_PIXELS), key=lambda key: (-pixels[key], key))
@@ -94,9 +97,9 @@ def text_size(text: str, font: ImageFont.FreeTypeFont) -> tuple[float, float]:
 
 
 def _widest_part(mask: Bool) -> tuple[float, float, float]:
-    """Return the point (u, v) of a mask (H, W) that is farthest from its border, and this distance, px.
+    """Return a point (u, v) far from the border of a mask, and its distance to the border, px.
 
-    Among points with similar distances, the point nearest to the centroid of the mask is returned.
+    Of all points with about the largest distance, the nearest one to the centroid is returned.
     """
     u, v, width, height = cv2.boundingRect(mask.astype(np.uint8))
     framed = np.pad(mask[v : v + height, u : u + width], 1).astype(np.uint8)
@@ -109,19 +112,17 @@ def _widest_part(mask: Bool) -> tuple[float, float, float]:
 def _place_next_to(
     u: float, v: float, size: tuple[float, float], boxes: Sequence[Box], objects: Bool, others: Bool
 ) -> tuple[float, float] | None:
-    """Return the center (u, v), px, of the position with the lowest cost for an object's name; None if none is free.
+    """Return the best center (u, v) for a name next to its object, px.
 
-    A free position is inside the image and overlaps no other name. The cost of a position is the sum of three terms,
-    px: the distance from the object, COVERING times the fraction of the name over objects, and CROSSING times the
-    fraction of the leader line over other objects.
+    Return None if there is no free position.
 
     Args:
-        u: Column of the point on the object, px.
-        v: Row of the point on the object, px.
-        size: Width and height of the name, px.
-        boxes: Boxes of the names that are already placed.
-        objects: (H, W) mask of all objects.
-        others: (H, W) mask of all other objects.
+        u: The column of the point on the object, px.
+        v: The row of the point on the object, px.
+        size: The width and height of the name, px.
+        boxes: The boxes of the names that are already placed.
+        objects: A Boolean array (H, W), True on any object.
+        others: A Boolean array (H, W), True on other objects.
     """
     best, least = None, np.inf
     angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
@@ -134,6 +135,7 @@ def _place_next_to(
         if any(((line >= other[:2]) & (line <= other[2:])).all(axis=1).any() for other in boxes):
             continue
         columns, rows = np.rint(line).astype(int).T
+        # prefer short lines, and names and lines that are not over objects
         cost = distance + COVERING * objects[_pixels(box)].mean() + CROSSING * others[rows, columns].mean()
         if cost < least:
             best, least = (a, b), cost

@@ -1,4 +1,4 @@
-"""Images of a lit surface in its own colors, or in instance colors on a pale background."""
+"""Lit images of a surface in its own colors or in instance colors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NOTHING = (229, 232, 236)  # RGB of empty pixels; not white, because surfaces ma
 
 
 class LitView:
-    """View of a surface from `camera` at `T_world_camera` (4, 4), with precomputed lighting.
+    """View of a surface with precomputed lighting.
 
     The methods return images of this view in different colors.
     """
@@ -35,16 +35,16 @@ class LitView:
         self._light *= cv2.resize(ambient, self._light.shape[::-1])
 
     def in_colors(self, colors: UInt8) -> UInt8:
-        """Return the lit image (H, W, 3), RGB, in the RGB `colors` (V, 3) of the vertices."""
+        """Return the lit image (H, W, 3), RGB, in the given colors (V, 3) of the vertices."""
         return self._developed(self._fine.interpolated(colors * np.float32(1.08)))
 
     def in_instances(self, colors: UInt8, ids: Int32, color_of: Mapping[int, UInt8]) -> UInt8:
         """Return the lit image (H, W, 3), RGB, with one color per instance.
 
         Args:
-            colors: (V, 3) RGB of the vertices; their brightness remains visible.
-            ids: (V,) instance ids of the vertices, 0 = none.
-            color_of: RGB color (3,) by instance id.
+            colors: The colors (V, 3) of the vertices, RGB. Their brightness remains visible.
+            ids: The instance (V,) of each vertex, 0 = none.
+            color_of: The color (3,) of each instance by id, RGB.
         """
         palette = np.zeros((max([0, *color_of]) + 1, 3), np.float32)
         for key, rgb in color_of.items():
@@ -55,9 +55,9 @@ class LitView:
         return self._developed(painted)
 
     def _developed(self, color: Float32) -> UInt8:
-        """Return the lit image (H, W, 3), RGB, at the camera's resolution.
+        """Return the lit image (H, W, 3), RGB, at the resolution of the camera.
 
-        `color` is the unlit image at the supersampled resolution; it is modified in place.
+        `color` is the unlit image at the supersampled resolution, modified in place.
         """
         np.clip(color * self._light[..., None], 0, 255, out=color)
         color[self._fine.depth <= 0] = NOTHING

@@ -1,4 +1,4 @@
-"""Numba kernels of lit_view.py."""
+"""Kernels of lit_view.py."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ AMBIENT, DIFFUSE = 0.70, 0.34  # relative brightness of ambient light, and of th
 
 @njit(cache=True, nogil=True)
 def light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Float32) -> None:
-    """Write the relative brightness of each pixel to `light` (H, W), and normalize the normals.
+    """Compute the brightness of each pixel, and normalize the normals.
 
     Args:
-        normals: (H, W, 3) normals, world frame; replaced by unit vectors in the camera frame that face the camera.
-        R_world_camera: (3, 3) rotation of the camera.
-        K: (3, 3) camera matrix, px.
-        light: (H, W) output.
+        normals: The normals (H, W, 3) in the world frame. They are replaced by unit normals toward the camera in the
+            camera frame.
+        R_world_camera: The rotation (3, 3) of the camera.
+        K: The camera matrix (3, 3), px.
+        light: The output (H, W), the relative brightness.
     """
     R = R_world_camera
     for v in range(normals.shape[0]):
@@ -38,13 +39,13 @@ def light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Float
 
 @njit(cache=True, nogil=True)
 def paint(ids: Int32, gray: Float32, palette: Float32, painted: Float32) -> None:
-    """Write the unlit color of each pixel's instance, RGB, to `painted` (H, W, 3); borders of instances are darker.
+    """Compute the unlit instance color of each pixel, with darker borders.
 
     Args:
-        ids: (H, W) instance ids, 0 = none.
-        gray: (H, W) brightness of the surface, 0 to 255, which adds some texture to the colors.
-        palette: (N, 3) RGB color of the instance with id n in row n.
-        painted: (H, W, 3) output.
+        ids: The instance (H, W) at each pixel, 0 = none.
+        gray: The brightness (H, W) of the surface in [0, 255], which adds texture to the colors.
+        palette: The color (N, 3) of each instance by id, RGB.
+        painted: The output (H, W, 3), RGB.
     """
     height, width = ids.shape
     for v in range(height):

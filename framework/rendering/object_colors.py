@@ -1,4 +1,4 @@
-"""Matching of objects between maps, for consistent colors across images."""
+"""Consistent colors for the objects in several maps of one scene."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ UNKNOWN = (206, 184, 152)  # RGB of ground-truth instances of unknown class (not
 
 
 class ObjectColors:
-    """Numbers and colors of the objects of one scene, shared by several maps.
+    """Numbers and colors of the objects in one scene.
 
-    The objects are the ground-truth instances and the unmatched map instances, numbered from 1.
+    The objects are the ground-truth instances and the unmatched instances of the maps, numbered from 1.
     """
 
     def __init__(self, truth: SceneTruth) -> None:
@@ -33,11 +33,11 @@ class ObjectColors:
     def objects(self, ids: Int32, true_ids: Int32) -> dict[int, int]:
         """Return the object number of each instance of a map, by instance id.
 
-        Unmatched instances become new objects in dark colors.
+        Unmatched instances become new objects with dark colors.
 
         Args:
-            ids: (V,) instance ids of the map's points, 0 = none.
-            true_ids: (V,) ground-truth ids of the map's points, 0 = none.
+            ids: The instance (V,) of each point of the map, 0 = none.
+            true_ids: The ground-truth instance (V,) of each point, 0 = none.
         """
         same = {key: self.true_objects[true] for key, true in same_objects(ids, true_ids).items()}
         others = np.setdiff1d(ids, [0, *same]).tolist()
@@ -47,13 +47,13 @@ class ObjectColors:
 
 
 def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
-    """Return the ground-truth id of each matched instance, by instance id.
+    """Match instances to ground-truth instances, and return the ground-truth id by instance id.
 
-    The matching is one-to-one and maximizes the sum of IoU. Pairs with an IoU below SAME_OBJECT_IOU are omitted.
+    The matching is one-to-one and maximizes the sum of the IoUs. Pairs with a low IoU are omitted.
 
     Args:
-        ids: (V,) instance ids of the points, 0 = none.
-        true_ids: (V,) ground-truth ids of the points, 0 = none.
+        ids: The instance (V,) of each point, 0 = none.
+        true_ids: The ground-truth instance (V,) of each point, 0 = none.
     """
     found, rows = np.unique(ids, return_inverse=True)
     true, columns = np.unique(true_ids, return_inverse=True)
@@ -66,6 +66,6 @@ def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
 
 
 def relabeled(ids: Int32, object_of: Mapping[int, int]) -> Int32:
-    """Return the object numbers (V,) of the instance `ids` (V,) by the mapping `object_of`; 0 = none."""
+    """Return the object number (V,) of each point from its instance (V,), 0 = none."""
     values, inverse = np.unique(ids, return_inverse=True)
     return np.array([object_of.get(key, 0) for key in values.tolist()], np.int32)[inverse]

@@ -1,4 +1,4 @@
-"""overview.png: the map in its colors and in instance colors, side by side, from one viewpoint."""
+"""Overview image of a map: its own colors and instance colors, side by side."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ LABEL_PX, LEGEND_PX, TITLE_PX = 17, 17, 22  # font sizes
 def write_overview(
     path: Path, mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], poses: Float64, title: str
 ) -> None:
-    """Write the overview as a PNG.
+    """Write the overview image of a map as a PNG file.
 
     Args:
-        path: PNG file.
-        mesh: Mesh of the map.
-        instances: Class name and confidence by instance id; all other ids are background.
-        poses: (F, 4, 4) T_world_camera of the mapped frames.
-        title: Title above the images.
+        path: The output file.
+        mesh: The mesh of the map.
+        instances: The class name and confidence of each instance by id. All other ids are background.
+        poses: The camera poses (F, 4, 4) of the mapped frames.
+        title: The title above the images.
     """
     image = overview(mesh, instances, poses, title)
     with atomic_write(path) as temporary:
@@ -44,7 +44,10 @@ def write_overview(
 
 
 def overview(mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], poses: Float64, title: str) -> UInt8:
-    """Return the overview image (H, W, 3), RGB; for the arguments, see `write_overview`."""
+    """Return the overview image (H, W, 3), RGB.
+
+    See `write_overview` for the arguments.
+    """
     ids = np.where(np.isin(mesh.instance_ids, list(instances)), mesh.instance_ids, 0).astype(np.int32)
     shown = [key for key in sorted(instances) if (ids == key).any()]
     centroids = np.array([mesh.vertices[ids == key].mean(axis=0) for key in shown], np.float64).reshape(-1, 3)
@@ -80,7 +83,7 @@ def _text_panel(text: str, height: int, x: int, ink: tuple[int, int, int], ancho
 
 
 def _legend(entries: Iterable[tuple[UInt8, str, float]]) -> UInt8:
-    """Return the image of the legend: color, name and confidence of each object, most confident first."""
+    """Return the image of the legend, with the color, name and confidence of each object."""
     ranked = sorted(entries, key=lambda entry: -entry[2])
     rows = min(LEGEND_ROWS, -(-len(ranked) // LEGEND_COLUMNS))
     image = Image.new("RGB", (2 * PANEL_WIDTH, LEGEND_ROW * rows + 20), PAPER)

@@ -1,4 +1,4 @@
-"""Colors for instances and classes; nearby instances get dissimilar colors."""
+"""Colors for instances and classes."""
 
 from __future__ import annotations
 
@@ -19,16 +19,23 @@ DARK = ((130, 95), (60, 125))  # saturation and value of darker shades, disjoint
 
 
 def candidates(shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
-    """Return the RGB colors (K, 3) of all hues in each shade; a shade is a saturation and a value, 0 to 255."""
+    """Return the colors (K, 3), RGB, of all hues in the given shades.
+
+    A shade is a saturation and a value in [0, 255].
+    """
     hues = np.arange(HUES) * (180 // HUES)
     hsv = np.array([(hue, *shade) for shade in shades for hue in hues], np.uint8)
     return np.asarray(cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0], np.uint8)
 
 
 def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
-    """Return RGB colors (N, 3) for objects at the centroids (N, 3), m. Nearby objects get dissimilar colors.
+    """Return dissimilar colors (N, 3), RGB, for nearby objects.
 
-    Each object, in the given order, gets the candidate color that is least similar to the colors of nearby objects.
+    Each object gets the color that is least similar to the colors of nearby objects before it.
+
+    Args:
+        centroids: The centroids (N, 3) of the objects, m.
+        shades: The shades of the candidate colors; see `candidates`.
     """
     rgb = candidates(shades)
     lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0]
@@ -42,11 +49,11 @@ def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEA
 
 
 def object_colors(centroids: Mapping[int, Float64], likely: Set[int]) -> dict[int, UInt8]:
-    """Return the RGB color (3,) of each object, by object id.
+    """Return the color (3,) of each object by id, RGB.
 
     Args:
-        centroids: Centroid (3,), m, by object id.
-        likely: Ids of the likely objects. They are colored first, so that they have the same colors as in overview.png.
+        centroids: The centroid (3,) of each object by id, m.
+        likely: The ids of likely objects. They are colored first, so that they have the same colors as in overview.png.
     """
     ordered = sorted(centroids, key=lambda key: (key not in likely, key))
     positions = np.array([centroids[key] for key in ordered], np.float64).reshape(-1, 3)
@@ -54,12 +61,12 @@ def object_colors(centroids: Mapping[int, Float64], likely: Set[int]) -> dict[in
 
 
 def class_colors(objects: Sequence[tuple[str, float]]) -> dict[str, UInt8]:
-    """Return the RGB color (3,) of each class, by class name.
+    """Return the color (3,) of each class by name, RGB.
 
-    The colors of the classes with the most confident objects differ most.
+    The classes of the most confident objects get the most dissimilar colors.
 
     Args:
-        objects: Class name and confidence of each object.
+        objects: The class name and confidence of each object.
     """
     most: dict[str, float] = {}
     for name, confidence in objects:

@@ -1,7 +1,8 @@
-"""Rasterization of triangle meshes, several times faster than ray casting for small triangles.
+"""Rasterizer of triangle meshes.
 
-Edge functions are evaluated in homogeneous coordinates: Olano and Greer, "Triangle Scan Conversion Using 2D Homogeneous
-Coordinates", Graphics Hardware 1997. No clipping is needed, and triangles with a common edge leave no gap.
+Edge functions are evaluated in homogeneous coordinates, as in Olano and Greer, "Triangle Scan Conversion Using 2D
+Homogeneous Coordinates", Graphics Hardware 1997. No clipping is needed, and adjacent triangles leave no gap. For small
+triangles, the rasterizer is several times faster than ray casting.
 """
 
 from __future__ import annotations
@@ -16,18 +17,18 @@ from framework.rendering.rasterizer_kernels import bounding_spheres, draw_triang
 
 @dataclass(frozen=True)
 class VisibilityBuffer:
-    """The visible triangle of each pixel."""
+    """The visible triangle at each pixel."""
 
     triangle: Int32  # (H, W) index of the triangle, NO_TRIANGLE = none
     depth: Float32  # (H, W) m along z, 0 = none
-    uv: Float32  # (H, W, 2) barycentric weights of the triangle's second and third vertex
+    uv: Float32  # (H, W, 2) barycentric weights of the second and third vertex
 
     def nearest(self, triangles: Int32, labels: Int32) -> Int32:
-        """Return the label (H, W) of the triangle corner with the largest barycentric weight in each pixel, 0 = none.
+        """Return the label (H, W) of the vertex with the largest barycentric weight at each pixel, 0 = none.
 
         Args:
-            triangles: (F, 3) vertex indices of the mesh.
-            labels: (V,) labels of the vertices.
+            triangles: The triangles (F, 3) of the mesh.
+            labels: The label (V,) of each vertex.
         """
         image = np.zeros(self.triangle.shape, np.int32)
         nearest(self.triangle, self.uv, triangles, labels, image)
@@ -35,10 +36,10 @@ class VisibilityBuffer:
 
 
 class Rasterizer:
-    """Rasterizer of a fixed triangle mesh. It is thread-safe."""
+    """Thread-safe rasterizer of a triangle mesh."""
 
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
-        """Prepare a mesh of vertices (V, 3), m, in the world frame, and two-sided triangles (F, 3)."""
+        """Prepare a mesh of vertices (V, 3), m, and two-sided triangles (F, 3)."""
         self._vertices = np.ascontiguousarray(vertices, np.float32)
         # spatial order improves culling and cache locality
         self._order = np.argsort(morton_codes(self._vertices, triangles), kind="stable").astype(np.int32)
@@ -46,9 +47,9 @@ class Rasterizer:
         self._spheres = bounding_spheres(self._vertices, self._triangles)
 
     def draw(self, camera: Camera, T_world_camera: Float64) -> VisibilityBuffer:
-        """Return the nearest triangle of each pixel of a camera at `T_world_camera` (4, 4).
+        """Return the nearest triangle at each pixel of a camera with the given pose (4, 4).
 
-        Triangles with equal depth are selected deterministically.
+        Ties in depth are resolved deterministically.
         """
         triangle = np.empty(camera.shape, np.int32)
         depth = np.empty(camera.shape, np.float32)

@@ -1,4 +1,4 @@
-"""Numba kernels of rasterizer.py."""
+"""Kernels of rasterizer.py."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ NEAR = 1e-9  # m, near plane for the bounds of triangles partly behind the camer
 
 @njit(cache=True, nogil=True)
 def morton_codes(vertices: Float32, triangles: Int32) -> npt.NDArray[np.uint32]:
-    """Return the Morton code (F,) of each triangle's centroid in the bounding cube of all centroids, 10 bits per axis.
+    """Return the Morton code (F,) of the centroid of each triangle.
 
     Args:
-        vertices: (V, 3) m.
-        triangles: (F, 3) vertex indices.
+        vertices: The vertices (V, 3), m.
+        triangles: The triangles (F, 3).
     """
     middle = np.empty((len(triangles), 3), np.float32)
     for f in range(len(triangles)):
@@ -48,13 +48,13 @@ def morton_codes(vertices: Float32, triangles: Int32) -> npt.NDArray[np.uint32]:
 
 @njit(cache=True, nogil=True)
 def bounding_spheres(vertices: Float32, triangles: Int32) -> Float64:
-    """Return a bounding sphere for each chunk of CHUNK consecutive triangles.
+    """Return the bounding sphere (center and radius, m) of each chunk of consecutive triangles.
 
-    The array (ceil(F / CHUNK), 4) contains the center (x, y, z), in the frame of the vertices, and the radius, m.
+    The result (ceil(F / CHUNK), 4) contains x, y, z and the radius.
 
     Args:
-        vertices: (V, 3) m.
-        triangles: (F, 3) vertex indices.
+        vertices: The vertices (V, 3), m.
+        triangles: The triangles (F, 3).
     """
     spheres = np.zeros(((len(triangles) + CHUNK - 1) // CHUNK, 4))
     for chunk in range(len(spheres)):
@@ -87,20 +87,20 @@ def draw_triangles(
     depth: Float32,
     uv: Float32,
 ) -> None:
-    """Rasterize triangles, and write the arrays of a `VisibilityBuffer`.
+    """Rasterize triangles into the arrays of a `VisibilityBuffer`.
 
     Args:
-        vertices: (V, 3) m, world frame.
-        triangles: (F, 3) vertex indices.
-        order: (F,) index that is written to `triangle` for each row of `triangles`.
-        spheres: Bounding spheres of the triangles, from `bounding_spheres`.
-        T_world_camera: (4, 4) camera pose.
-        intrinsics: fx, fy, cx, cy, px.
-        x: (W,) coordinate of each pixel column at z = 1.
-        y: (H,) coordinate of each pixel row at z = 1.
-        triangle: (H, W) output, index of the visible triangle, NO_TRIANGLE = none.
-        depth: (H, W) output, m along z, 0 = none.
-        uv: (H, W, 2) output, barycentric weights of the second and third vertex.
+        vertices: The vertices (V, 3) in the world frame, m.
+        triangles: The triangles (F, 3).
+        order: The index (F,) to write for each triangle.
+        spheres: The bounding spheres of the chunks, from `bounding_spheres`.
+        T_world_camera: The camera pose (4, 4).
+        intrinsics: The intrinsics fx, fy, cx, cy, px.
+        x: The coordinate (W,) of each pixel column at z = 1.
+        y: The coordinate (H,) of each pixel row at z = 1.
+        triangle: The output (H, W), the index of the visible triangle, NO_TRIANGLE = none.
+        depth: The output (H, W), m, 0 = none.
+        uv: The output (H, W, 2), the barycentric weights of the second and third vertex.
     """
     height, width = triangle.shape
     closeness = np.zeros((height, width))  # 1/m, inverse depth; 0 = no surface
@@ -148,14 +148,14 @@ def draw_triangles(
 
 @njit(cache=True, nogil=True)
 def nearest(triangle: Int32, uv: Float32, triangles: Int32, labels: Int32, image: Int32) -> None:
-    """Set each covered pixel of `image` (H, W) to the label of its triangle's corner with the largest weight.
+    """Write the label of the vertex with the largest barycentric weight at each pixel.
 
     Args:
-        triangle: (H, W) index of the visible triangle, NO_TRIANGLE = none.
-        uv: (H, W, 2) barycentric weights of the second and third vertex.
-        triangles: (F, 3) vertex indices.
-        labels: (V,) labels of the vertices.
-        image: (H, W) output; other pixels keep their values.
+        triangle: The visible triangle (H, W) at each pixel, NO_TRIANGLE = none.
+        uv: The barycentric weights (H, W, 2) of the second and third vertex.
+        triangles: The triangles (F, 3).
+        labels: The label (V,) of each vertex.
+        image: The output (H, W). Pixels without a triangle keep their values.
     """
     for v in range(triangle.shape[0]):
         for u in range(triangle.shape[1]):
@@ -168,14 +168,14 @@ def nearest(triangle: Int32, uv: Float32, triangles: Int32, labels: Int32, image
 
 @njit(cache=True, nogil=True)
 def interpolate(triangle: Int32, uv: Float32, triangles: Int32, values: Float32, image: Float32) -> None:
-    """Set each covered pixel of `image` (H, W, C) to the interpolated values of its triangle's vertices.
+    """Interpolate vertex values at each pixel.
 
     Args:
-        triangle: (H, W) index of the visible triangle, NO_TRIANGLE = none.
-        uv: (H, W, 2) barycentric weights of the second and third vertex.
-        triangles: (F, 3) vertex indices.
-        values: (V, C) values of the vertices.
-        image: (H, W, C) output; other pixels keep their values.
+        triangle: The visible triangle (H, W) at each pixel, NO_TRIANGLE = none.
+        uv: The barycentric weights (H, W, 2) of the second and third vertex.
+        triangles: The triangles (F, 3).
+        values: The values (V, C) of the vertices.
+        image: The output (H, W, C). Pixels without a triangle keep their values.
     """
     for v in range(triangle.shape[0]):
         for u in range(triangle.shape[1]):
@@ -191,7 +191,7 @@ def interpolate(triangle: Int32, uv: Float32, triangles: Int32, values: Float32,
 
 @njit(cache=True, nogil=True, inline="always")
 def _corners(vertices, triangles, f, T_world_camera):
-    """Return the three corners of triangle f, m, in the camera frame."""
+    """Return the three corners of a triangle in the camera frame, m."""
     i, j, k = np.uint64(triangles[f, 0]), np.uint64(triangles[f, 1]), np.uint64(triangles[f, 2])
     return (
         _in_camera(T_world_camera, vertices[i, 0], vertices[i, 1], vertices[i, 2]),
@@ -202,12 +202,9 @@ def _corners(vertices, triangles, f, T_world_camera):
 
 @njit(cache=True, nogil=True, inline="always")
 def _edge_functions(a, b, c):
-    """Return the three edge functions of a triangle and the nonnegative triple product of its corners.
-
-    The barycentric weight of a corner is proportional to the dot product of the pixel's ray with the cross product of
-    the other two corners. At a common edge, both triangles compute the same value with opposite signs, which leaves no
-    gap.
-    """
+    """Return the three edge functions of a triangle and the nonnegative triple product of its corners."""
+    # The barycentric weight of a corner is proportional to the dot product of the ray with the cross product of the
+    # other two corners. At a common edge, two triangles compute the same value with opposite signs, so there is no gap.
     ea, eb, ec = _cross(b, c), _cross(c, a), _cross(a, b)
     volume = a[0] * ea[0] + a[1] * ea[1] + a[2] * ea[2]
     if volume < 0:  # back side
@@ -217,7 +214,7 @@ def _edge_functions(a, b, c):
 
 @njit(cache=True, nogil=True, inline="always")
 def _in_camera(T, x, y, z):
-    """Return the camera-frame coordinates, m, of a point x, y, z (m) in the world frame; T is T_world_camera."""
+    """Transform a world point to the camera frame."""
     x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
     return (
         T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,
@@ -233,7 +230,7 @@ def _cross(p, q):
 
 @njit(cache=True, nogil=True)
 def _is_out_of_sight(center, radius, intrinsics, width, height):
-    """Return True if a sphere is completely outside the view frustum; its center (m) is in the camera frame."""
+    """Return True if a sphere in the camera frame is completely outside the view frustum."""
     fx, fy, cx, cy = intrinsics
     x, y, z = center
     for distance, slope in (
@@ -250,9 +247,9 @@ def _is_out_of_sight(center, radius, intrinsics, width, height):
 
 @njit(cache=True, nogil=True, inline="always")
 def _pixels_of(a, b, c, intrinsics, width, height):
-    """Return the pixel bounds of a triangle: first column, end column, first row and end row.
+    """Return the first column, end column, first row and end row of a triangle in the camera frame.
 
-    The corners a, b and c are in the camera frame, m. The ends are exclusive.
+    The ends are exclusive.
     """
     fx, fy, cx, cy = intrinsics
     if min(a[2], b[2], c[2]) > NEAR:
@@ -271,10 +268,7 @@ def _pixels_of(a, b, c, intrinsics, width, height):
 
 @njit(cache=True, nogil=True)
 def _bounds_in_front(a, b, c):
-    """Return the left, right, top and bottom bounds, projected to z = 1, of a triangle that is clipped at z = NEAR.
-
-    The corners a, b and c are in the camera frame, m.
-    """
+    """Return the left, right, top and bottom of a triangle at z = 1, after clipping at the near plane."""
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
     for p, q in ((a, b), (b, c), (c, a)):
         x, y, z = p

@@ -1,4 +1,4 @@
-"""Oriented triangle surfaces and their rasterized views, without OpenGL."""
+"""Oriented triangle surfaces and their views."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from framework.data import Bool, Camera, Float32, Float64, Int32
 from framework.rendering.rasterizer import Rasterizer, VisibilityBuffer
 from framework.rendering.rasterizer_kernels import NO_TRIANGLE, interpolate
 
-VOTES, VOTERS = 20000, 50  # approximate numbers of triangles and cameras that are sampled to determine the front side
+VOTES, VOTERS = 20000, 50  # approximate numbers of sampled triangles and cameras to determine the front side
 
 
 @dataclass(frozen=True)
 class Hits:
-    """The visible surface point of each pixel of a camera."""
+    """The visible surface point at each pixel of a camera."""
 
     camera: Camera
     buffer: VisibilityBuffer
@@ -25,7 +25,7 @@ class Hits:
 
     @property
     def depth(self) -> Float32:
-        """Depth (H, W), m along z, 0 = none."""
+        """Depth (H, W), m, 0 = none."""
         return self.buffer.depth
 
     @property
@@ -35,7 +35,7 @@ class Hits:
 
     @property
     def points_world(self) -> Float32:
-        """Points (H, W, 3), m, in the world frame; zero vector = none."""
+        """World points (H, W, 3), m, 0 = none."""
         return self.interpolated(self.vertices)
 
     def subsampled(self, n: int) -> Hits:
@@ -48,21 +48,18 @@ class Hits:
         return replace(self, camera=camera, buffer=buffer)
 
     def interpolated(self, values: Float32) -> Float32:
-        """Return the vertex values (V, C), interpolated at each pixel (H, W, C); 0 for pixels without a surface."""
+        """Return the interpolated vertex values (H, W, C) at each pixel, 0 = no surface."""
         image = np.zeros((*self.camera.shape, values.shape[1]), np.float32)
         interpolate(self.buffer.triangle, self.buffer.uv, self.triangles, np.ascontiguousarray(values), image)
         return image
 
     def nearest(self, labels: Int32) -> Int32:
-        """Return for each pixel the label (H, W) of the triangle corner with the largest weight, 0 = none.
-
-        `labels` (V,) are the labels of the vertices.
-        """
+        """Return the label (H, W) of the vertex with the largest barycentric weight at each pixel, 0 = none."""
         return self.buffer.nearest(self.triangles, labels)
 
 
 class Surface:
-    """Triangle mesh whose winding order defines the front side."""
+    """Triangle mesh with a front side, which is defined by the winding order."""
 
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
         self.vertices = np.ascontiguousarray(vertices, np.float32)  # (V, 3) m, world frame
@@ -72,12 +69,12 @@ class Surface:
     def seen_from(cls, vertices: Float32, triangles: Int32, poses: Float64) -> Surface:
         """Return the surface whose front side faces the cameras.
 
-        The winding order is reversed if necessary, because mesh extractors use different winding orders.
+        Mesh extractors use different winding orders, so the order is reversed if necessary.
 
         Args:
-            vertices: (V, 3) m, world frame.
-            triangles: (F, 3) vertex indices.
-            poses: (P, 4, 4) T_world_camera.
+            vertices: The vertices (V, 3) in the world frame, m.
+            triangles: The triangles (F, 3).
+            poses: The camera poses (P, 4, 4).
         """
         some = cls(vertices, triangles[:: max(1, len(triangles) // VOTES)])
         centers = vertices[some.triangles].mean(axis=1)
@@ -92,13 +89,13 @@ class Surface:
 
     @cached_property
     def face_normals(self) -> Float32:
-        """Face normals (F, 3), world frame; the length of a normal is twice the area of its triangle, m^2."""
+        """Face normals (F, 3) in the world frame, with twice the area of the triangle, m^2, as length."""
         a, b, c = self.vertices[self.triangles].transpose(1, 0, 2)
         return np.cross(b - a, c - a)
 
     @cached_property
     def vertex_normals(self) -> Float32:
-        """Unit normals (V, 3), world frame: the area-weighted mean over the adjacent triangles."""
+        """Unit normals (V, 3) in the world frame, the area-weighted mean over adjacent triangles."""
         corners, weights = self.triangles.ravel(), np.repeat(self.face_normals, 3, axis=0)
         x, y, z = (np.bincount(corners, weights[:, k], minlength=len(self.vertices)) for k in range(3))
         length = np.maximum(np.sqrt(x**2 + y**2 + z**2), 1e-12)
@@ -106,7 +103,10 @@ class Surface:
 
 
 class FrontSides:
-    """The triangles of a surface that face a viewpoint, without walls and ceilings that are seen from behind."""
+    """The triangles of a surface that face a viewpoint.
+
+    Walls and ceilings seen from behind are omitted.
+    """
 
     def __init__(self, surface: Surface, eye_world: Float64) -> None:
         self._eye_world = eye_world  # (3,) m, position of the viewpoint
@@ -117,7 +117,7 @@ class FrontSides:
         self._rasterizer = Rasterizer(self._vertices, self._triangles)
 
     def seen_by(self, camera: Camera, R_world_camera: Float64) -> Hits:
-        """Return the visible surface points of a camera at the viewpoint with rotation `R_world_camera` (3, 3)."""
+        """Return the visible surface points of a camera at the viewpoint with the given rotation (3, 3)."""
         T_world_camera = np.eye(4)
         T_world_camera[:3, :3], T_world_camera[:3, 3] = R_world_camera, self._eye_world
         return Hits(camera, self._rasterizer.draw(camera, T_world_camera), self._vertices, self._triangles)

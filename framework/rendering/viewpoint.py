@@ -1,4 +1,7 @@
-"""Selection of a viewpoint for a map: an oblique view into the room from above, with many visible objects."""
+"""Selection of a viewpoint for a map.
+
+The view is oblique, from above, and shows many objects.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +23,11 @@ LEVEL_CONE_RAD = np.deg2rad(30)  # largest angle between floor normals and the m
 def upward(poses: Float64, surface: Surface) -> Float64:
     """Return the up direction (3,), a unit vector in the world frame.
 
-    It is the mean of the cameras' -y axes, refined with the normals of floors and table tops.
+    The mean up direction of the cameras is refined with the normals of floors and table tops.
 
     Args:
-        poses: (F, 4, 4) T_world_camera.
-        surface: Surface of the map.
+        poses: The camera poses (F, 4, 4) of the mapped frames.
+        surface: The surface of the map.
     """
     up = -poses[:, :3, 1].mean(axis=0)
     up /= np.linalg.norm(up)
@@ -39,17 +42,17 @@ def upward(poses: Float64, surface: Surface) -> Float64:
 
 
 def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return a camera and the pose T_world_camera (4, 4) with the best view of a surface.
+    """Return the camera and the camera pose (4, 4) with the best view of a surface.
 
-    Candidate views look down from AZIMUTHS directions at the angles ELEVATIONS_RAD. The best view has the highest
-    `_score`, which favors many visible objects; directions similar to those of the mapping cameras are preferred.
+    Candidate views look down from several directions. The best view shows many objects, preferably from a direction
+    similar to those of the mapping cameras.
 
     Args:
-        surface: Surface to show.
-        instance_ids: (V,) instance ids of the surface's vertices, 0 = none.
-        poses: (F, 4, 4) T_world_camera of the mapped frames.
-        width: Width of the image in px.
-        height: Height of the image in px.
+        surface: The surface.
+        instance_ids: The instance (V,) of each vertex, 0 = none.
+        poses: The camera poses (F, 4, 4) of the mapped frames.
+        width: The width of the image, px.
+        height: The height of the image, px.
     """
     up = upward(poses, surface)
     forward = poses[:, :3, 2].mean(axis=0)
@@ -78,11 +81,11 @@ def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int,
 
 
 def looking(forward: Float64, up: Float64) -> Float64:
-    """Return the rotation R_world_camera (3, 3) of a camera from its viewing direction and its up direction.
+    """Return the rotation R_world_camera (3, 3) of a camera with the given viewing direction.
 
     Args:
-        forward: (3,) viewing direction, world frame.
-        up: (3,) up direction of the image, world frame; not parallel to `forward`.
+        forward: The viewing direction (3,) in the world frame.
+        up: The up direction (3,) of the image in the world frame, not parallel to `forward`.
     """
     z = forward / np.linalg.norm(forward)
     x = np.cross(z, up)
@@ -91,29 +94,26 @@ def looking(forward: Float64, up: Float64) -> Float64:
 
 
 def fitted(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return a camera, and the pose T_world_camera (4, 4) nearest to the points that shows all points but outliers.
+    """Return a camera and its pose (4, 4), from which all points except outliers are visible.
 
     Args:
-        R_world_camera: (3, 3) rotation of the camera.
-        points_world: (P, 3) m.
-        width: Width of the image in px.
-        height: Height of the image in px.
+        R_world_camera: The rotation (3, 3) of the camera.
+        points_world: The points (P, 3), m.
+        width: The width of the image, px.
+        height: The height of the image, px.
     """
     return _framed(R_world_camera, _without_strays(points_world), width, height)
 
 
 def _without_strays(points: Float32) -> Float32:
-    """Return the points (P, 3) whose coordinates are between the 0.3rd and the 99.7th percentile of each axis.
-
-    If no point is left, return all points.
-    """
+    """Return the points without outliers, i.e. between two percentiles along each axis."""
     low, high = np.percentile(points, [0.3, 99.7], axis=0)
     kept = points[((points >= low) & (points <= high)).all(axis=1)]
     return kept if len(kept) else points
 
 
 def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return a camera and pose like `fitted`, but with all points in view, including outliers."""
+    """Return a camera and its pose (4, 4), from which all points are visible."""
     focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     x, y, z = R_world_camera.T @ points_world.T
@@ -129,14 +129,7 @@ def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: 
 
 
 def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: Float64) -> Int32:
-    """Return the indices of the visible points: the nearest front-facing point of each pixel.
-
-    Args:
-        points: (P, 3) m, world frame.
-        normals: (P, 3) unit vectors, world frame.
-        camera: Camera of the image.
-        T_world_camera: (4, 4) pose of the camera.
-    """
+    """Return the indices of the visible points: the nearest front-facing point at each pixel."""
     nearest = np.full(camera.shape, -1, np.int32)
     points, normals = (
         np.ascontiguousarray(points),
@@ -147,9 +140,6 @@ def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: 
 
 
 def _score(instance_ids: Int32) -> float:
-    """Return the score of a view from the instance ids (N,) of its visible points, 0 = none.
-
-    The score is the sum of the square roots of each instance's number of points and of N. The square roots favor many
-    small objects over one large object.
-    """
+    """Return the score of a view from the instances (N,) of its visible points."""
+    # square roots favor many small objects over one large object
     return float(np.sqrt(np.bincount(instance_ids, minlength=1)[1:]).sum() + np.sqrt(len(instance_ids)))

@@ -1,4 +1,4 @@
-"""Numba kernels of viewpoint.py."""
+"""Kernels of viewpoint.py."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from framework.data import Float32, Float64, Int32
 
 @njit(cache=True, nogil=True)
 def sum_level_normals(normals: Float32, up: Float64, cosine: float) -> tuple[Float64, float]:
-    """Return the sum (3,) of the face normals in a cone around `up`, and the fraction of the total area of these faces.
+    """Return the sum (3,) of the face normals in a cone around `up`, and the fraction of their area.
 
     Args:
-        normals: (F, 3) face normals; the length is proportional to the area.
-        up: (3,) unit vector, the axis of the cone.
-        cosine: Cosine of the half angle of the cone.
+        normals: The face normals (F, 3), with a length proportional to the area.
+        up: The axis (3,) of the cone, a unit vector.
+        cosine: The cosine of the half angle of the cone.
     """
     total, inside, area = np.zeros(3), 0.0, 0.0
     for f in range(len(normals)):
@@ -32,14 +32,14 @@ def sum_level_normals(normals: Float32, up: Float64, cosine: float) -> tuple[Flo
 def draw_fronts(
     points: Float32, normals: Float32, T: Float64, intrinsics: tuple[float, float, float, float], nearest: Int32
 ) -> None:
-    """Write the index of the nearest front-facing point in each pixel to `nearest`.
+    """Write the index of the nearest front-facing point at each pixel to `nearest`.
 
     Args:
-        points: (P, 3) m, world frame.
-        normals: (P, 3) normals of the points, world frame.
-        T: (4, 4) T_world_camera.
-        intrinsics: fx, fy, cx, cy, px.
-        nearest: (H, W) output; pixels without a point keep their values.
+        points: The points (P, 3) in the world frame, m.
+        normals: The normals (P, 3) of the points in the world frame.
+        T: The camera pose T_world_camera (4, 4).
+        intrinsics: The intrinsics fx, fy, cx, cy, px.
+        nearest: The output (H, W). Pixels without a point keep their values.
     """
     fx, fy, cx, cy = intrinsics
     height, width = nearest.shape

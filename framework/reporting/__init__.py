@@ -1,1 +1,1 @@
-"""Reports: self-contained HTML pages with an interactive map, its objects, and their evaluation."""
+"""Self-contained HTML reports with an interactive map, its objects and their evaluation."""

@@ -1,4 +1,7 @@
-"""Charts of a report: matplotlib figures as SVG elements in the light or dark colors of the page."""
+"""Charts of a report.
+
+The charts are matplotlib figures, converted to SVG elements. They use the light or dark colors of the page.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +63,7 @@ VARIABLES = {color: f"var(--{name})" for name, color in COLORS.items()}
 
 @dataclass(frozen=True)
 class Footprint:
-    """An object in the top view."""
+    """The outline of an object in the top view."""
 
     corners_world: Float64  # (8, 3) m, corners of the bounding box
     name: str
@@ -79,7 +82,7 @@ class PlottedPath:
 
 @dataclass(frozen=True)
 class StageRow:
-    """Percentiles of the time of one stage per frame, ms."""
+    """Percentiles of the run time of one stage, ms."""
 
     stage: str
     lowest: float  # 5th percentile
@@ -93,7 +96,7 @@ def box_corners(box: Box) -> Float64:
 
 
 def stage_rows(times: StageTimes) -> list[StageRow]:
-    """Return the percentiles of each stage that ran, in the order of the pipeline."""
+    """Return the percentiles of each stage that ran, in pipeline order."""
     rows = []
     for stage in (*STAGES, FUSION):
         values = times.milliseconds.get(stage, np.zeros(0))
@@ -109,14 +112,17 @@ def top_view(
     up: Float64,
     height: float = HEIGHT,
 ) -> tuple[str, float]:
-    """Return the SVG of a top view, and the larger side of the paths' bounding rectangle relative to the view's width.
+    """Draw camera paths and objects in top view.
 
     Args:
         paths: Estimated paths, at least one.
-        true_paths: Positions (n, 3), m, of each ground-truth path; drawn as a dashed line.
+        true_paths: Positions (n, 3) of each ground-truth path, m. They are drawn as dashed lines.
         objects: Objects to draw as filled outlines.
-        up: (3,) unit vector opposite to gravity, world frame.
+        up: Up direction (3,) in the world frame, a unit vector.
         height: Height of the chart, px.
+
+    Returns:
+        The SVG element, and the longer side of the area covered by the paths, relative to the width of the chart.
     """
     plot_height = height - FOOT
     plane = _horizontal(paths[0].positions, up)
@@ -157,7 +163,13 @@ def top_view(
 
 
 def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT_HEIGHT) -> str:
-    """Return the SVG of a line chart of the position `errors` (n,), m, of the frames with the numbers `frames` (n,)."""
+    """Draw a line chart of the position error by frame, and return its SVG element.
+
+    Args:
+        frames: Frame numbers (n,).
+        errors: Position errors (n,), m.
+        height: Height of the chart, px.
+    """
     figure, axes = _chart(height, frames[0], frames[-1], "Position error, mm")
     axes.plot(frames, 1e3 * errors, color=COLORS["accent"], linewidth=2, gid="chart-errors")
     axes.set_ylim(0, max(1.08e3 * float(errors.max(initial=0.0)), 1e-3))
@@ -165,7 +177,10 @@ def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT
 
 
 def stage_areas(times: StageTimes) -> str:
-    """Return the SVG of a stacked area chart of the stage times by frame: running medians over WINDOW frames, ms."""
+    """Draw a stacked area chart of the stage times by frame, and return its SVG element.
+
+    The areas show running medians over WINDOW frames, ms.
+    """
     chosen = np.unique(np.linspace(0, len(times.frames) - 1, MAX_POINTS).astype(int))
     stages = [row.stage for row in stage_rows(times)]
     layers = [np.nan_to_num(running_median(times.milliseconds[stage], WINDOW))[chosen] for stage in stages]
@@ -179,11 +194,11 @@ def stage_areas(times: StageTimes) -> str:
 
 
 def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int], last_frame: int) -> str:
-    """Return the SVG of a chart of the mapping progress: visible surface and number of detected objects by frame.
+    """Draw the visible surface and the number of detected objects by frame, and return the SVG element.
 
     Args:
-        frames: (n,) frame numbers of `fraction`.
-        fraction: (n,) fraction of the final surface that was visible up to each frame, in [0, 1].
+        frames: Frame numbers (n,).
+        fraction: Fraction (n,) of the final surface that was visible up to each frame, in [0, 1].
         first_frames: Number of the frame in which each object was first detected.
         last_frame: Number of the last frame of the sequence.
     """
@@ -211,7 +226,7 @@ def round_length(longest: float) -> float:
 
 
 def _chart(height: float, first: float, last: float, title: str, right: float = RIGHT) -> tuple[Figure, Axes]:
-    """Return a figure and its empty axes, with the frame numbers `first` to `last` on the x axis; lengths in px."""
+    """Return a figure and its empty axes, with frame numbers on the x axis. Lengths are in px."""
     figure = Figure((WIDTH / 72, height / 72), dpi=72, facecolor="none")
     inner = 1 - (LEFT + right) / WIDTH, 1 - (TOP + BOTTOM) / height
     axes = figure.add_axes((LEFT / WIDTH, BOTTOM / height, *inner), facecolor="none")
@@ -230,11 +245,8 @@ def _chart(height: float, first: float, last: float, title: str, right: float = 
 def _horizontal(positions: Float64, up: Float64) -> Float64:
     """Return the right and up axes (2, 3) of the top view, unit vectors in the world frame.
 
-    The right axis is the horizontal direction in which the positions have the largest variance.
-
-    Args:
-        positions: (P, 3) m, world frame.
-        up: (3,) unit vector opposite to gravity, world frame.
+    The right axis is the horizontal direction with the largest variance of the positions (P, 3). `up` (3,) is the up
+    direction, a unit vector.
     """
     any_level = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     level = np.stack([any_level, np.cross(up, any_level)]) / np.linalg.norm(any_level)
@@ -244,13 +256,13 @@ def _horizontal(positions: Float64, up: Float64) -> Float64:
 
 
 def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, px: float, gid: str) -> bool:
-    """Draw an object, and return True; return False without drawing if its outline has no area.
+    """Draw an object in the top view. Return False if its outline has no area.
 
     Args:
         axes: Axes of the top view.
-        one: Object to draw.
-        corners: (8, 2) m, corners of the object in the axes of the top view.
-        px: Side of a pixel in the world, m.
+        one: Object.
+        corners: Corners (8, 2) of the object in the axes of the top view, m.
+        px: Size of a pixel, m.
         gid: Id of the outline in the SVG.
     """
     try:
@@ -267,7 +279,9 @@ def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, px: float, gid
 
 
 def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) -> str:
-    """Return a figure as an `<svg>` element without inline styles, which the page's content security policy forbids.
+    """Convert a figure to an `<svg>` element without inline styles.
+
+    The content security policy of the page forbids inline styles.
 
     Args:
         figure: Figure to convert.
@@ -289,9 +303,9 @@ def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) ->
 
 
 def _attributes(style: re.Match[str]) -> str:
-    """Return the CSS properties of a matched `style`, except for fonts, as SVG attributes.
+    """Convert a matched `style` attribute to SVG attributes, without fonts.
 
-    The colors in COLORS are replaced by the CSS variables of the page.
+    Colors in COLORS are replaced by the CSS variables of the page.
     """
     pairs = [item.split(":", 1) for item in style[1].split(";") if ":" in item]
     kept = [(key.strip(), value.strip()) for key, value in pairs if not key.strip().startswith("font")]

@@ -1,4 +1,4 @@
-"""HTML page that compares several runs."""
+"""HTML page with a comparison of several runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
-MAX_MAPS = 6  # maximum number of maps in the page; their total size is limited to that of one map in a run's page
+MAX_MAPS = 6  # maximum number of maps in the page; their total size has the limit of a single map
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of N runs with the first run."""
+    """A comparison of several runs with the first run."""
 
     runs: Sequence[RunContents]
     names: Sequence[str]  # unique
@@ -98,7 +98,9 @@ class Comparison:
 
     @classmethod
     def of(cls, runs: Sequence[RunContents], links: Sequence[str]) -> Comparison:
-        """Return the comparison of the runs. The maps are decimated to the total size of one map.
+        """Return the comparison of runs.
+
+        The maps are decimated, so that their total size is that of one map.
 
         Args:
             runs: Outputs of the runs, at least one.
@@ -230,12 +232,12 @@ def compared(values: Sequence[float | None], digits: int, better: int) -> list[C
 
 
 def short_names(directories: Sequence[Path]) -> list[str]:
-    """Return the paths of the directories relative to their deepest common parent directory."""
+    """Return the paths of directories relative to their deepest common parent directory."""
     resolved = [path.resolve() for path in directories]
     common = Path(os.path.commonpath([path.parent for path in resolved]))
     return [str(path.relative_to(common)) for path in resolved]
 
 
 def _target(node: Any) -> str:
-    """Return the class name of a plugin from its config node, "" for a node without a plugin."""
+    """Return the class name of the plugin in a config node, or "" without a plugin."""
     return str(node.get("_target_")).rpartition(".")[2] if isinstance(node, dict) else ""

@@ -1,4 +1,7 @@
-"""The map of a run for the viewer of the report: decimated, with object colors and an initial view."""
+"""Maps for the viewer of a report.
+
+A map is decimated, and has object colors and an initial view.
+"""
 
 from __future__ import annotations
 
@@ -49,15 +52,17 @@ class MapScene:
     mesh: InstanceMesh  # decimated; the front sides of its triangles face the cameras
     surface: Surface  # surface of `mesh`
     sightings: Sightings
-    up: Float64  # (3,) unit vector opposite to gravity, world frame
+    up: Float64  # (3,) up direction in the world frame, a unit vector
 
     @classmethod
     def of(cls, contents: RunContents, footage: Footage, fraction: float = 1.0) -> MapScene | None:
-        """Return the map, decimated to a fraction of MAX_TRIANGLES and MAX_BYTES; None for an empty map.
+        """Return the map of a run, or None for an empty map.
+
+        The map is decimated to a fraction of MAX_TRIANGLES and MAX_BYTES.
 
         Args:
             contents: Outputs of the run.
-            footage: Images of the run's sequence; may be empty.
+            footage: Images of the sequence; may be empty.
             fraction: Fraction of the size limits, in (0, 1].
         """
         if contents.mesh is None or not len(contents.poses):
@@ -82,18 +87,18 @@ class MapScene:
 
     @property
     def likely_labels(self) -> Int32:
-        """Label (V,) of each vertex: position of its object in `likely_ids`, counted from 1; 0 = no likely object."""
+        """Index (V,) of the object of each vertex in `likely_ids`, starting at 1, or 0 for no likely object."""
         likely = np.array([0, *likely_ids(self.contents)])
         indices = np.minimum(np.searchsorted(likely, self.mesh.instance_ids), len(likely) - 1)
         return np.where(likely[indices] == self.mesh.instance_ids, indices, 0).astype(np.int32)
 
     @cached_property
     def view(self) -> tuple[Camera, Float64]:
-        """Initial view: a camera and its pose T_world_camera (4, 4)."""
+        """Camera and camera pose (4, 4) of the initial view."""
         return best_view(self.surface, self.likely_labels, self.contents.poses, VIEW_WIDTH, VIEW_HEIGHT)
 
     def data(self) -> dict[str, Any]:
-        """Return the data that viewer.js needs in addition to the GLB file, as JSON values."""
+        """Return the data for viewer.js that the GLB file does not contain, as JSON values."""
         poses = self.contents.poses
         _, T_world_camera = self.view
         eye, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
@@ -151,7 +156,7 @@ def likely_ids(contents: RunContents) -> list[int]:
 
 
 def colors_by_id(objects: tuple[StoredInstance, ...]) -> dict[int, UInt8]:
-    """Return the RGB color (3,) by object id; objects without vertices are gray."""
+    """Return the RGB color (3,) of each object by id. Objects without vertices are gray."""
     positions = {one.id: one.centroid for one in objects if one.centroid is not None}
     colors = object_colors(positions, {one.id for one in objects if one.confidence >= LIKELY})
     return {one.id: colors.get(one.id, np.array((150, 150, 150), np.uint8)) for one in objects}

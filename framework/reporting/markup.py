@@ -1,4 +1,7 @@
-"""HTML pages from Jinja2 templates. Values are escaped, and pages load nothing from the network."""
+"""HTML pages from Jinja2 templates.
+
+Values are escaped, and pages load nothing from the network.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,9 @@ POLICY = (
 
 
 def page(template: str, title: str, context: Mapping[str, Any], data: Mapping[str, Any], maps: Sequence[str]) -> str:
-    """Return a page as HTML. Its content security policy allows only the scripts in assets/ and no network access.
+    """Return an HTML page.
+
+    The content security policy of the page allows only the scripts in assets/ and no network access.
 
     Args:
         template: File in templates/ that extends page.html.

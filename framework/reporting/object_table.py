@@ -1,4 +1,4 @@
-"""The objects of a map as rows of a table and as data for the panel next to the map."""
+"""Object data for the table and for the panel next to the map."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ObjectRow:
 def object_rows(
     contents: RunContents, pictures: Mapping[int, Picture], match_results: Mapping[int, MatchResult]
 ) -> list[ObjectRow]:
-    """Return the rows of the table, most confident object first.
+    """Return the rows of the object table, most confident object first.
 
     Args:
         contents: Outputs of the run.
@@ -87,10 +87,9 @@ def object_data(
 
 
 def _size(one: StoredInstance, up: Float64 | None) -> str:
-    """Return the side lengths of an object's oriented box as text, cm.
+    """Return the side lengths of the box of an object as text, cm.
 
-    The order is length, width and height, where the length is the longer level side. If `up` (3,) is None, the order is
-    descending.
+    The order is length, width and height. Without an up direction, the order is descending.
     """
     sides = np.sort(one.obb.extent)[::-1]
     if up is not None:
@@ -101,7 +100,7 @@ def _size(one: StoredInstance, up: Float64 | None) -> str:
 
 
 def _height_above_floor(one: StoredInstance, contents: RunContents) -> float | None:
-    """Return the height of the lowest point of an object's box above the floor, m; None if the floor is unknown."""
+    """Return the height of an object above the floor in m, or None if unknown."""
     floor, up = contents.record.metrics.get("map.floor_m"), contents.up
     if not isinstance(floor, float) or up is None:
         return None

@@ -1,4 +1,4 @@
-"""Images of objects, cropped from the frame with the best view or from a rendering of the map."""
+"""Images of objects, cropped from the best frame or from a rendering of the map."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Picture:
 
 
 class Photographer:
-    """Renderer of object images of one map."""
+    """Renderer of images of the objects in a map."""
 
     def __init__(self, mesh: InstanceMesh, surface: Surface, poses: Float64, footage: Footage) -> None:
         self._mesh, self._surface, self._poses, self._footage = mesh, surface, poses, footage
@@ -44,10 +44,10 @@ class Photographer:
     def pictures(self, labels: Int32, best: Mapping[int, int], colors: Mapping[int, UInt8]) -> dict[int, Picture]:
         """Return an image of each visible object by label.
 
-        The image shows the object from the pose with the best view, outlined in its color.
+        Each image shows the best view of the object, with an outline in its color.
 
         Args:
-            labels: (V,) object labels of the mesh's vertices, 0 = none.
+            labels: Object labels (V,) of the vertices, 0 = none.
             best: Index of the pose with the best view, by label.
             colors: RGB color (3,) by label.
         """
@@ -63,9 +63,9 @@ class Photographer:
         return taken
 
     def _seen_from(self, k: int) -> tuple[UInt8, str]:
-        """Return the image (H, W, 3), RGB, at pose `k`, and its source ("frame N" or "map").
+        """Return the RGB image (H, W, 3) at pose `k`, and its source ("frame N" or "map").
 
-        The image is the frame at this pose if it is readable, otherwise a rendering of the map.
+        Unreadable frames are replaced by a rendering of the map.
         """
         if k in self._footage.images:
             return self._footage.images[k], f"frame {self._footage.frames[k]}"
@@ -73,12 +73,12 @@ class Photographer:
 
 
 def _crop(image: UInt8, mask: Bool, color: UInt8, scale: float) -> UInt8:
-    """Return the part of an image around an object, with the object's outline.
+    """Return the part of an image around an object, with the outline of the object.
 
     Args:
-        image: (H, W, 3) RGB.
-        mask: (H, W) pixels of the object.
-        color: (3,) RGB of the outline.
+        image: RGB image (H, W, 3).
+        mask: Mask (H, W) of the object.
+        color: RGB color (3,) of the outline.
         scale: Size of the result, relative to WIDTH x HEIGHT px.
     """
     height, width = mask.shape
@@ -101,7 +101,7 @@ def _crop(image: UInt8, mask: Bool, color: UInt8, scale: float) -> UInt8:
 
 
 def webp_url(image: Image.Image, quality: int) -> str:
-    """Return an image as a `data:` URL with the WebP quality `quality`, 0 to 100."""
+    """Return an image as a `data:` URL in WebP format, with a quality of 0 to 100."""
     file = BytesIO()
     image.save(file, "WEBP", quality=quality, method=4)
     return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"

@@ -1,4 +1,4 @@
-"""The outputs of a run that a report shows."""
+"""The outputs of a run that are shown in a report."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TIMINGS_HEADER = "frame,stage,milliseconds\n"
 
 @dataclass(frozen=True)
 class RunContents:
-    """The outputs of a run; None = missing."""
+    """The outputs of a run. Missing outputs are None."""
 
     record: Record
     partial: str  # reason for the early end of the run, "" = complete run
@@ -45,7 +45,11 @@ class RunContents:
 
     @classmethod
     def read(cls, directory: Path) -> RunContents:
-        """Read a run. Raises DataError for a missing run, a damaged file, or files of different runs."""
+        """Read the outputs of a run.
+
+        Raises:
+            DataError: The run is missing, a file is damaged, or the files belong to different runs.
+        """
         if path_exists(directory / METRICS):
             record, partial = read_record(directory), ""
         elif path_exists(directory / PARTIAL_METRICS):
@@ -74,7 +78,7 @@ class RunContents:
 
     @property
     def up(self) -> Float64 | None:
-        """Unit vector (3,) opposite to gravity, in the world frame; None if unknown."""
+        """Up direction (3,), a unit vector in the world frame, or None if unknown."""
         values = [self.record.metrics.get(f"map.up.{axis}") for axis in "xyz"]
         up = np.array([value if is_number(value) else np.nan for value in values], np.float64)
         length = np.linalg.norm(up)
@@ -109,13 +113,15 @@ class RunContents:
         return sorted({max(0, int(k)) for k in before})
 
     def instance_ids(self, mesh: InstanceMesh) -> Int32:
-        """Return the object id (V,) of each vertex of a mesh; 0 = none, or not in instances.json."""
+        """Return the object id (V,) of each vertex of a mesh.
+
+        The id is 0 for vertices without an object in instances.json.
+        """
         listed = np.isin(mesh.instance_ids, [one.id for one in self.objects])
         return np.where(listed, mesh.instance_ids, 0).astype(np.int32)
 
 
 def _map_of(record: Record) -> tuple[InstanceMesh | None, list[StoredInstance]]:
-    """Read mesh.ply and instances.json. Raises DataError if they belong to different runs."""
     mesh, instances = record.directory / MESH, record.directory / INSTANCES
     if path_exists(mesh) and path_exists(instances):
         return read_objects(record)

@@ -40,7 +40,7 @@ from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
 OVERVIEW_WIDTH = 1400  # px, of the image for browsers without WebGL
-SMALL_PATH = 0.3  # largest extent of a path, relative to the width of the top view, at which it is also shown enlarged
+SMALL_PATH = 0.3  # maximum extent of a path that is also shown enlarged, relative to the width of the top view
 TOP_VIEW_KEY = (
     ("mine", "estimated"),
     ("truth", "ground truth"),
@@ -52,7 +52,7 @@ TOP_VIEW_KEY = (
 
 @dataclass(frozen=True)
 class RunReport:
-    """The content of a run's page."""
+    """The content of the page of a run."""
 
     contents: RunContents
     scene: MapScene | None  # None = empty map
@@ -64,7 +64,10 @@ class RunReport:
 
     @classmethod
     def of(cls, contents: RunContents) -> RunReport:
-        """Return the report of a run, with images of its sequence if the sequence is still readable."""
+        """Return the report of a run.
+
+        It contains images of the sequence if the sequence is still readable.
+        """
         source = RunSource.of(contents)
         chosen = spread_out(len(contents.poses))
         footage = Footage.of(source, chosen, source.camera or NOT_CAMERA)
@@ -139,9 +142,10 @@ class RunReport:
         return {"whole": whole, "text": self._path_text(), "legend": keys, "details": details}
 
     def _top_views(self, up: Float64) -> tuple[str, str | None]:
-        """Return the SVG of the path with the objects, and the SVG of the enlarged path.
+        """Return the top view of the path and the objects, and an enlarged view of the path, both as SVG.
 
-        The second is None if the path is large enough in the first. `up` (3,) is the unit vector opposite to gravity.
+        The second view is None if the path is large enough in the first. `up` (3,) is the up direction in the world
+        frame.
         """
         contents = self.contents
         colors = colors_by_id(contents.objects)
@@ -217,7 +221,7 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
 
 
 def overview_url(path: Path) -> str:
-    """Return overview.png, reduced to a width of OVERVIEW_WIDTH, as a `data:` URL; "" if it cannot be read."""
+    """Return a reduced overview.png as a `data:` URL, or "" if it cannot be read."""
     try:
         small = Image.fromarray(read_color(path))
     except FrameError:

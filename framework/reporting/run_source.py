@@ -1,4 +1,4 @@
-"""The sequence of a run, if it is still available: its images and ground-truth poses."""
+"""Images and ground-truth poses of the sequence of a run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MIN_CLARITY = 0.3  # minimum clarity, so that a blurred close view of an object 
 
 @dataclass(frozen=True)
 class RunSource:
-    """The sequence of a run with its tracked frames."""
+    """The sequence of a run, with access to its tracked frames."""
 
     contents: RunContents
     video: RGBDSequence | None
@@ -33,7 +33,7 @@ class RunSource:
 
     @classmethod
     def of(cls, contents: RunContents) -> RunSource:
-        """Return the sequence opened from the run's config. If it is unreadable, `video` is None."""
+        """Open the sequence of a run from its config. If it is unreadable, `video` is None."""
         dataset = contents.record.dataset
         if any("${" in str(value) for _, value in leaves({"dataset": dataset})):
             return cls(contents, None, "the interpolations in the config of the run are not resolved")
@@ -53,12 +53,12 @@ class RunSource:
         return None if self.video is None else self.video.camera
 
     def frame(self, k: int) -> Frame | None:
-        """Return the frame of pose `k` of the trajectory, counted from 0; None if the frame cannot be read."""
+        """Return the frame of pose `k` of the trajectory, or None if the frame cannot be read."""
         numbers = self.contents.tracked_frames
         if self.video is None or not numbers or self.contents.times is None:
             return None
         first = int(np.searchsorted(self.contents.times.frames, numbers[k]))
-        # the position is larger than `first` if timings.csv omits frames before this one
+        # timings.csv may omit earlier frames, so the position may be larger than `first`
         skipped = len(self.video) - len(self.contents.times.frames)
         for position in range(first, min(first + max(skipped, 0) + 1, len(self.video))):
             try:
@@ -72,10 +72,11 @@ class RunSource:
         return None
 
     def scene_truth(self) -> tuple[SceneTruth | None, str]:
-        """Return the ground-truth instances in the world frame of the run's map, and "".
+        """Return the ground-truth instances in the world frame of the map.
 
-        If the instances are unavailable or have changed since the run, return None and the reason. The reason is "" for
-        a run without ground truth.
+        Returns:
+            The instances and "". If they are unavailable or have changed since the run, None and the reason. The reason
+            is "" for a run without ground truth.
         """
         expected = self.contents.record.metrics.get(TRUTH)
         if self.video is None:
@@ -96,7 +97,10 @@ class RunSource:
 
 @dataclass(frozen=True)
 class Footage:
-    """Frames of the sequence; the keys are indices of poses in the trajectory. Unreadable frames are missing."""
+    """Images and camera positions of selected frames of a sequence.
+
+    The keys are indices of poses in the trajectory. Unreadable frames are missing.
+    """
 
     camera: Camera  # camera of the images
     images: Mapping[int, UInt8]  # (H, W, 3) RGB
@@ -131,7 +135,10 @@ class Footage:
 
 @dataclass(frozen=True)
 class TruePath:
-    """The ground-truth camera path, rigidly aligned with the trajectory as for the ATE."""
+    """The ground-truth camera path, aligned with the trajectory.
+
+    The rigid alignment is the same as for the ATE.
+    """
 
     chosen: list[int]  # indices of n poses in the trajectory
     positions: Float64  # (n, 3) m, in the world frame of the map
@@ -139,10 +146,10 @@ class TruePath:
 
     @classmethod
     def of(cls, poses: Float64, true_positions: Mapping[int, Float64]) -> TruePath | None:
-        """Return the aligned ground-truth path; None for fewer than three positions.
+        """Return the aligned ground-truth path, or None for fewer than three positions.
 
         Args:
-            poses: (P, 4, 4) T_world_camera of the trajectory.
+            poses: Camera poses (P, 4, 4) of the trajectory.
             true_positions: Ground-truth camera position (3,), m, by index of the pose in the trajectory.
         """
         chosen = sorted(true_positions)

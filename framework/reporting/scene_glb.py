@@ -1,4 +1,4 @@
-"""A decimated map as a GLB file, with one node per object and one background node."""
+"""Decimated maps as GLB files, with one node per object and one background node."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ FIRST_SEEN = "_FIRST_SEEN"  # name of the vertex attribute with the values of `f
 
 
 def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str], up: Float64) -> bytes:
-    """Return the map as binary glTF 2.0, unlit, with the attribute `_FIRST_SEEN`.
+    """Return a map as an unlit GLB file (binary glTF 2.0).
 
-    The vertices have world coordinates; the matrix of each node rotates them upright. The extras of an object's node
-    contain its id and class. The file of a `light_enough` mesh has at most MAX_BYTES bytes.
+    The vertices have world coordinates, and the matrix of each node rotates them upright. The metadata (`extras`) of an
+    object node contains its id and class. The file of a `light_enough` mesh has at most MAX_BYTES bytes.
 
     Args:
         mesh: Mesh of the map.
-        first_seen: (V,) in [0, 1], fraction of the sequence before the first view of each vertex; 1 = never visible.
+        first_seen: Fraction (V,) of the sequence before the first view of each vertex, in [0, 1]; 1 = never visible. It
+            is stored as the attribute `_FIRST_SEEN`.
         names: Class name by id, for the objects with a node.
-        up: (3,) unit vector opposite to gravity, world frame.
+        up: Up direction (3,) in the world frame, a unit vector.
     """
     labels = np.where(np.isin(mesh.instance_ids, list(names)), mesh.instance_ids, 0).astype(np.int32)
     of_triangle = triangle_labels(mesh.triangles, labels)
@@ -48,5 +49,5 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
 
 
 def light_enough(mesh: InstanceMesh, most_bytes: int = MAX_BYTES) -> InstanceMesh:
-    """Return the mesh, decimated so that its GLB file has at most `most_bytes` bytes."""
+    """Simplify a mesh, so that its GLB file has at most `most_bytes` bytes."""
     return clustered(mesh, most_bytes - NOT_GEOMETRY, BYTES_OF_VERTEX, BYTES_OF_TRIANGLE)

@@ -1,4 +1,7 @@
-"""Comparison of a run's objects with the ground truth: metrics, and galleries of missed, wrong and correct objects."""
+"""Report section that compares the objects of a run with the ground truth.
+
+The section contains metrics, and galleries of missed, wrong and correct objects.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +71,7 @@ class Gallery:
 
 @dataclass(frozen=True)
 class TruthCheck:
-    """The outcome of each object, and the missed ground-truth objects."""
+    """The outcomes of all objects, and the missed ground-truth objects."""
 
     match_results: Mapping[int, MatchResult]  # by object id
     missed: list[Card]
@@ -82,7 +85,7 @@ class TruthCheck:
         photographer: Photographer | None,
         footage: Footage,
     ) -> TruthCheck | None:
-        """Return the comparison of the objects with the ground truth; None for a run without a mesh."""
+        """Return the comparison of the objects with the ground truth, or None for a run without a mesh."""
         if contents.mesh is None:
             return None
         objects = contents.objects
@@ -125,7 +128,7 @@ class TruthCheck:
 def truth_section(
     check: TruthCheck | None, why_unchecked: str, contents: RunContents, pictures: Mapping[int, Picture]
 ) -> dict[str, Any] | None:
-    """Return the variables of the ground-truth section in run.html; None for a run without ground truth.
+    """Return the variables of the ground-truth section in run.html, or None without ground truth.
 
     Args:
         check: Comparison of the objects with the ground truth; None = not available.

@@ -1,4 +1,4 @@
-"""Visibility of a decimated map along a trajectory: first view of each vertex, best view of each object."""
+"""Visibility of a decimated map along a trajectory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOT_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # nominal Kinect, use
 
 @dataclass(frozen=True)
 class Sightings:
-    """Visibility of a mesh with V vertices from n poses of the trajectory."""
+    """Visibility of a mesh with V vertices from n poses."""
 
     chosen: list[int]  # indices of the n poses in the trajectory
     first_seen: Int32  # (V,) index into `chosen` of the first pose with a view of each vertex; n = never visible
@@ -31,9 +31,9 @@ class Sightings:
 
     @property
     def growth(self) -> Float64:
-        """Fraction (n,), in [0, 1], of the vertices with a view whose first view is at or before each chosen pose."""
+        """Fraction (n,) of the visible vertices that were seen up to each pose, in [0, 1]."""
         counts = np.bincount(self.first_seen, minlength=len(self.chosen) + 1)[: len(self.chosen)]
-        return np.asarray(np.cumsum(counts) / max(1, counts.sum()))
+        return np.asarray(np.cumsum(counts) / max(1, int(counts.sum())))
 
 
 def spread_out(count: int, most: int = LOOKS) -> list[int]:
@@ -44,12 +44,12 @@ def spread_out(count: int, most: int = LOOKS) -> list[int]:
 def sightings(
     mesh: InstanceMesh, labels: Int32, poses: Float64, camera: Camera, clarity: Mapping[int, float]
 ) -> Sightings:
-    """Return the visibility of a mesh from at most LOOKS evenly spaced poses of the trajectory.
+    """Return the visibility of a mesh from at most LOOKS evenly spaced poses.
 
     Args:
         mesh: Mesh of the map.
-        labels: (V,) object labels of the vertices, 0 = none.
-        poses: (P, 4, 4) T_world_camera.
+        labels: Object labels (V,) of the vertices, 0 = none.
+        poses: Camera poses (P, 4, 4) of the trajectory.
         camera: Camera of the sequence.
         clarity: Sharpness of the image in [0, 1], by index of the pose; 1 if missing.
     """
@@ -80,10 +80,10 @@ def _seen(vertices: Float32, T_world_camera: Float64, camera: Camera, depth: Flo
     """Return the mask (V,) of the vertices inside the image, and the mask (V,) of the visible vertices.
 
     Args:
-        vertices: (V, 3) m, world frame.
-        T_world_camera: (4, 4) camera pose.
+        vertices: Vertices (V, 3) in the world frame, m.
+        T_world_camera: Camera pose (4, 4).
         camera: Camera of the depth image.
-        depth: (H, W) m along z, 0 = no surface.
+        depth: Depth image (H, W) along z, m; 0 = no surface.
     """
     T_camera_world = inverse(T_world_camera).astype(np.float32)
     x, y, z = T_camera_world[:3, :3] @ vertices.T + T_camera_world[:3, 3:]

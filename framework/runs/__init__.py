@@ -1,1 +1,1 @@
-"""Run directories: writing and reading."""
+"""Reading and writing of run directories."""

@@ -1,4 +1,4 @@
-"""Stored runs as a pandas data frame: one row per run, one typed column per option, parameter and metric."""
+"""Stored runs as a pandas data frame."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
 RUN = "run"  # column of the run directory
-LONGEST = 2**63  # integers of this size or more do not fit in a column of integers
+LONGEST = 2**63  # exclusive limit of the integers in a column of type Int64
 
 log = logging.getLogger(__name__)
 
 
 def load_runs(folder: Path | str) -> DataFrame:
-    """Read the completed runs in a folder and its subfolders as a pandas data frame, one row per run.
+    """Read the completed runs in a folder and its subfolders as a pandas data frame.
 
-    `load_runs(DIR).groupby("refiner")["instances.ap50"].mean()` compares the refiners of a sweep.
+    The data frame has one row per run. For example, `load_runs(DIR).groupby("refiner")["instances.ap50"].mean()`
+    compares the refiners of a sweep.
 
     Args:
         folder: The folder of a sweep or of several runs.
@@ -33,11 +34,11 @@ def load_runs(folder: Path | str) -> DataFrame:
         - `run`: the run directory, relative to `folder`
         - `row`: the row of an experiment
         - `dataset`, `detector`, `tracker`, `refiner`, `fuser`, `preset`: the chosen options
-        - `fuser.voxel_size`, ...: the parameters; lists as JSON
+        - `fuser.voxel_size`, ...: the parameters, with lists as JSON
         - `instances.ap50`, `fps`, ...: the metrics, in the units of metrics.json
-        - `git_commit`, `code.refiner`, `config_hash`, `inputs_sha256`, `environment.cpus`, ...: the origin of the run
+        - `git_commit`, `code.refiner`, `config_hash`, `inputs_sha256`, `environment.cpus`, ...: the provenance
 
-        The types are Int64, float64, boolean and string. Values that a run does not have are NA.
+        The types of the columns are Int64, float64, boolean and string. Missing values are NA.
 
     Raises:
         DataError: The folder is missing or contains no completed run.
@@ -50,7 +51,7 @@ def load_runs(folder: Path | str) -> DataFrame:
 
 
 def data_frame(records: Sequence[Record], root: Path) -> DataFrame:
-    """Return the runs in a folder as in `load_runs`."""
+    """Return a data frame of runs with the columns of `load_runs`."""
     from pandas import DataFrame
 
     rows = [dict(_values(record, root)) for record in records]
@@ -59,16 +60,16 @@ def data_frame(records: Sequence[Record], root: Path) -> DataFrame:
 
 
 def _values(record: Record, root: Path) -> Iterator[tuple[str, Any]]:
-    """Yield the columns of a run in order. A parameter has precedence over a metric of the same name."""
+    """Yield the name and the value of each column of a run."""
     yield RUN, record.directory.relative_to(root).as_posix()
     yield from record.settings.items()
-    for key, value in record.metrics.items():
+    for key, value in record.metrics.items():  # a setting has precedence over a metric of the same name
         if key not in record.settings and not key.startswith(CHOICE):
             yield key, value
 
 
 def _column(values: list[Any]) -> Series:
-    """Return the values as a column; None = NA."""
+    """Return a column of the values, with NA for None."""
     from pandas import Series
 
     known = [value for value in values if value is not None]

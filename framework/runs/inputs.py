@@ -1,4 +1,4 @@
-"""Hash of the input files of a run, such as weights and the recording."""
+"""Hashes of the input files of a run, such as weights and recordings."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from framework.files.search_paths import folder_of
 from framework.runs.provenance import leaves, relevant
 
 INPUTS = "inputs_sha256"  # key in metrics.json
-ROOT = "dataset.root"  # key of the recording
+ROOT = "dataset.root"  # config key of the folder of the recording
 MAX_FILES = 200_000  # maximum number of hashed files of a recording (takes 3 s); known datasets have up to 20,000
 OUTPUTS = {"outputs", "multirun"}  # Hydra's output folders
 
 
 def input_hashes(config: Mapping[str, Any]) -> dict[str, str]:
-    """Return the SHA-256 (hex) of the input files that a resolved config names, by config key.
+    """Return the SHA-256 (hex) of each input file in a resolved config, by config key.
 
-    Files and folders are hashed by content. A recording is hashed by the names, sizes and modification times of the
-    files in dataset.root and below dataset.scene, which is faster.
+    Files and folders are hashed by content. A recording is hashed by the names, sizes and modification times of its
+    files, because this is faster.
     """
     found = {}
     for key, value in leaves(relevant(config)):
@@ -44,25 +44,25 @@ def input_hashes(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def inputs_sha256(config: Mapping[str, Any]) -> str:
-    """Return the SHA-256 (hex) of the input files that a resolved config names."""
+    """Return the SHA-256 (hex) of all input files in a resolved config."""
     return hash_of(input_hashes(config))
 
 
 def hash_of(inputs: Mapping[str, str]) -> str:
-    """Return the SHA-256 (hex) of the keys and hashes of `input_hashes`."""
+    """Return the SHA-256 (hex) of a result of `input_hashes`."""
     return hashlib.sha256(repr(sorted(inputs.items())).encode()).hexdigest()
 
 
 def _truth_files(value: str) -> list[str]:
-    """Return the files of `dataset.ground_truth`; empty if one is missing, because the run itself reports the error."""
+    """Return the files of `dataset.ground_truth`, or an empty list if a file is missing."""
     try:
         return [str(path) for path in truth_files(Path(value))]
-    except (ConfigError, DataError):
+    except (ConfigError, DataError):  # reported by the run itself
         return []
 
 
 def _content(value: str) -> str:
-    """Return the hash of a file or folder; "" if it does not exist."""
+    """Return the hash of a file or folder, or "" if it does not exist."""
     try:
         return content_hash(Path(value))
     except (ConfigError, DataError, OSError, ValueError):
@@ -70,11 +70,11 @@ def _content(value: str) -> str:
 
 
 def _listed(root: Path, scene: str) -> Iterator[tuple[str, str, int, int]]:
-    above = (root / scene).resolve().parents[:2]  # folders of ScanNet's label tables
+    above = (root / scene).resolve().parents[:2]  # possible folders of the label tables of ScanNet
     walks: list[Iterable[tuple[str, list[str], list[str]]]]
     walks = [[(str(folder), [], [LABEL_TABLE, FIRST_LABEL_TABLE]) for folder in above]]
     if scene:
-        walks.append(islice(os.walk(root), 1))  # files that scenes share, such as Replica's cam_params.json
+        walks.append(islice(os.walk(root), 1))  # files shared by scenes, such as cam_params.json of Replica
     walks.append(os.walk(root / scene, followlinks=True))  # MAX_FILES limits cyclic links
     for folder, folders, files in chain.from_iterable(walks):
         folders[:] = sorted(set(folders) - OUTPUTS)

@@ -1,4 +1,4 @@
-"""instances.json: the objects of a map."""
+"""Reading and writing of instances.json, the instances of a map."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from framework.files.json_file import read_json, write_json
 from framework.runs.metrics import class_name
 
 LARGEST_ID = 2**31 - 1
-FARTHEST = 1e6  # m, limit of coordinates and sizes; the resolution of float32 there is 6 cm
+FARTHEST = 1e6  # m, maximum coordinate and size; float32 has a resolution of 6 cm there
 NO_CLASS = "object"  # class name in a map without classes
 
 
 @dataclass(frozen=True)
 class StoredInstance:
-    """One object of instances.json; lengths in m, in the world frame."""
+    """An instance in instances.json. Coordinates are in m, in the world frame."""
 
     id: int  # 1 to LARGEST_ID
     class_name: str  # NO_CLASS in a map without classes
@@ -36,21 +36,21 @@ class StoredInstance:
 
     @property
     def probability(self) -> float | None:
-        """Return the probability of `class_name`; None = unknown."""
+        """Probability of `class_name`, or None if unknown."""
         return self.class_probabilities.get(self.class_name)
 
 
 def write_instances(
     path: Path, mesh: InstanceMesh, instances: Mapping[int, Instance], classes: tuple[str, ...]
 ) -> None:
-    """Write the objects sorted by id; lengths in m. Confidences and probabilities are not rounded, to avoid ties."""
+    """Write the instances sorted by id. Lengths are in m."""
     write_json(
         path,
         [
             {
                 "id": instance.id,
                 "class": class_name(instance, classes),
-                "confidence": float(instance.confidence),
+                "confidence": float(instance.confidence),  # not rounded, to avoid equal values
                 # shortest decimal form of each float32: 0.9, not 0.8999999761581421
                 "class_probabilities": {
                     name: float(str(value)) for name, value in zip(classes, instance.class_probabilities, strict=True)
@@ -72,7 +72,11 @@ def write_instances(
 
 
 def read_instances(path: Path) -> list[StoredInstance]:
-    """Read the objects that `write_instances` wrote. Raises DataError if the file is missing or invalid."""
+    """Read the instances that were written by `write_instances`.
+
+    Raises:
+        DataError: The file is missing or invalid.
+    """
     entries = read_json(path)
     if not isinstance(entries, list):
         raise DataError(f"{path}: expected a JSON array of instances, got {entries!r:.40}")
@@ -112,7 +116,7 @@ def _stored(where: str, entry: Any) -> StoredInstance:
 
 
 def _integer(where: str, entry: Mapping[str, Any], key: str, lowest: int | None = None) -> int:
-    """Return an integer in [`lowest`, LARGEST_ID]; `lowest` None = any integer."""
+    """Return an integer in [`lowest`, LARGEST_ID], or any integer without `lowest`."""
     value = entry.get(key)
     if isinstance(value, int) and not isinstance(value, bool) and (lowest is None or lowest <= value <= LARGEST_ID):
         return value

@@ -1,6 +1,7 @@
-"""Values that experiment trackers receive: parameters and metrics of a run, and values of each frame.
+"""Parameters and metrics of a run, and values of each frame, for experiment trackers.
 
-The names are the keys of config.yaml and metrics.json, with the prefixes `run/` and `frame/`.
+The names are the keys of config.yaml and metrics.json. Metrics of a run have the prefix `run/`, and values of a frame
+have the prefix `frame/`.
 """
 
 from __future__ import annotations
@@ -16,17 +17,23 @@ from framework.runs.stored_runs import is_number
 
 
 def parameter_values(config: Mapping[str, Any]) -> dict[str, bool | int | float | str]:
-    """Return the parameters that change results by dotted key, from a resolved config. Other types become JSON text."""
+    """Return the parameters in a resolved config that affect results, by dotted key.
+
+    Lists and null become JSON text.
+    """
     values = leaves(relevant(config))
     return {key: value if isinstance(value, bool | int | float | str) else json.dumps(value) for key, value in values}
 
 
 def frame_values(pose: Pose, stage_ms: Mapping[str, float], scene: SceneMap) -> dict[str, float]:
-    """Return the stage times, ms, the tracking state (1 = lost) and the size of the map after a frame."""
+    """Return the stage times, the tracking state and the map size after a frame.
+
+    Times are in ms. The tracking state is 1 for a lost pose, otherwise 0.
+    """
     times = {f"frame/stage_ms.{stage}": milliseconds for stage, milliseconds in stage_ms.items()}
     return times | {"frame/lost": float(pose.lost), "frame/map.voxels": float(scene.statistics.voxels)}
 
 
 def run_values(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Return the metrics of a run that are numbers."""
+    """Return the numeric metrics of a run."""
     return {f"run/{key}": float(value) for key, value in metrics.items() if is_number(value)}

@@ -1,11 +1,11 @@
-"""manifest.json: status, input files and the SHA-256 of all result files of a run."""
+"""Manifest of a run: status, inputs, parameters and hashes of the result files."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -29,21 +29,26 @@ class Manifest:
     """Contents of manifest.json."""
 
     status: RunStatus
-    files: Mapping[str, tuple[int, str]]  # size, bytes, and SHA-256 (hex) by file name
+    files: Mapping[str, tuple[int, str]]  # size in bytes and SHA-256 (hex) by file name
     inputs: Mapping[str, str]  # SHA-256 (hex) of the input files, by config key
+    parameters: Mapping[str, str]  # values of the parameters that change results, by dotted key
 
-    @classmethod
-    def of(cls, directory: Path, names: list[str], status: RunStatus, inputs: Mapping[str, str]) -> Manifest:
-        """Return the manifest of the existing files with these names in a run directory.
+    def with_files(self, directory: Path, names: Iterable[str]) -> Manifest:
+        """Return a copy of the manifest with the existing files of these names.
 
-        Raises DataError if a file cannot be read.
+        Raises:
+            DataError: A file cannot be read.
         """
         paths = [directory / name for name in names if (directory / name).exists()]
-        return cls(status, {path.name: (path.stat().st_size, path_hash(path)) for path in paths}, inputs)
+        return replace(self, files={path.name: (path.stat().st_size, path_hash(path)) for path in paths})
 
     @classmethod
     def read(cls, directory: Path) -> Manifest:
-        """Read the manifest of a run directory. Raises DataError for another digest or wrong types."""
+        """Read the manifest of a run directory.
+
+        Raises:
+            DataError: The file is missing, damaged or invalid.
+        """
         path = directory / MANIFEST
         content = read_json(path)
         if not isinstance(content, dict):
@@ -53,21 +58,29 @@ class Manifest:
             raise DataError(f"{path}: expected the digest {_digest(content)[:12]}, got {digest!s:.12}; repeat the run")
         try:
             files = {str(name): (int(one["bytes"]), str(one["sha256"])) for name, one in content["files"].items()}
-            return cls(RunStatus[content["status"]], files, {key: str(one) for key, one in content["inputs"].items()})
+            texts = [{key: str(one) for key, one in content[name].items()} for name in ("inputs", "parameters")]
+            return cls(RunStatus[content["status"]], files, *texts)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise DataError(f"{path}: expected status, files and inputs, got an error ({error!r})") from error
+            raise DataError(
+                f"{path}: expected status, files, inputs and parameters, got an error ({error!r})"
+            ) from error
 
     def write(self, directory: Path) -> None:
-        """Write the manifest atomically. Raises DataError if writing fails."""
+        """Write the manifest to a run directory.
+
+        Raises:
+            DataError: The file cannot be written.
+        """
         content: dict[str, Any] = {
             "status": self.status.name,
             "files": {name: {"bytes": size, "sha256": sha256} for name, (size, sha256) in self.files.items()},
             "inputs": dict(self.inputs),
+            "parameters": dict(self.parameters),
         }
         write_json(directory / MANIFEST, content | {"digest": _digest(content)})
 
     def changed_files(self, directory: Path, optional: Collection[str] = ()) -> list[str]:
-        """Return one message for each changed or missing file; files in `optional` may be missing."""
+        """Return one message for each changed or missing file. Files in `optional` may be missing."""
         found = []
         for name, (size, sha256) in self.files.items():
             path = directory / name
@@ -81,5 +94,5 @@ class Manifest:
 
 
 def _digest(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256 (hex) of the canonical JSON: sorted keys, no spaces."""
+    """Return the SHA-256 (hex) of the content as canonical JSON."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""mesh.ply: the surface of a map."""
+"""Reading and writing of mesh.ply, the surface of a map."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from framework.files.ply import read_ply, write_ply
 
 CHANNELS = ("red", "green", "blue")
 TYPES = {**dict.fromkeys(CHANNELS, np.uint8), "instance": np.int32, "class": np.int32}
-"""Properties of a vertex in addition to its position."""
+"""Types of the vertex properties other than the position."""
 
 CLASSES = "classes "  # prefix of the comment with the class names
 
 
 def write_mesh(path: Path, mesh: InstanceMesh) -> None:
-    """Write a binary little-endian PLY file: vertex x y z [m], red green blue, instance (0 = none), class.
+    """Write a mesh to a binary PLY file.
 
-    `class` is an index into the comment line `classes`; -1 = none.
+    Each vertex has a position in m, a color, an instance id and a class. The class is an index into the class names in
+    the header. Vertices without an instance have the id 0, and vertices without a class have the index -1.
     """
     properties: dict[str, Array] = {
         **{channel: mesh.colors[:, k] for k, channel in enumerate(CHANNELS)},
@@ -35,7 +36,11 @@ def write_mesh(path: Path, mesh: InstanceMesh) -> None:
 
 
 def read_mesh(path: Path) -> InstanceMesh:
-    """Read the mesh that `write_mesh` wrote. Raises DataError if the file is missing, damaged or not such a mesh."""
+    """Read a mesh that was written by `write_mesh`.
+
+    Raises:
+        DataError: The file is missing or damaged, or is not the mesh of a run.
+    """
     ply = read_ply(path)
     for name, kind in TYPES.items():
         if name not in ply.properties or ply.properties[name].dtype != kind:

@@ -1,4 +1,4 @@
-"""The metrics of one run: the flat dictionary of metrics.json."""
+"""Metrics of a run, as stored in metrics.json."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ TRUTH = "truth_sha256"  # key of the ground-truth hash in metrics.json
 
 
 def run_metrics(result: RunResult) -> Metrics:
-    """Return counts, speed, stage times, map size and the estimated color delay.
+    """Return the frame counts, speed, stage times, map size and color delay of a run.
 
-    For live video, also return dropped frames and latency.
+    The dropped frames and the latency are included for live video.
     """
     metrics: Metrics = {
         "frames": result.frames,
@@ -63,8 +63,8 @@ def run_metrics(result: RunResult) -> Metrics:
 
 
 def trajectory_metrics(result: RunResult) -> Metrics:
-    """Return the trajectory errors (ATE, RPE) of the frames that are not lost; empty without ground-truth poses."""
-    reference: list[Float64 | None] = [None] * result.frames  # includes skipped frames; no relative pose spans them
+    """Return the ATE and RPE of a run, or an empty dictionary without ground-truth poses."""
+    reference: list[Float64 | None] = [None] * result.frames  # with skipped frames, so that no relative pose spans them
     estimated = [Pose(np.eye(4), lost=True)] * result.frames
     for frame in result.tracked:
         reference[frame.position], estimated[frame.position] = frame.T_world_camera_truth, frame.pose
@@ -72,7 +72,10 @@ def trajectory_metrics(result: RunResult) -> Metrics:
 
 
 def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:
-    """Return the up direction, its source and the floor height, m; empty if the up direction is unknown."""
+    """Return the up direction, its source and the floor height in m.
+
+    The result is empty if the up direction is unknown.
+    """
     gravity = scene.gravity()
     up = gravity.up
     if up is None:
@@ -89,9 +92,16 @@ def instance_metrics(
     classes: tuple[str, ...],
     trajectory: tuple[Float64, Float64],
 ) -> Metrics:
-    """Return the number of instances, and their metrics if the ground truth can be aligned to the map.
+    """Return the number of instances and their metrics.
 
-    `trajectory` contains the timestamps (F,) in s and the poses T_world_camera (F, 4, 4) of the map.
+    The metrics are omitted without ground truth, or if the ground truth cannot be aligned with the map.
+
+    Args:
+        video: The mapped video.
+        mesh: The mesh of the map.
+        found: The instances of the map by id.
+        classes: The class names of the map.
+        trajectory: The timestamps (F,), s, and the poses T_world_camera (F, 4, 4) of the mapped frames.
     """
     count: Metrics = {"instances.count": len(found)}
     truth = video.scene_truth()
@@ -110,14 +120,14 @@ def evaluation_metrics(
 ) -> Metrics:
     """Return the instance metrics, the release of the ground truth and its hash.
 
-    The keys `instances.to_map.*` contain the main metrics with labels transferred from the ground truth to the map,
-    instead of from the map to the ground truth.
+    By default, labels are transferred from the map to the ground truth. The keys `instances.to_map.*` contain the main
+    metrics with labels transferred from the ground truth to the map.
 
     Args:
-        predictions: Instances of the map.
-        truth: Ground truth in the world frame of the dataset, for the hash.
-        aligned: Ground truth in the world frame of the map.
-        annotation: Release of the ground truth, "" = the dataset has a single release (None in the metrics).
+        predictions: The instances of the map.
+        truth: The ground truth in the world frame of the dataset, for the hash.
+        aligned: The ground truth in the world frame of the map.
+        annotation: The release of the ground truth, or "" for a dataset with a single release.
     """
     figures = instances.evaluate(predictions, aligned).metrics()
     to_map = instances.evaluate(predictions, aligned, transfer=Transfer.TO_MAP).metrics()
@@ -126,7 +136,7 @@ def evaluation_metrics(
 
 
 def truth_sha256(truth: SceneTruth) -> str:
-    """Return the SHA-256 (hex) of the ground truth of an evaluation."""
+    """Return the SHA-256 (hex) of a ground truth."""
     digest = hashlib.sha256(repr((sorted(truth.class_names.items()), truth.classes)).encode())
     for array in (truth.points_world, truth.instance_ids):
         add_values(digest, array)
@@ -134,10 +144,10 @@ def truth_sha256(truth: SceneTruth) -> str:
 
 
 def is_evaluation(key: str) -> bool:
-    """Return True for a key of `evaluation_metrics`."""
+    """Return True for the key of a metric from `evaluation_metrics`."""
     return key in ("annotation_release", TRUTH) or (key.startswith("instances.") and key != "instances.count")
 
 
 def class_name(instance: Instance, classes: tuple[str, ...]) -> str | None:
-    """Return the most probable class of an instance; None in a map without classes."""
+    """Return the most probable class of an instance, or None in a map without classes."""
     return classes[int(np.argmax(instance.class_probabilities))] if classes else None

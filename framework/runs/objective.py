@@ -1,4 +1,4 @@
-"""The objective of a run: the metrics that a sweeper such as Optuna optimizes."""
+"""Objective of a run for sweepers such as Optuna."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ OF_GROUND_TRUTH = ("instances.ap", "instances.mean_iou", "trajectory.")  # prefi
 
 
 def objective_keys(objective: Any) -> list[str]:
-    """Return the keys of metrics.json that the config key `objective` names; [] = none. Raises ConfigError."""
+    """Return the names of the metrics in the config key `objective`, or [] without an objective.
+
+    Raises:
+        ConfigError: The value is neither a name nor a list of names.
+    """
     if objective is None:
         return []
     keys = list(objective) if isinstance(objective, ListConfig | list) else [objective]
@@ -27,11 +31,14 @@ def objective_keys(objective: Any) -> list[str]:
 
 
 def objective_of(directory: Path, objective: Any) -> float | list[float] | None:
-    """Return the objective of a completed run: a number, or a list of numbers for a list of keys; None = no objective.
+    """Return the objective of a completed run.
 
     Args:
         directory: The run directory.
-        objective: The config key `objective`.
+        objective: The value of the config key `objective`.
+
+    Returns:
+        A number for one metric, a list of numbers for a list of metrics, or None without an objective.
 
     Raises:
         ConfigError: A metric is unknown, undefined or not a number.

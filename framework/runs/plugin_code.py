@@ -1,4 +1,4 @@
-"""Version and hash of the code of a run's plugins."""
+"""Version and hash of the code of plugins."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from framework.config.composition import installed_config_dirs
+from framework.files.module_imports import required_modules
 from framework.registry import STAGES
 from framework.runs.provenance import leaves, package_version
 
-CODE = "code."  # prefix of the keys of metrics.json: code.refiner = "my_package 0.1.0 3f2a9c41d0b7"
-OWN = ("framework", "plugins")  # packages of this project; tables list its commit
+CODE = "code."  # prefix of keys in metrics.json, e.g. code.refiner = "my_package 0.1.0 3f2a9c41d0b7"
+OWN = ("framework", "plugins")  # packages of this project
 MAX_FILES = 2000  # maximum number of hashed files of a package
 MAX_HASHED = 1_000_000  # maximum size of a file that is hashed by content, bytes
 IGNORED = {"__pycache__", ".git"}  # folders without code
@@ -23,10 +25,11 @@ DIGITS = 12  # number of digits of a shown hash
 def plugin_code(config: Mapping[str, Any]) -> dict[str, str]:
     """Return the package, version and hash of the plugins of each stage, by key of metrics.json.
 
-    A stage with plugins of several packages, such as a chain of refiners, lists them all. The hash covers the first
-    MAX_FILES files of a package in alphabetical order, or a single file. Files above MAX_HASHED bytes are represented
-    by size and modification time. For plugins of this project, only the plugin's own file is hashed, without comments
-    and docstrings.
+    A stage may have several plugins, such as a chain of refiners.
+
+    The hash of a third-party plugin covers the modules that it imports from its package. It also covers data files of
+    the package, such as weights, but not config options. Files larger than MAX_HASHED bytes are hashed by size and
+    modification time. The hash of a plugin of this project covers only its own module, without comments and docstrings.
 
     Args:
         config: The resolved config of a run.
@@ -38,7 +41,7 @@ def plugin_code(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def targets_of(config: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the stage and the dotted class name of each plugin of a resolved config, including nested plugins."""
+    """Return the stage and the class name of each plugin in a resolved config, including nested plugins."""
     values = leaves({stage: config.get(stage) or {} for stage in STAGES})
     return [
         (key.partition(".")[0], value) for key, value in values if key.endswith("._target_") and isinstance(value, str)
@@ -46,19 +49,24 @@ def targets_of(config: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def plugin_files(target: str) -> list[tuple[str, Path]]:
-    """Return the relative names and the paths of the files of a third-party class; empty for this project's classes."""
+    """Return the files in the package of a third-party plugin, as pairs of a name and a path.
+
+    A name includes the folder of the package, e.g. "my_package/refiner.py". The list is empty for plugins of this
+    project.
+    """
     package = target.partition(".")[0]
     return [] if package in OWN else _files_of(package)
 
 
 def changed_code(metrics: Mapping[str, Any], now: Mapping[str, str]) -> list[str]:
-    """Return the differences between the stored and the current plugin code: "refiner: a 1.0 3f -> a 1.0 9c".
+    """Return one message for each stage whose plugin code has changed since a run.
 
-    Runs without these keys are from before version 0.1.0 and have no known difference.
+    A message has the form "refiner: a 1.0 3f -> a 1.0 9c". Runs from before version 0.1.0 do not contain the code, and
+    have no messages.
 
     Args:
         metrics: The metrics of the run.
-        now: The result of `plugin_code` for its config.
+        now: The current result of `plugin_code`.
     """
     if not any(key.startswith(CODE) for key in metrics):
         return []
@@ -70,11 +78,11 @@ def changed_code(metrics: Mapping[str, Any], now: Mapping[str, str]) -> list[str
 
 
 def _described(target: str) -> str:
-    """Return "PACKAGE VERSION HASH" of the class with this dotted name; "PACKAGE missing" if it has no files."""
+    """Return the package, version and hash of a class as text."""
     module = target.rpartition(".")[0]
     package = module.partition(".")[0]
     own = package in OWN
-    files = _files_of(module if own else package)
+    files = _files_of(module) if own else _required_files(target)
     if not files:
         return f"{package} missing"
     digest = hashlib.sha256()
@@ -86,8 +94,27 @@ def _described(target: str) -> str:
     return " ".join(filter(None, (module if own else package, known, digest.hexdigest()[:DIGITS])))
 
 
+def _required_files(target: str) -> list[tuple[str, Path]]:
+    """Return the names and paths of the package files that a class depends on."""
+    files = _files_of(target.partition(".")[0])
+    modules = {_dotted(name): path for name, path in files if path.suffix == ".py"}
+    required = required_modules(target, modules)
+    others = [path for _, path in files if path.suffix != ".py" and not _is_option(path)]
+    return [(name, path) for name, path in files if _dotted(name) in required or path in others]
+
+
+def _is_option(path: Path) -> bool:
+    """Return True for a config option of an installed package."""
+    return any(path.resolve().is_relative_to(folder) for folder in installed_config_dirs())
+
+
+def _dotted(name: str) -> str:
+    """Return the module name of a file, e.g. "a.b" for "a/b.py"."""
+    return name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
 def _files_of(name: str) -> list[tuple[str, Path]]:
-    """Return the relative names and the paths of the files of a package or module; empty if it is not found."""
+    """Return the names and paths of the files of a package or module, or [] if it is not found."""
     try:
         spec = importlib.util.find_spec(name)
     except (ImportError, ValueError):  # the error of a broken package is reported when the plugin is built

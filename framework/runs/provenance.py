@@ -19,27 +19,32 @@ PACKAGES = ("torch", "numpy", "numba", "open3d")
 UNKNOWN = "unknown"
 WITHOUT_EFFECT = (
     *("hydra", "debug", "skip_completed", "prefetch", "detection_cache", "detection_cache_dir", "viewer", "objective"),
-    "threads",  # changes only the last digits of network outputs
+    "threads",  # affects only the last digits of network outputs
     *("row", "rows", "sequences", "table", "figure"),  # settings of an experiment
 )
-"""Config keys that do not change results."""
+"""Config keys that do not affect results."""
 
-OF_SPEED = ("threads", "prefetch", "detection_cache")  # config keys that change times
-OF_MACHINE = ("environment.processor", "environment.cpus")  # keys of metrics.json that change times
+OF_SPEED = ("threads", "prefetch", "detection_cache")  # config keys that affect speed
+OF_MACHINE = ("environment.processor", "environment.cpus")  # keys of metrics.json that affect speed
 
 
 def config_hash(resolved: Mapping[str, Any]) -> str:
-    """Return the SHA-256 (hex) of the config keys and values that change results, independent of their order."""
+    """Return the SHA-256 (hex) of the part of a config that affects results, independent of the order of keys."""
     return hashlib.sha256(json.dumps(relevant(resolved), sort_keys=True, default=str).encode()).hexdigest()
 
 
 def relevant(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part of a config that changes results."""
+    """Return the part of a config that affects results."""
     return {key: value for key, value in config.items() if key not in WITHOUT_EFFECT}
 
 
+def parameters_of(config: Mapping[str, Any]) -> dict[str, str]:
+    """Return the parameters that affect results as text, by dotted key."""
+    return {key: str(value) for key, value in leaves(relevant(config))}
+
+
 def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of a config by dotted key; a list is one value."""
+    """Yield the dotted key and the value of each parameter in a config. A list is one value."""
     for key, value in node.items():
         if isinstance(value, Mapping) and value:
             yield from leaves(value, f"{prefix}{key}.")
@@ -48,17 +53,20 @@ def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def shows_speed(config: Mapping[str, Any]) -> bool:
-    """Return True if the table of a config's experiment has the column `fps`."""
+    """Return True if the table of the experiment has the column `fps`."""
     return "fps" in (config.get("table") or {}).get("columns", ())
 
 
 def speed_settings(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that change the times of a run but not its results."""
+    """Return the settings that affect the speed of a run but not its results."""
     return {key: config.get(key) for key in OF_SPEED} | {key: metrics.get(key) for key in OF_MACHINE}
 
 
 def code_version() -> dict[str, str | bool]:
-    """Return the commit of the checkout and a flag for modified files; "unknown" outside of a checkout."""
+    """Return the commit of the checkout, and True if files are modified.
+
+    Both values are "unknown" outside of a checkout.
+    """
     checkout = Path(framework.__file__).resolve().parent.parent
     top = _git(checkout, "rev-parse", "--show-toplevel")
     if top is None or Path(top).resolve() != checkout:  # installed from a wheel, possibly inside another repository
@@ -70,7 +78,7 @@ def code_version() -> dict[str, str | bool]:
 
 
 def environment() -> dict[str, str | int]:
-    """Return the machine and library versions, which affect times and the last digits of results."""
+    """Return the machine and the versions of the main libraries."""
     return {
         "environment.python": platform.python_version(),
         "environment.platform": platform.platform(),
@@ -83,10 +91,8 @@ def environment() -> dict[str, str | int]:
 
 @cache
 def frozen_environment() -> str:
-    """Return the Python version and the versions of all installed packages, as constraints for pip.
-
-    Leftovers of interrupted installations have no name and are omitted.
-    """
+    """Return the versions of Python and all installed packages in the format of pip constraints."""
+    # interrupted installations leave packages without a name
     named = [package for package in distributions() if "Name" in package.metadata]
     packages = {f"{package.name}=={package.version}" for package in named if package.name != "instancemap"}
     return "\n".join([f"# Python {platform.python_version()}", *sorted(packages, key=str.lower)]) + "\n"
@@ -111,7 +117,7 @@ def processor() -> str:
 
 
 def package_version(package: str) -> str | None:
-    """Return the version of an installed package; None = not installed."""
+    """Return the version of a package, or None if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

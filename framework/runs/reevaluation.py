@@ -1,4 +1,4 @@
-"""Re-evaluation of stored runs with the current code, from their meshes and instances."""
+"""Re-evaluation of the instances of stored runs."""
 
 from __future__ import annotations
 
@@ -27,15 +27,22 @@ from framework.runs.stored_runs import CONFIG, EVALUATION, GROUND_TRUTH, METRICS
 
 @dataclass(frozen=True)
 class Truth:
-    """The ground truth of a run's dataset."""
+    """The ground truth of a dataset."""
 
     scene: SceneTruth | None  # None = not labeled
-    annotation: str  # release of the ground truth, as in RGBDVideo.annotation
-    named: str | None = None  # dataset.ground_truth; None = the ground truth of the dataset
+    annotation: str  # release of the ground truth
+    named: str | None = None  # path in dataset.ground_truth; None = the default ground truth of the dataset
 
     @classmethod
     def of(cls, dataset: Mapping[str, Any]) -> Truth:
-        """Read the ground truth of a dataset's resolved config. Raises InstanceMapError."""
+        """Read the ground truth of a dataset.
+
+        Args:
+            dataset: The resolved config of the dataset.
+
+        Raises:
+            InstanceMapError: The config contains an interpolation, or the dataset cannot be read.
+        """
         for key, value in leaves({"dataset": dataset}):
             if "${" in str(value):
                 raise DataError(f"{key}: expected a resolved value in the run's {CONFIG}, got {value}; repeat the run")
@@ -44,27 +51,34 @@ class Truth:
         return cls(video.scene_truth(), video.annotation, None if named is None else str(named))
 
     def in_world_of(self, record: Record) -> SceneTruth | None:
-        """Return the ground truth in the world frame of a run; None = no ground truth.
+        """Return the ground truth in the world frame of a run, or None for an unlabeled dataset.
 
-        Raises DataError if the trajectory of the run is missing or invalid, or has no time in common with the
-        ground-truth trajectory.
+        Raises:
+            DataError: The trajectory of the run cannot be read, or has no time in common with the ground truth.
         """
         return self.scene and in_map_world(self.scene, *read_tum(record.directory / TRAJECTORY))
 
 
 @dataclass(frozen=True)
 class Reevaluation:
-    """The stored and the new metrics of a run."""
+    """A stored run and its new metrics."""
 
     record: Record
-    metrics: Mapping[str, Any]  # the new metrics.json
+    metrics: Mapping[str, Any]  # new contents of metrics.json
 
     @classmethod
     def of(cls, record: Record, truth: Truth, allow_changed: bool = False) -> Reevaluation:
-        """Return a run with re-evaluated instances; all other metrics are kept.
+        """Evaluate the instances of a run again.
 
-        Raises DataError if the files are inconsistent or the ground truth is missing. Also raises DataError if the
-        ground truth has changed since the run, unless `allow_changed` is set.
+        All other metrics of the run are kept.
+
+        Args:
+            record: The stored run.
+            truth: The ground truth of its dataset.
+            allow_changed: Accept a ground truth that has changed since the run.
+
+        Raises:
+            DataError: The files of the run are inconsistent, or the ground truth is missing or has changed.
         """
         if truth.scene is None:
             if any(map(is_evaluation, record.metrics)):
@@ -94,7 +108,7 @@ class Reevaluation:
 
     @property
     def changed(self) -> dict[str, tuple[Any, Any]]:
-        """Return the changed metrics as (old, new) by key; None = unknown."""
+        """Old and new value of each changed metric, by key. Undefined values are None."""
         old, new = self.record.metrics, self.metrics
         return {
             key: (value, new.get(key)) for key, value in old.items() if is_evaluation(key) and new.get(key) != value
@@ -102,16 +116,19 @@ class Reevaluation:
 
     @property
     def added(self) -> list[str]:
-        """Return the keys of the new metrics that were not stored."""
+        """Keys of the metrics that the stored run does not have."""
         return [key for key in self.metrics if is_evaluation(key) and key not in self.record.metrics]
 
     def write(self) -> None:
-        """Replace metrics.json but keep its modification time, which tables use to select the latest of several runs.
+        """Replace metrics.json, but keep its modification time.
 
-        Raises DataError if the run has been restarted.
+        Tables use the modification time to select the latest of several runs.
+
+        Raises:
+            DataError: The run has been restarted.
         """
         path = self.record.directory / METRICS
-        with locked(self.record.directory):  # a new run waits
+        with locked(self.record.directory):  # a new run in this directory waits
             try:
                 before = path.stat()
             except OSError:
@@ -124,14 +141,14 @@ class Reevaluation:
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
             if (self.record.directory / MANIFEST).exists():
                 stored = Manifest.read(self.record.directory)
-                names = list(stored.files)
-                Manifest.of(self.record.directory, names, stored.status, stored.inputs).write(self.record.directory)
+                stored.with_files(self.record.directory, stored.files).write(self.record.directory)
 
 
 def read_predictions(record: Record) -> PredictedInstances:
-    """Return the predictions that a run evaluated at its end.
+    """Return the instances of a stored run for evaluation.
 
-    Raises DataError if mesh.ply or instances.json is missing, invalid or inconsistent with the other files of the run.
+    Raises:
+        DataError: The mesh or the instances are missing, invalid or from different runs.
     """
     mesh, instances = read_objects(record)
     return PredictedInstances.on_mesh(
@@ -143,8 +160,11 @@ def read_predictions(record: Record) -> PredictedInstances:
 
 
 def dataset_of(record: Record, ground_truth: str | None = None) -> dict[str, Any]:
-    """Return the dataset config of a run, with its key `ground_truth` replaced.
+    """Return the dataset config of a run, optionally with another ground truth.
 
-    The value "" selects the ground truth of the dataset; None leaves the key unchanged.
+    Args:
+        record: The stored run.
+        ground_truth: The new value of the key `ground_truth`. An empty text selects the default ground truth of the
+            dataset, and None keeps the value.
     """
     return record.dataset | ({} if ground_truth is None else {"ground_truth": ground_truth or None})

@@ -1,4 +1,4 @@
-"""Comparison of a repeated run with the stored run: possible causes of differences, and the first difference."""
+"""Comparison of a stored run with its repetition."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from framework.files.atomic_write import read_text
 from framework.runs.inputs import ROOT, input_hashes
 from framework.runs.manifest import Manifest
 from framework.runs.plugin_code import changed_code, plugin_code
-from framework.runs.provenance import code_version, leaves, package_version, relevant
+from framework.runs.provenance import code_version, leaves, package_version, parameters_of
 from framework.runs.stored_runs import (
     CONFIG,
     DIGESTS,
@@ -25,29 +25,30 @@ from framework.runs.stored_runs import (
     TRAJECTORY,
     Record,
     commit_of,
-    read_yaml,
 )
 from framework.runtime.run_log import FUSION, STAGES
 
-COMPARED = (TRAJECTORY, INSTANCES, MESH, MAP, KEYFRAMES)  # files without times
-COMPOSED = Path(".hydra/config.yaml")  # the config as composed by Hydra
+COMPARED = (TRAJECTORY, INSTANCES, MESH, MAP, KEYFRAMES)  # result files, which contain no times
 PACKAGES = ("numba", "numpy", "onnxruntime", "opencv-python-headless", "scipy", "torch", "transformers")
-"""Packages that may change the last digits of results."""
+"""Packages that may affect the last digits of results."""
 
-LARGE = (MAP, MESH, KEYFRAMES)  # files that a bundle contains only on request; their hashes are in the manifest
+LARGE = (MAP, MESH, KEYFRAMES)  # files that are optional in a bundle
 ORDER = (*STAGES, FUSION)  # order of the stages within a frame
 
 
 def causes(record: Record) -> list[str]:
-    """Return what has changed since a run and may change its results, one line each; empty = nothing known.
+    """Return one message for each change since a run that may affect its results.
 
-    These are result files that differ from manifest.json, parameters, input files, plugin code, the commit and the
-    versions of numerical packages. Raises DataError if the manifest is missing or damaged.
+    The changes are in stored files, parameters, input files, plugin code, the commit and the versions of numerical
+    packages.
+
+    Raises:
+        DataError: The manifest is missing or damaged.
     """
     manifest = Manifest.read(record.directory)
     return [
         *manifest.changed_files(record.directory, optional=LARGE),
-        *_changed_parameters(record),
+        *_changed_parameters(manifest.parameters, record),
         *_changed_inputs(manifest.inputs, input_hashes(record.config), record.config),
         *(f"plugin code of {change}" for change in changed_code(record.metrics, plugin_code(record.config))),
         *_changed_commit(record),
@@ -55,15 +56,13 @@ def causes(record: Record) -> list[str]:
     ]
 
 
-def _changed_parameters(record: Record) -> Iterator[str]:
-    """Yield the parameters in config.yaml that differ from the config as composed by Hydra."""
-    if not (record.directory / COMPOSED).exists():
-        return
-    composed = dict(leaves(relevant(read_yaml(record.directory / COMPOSED))))
-    for key, value in leaves(relevant(record.config)):
-        before = composed.get(key, value)
-        if before != value and "${" not in str(before):
-            yield f"{record.directory / CONFIG}: {key}: expected {before} (as composed by Hydra), got {value}"
+def _changed_parameters(before: Mapping[str, str], record: Record) -> Iterator[str]:
+    """Yield the parameters in config.yaml that differ from those in manifest.json."""
+    now = parameters_of(record.config)
+    for key in dict.fromkeys([*before, *now]):
+        expected, got = (values.get(key, "no value") for values in (before, now))
+        if expected != got:
+            yield f"{record.directory / CONFIG}: {key}: expected {expected}, got {got}"
 
 
 def _changed_inputs(before: Mapping[str, str], now: Mapping[str, str], config: Mapping[str, Any]) -> Iterator[str]:
@@ -85,7 +84,7 @@ def _changed_commit(record: Record) -> Iterator[str]:
 
 
 def _changed_packages(path: Path) -> Iterator[str]:
-    """Yield the numerical packages whose version differs from that in environment.txt."""
+    """Yield the numerical packages whose installed version differs from environment.txt."""
     if not path.exists():
         return
     before = dict(line.split("==", 1) for line in read_text(path).splitlines() if "==" in line)
@@ -108,9 +107,10 @@ class Reproduction:
 
     @classmethod
     def of(cls, before: Path, after: Path) -> Reproduction:
-        """Compare the run directories of a run and its repetition.
+        """Compare the directories of a run and its repetition.
 
-        Raises DataError if a manifest or a file of digests is invalid.
+        Raises:
+            DataError: A manifest or a file with digests is invalid.
         """
         old, new = Manifest.read(before).files, Manifest.read(after).files
         names = [name for name in COMPARED if name in old or name in new]
@@ -131,7 +131,7 @@ class Reproduction:
 
 
 def _first_difference(before: Path, after: Path) -> tuple[int, str] | None:
-    """Return the first frame and its first stage with different digests; None = no difference or no digests."""
+    """Return the first frame and stage with different digests, or None."""
     if not (before.exists() and after.exists()):
         return None
     old, new = _digests(before), _digests(after)
@@ -140,7 +140,7 @@ def _first_difference(before: Path, after: Path) -> tuple[int, str] | None:
 
 
 def _digests(path: Path) -> dict[tuple[int, str], str]:
-    """Return the digests by frame and stage. Raises DataError if the file cannot be read or is invalid."""
+    """Read the digests by frame and stage."""
     try:
         rows = list(csv.DictReader(read_text(path).splitlines()))
         return {(int(row["frame"]), row["stage"]): row["digest"] for row in rows if row["stage"] in ORDER}

@@ -1,4 +1,4 @@
-"""Bundles: a ZIP file with runs, their table, and the sources of third-party plugins."""
+"""Bundles: ZIP files with runs, their tables and the code of third-party plugins."""
 
 from __future__ import annotations
 
@@ -14,20 +14,29 @@ from framework.errors import DataError
 from framework.files.atomic_write import atomic_write
 from framework.runs.manifest import MANIFEST, Manifest
 from framework.runs.plugin_code import plugin_files, targets_of
-from framework.runs.reproduction import COMPOSED, LARGE
+from framework.runs.reproduction import LARGE
 from framework.runs.stored_runs import completed_runs
 from framework.runs.sweep_file import SWEEP
 
-TABLES = (SWEEP, "table.md", "table.tex", "table.csv")
-PLUGINS = "plugins"  # folder with the sources of third-party plugins
-OPTIONS = "options"  # folder that registers these plugins, for the composition of configs
+SWEEP_FILES = (SWEEP, "table.md", "table.tex", "table.csv")
+PLUGINS = "plugins"  # folder with the code of third-party plugins
+OPTIONS = "options"  # config folder with an option for each of these plugins
 MAX_SIZE = 2**36  # maximum total size of an extracted bundle, bytes
 
 
 def write_bundle(folder: Path, path: Path, with_maps: bool = False) -> int:
-    """Write the completed runs below `folder`, their tables and their third-party plugins to a ZIP file.
+    """Write a bundle of the completed runs in a folder and its subfolders.
 
-    Returns the number of runs. Raises DataError if no run is complete, or if a run differs from its manifest.
+    Args:
+        folder: The folder of the runs and their tables.
+        path: The ZIP file.
+        with_maps: Include the maps, meshes and keyframes.
+
+    Returns:
+        The number of runs.
+
+    Raises:
+        DataError: No run is complete, or a file has changed since its run.
     """
     records, _ = completed_runs(folder)
     targets = {pair for record in records for pair in targets_of(record.config)}
@@ -39,8 +48,8 @@ def write_bundle(folder: Path, path: Path, with_maps: bool = False) -> int:
                 raise DataError(f"{changed[0]}; repeat the run")
             names = [name for name in manifest.files if with_maps or name not in LARGE]
             of_run = record.directory.relative_to(folder) if record.directory != folder else record.directory.name
-            _add_files(archive, record.directory, [*names, MANIFEST, str(COMPOSED)], Path(of_run))
-        _add_files(archive, folder, TABLES, Path())
+            _add_files(archive, record.directory, [*names, MANIFEST], Path(of_run))
+        _add_files(archive, folder, SWEEP_FILES, Path())
         for name, file in sorted({pair for files in sources.values() for pair in files}):
             archive.write(file, f"{PLUGINS}/{name}")
         for k, (stage, target) in enumerate(sources):
@@ -49,7 +58,7 @@ def write_bundle(folder: Path, path: Path, with_maps: bool = False) -> int:
 
 
 def _add_files(archive: zipfile.ZipFile, folder: Path, names: Iterable[str], inside: Path) -> None:
-    """Add the existing files with these names in `folder` to the folder `inside` of the archive."""
+    """Copy the existing files of a folder to the folder `inside` of the archive."""
     for name in names:
         if (folder / name).exists():
             archive.write(folder / name, (inside / name).as_posix())
@@ -57,9 +66,16 @@ def _add_files(archive: zipfile.ZipFile, folder: Path, names: Iterable[str], ins
 
 @contextmanager
 def opened_bundle(path: Path, trust_code: bool) -> Iterator[Path]:
-    """Yield a temporary folder with the contents of a bundle, whose plugins can be imported inside the context.
+    """Extract a bundle to a temporary folder, and yield the folder.
 
-    Raises DataError for an unreadable or too large file, and for a bundle with plugins unless `trust_code` is set.
+    The plugins of the bundle can be imported inside the context.
+
+    Args:
+        path: The ZIP file.
+        trust_code: Accept a bundle with plugin code.
+
+    Raises:
+        DataError: The file is not a ZIP file, is too large, or contains plugin code without `trust_code`.
     """
     try:
         archive = zipfile.ZipFile(path)

@@ -1,4 +1,8 @@
-"""Writing of the run directory: every file atomically, small files first, metrics.json last."""
+"""Writing of the run directory.
+
+Each file is written atomically, and small files are written first. The file metrics.json is written after all results
+and marks a complete run.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +33,7 @@ from framework.runs.manifest import MANIFEST, Manifest, RunStatus
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
 from framework.runs.plugin_code import plugin_code
-from framework.runs.provenance import code_version, config_hash, environment, frozen_environment
+from framework.runs.provenance import code_version, config_hash, environment, frozen_environment, parameters_of
 from framework.runs.stored_runs import (
     CHOICE,
     CONFIG,
@@ -60,17 +64,17 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class RunRecord:
-    """Writer for one run directory."""
+    """Writer of a run directory."""
 
     directory: Path
-    config: Mapping[str, Any]  # resolved
+    config: Mapping[str, Any]  # resolved config
     choices: Mapping[str, str | None]  # chosen option of each config group
-    inputs: Mapping[str, str]  # input_hashes
+    inputs: Mapping[str, str]  # SHA-256 of the input files, by config key
     provenance: Metrics  # code and machine at the start of the run
 
     @classmethod
     def begin(cls, directory: Path, config: DictConfig, choices: Mapping[str, str | None]) -> RunRecord:
-        """Start a run in `directory`: remove the metrics and report of an earlier run."""
+        """Prepare the directory for a run, and remove the metrics and the report of an earlier run."""
         plain = resolved(config)
         inputs = input_hashes(plain)
         provenance: Metrics = {**code_version(), **plugin_code(plain), **environment()}
@@ -87,8 +91,7 @@ class RunRecord:
     ) -> BaseException | None:
         """Write all outputs and log the main metrics.
 
-        The map is written before it is evaluated, in case the ground truth is unusable. Until the end,
-        metrics.partial.json marks the run as partial, in case the process is killed.
+        An error does not prevent the writing of other files. The run is then partial.
 
         Args:
             video: The mapped video.
@@ -96,8 +99,7 @@ class RunRecord:
             counts: Additional metrics.
 
         Returns:
-            The reason for a partial run: `result.stopped_by`, or the first write error. Other files are still written.
-            None = the run is complete.
+            None for a complete run. For a partial run, `result.stopped_by` or the first write error.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         scene, attempt = result.scene, _Attempts(result.stopped_by)
@@ -117,16 +119,15 @@ class RunRecord:
             attempt(write_instances, self.directory / INSTANCES, *found, scene.classes)
             figures |= attempt(room_metrics, scene, found[0]) or {}
             figures["instances.count"] = len(found[1])
-        attempt(self._write_partial, video, figures, attempt.error)
-        if found is not None:
+        attempt(self._write_partial, video, figures, attempt.error)  # in case the process is killed
+        if found is not None:  # the map is written before the evaluation, in case the ground truth is unusable
             attempt(write_mesh, self.directory / MESH, found[0])
         attempt(scene.save, self.directory / MAP)
         if result.keyframes:
             attempt(write_keyframes, self.directory / KEYFRAMES, result.keyframes)
         if found is not None:
-            stored = attempt(
-                read_tum, self.directory / TRAJECTORY
-            )  # as written, so that a re-evaluation returns the same metrics
+            # as written, so that a re-evaluation returns the same metrics
+            stored = attempt(read_tum, self.directory / TRAJECTORY)
             figures |= (stored and attempt(instance_metrics, video, *found, scene.classes, stored)) or {}
         figures |= attempt(trajectory_metrics, result) or {}
         title = headline({"sequence": video.name, **figures})
@@ -157,13 +158,16 @@ class RunRecord:
         }
 
     def _write_partial(self, video: RGBDVideo, figures: Metrics, error: BaseException | None) -> None:
-        """Write the metrics of a partial run with the reason; `error` None = the outputs are still being written."""
+        """Write the metrics of a partial run, and the reason for its early end.
+
+        Without an error, the outputs are still being written.
+        """
         why = "the outputs were not completed" if error is None else reason(error)
         write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
 
     def _write_manifest(self, status: RunStatus) -> None:
-        names = [*RESULT_FILES, METRICS, PARTIAL_METRICS]
-        Manifest.of(self.directory, names, status, self.inputs).write(self.directory)
+        manifest = Manifest(status, {}, self.inputs, parameters_of(self.config))
+        manifest.with_files(self.directory, [*RESULT_FILES, METRICS, PARTIAL_METRICS]).write(self.directory)
 
     def _announce(
         self, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics, error: BaseException | None
@@ -184,14 +188,14 @@ class RunRecord:
 
 @dataclass
 class _Attempts:
-    """Callable that runs functions and logs their errors, so that a failing call does not prevent later calls."""
+    """Callable that runs a function and logs its error instead of raising it."""
 
     error: BaseException | None  # first error; None = no error
 
     def __call__(
         self, function: Callable[Arguments, Made], *arguments: Arguments.args, **named: Arguments.kwargs
     ) -> Made | None:
-        """Return the result of the function; None if it fails."""
+        """Return the result of the function, or None if it fails."""
         try:
             return function(*arguments, **named)
         except Exception as error:
@@ -206,13 +210,13 @@ def _write_config(path: Path, config: Mapping[str, Any]) -> None:
 
 
 def _from_here(path: Path) -> Path:
-    """Return the path relative to the working directory if it is inside it, otherwise the absolute path."""
+    """Return the path relative to the working directory, or the absolute path if it is elsewhere."""
     here, place = Path.cwd(), path.absolute()
     return place.relative_to(here) if place.is_relative_to(here) else place
 
 
 def _labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -> dict[int, tuple[str, float]]:
-    """Return the class name and confidence of the likely instances by id."""
+    """Return the class name and the confidence of each likely instance, by id."""
     return {
         key: (class_name(instance, classes) or "object", instance.confidence)
         for key, instance in instances.items()
@@ -225,7 +229,7 @@ _QUALITY = {"instances.ap50": "AP50", "instances.ap25": "AP25"}
 
 
 def headline(metrics: Mapping[str, Any]) -> str:
-    """Return the available main metrics of a run in one line."""
+    """Return the main metrics of a run as one line of text."""
     parts = [str(metrics["sequence"])]
     if "frames" in metrics:
         parts += [f"{metrics['frames']} frames at {metrics['fps']:.1f}/s"]
@@ -243,14 +247,14 @@ def headline(metrics: Mapping[str, Any]) -> str:
 
 
 def reason(error: BaseException) -> str:
-    """Return the error that ended a partial run as one line of text."""
+    """Return the reason for a partial run as one line of text."""
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted by Ctrl-C"
     return one_line(error) if isinstance(error, InstanceMapError) else f"{type(error).__name__}: {one_line(error)}"
 
 
 def write_timings(path: Path, result: RunResult) -> None:
-    """Write the time of each stage for each frame, in chronological order."""
+    """Write the time of each stage for each frame as CSV, in chronological order."""
     with atomic_write(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("frame", "stage", "milliseconds"))
@@ -258,7 +262,7 @@ def write_timings(path: Path, result: RunResult) -> None:
 
 
 def write_digests(path: Path, result: RunResult) -> None:
-    """Write the digest of each stage for each frame, in chronological order."""
+    """Write the digest of each stage for each frame as CSV, in chronological order."""
     lines = [f"{one.frame},{one.stage},{one.digest:08x}" for one in result.digests]
     _write_text(path, "\n".join(["frame,stage,digest", *lines]) + "\n")
 
@@ -269,19 +273,20 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def peak_memory() -> int | None:
-    """Return the peak resident memory of this process in bytes; None on Windows, which has no module `resource`.
+    """Return the peak resident memory of this process in bytes, or None on Windows.
 
-    On Linux, the peak is measured from the start of the run; on macOS, from the start of the process.
+    On Linux, it is measured from the start of the run. On macOS, it is measured from the start of the process.
     """
     try:
         import resource
-    except ImportError:
+    except ImportError:  # Windows
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # Linux counts in KiB
 
 
 def _reset_peak_memory() -> None:
-    """Reset the peak memory of the process on Linux, because it includes earlier jobs of a sweep."""
+    """Reset the peak memory of this process on Linux."""
+    # otherwise, it includes earlier jobs of the sweep
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")

@@ -1,4 +1,4 @@
-"""Rows of a comparison: means of runs with their spread, and paired differences."""
+"""Grouping of runs into the rows of a comparison table."""
 
 from __future__ import annotations
 
@@ -14,21 +14,24 @@ from framework.runs.metrics import TRUTH
 from framework.runs.stored_runs import CHOICE, Record, is_number
 
 DATA = "dataset.root"  # config key of the dataset folder
-ANNOTATION = "annotation"  # key of the release of the ground truth in the differences between rows
+ANNOTATION = "annotation"  # name of the ground-truth release in the variant of a row
 CONFIDENCE = 0.95
 PRESET_STAGES = ("tracker", "refiner", "fuser")  # stages set by preset=NAME
 
-ABSENT = "–"  # value of a key that a run does not have
+ABSENT = "–"  # text for a key that a run does not have
 
-Run = tuple[str, ...]  # values of the keys that are averaged over, e.g. ("3",) for seed 3
+Run = tuple[str, ...]  # values of the averaged keys, e.g. ("3",) for seed 3
 
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over runs. NaN = undefined, such as the mean of no run or the deviation of a single run."""
+    """The mean and the standard deviation of a metric over runs.
+
+    The mean of no run and the deviation of a single run are NaN.
+    """
 
     value: float
-    deviation: float  # sample standard deviation, with the divisor n - 1; 0 = equal values
+    deviation: float  # sample standard deviation, with the divisor n - 1
     count: int
 
     @classmethod
@@ -36,24 +39,24 @@ class Mean:
         sample = np.array(list(values), np.float64)
         if not len(sample):
             return cls(math.nan, math.nan, 0)
-        if np.ptp(sample) == 0:  # without rounding errors
+        if np.ptp(sample) == 0:  # exact for equal values
             return cls(float(sample[0]), 0.0 if len(sample) > 1 else math.nan, len(sample))
         return cls(float(sample.mean()), float(sample.std(ddof=1)), len(sample))
 
     @property
     def error(self) -> float:
-        """Return the standard error of the mean."""
+        """Standard error of the mean."""
         return self.deviation / math.sqrt(self.count) if self.count > 1 else math.nan
 
 
 @dataclass(frozen=True)
 class RunRow:
-    """Runs with equal config values, except for the averaged keys."""
+    """One row of a comparison table: runs that differ only in the averaged keys."""
 
     name: str
     records: Mapping[Run, Record]
-    system: str = ""  # name of the row in an experiment; "" = no experiment
-    variant: tuple[str, ...] = ()  # other overrides that differ between rows, e.g. ("tracker=icp_only",)
+    system: str = ""  # name of the row in an experiment, "" = no experiment
+    variant: tuple[str, ...] = ()  # other settings that differ between rows, e.g. ("tracker=icp_only",)
 
     @property
     def pose_source(self) -> str:
@@ -61,13 +64,13 @@ class RunRow:
 
     @property
     def poses(self) -> str:
-        """Return the pose source as text, including the tracker of tracked poses."""
+        """Pose source as text, with the tracker of tracked poses."""
         tracked = {"tracked": f"tracked ({self._distinct(f'{CHOICE}tracker')})"}
         return tracked.get(self.pose_source, self.pose_source.replace("_", " "))
 
     @property
     def annotation(self) -> str:
-        """Return the release of the ground truth; "" = unknown."""
+        """Release of the ground truth, or "" if unknown."""
         return "/".join(sorted({record.annotation for record in self.records.values()}))
 
     def _distinct(self, key: str) -> str:
@@ -75,13 +78,16 @@ class RunRow:
 
     @property
     def peers(self) -> tuple[str, ...]:
-        """Return the key of comparable rows: the variant in an experiment, otherwise the source of poses and data."""
+        """Key that comparable rows have in common.
+
+        In an experiment, this is the variant. For other rows, it consists of the pose source and the data.
+        """
         if self.system:
             return self.variant
         return (self.pose_source, *(part for part in self.variant if is_of_data(part)))
 
     def values(self, column: str) -> dict[Run, float]:
-        """Return the metric `column` of each run; runs with an undefined value are omitted."""
+        """Return the value of a metric for each run, without undefined values."""
         found = {run: record.metrics.get(column) for run, record in self.records.items()}
         return {run: float(value) for run, value in found.items() if is_number(value)}
 
@@ -89,25 +95,25 @@ class RunRow:
         return Mean.of(self.values(column).values())
 
     def shares_data(self, other: RunRow) -> bool:
-        """Return True if every run in both rows has the same data, and there is such a run."""
+        """Return True if both rows have common runs, and these have the same data."""
         runs = self.records.keys() & other.records.keys()
         return bool(runs) and all(data_of(self.records[run]) == data_of(other.records[run]) for run in runs)
 
 
 def data_of(record: Record) -> tuple[Any, ...]:
-    """Return the identity of the data of a run: its dataset, sequence and ground truth."""
+    """Return a key for the dataset, sequence and ground truth of a run."""
     keys = ("sequence", "annotation_release", TRUTH)
     parameters = (record.parameters.get(key) for key in (DATA, "dataset.scene"))
     return (record.choices.get("dataset"), *parameters, *(record.metrics.get(key) for key in keys))
 
 
 def is_of_data(part: str) -> bool:
-    """Return True if a part of a row's variant, such as dataset=desk, describes its data."""
+    """Return True if a part of a variant, such as dataset=desk, is about the data."""
     return is_below(part.partition("=")[0], ("dataset", ANNOTATION, "seed"))
 
 
 def value_of(record: Record, key: str) -> str:
-    """Return an option or parameter of a run as text; ABSENT = the run does not have the key."""
+    """Return an option or parameter of a run as text, or ABSENT if the run does not have it."""
     return str(record.settings[key]) if key in record.settings else ABSENT
 
 
@@ -117,23 +123,23 @@ def rows_of(
     overrides: Mapping[str, Sequence[str]] | None = None,
     asked: Collection[str] | None = None,
 ) -> list[RunRow]:
-    """Group `records` into rows: first the rows in `overrides`, then other rows by name.
+    """Group runs into the rows of a table.
 
-    Records of an experiment are grouped by their config key `row`. Other records are grouped by their differing options
-    and parameters, except for the averaged keys `over` and the keys that depend on them (`dependent_keys`).
+    Runs of an experiment are grouped by their row in the experiment. Other runs are grouped by the options and
+    parameters that differ between them. Averaged keys and keys that depend on them do not separate rows.
 
-    A row of an experiment is split by differences within it, by data folder and by annotation. It is also split by
-    differences between rows that no override causes, such as the pose source or the number of frames. The later of two
-    records of the same run is used.
+    A row of an experiment is split if its runs have different settings, data folders or annotations. It is also split
+    if it differs from other rows in a setting that no override changes, such as the number of frames. If a run was
+    repeated, the latest record is used.
 
     Args:
         records: The runs.
-        over: The averaged keys: options and parameters.
-        overrides: The overrides of each row of an experiment by name.
-        asked: The keys in the overrides of the sweep; None = unknown.
+        over: The averaged keys, i.e. names of options and parameters.
+        overrides: The overrides of each row of an experiment, by name.
+        asked: The keys that the overrides of the sweep set; None = unknown.
 
     Returns:
-        The rows, each with at least one run.
+        The rows, each with at least one run. Rows in `overrides` are first; other rows are sorted by name.
     """
     overrides = overrides or {}
     variants = [_Variant.of(record, over) for record in sorted(records, key=lambda record: record.written)]
@@ -144,7 +150,7 @@ def rows_of(
         + [("", {key: value for key, value in one.choices.items() if key not in changed}) for one in variants]
     )
 
-    def dataset_of(one: _Variant) -> Any:  # rows of several datasets are named by their dataset, not by its folder
+    def dataset_of(one: _Variant) -> Any:  # rows of several datasets are named by the dataset, not by its folder
         return one.choices.get("dataset") if "dataset" in stages else ""
 
     parameters = _differing(
@@ -158,7 +164,7 @@ def rows_of(
         variant += [f"{key}={one.parameters[key]}" for key in parameters if key in one.parameters and key not in own]
         rows.setdefault((one.row, tuple(variant)), {})[one.run] = one.record
     place = {name: k for k, name in enumerate(overrides)}
-    # the parts of a split row take its position
+    # the parts of a split row stay together
     order = sorted(rows, key=lambda key: (place.get(key[0], len(place)), key))
     return [_row(system, variant, rows[system, variant]) for system, variant in order]
 
@@ -169,19 +175,18 @@ def _row(system: str, variant: tuple[str, ...], records: Mapping[Run, Record]) -
 
 
 def _changed(override: str) -> tuple[str, ...]:
-    """Return the keys changed by an override: refiner.links.x for refiner@refiner.links.x=y."""
+    """Return the keys that an override changes, e.g. refiner.links.x for refiner@refiner.links.x=y."""
     group, _, package = override.lstrip("+~").partition("=")[0].partition("@")
     return PRESET_STAGES if group == "preset" else (package or group.replace("/", "."),)
 
 
 def _all_changed(keys: Iterable[str]) -> Iterator[str]:
-    """Yield the keys changed by overrides of these keys and groups."""
     for key in keys:
         yield from _changed(key)
 
 
 def _kept(one: _Variant, changed: Collection[str]) -> Iterator[tuple[Any, Mapping[str, Any]]]:
-    """Yield the parameters that no row changes, with their stage and its option."""
+    """Yield each parameter that no override changes, with its stage and the option of this stage."""
     for key, value in one.parameters.items():
         if not is_below(key, changed):
             stage = key.partition(".")[0]
@@ -196,12 +201,12 @@ def is_below(key: str, others: Collection[str]) -> bool:
 
 @dataclass(frozen=True)
 class _Variant:
-    """The row and run of a record."""
+    """A record with its row, its run and its settings."""
 
     record: Record
     row: str
     run: Run
-    choices: Mapping[str, Any]  # by stage, and the annotation
+    choices: Mapping[str, Any]  # option of each stage, and the annotation
     parameters: Mapping[str, Any]  # by dotted key
 
     @classmethod
@@ -212,16 +217,20 @@ class _Variant:
 
     @property
     def values(self) -> Mapping[str, Any]:
-        """Return the chosen options, the annotation and the parameters."""
+        """Chosen options, annotation and parameters by key."""
         return {**self.parameters, **self.choices}
 
 
 def dependent_keys(records: Sequence[Record], over: Sequence[str], asked: Collection[str] | None = None) -> list[str]:
-    """Return the differing keys that are averaged because they depend on a key in `over`, for a note.
+    """Return the keys that are averaged because they depend on an averaged key.
 
-    These keys have the same value as a key in `over` in every record, even by chance, or are set by an averaged option.
-    Keys with the same last part as a key in `over`, such as dataset.seed for seed, and the parameters of averaged and
-    returned options are omitted.
+    The notes of a table list these keys. Obvious keys are omitted. These are keys with the same last part as an
+    averaged key, such as dataset.seed for seed, and the parameters of averaged or returned options.
+
+    Args:
+        records: The runs.
+        over: The averaged keys.
+        asked: The keys that the overrides of the sweep set; None = unknown.
     """
     variants = [_Variant.of(record, over) for record in records]
     names = {key.rpartition(".")[2] for key in over}
@@ -233,11 +242,12 @@ def dependent_keys(records: Sequence[Record], over: Sequence[str], asked: Collec
 
 
 def _dependent(variants: Sequence[_Variant], over: Sequence[str], asked: Collection[str] | None) -> set[str]:
-    """Return the keys `over` and the keys that depend on them.
+    """Return the averaged keys `over` and the keys that depend on them.
 
-    A key depends on `over` if its value equals that of a key in `over` in every record. The parameters and the
-    annotation of an averaged option also depend on it, and all keys that are not in `asked`, if each option has one
-    value of the key.
+    A parameter depends on an averaged key if both have the same value in every run.
+
+    A key depends on an averaged option if it has one value for each option. It must be a parameter of the option, the
+    annotation of a dataset, or a key that is not in `asked`.
     """
     found = set(over)
     keys = {key for one in variants for key in one.values}
@@ -260,7 +270,7 @@ def _dependent(variants: Sequence[_Variant], over: Sequence[str], asked: Collect
 
 
 def _differing(groups: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[str]:
-    """Return the keys that have several values within a group, in order; `groups` are (group, values) pairs."""
+    """Return the keys with several values within a group. `groups` contains pairs of a group and its values."""
     seen: dict[Any, dict[str, set[str]]] = {}
     for group, values in groups:
         for key, value in values.items():
@@ -270,5 +280,5 @@ def _differing(groups: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[str]:
 
 
 def natural(run: Run) -> tuple[tuple[float, str], ...]:
-    """Return a sort key that orders numbers by value, and other texts alphabetically after them."""
+    """Return a sort key that orders numbers by value, followed by other texts in alphabetical order."""
     return tuple((float(word) if word.isdecimal() else math.inf, word) for word in run)

@@ -1,4 +1,4 @@
-"""The mesh and objects of a stored run."""
+"""Mesh and instances of a stored run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from framework.runs.stored_runs import INSTANCES, MESH, METRICS, TRAJECTORY, Rec
 
 @dataclass(frozen=True)
 class StoredMap:
-    """A map of F frames with V vertices."""
+    """The map of a stored run, with V vertices and F frames."""
 
     mesh: InstanceMesh
     ids: Int32  # (V,) instance id of each vertex, 0 = no stored instance
@@ -29,7 +29,11 @@ class StoredMap:
 
     @classmethod
     def of(cls, record: Record) -> StoredMap:
-        """Read the map of a run. Raises DataError for invalid or inconsistent files, and for an empty map."""
+        """Read the map of a run.
+
+        Raises:
+            DataError: The map is empty, or its files are invalid or inconsistent.
+        """
         mesh, instances = read_objects(record)
         _, poses = read_tum(record.directory / TRAJECTORY)
         if not len(mesh.triangles) or not len(poses):
@@ -39,12 +43,19 @@ class StoredMap:
         return cls(mesh, ids, names, poses, record)
 
     def true_ids(self, truth: SceneTruth) -> Int32:
-        """Return the id (V,) of the ground-truth instance nearest to each vertex; 0 = none within MAX_DISTANCE."""
+        """Return the ids (V,) of the nearest ground-truth instances.
+
+        The id of a vertex is 0 without a ground-truth point within MAX_DISTANCE.
+        """
         return transfer_labels(truth.points_world, truth.instance_ids, self.mesh.vertices, MAX_DISTANCE)
 
 
 def read_objects(record: Record) -> tuple[InstanceMesh, list[StoredInstance]]:
-    """Read mesh.ply and instances.json of a completed run. Raises DataError if they are inconsistent."""
+    """Read the mesh and the instances of a completed run.
+
+    Raises:
+        DataError: A file is missing or invalid, or the files are from different runs.
+    """
     mesh, instances = read_labeled_mesh(record.directory)
     if len(instances) != record.metrics.get("instances.count"):
         raise DataError(
@@ -55,7 +66,11 @@ def read_objects(record: Record) -> tuple[InstanceMesh, list[StoredInstance]]:
 
 
 def read_labeled_mesh(directory: Path) -> tuple[InstanceMesh, list[StoredInstance]]:
-    """Read mesh.ply and instances.json of a completed or partial run. Raises DataError if they are inconsistent."""
+    """Read the mesh and the instances of a completed or partial run.
+
+    Raises:
+        DataError: A file is missing or invalid, or the files are from different runs.
+    """
     mesh_path, instances_path = directory / MESH, directory / INSTANCES
     instances, mesh = read_instances(instances_path), read_mesh(mesh_path)
     ids, counts = np.unique(mesh.instance_ids, return_counts=True)

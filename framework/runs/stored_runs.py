@@ -1,4 +1,4 @@
-"""Stored runs: completed runs, and incomplete runs with the reasons."""
+"""Search and reading of stored runs."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ from framework.runs.timings_file import current_key
 
 CONFIG = "config.yaml"
 METRICS = "metrics.json"  # exists only for completed runs
-PARTIAL_METRICS = "metrics.partial.json"  # metrics of a partial run, with the reason under `partial`
+PARTIAL_METRICS = "metrics.partial.json"  # metrics of a partial run; the key `partial` contains the reason
 LOG = "instancemap.log"
 MAP = "map.npz"
 MESH = "mesh.ply"
 INSTANCES = "instances.json"
 TRAJECTORY = "trajectory.txt"
 REPORT = "report.html"  # written by `instancemap report`
-KEYFRAMES = "keyframes.npz"  # of the tracker, to resume the map; optional
+KEYFRAMES = "keyframes.npz"  # keyframes of the tracker, to resume the map; optional
 MAPPED = (TRAJECTORY, "timings.csv", INSTANCES, MESH, MAP, "overview.png")
-"""Files of a map in the order of writing, small files first in case the disk is full."""
+"""Files of a map in the order of writing. Small files are first in case the disk becomes full."""
 
-DIGESTS = "digests.csv"  # digest of each stage and frame, to locate differences between runs
+DIGESTS = "digests.csv"  # digest of each stage for each frame, to locate differences between runs
 ENVIRONMENT = "environment.txt"  # versions of all installed packages, as constraints for pip
 RESULT_FILES = (CONFIG, *MAPPED, KEYFRAMES, DIGESTS, ENVIRONMENT)
 """Files listed in manifest.json, in addition to the metrics."""
 
-EVALUATION = "evaluation."  # prefix of the keys with the code version of the last re-evaluation
-GROUND_TRUTH = EVALUATION + "ground_truth"  # key of the `dataset.ground_truth` of the last re-evaluation, if it was set
+EVALUATION = "evaluation."  # prefix of keys about the last re-evaluation
+GROUND_TRUTH = EVALUATION + "ground_truth"  # key of the last re-evaluated `dataset.ground_truth`; optional
 
 CHOICE = "choice."  # prefix of the chosen options in metrics.json
 GROUPS = (*STAGES, "preset", "sequences")  # config groups whose chosen option is stored
@@ -67,11 +67,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Record:
-    """A completed run."""
+    """A stored run."""
 
     directory: Path
     metrics: Mapping[str, Any]  # flat; None = undefined
-    config: Mapping[str, Any]  # resolved
+    config: Mapping[str, Any]  # resolved config
     written: float  # modification time of the metrics file, s since the epoch
 
     @property
@@ -80,7 +80,7 @@ class Record:
 
     @property
     def code(self) -> str:
-        """Return the commit of the run, and the commit of its re-evaluation if they differ."""
+        """Commit of the run and, if different, of its re-evaluation."""
         prefix = len(EVALUATION)
         later = {key[prefix:]: value for key, value in self.metrics.items() if key.startswith(EVALUATION)}
         evaluator = commit_of(later) if later else self.commit
@@ -88,35 +88,38 @@ class Record:
 
     @property
     def dataset(self) -> dict[str, Any]:
-        """Return the config of the dataset, with the ground truth of the last evaluation."""
+        """Config of the dataset, with the ground truth of the last evaluation."""
         config = dict(self.config.get("dataset") or {})
         return config | ({"ground_truth": self.metrics[GROUND_TRUTH]} if GROUND_TRUTH in self.metrics else {})
 
     @property
     def annotation(self) -> str:
-        """Return the release of the ground truth; "" = unknown."""
+        """Release of the ground truth, or "" if unknown."""
         return str(self.metrics.get("annotation_release") or "")
 
     @property
     def row(self) -> str:
-        """Return the row of an experiment; "" = no experiment."""
+        """Name of the row in an experiment, or "" without an experiment."""
         row = self.config.get("row")
         return "" if row is None else str(row)
 
     @cached_property
     def choices(self) -> dict[str, str]:
-        """Return the chosen option of each config group."""
+        """Chosen option of each config group."""
         chosen = {key.removeprefix(CHOICE): value for key, value in self.metrics.items() if key.startswith(CHOICE)}
         return {group: str(option) for group, option in chosen.items() if option is not None}
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
-        """Return the parameters that change results by dotted key."""
+        """Parameters that affect results, by dotted key."""
         return dict(leaves(relevant(self.config)))
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """Return the row, the chosen options, the parameters, and the settings that change times, by key."""
+        """All settings of the run by key.
+
+        These are the row, the chosen options, the parameters and the settings that affect speed.
+        """
         row = {"row": self.row} if self.row else {}
         speed = {key: self.config[key] for key in OF_SPEED if key in self.config}
         return (
@@ -129,33 +132,42 @@ class Record:
 
 @dataclass(frozen=True)
 class Incomplete:
-    """A run without complete outputs, and the reason."""
+    """An incomplete run, with the reason."""
 
     directory: Path
     reason: str
 
 
-WITH_CHANGES = " with changes"  # suffix of a modified commit
+WITH_CHANGES = " with changes"  # suffix for a checkout with modified files
 
 
 def commit_of(metrics: Mapping[str, Any]) -> str:
-    """Return the short commit of a run: "7dcc5d0", "7dcc5d0 with changes" or "unknown"."""
+    """Return the short commit of a run, e.g. "7dcc5d0" or "7dcc5d0 with changes".
+
+    The commit is "unknown" for runs outside of a checkout.
+    """
     changes = WITH_CHANGES if metrics.get("git_dirty") is True else ""
     return f"{str(metrics.get('git_commit'))[:7]}{changes}"
 
 
 def read_record(directory: Path, check_config: bool = True) -> Record:
-    """Read the completed run in `directory`. Raises DataError for invalid or inconsistent files.
+    """Read the completed run in a directory.
 
-    Without `check_config`, the config may differ from that of the run.
+    Args:
+        directory: The run directory.
+        check_config: Require that config.yaml has not changed since the run.
+
+    Raises:
+        DataError: A file is missing, invalid or inconsistent.
     """
     return _read(directory, METRICS, check_config)
 
 
 def read_partial(directory: Path) -> tuple[Record, str]:
-    """Read the partial run in `directory`, and the reason for its early end.
+    """Read the partial run in a directory, and the reason for its early end.
 
-    Raises DataError if its metrics or config are missing, invalid or from different runs.
+    Raises:
+        DataError: The metrics or the config are missing, invalid or from different runs.
     """
     record = _read(directory, PARTIAL_METRICS)
     return record, str(record.metrics.get("partial"))
@@ -177,7 +189,7 @@ def _read(directory: Path, name: str, check_config: bool = True) -> Record:
 
 
 def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
-    """Return the completed and the incomplete runs in `root` and its subfolders, sorted by path."""
+    """Return the completed and the incomplete runs in a folder and its subfolders, sorted by path."""
     records: list[Record] = []
     others: list[Incomplete] = []
     for directory in _run_directories(root):
@@ -192,9 +204,10 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
 
 
 def completed_runs(root: Path) -> tuple[list[Record], list[Incomplete]]:
-    """Return the completed and the incomplete runs as in `find_records`.
+    """Return the completed and the incomplete runs in a folder that contains at least one completed run.
 
-    Raises DataError if `root` is not a folder or contains no completed run.
+    Raises:
+        DataError: The folder is missing or contains no completed run.
     """
     if not root.is_dir():
         raise DataError(f"{root}: expected a folder of runs, got no folder")
@@ -205,16 +218,16 @@ def completed_runs(root: Path) -> tuple[list[Record], list[Incomplete]]:
 
 
 def no_run_error(root: Path, incomplete: Sequence[Incomplete]) -> DataError:
-    """Return the error for a folder without a completed run, with the reasons of its incomplete runs."""
+    """Return the error for a folder without a completed run."""
     why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
     return DataError(f"{root}: expected a completed run, got none{f' ({why})' if why else ''}")
 
 
 def is_recorded(directory: Path, config: DictConfig) -> bool:
-    """Return True if `directory` contains a completed run with this config and these inputs. Log the decision.
+    """Return True if a directory contains a completed run with this config, and log the decision.
 
-    The code of its plugins must match. If the experiment's table shows the speed, settings that change times must also
-    match. The commit may differ: most commits do not change results, and tables list the commits of their runs.
+    The input files and the code of the plugins must be the same, too. For experiments with a speed column, this also
+    applies to the settings that affect speed. The commit may differ, because most commits do not change results.
     """
     if not (directory / METRICS).exists():
         return False
@@ -230,7 +243,7 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
     if changed := changed_code(record.metrics, plugin_code(plain)):
         log.info("repeating the run: the code changed since the run in %s: %s", directory, "; ".join(changed))
         return False
-    if record.metrics.get(INPUTS) not in (None, inputs_sha256(plain)):  # None = written before the key existed
+    if record.metrics.get(INPUTS) not in (None, inputs_sha256(plain)):  # None = written by a version without this key
         log.info("repeating the run: weights or data changed since the run in %s", directory)
         return False
     settings = speed_settings(record.config, record.metrics)
@@ -245,7 +258,7 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
     if lost := [name for name in MAPPED if not (directory / name).exists()]:
         log.warning("%s: expected %s, got none; set skip_completed=false to repeat the run", directory, ", ".join(lost))
     now = commit_of(code_version())
-    if record.commit == now and not now.endswith(WITH_CHANGES):  # modified trees may differ
+    if record.commit == now and not now.endswith(WITH_CHANGES):  # two checkouts with changes may differ
         log.info("skipped: the completed run in %s", directory)
     else:
         message = (
@@ -257,9 +270,10 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML mapping without resolving interpolations.
+    """Read the keys and values in a YAML file, without resolving interpolations.
 
-    Raises DataError if the file is missing or does not contain a mapping.
+    Raises:
+        DataError: The file is missing or invalid, or contains a list.
     """
     if not path.exists():
         raise DataError(f"{path}: expected a file, got none")
@@ -273,16 +287,18 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _with_text_keys(node: Any) -> Any:
-    """Return the node with text keys as in JSON, because YAML keys such as 1 and true cannot be sorted."""
+    """Convert all keys of nested mappings to text."""
+    # YAML keys such as 1 and true cannot be sorted
     if isinstance(node, dict):
         return {str(key): _with_text_keys(value) for key, value in node.items()}
     return [_with_text_keys(one) for one in node] if isinstance(node, list) else node
 
 
 def read_metrics(directory: Path) -> dict[str, Any]:
-    """Read metrics.json, or metrics.partial.json of a partial run.
+    """Read the metrics of a completed or partial run.
 
-    Raises DataError if neither file exists, or if the file is invalid.
+    Raises:
+        DataError: The metrics are missing or invalid.
     """
     for name in (METRICS, PARTIAL_METRICS):
         if path_exists(directory / name):
@@ -315,7 +331,7 @@ def _run_directories(root: Path) -> Iterator[Path]:
 
 
 def _why_incomplete(directory: Path) -> str:
-    """Return the reason why a run is incomplete. The error of a failed job is the last message in its log."""
+    """Return the reason why a run is incomplete."""
     if (directory / PARTIAL_METRICS).exists():
         try:
             return f"partial: {_read_flat(directory / PARTIAL_METRICS).get('partial')}"
@@ -326,6 +342,7 @@ def _why_incomplete(directory: Path) -> str:
     except DataError:
         lines = []
     matches = [match for match in map(_LOG_LINE.match, lines) if match]
+    # the error of a failed run is the last message in its log
     if matches and matches[-1]["level"] in ("ERROR", "CRITICAL"):
         return f"failed: {matches[-1]['message']}"
     return "incomplete: running or killed"

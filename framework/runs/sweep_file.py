@@ -1,4 +1,4 @@
-"""multirun.yaml: the runs of the last sweep in a folder."""
+"""Reading of multirun.yaml, the config of the last sweep in a folder."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.config.validation import checked_rows
 from framework.runs.provenance import OF_SPEED, WITHOUT_EFFECT
 
-_OF_ITSELF = re.compile(
-    r"\$\{[\w.]+\}|\$\{all_of:\$\{[\w.]+\}\}"
-)  # references to keys of the same config, as in the included experiments
+# references to keys of the same config, such as ${sequences.all}
+_INTERNAL_REFERENCE = re.compile(r"\$\{[\w.]+\}|\$\{all_of:\$\{[\w.]+\}\}")
 
 WITHOUT_CHANGES = {"experiment", "launcher", *WITHOUT_EFFECT} - {*OF_SPEED, "sequences"}
-"""Keys and groups that do not change the results or times of an experiment's runs."""
+"""Keys and groups that affect neither the results nor the speed of a run."""
 
 SWEEP = "multirun.yaml"  # written by Hydra's sweeper
 MAX_VALUES = 1000  # maximum number of values of a key; a range may have more
@@ -30,7 +29,10 @@ MAX_RUNS = 100_000  # maximum number of combinations of the values of all keys
 
 
 def requested_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the values of `keys` in each job of a sweep with this config; empty if they are not plain values."""
+    """Return the values of `keys` in each job of a sweep.
+
+    The result is empty if a key is not set by the sweep, or if its values depend on other settings.
+    """
     overrides = {override.key_or_group: override for override in _overrides(sweep)}
     if not all(key in overrides for key in keys):
         return []
@@ -43,12 +45,12 @@ def requested_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[
 
 
 def asked_keys(sweep: Mapping[str, Any]) -> set[str] | None:
-    """Return the keys and groups that the overrides of a sweep set; None without a sweep."""
+    """Return the keys and groups that the overrides of a sweep set, or None without a sweep."""
     return {override.key_or_group for override in _overrides(sweep)} if sweep else None
 
 
 def command_line(sweep: Mapping[str, Any]) -> list[str]:
-    """Return the overrides on the command line of a sweep that change results or times, in order."""
+    """Return the overrides on the command line of a sweep that affect results or speed."""
     found = []
     for text in _below(sweep, "overrides", "task", list):
         with suppress(HydraException):
@@ -59,7 +61,11 @@ def command_line(sweep: Mapping[str, Any]) -> list[str]:
 
 
 def sweep_rows(sweep: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return the overrides of each of the experiment's rows by name, resolved. Raises ConfigError."""
+    """Return the resolved overrides of each row of an experiment, by name.
+
+    Raises:
+        ConfigError: The rows are invalid.
+    """
     rows = checked_rows(sweep.get("rows"))
     try:
         resolved = OmegaConf.to_container(_without_hydra(sweep).rows, resolve=True) if rows else {}
@@ -69,7 +75,7 @@ def sweep_rows(sweep: Mapping[str, Any]) -> dict[str, list[str]]:
 
 
 def _overrides(sweep: Mapping[str, Any]) -> list[Override]:
-    """Return the overrides of the experiment, then the overrides of the command line, which take precedence."""
+    """Return the overrides of the experiment, followed by those of the command line, which take precedence."""
     found = []
     for text in [*_params(sweep), *_below(sweep, "overrides", "task", list)]:
         with suppress(HydraException):  # ${all_of:${rows}} is not a value
@@ -78,30 +84,32 @@ def _overrides(sweep: Mapping[str, Any]) -> list[Override]:
 
 
 def _params(sweep: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the sweeper's parameters as overrides; references such as ${sequences.all} are resolved."""
+    """Yield the parameters of the sweeper as overrides, with resolved references."""
     params = _below(sweep, "sweeper", "params", dict)
-    node = OmegaConf.merge(_without_hydra(sweep), {"params": _of_itself(params)}).params
+    node = OmegaConf.merge(_without_hydra(sweep), {"params": _without_external_references(params)}).params
     for key in params:
         with suppress(OmegaConfBaseException):  # ${hydra:...}, or a missing key
             yield f"{key}={node[key]}"
 
 
 def _without_hydra(sweep: Mapping[str, Any]) -> DictConfig:
-    """Return the sweep's config without the key `hydra`; references ${...} to values outside it become "???"."""
-    return OmegaConf.create({key: _of_itself(value) for key, value in sweep.items() if key != "hydra"})
+    """Return the config of a sweep without the key `hydra` and without external references."""
+    return OmegaConf.create(
+        {key: _without_external_references(value) for key, value in sweep.items() if key != "hydra"}
+    )
 
 
-def _of_itself(node: Any) -> Any:
-    """Return the node with "???" in place of references to values outside the config, such as ${oc.env:...}."""
+def _without_external_references(node: Any) -> Any:
+    """Replace references to values outside the config, such as ${oc.env:...}, with "???"."""
     if isinstance(node, Mapping):
-        return {key: _of_itself(value) for key, value in node.items()}
+        return {key: _without_external_references(value) for key, value in node.items()}
     if isinstance(node, list):
-        return [_of_itself(value) for value in node]
-    return "???" if isinstance(node, str) and "${" in _OF_ITSELF.sub("", node) else node
+        return [_without_external_references(value) for value in node]
+    return "???" if isinstance(node, str) and "${" in _INTERNAL_REFERENCE.sub("", node) else node
 
 
 def _below(sweep: Mapping[str, Any], part: str, name: str, kind: type) -> Any:
-    """Return the value of `hydra.<part>.<name>`, or an empty `kind` if it is missing or of another type."""
+    """Return the value of `hydra.<part>.<name>`, or an empty value if it is missing or not of type `kind`."""
     node: Any = sweep
     for key in ("hydra", part, name):
         node = node.get(key) if isinstance(node, Mapping) else None

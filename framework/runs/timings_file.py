@@ -1,4 +1,4 @@
-"""timings.csv: the time of each stage for each frame."""
+"""Reading of timings.csv, the time of each stage for each frame."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ OLD_STAGES = {
     "refine": "refinement",
     "fuse": "fusion",
 }
-"""Current stage names by the names before 0.1.0, which stored runs and sweeps may contain."""
+"""Current stage names by the names before version 0.1.0, for old runs and sweeps."""
 MAX_FRAME = 2**53  # limit of frame numbers; smaller integers are exact in float64
 
 
 @dataclass(frozen=True)
 class StageTimes:
-    """The stage times of a run."""
+    """The stage times of a run with F frames."""
 
     frames: Int64  # (F,) frame numbers, ascending
-    milliseconds: Mapping[str, Float64]  # (F,) by stage, NaN = not run, such as integration of a lost frame
+    milliseconds: Mapping[str, Float64]  # (F,) by stage, NaN = stage not run, e.g. integration of a lost frame
 
 
 def current_key(key: str) -> str:
@@ -41,7 +41,11 @@ def current_key(key: str) -> str:
 
 
 def read_timings(path: Path) -> StageTimes:
-    """Read the stage times of a run. Raises DataError if the file cannot be read, is invalid or has no times."""
+    """Read the stage times of a run.
+
+    Raises:
+        DataError: The file cannot be read, is invalid or contains no times.
+    """
     try:
         lines = list(csv.reader(read_text(path).splitlines(keepends=True)))
     except csv.Error as error:

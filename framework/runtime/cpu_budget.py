@@ -1,8 +1,8 @@
-"""CPU budget: division of the numba threads between prefetching (reading, detection) and mapping.
+"""Division of the CPU cores between prefetching (reading, detection) and mapping.
 
-A parallel loop waits for its slowest thread, so two loops that share all cores slow each other down. Each side gets its
-own cores instead, in proportion to its recent work. Kernel results do not depend on the number of threads. Threads of
-networks are neither limited nor counted. Background work has low priority.
+A parallel loop waits for its slowest thread. Two loops that share all cores therefore slow each other down. Prefetching
+and mapping each get their own cores, in proportion to their recent work. The results of kernels do not depend on the
+number of threads. Threads of networks are neither limited nor counted. Background work has low priority.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ RECENT = 15  # number of frames in the median of the work per frame
 
 
 def lower_priority() -> None:
-    """Lower the priority of the calling thread to LOW_PRIORITY. Only Linux supports this for single threads."""
+    """Lower the priority of the calling thread. Only Linux supports this for single threads."""
     if sys.platform == "linux":
         thread = threading.get_native_id()
         if os.getpriority(os.PRIO_PROCESS, thread) < LOW_PRIORITY:  # raising a priority requires privileges
@@ -31,18 +31,14 @@ def lower_priority() -> None:
 
 
 def parallel_kernels_are_thread_safe() -> bool:
-    """Return True if two threads may run parallel kernels at the same time.
-
-    numba's workqueue layer aborts the process if they do. numba selects a layer when it starts its threads, which
-    this function triggers.
-    """
-    numba.get_num_threads()
-    return str(numba.threading_layer()) in ("omp", "tbb")
+    """Return True if two threads may run parallel kernels at the same time."""
+    numba.get_num_threads()  # starts the threads and thus selects the threading layer
+    return str(numba.threading_layer()) in ("omp", "tbb")  # the layer workqueue aborts the process
 
 
 @contextmanager
 def kernel_threads(threads: int) -> Iterator[None]:
-    """Set the number of threads for kernels that the calling thread runs in the body."""
+    """Set the number of kernel threads of the calling thread in the `with` body."""
     before = numba.get_num_threads()
     numba.set_num_threads(threads)
     try:
@@ -53,7 +49,7 @@ def kernel_threads(threads: int) -> Iterator[None]:
 
 @contextmanager
 def limited_threads(threads: int) -> Iterator[None]:
-    """Limit the number of threads of kernels and torch networks in the calling thread; 0 = no limit."""
+    """Limit the threads of kernels and torch networks in the `with` body. With 0, there is no limit."""
     if threads == 0:
         yield
         return
@@ -70,7 +66,7 @@ def limited_threads(threads: int) -> Iterator[None]:
 
 
 class CpuBudget:
-    """Division of the kernel threads between prefetching and mapping, by their work on recent frames."""
+    """Division of the kernel threads between prefetching and mapping, based on recent frames."""
 
     def __init__(self, with_prefetch: bool = True) -> None:
         self.cores = int(numba.get_num_threads())
@@ -81,10 +77,10 @@ class CpuBudget:
 
     @contextmanager
     def prefetching(self, workers: int = 1) -> Iterator[None]:
-        """Run the body on the cores for prefetching. The body prefetches one frame, in one of `workers` threads.
+        """Run the `with` body, which prefetches one frame, on the cores for prefetching.
 
-        If no core is left for prefetching, the priority of the thread is lowered permanently, so that parallel loops of
-        mapping do not wait for it.
+        The calling thread is one of `workers` threads. If no core is left, its priority is lowered permanently, so that
+        parallel loops of mapping do not wait for it.
         """
         cores = self.cores if self._alone else self.prefetch_cores()
         if cores == 0:
@@ -96,7 +92,7 @@ class CpuBudget:
 
     @contextmanager
     def mapping(self) -> Iterator[None]:
-        """Run the body on the cores for mapping. The body maps one frame."""
+        """Run the `with` body, which maps one frame, on the cores for mapping."""
         threads = self.cores if self._alone else max(self.cores - self.prefetch_cores(), 1)
         with kernel_threads(threads):
             began = time.thread_time()
@@ -104,9 +100,10 @@ class CpuBudget:
             self._record(self._mapping, threads * (time.thread_time() - began))
 
     def prefetch_cores(self) -> int:
-        """Return the number of cores for prefetching: half of the cores before both sides have measured a frame.
+        """Return the number of cores for prefetching.
 
-        The number may be 0 or all cores if one side has almost no work.
+        It is half of the cores until both sides have processed a frame. It is 0 or all cores if one side has almost no
+        work.
         """
         with self._lock:
             if not (self._prefetching and self._mapping):

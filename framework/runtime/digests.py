@@ -1,4 +1,4 @@
-"""Digests of the results of each stage and frame, which locate the first difference between two runs."""
+"""Digests of the result of each stage and frame, to find the first difference between two runs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def digest_of(result: object) -> int:
 
 @digest_of.register
 def _(found: Detections) -> int:
-    return _of_arrays(found.boxes, found.scores, found.class_probabilities)  # masks: see the lifted clusters
+    return _of_arrays(found.boxes, found.scores, found.class_probabilities)  # the lifted clusters depend on the masks
 
 
 @digest_of.register
@@ -48,14 +48,12 @@ def _(scene: SceneMap) -> int:
 
 
 def _of_arrays(*arrays: Array) -> int:
-    """Return a CRC-32 of the shape of each array and the sum of its 64-bit words.
-
-    A CRC of all bytes takes ten times as long.
-    """
+    """Return a CRC-32 of the shapes of arrays and the sums of their 64-bit words."""
     digest = 0
     for array in arrays:
         values = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
         end = len(values) // 8 * 8
+        # a CRC of all bytes would take ten times as long
         total = int(values[:end].view(np.uint64).sum()) + int(values[end:].sum())
         digest = zlib.crc32(f"{array.shape}{total};".encode(), digest)
     return digest

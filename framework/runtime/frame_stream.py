@@ -1,4 +1,4 @@
-"""Frame streams of recordings (all frames) and live videos (the newest frame), and prefetching by threads."""
+"""Frame streams of recordings and live videos, and prefetching in threads."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Outcome = TypeVar("Outcome")
 
 
 class FrameStream(AbstractContextManager["FrameStream"]):
-    """Stream of frame readers in order. Any thread may take them."""
+    """Stream of frame readers, in order. Any thread may take a reader."""
 
     max_prefetched: int | None = None  # maximum number of prefetched frames; None = no limit
     dropped: int = 0  # number of frames that were not taken
 
     @abstractmethod
     def take(self) -> FrameReader | None:
-        """Return the reader of the next frame; None at the end."""
+        """Return the reader of the next frame, or None at the end."""
 
 
 def stream_of(video: RGBDVideo, ended: Callable[[], bool]) -> FrameStream:
@@ -56,9 +56,9 @@ class RecordedFrames(FrameStream):
 
 
 class LiveFrames(FrameStream):
-    """Stream of a live video. `take` returns the newest frame; older frames are dropped.
+    """Stream of the newest frames of a live video. Older frames are dropped.
 
-    A thread receives the frames, so that no queue builds up in the video source. Only one frame is prefetched.
+    A thread receives the frames, so that they do not accumulate in the video source. Only one frame is prefetched.
     """
 
     max_prefetched = 1
@@ -80,7 +80,10 @@ class LiveFrames(FrameStream):
         self._listener.join()
 
     def take(self) -> FrameReader | None:
-        """Wait for a frame and return its reader. Raises the error of the video after all earlier frames."""
+        """Wait for a frame and return its reader.
+
+        An error of the video is raised after all earlier frames.
+        """
         with self._changed:
             while self._newest is None and not self._over and not self._ended():
                 self._changed.wait(POLL_INTERVAL_S)
@@ -120,9 +123,15 @@ class LiveFrames(FrameStream):
 def prefetched_map(
     function: Callable[[Item], Outcome], items: Iterable[Item], prefetch: int, workers: int = 1
 ) -> Generator[Outcome]:
-    """Yield the outcomes of `map(function, items)`, computed by `workers` threads at most `prefetch` items in advance.
+    """Yield the results of `map(function, items)`, computed in advance by threads.
 
-    Errors are raised in place of their outcome. Closing the generator ends the workers after their current items.
+    An error is raised in place of its result. Closing the generator ends the threads after their current items.
+
+    Args:
+        function: Function to call.
+        items: Arguments of the calls.
+        prefetch: Maximum number of items that are computed in advance; 0 = no threads.
+        workers: Number of threads.
     """
     if prefetch == 0:
         yield from map(function, items)
@@ -142,7 +151,7 @@ def prefetched_map(
 
 
 class Turns:
-    """Lock of a critical section that threads enter in the order of their turn numbers, from 0."""
+    """Lock that threads acquire in the order of their turn numbers, starting at 0."""
 
     def __init__(self) -> None:
         self._next = 0
@@ -150,7 +159,7 @@ class Turns:
 
     @contextmanager
     def turn(self, number: int) -> Iterator[None]:
-        """Run the body after all turns with smaller numbers have ended."""
+        """Run the `with` body after all turns with smaller numbers have ended."""
         with self._changed:
             self._changed.wait_for(lambda: self._next == number)
         try:

@@ -1,4 +1,4 @@
-"""Retention of freed memory in the process.
+"""Reuse of freed memory.
 
 The C library returns large freed blocks to the system. The next large array then needs new pages. Allocating a huge
 page (2 MiB) takes 0.1 ms, or up to 5 ms in a virtual machine.
@@ -20,7 +20,7 @@ MAX_SHARED = 2**25  # maximum size of an array that reuses freed memory, bytes; 
 def keep_freed_memory() -> None:
     """Keep up to MAX_KEPT bytes of freed memory in the process, if its C library is glibc.
 
-    Nothing is changed if environment variables configure malloc.
+    Existing environment variables for malloc take precedence.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     configured = {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES"} & os.environ.keys()

@@ -1,4 +1,7 @@
-"""Process-wide settings: environment, threads, seeds and memory. Only the command line applies them automatically."""
+"""Process-wide settings: environment variables, threads, seeds and memory.
+
+Only the command line applies these settings automatically.
+"""
 
 from __future__ import annotations
 
@@ -47,10 +50,10 @@ ENVIRONMENT = {
 
 
 def set_environment() -> None:
-    """Set ENVIRONMENT in this process. It takes effect only before numpy and numba are imported.
+    """Set the environment variables in ENVIRONMENT for this process.
 
-    numba stores compiled kernels next to the code or in the user's cache, and fails if both are read-only, such as in a
-    container. In that case, this process uses a temporary cache with an unpredictable name.
+    The variables have no effect after numpy and numba are imported. numba stores compiled kernels next to the code or
+    in the cache of the user. If both are read-only, such as in a container, this process uses a temporary cache.
     """
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
@@ -111,7 +114,7 @@ def configure_process(threads: int = 0, seed: int | None = None) -> None:
 
 
 def available_cores() -> int:
-    """Return the number of cores that this process may use; all cores on macOS and Windows."""
+    """Return the number of cores that this process may use. On macOS and Windows, these are all cores."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -139,10 +142,11 @@ class Settings:
         return cls(seed=config.seed, device=config.device, threads=config.threads, **run_settings)
 
     def apply(self) -> None:
-        """Limit the threads of the libraries and seed the global generators. For processes of the command line only.
+        """Limit the threads of the libraries and seed the global random generators.
 
-        The project's own code uses separate generators seeded with `seed`. Third-party plugins may use the global
-        generators. Call this method again after the stages are built: torch is configured only if it is loaded already.
+        Only processes of the command line may call this method. Call it again after the stages are built, because torch
+        is configured only if it is already loaded. The project itself uses separate generators, but third-party plugins
+        may use the global ones.
         """
         self.limit_threads()
         self.seed_generators()
@@ -150,7 +154,7 @@ class Settings:
     def limit_threads(self) -> None:
         """Limit the threads of all libraries.
 
-        The TBB threads of Open3D have no setting. Only the affinity of the process limits them.
+        The TBB threads of Open3D can only be limited by the CPU affinity of the process.
         """
         import cv2
         import numba
@@ -179,9 +183,10 @@ class Settings:
 
 @contextmanager
 def frozen_garbage_collector() -> Iterator[None]:
-    """Exclude all existing objects from garbage collection in the body. Does nothing if objects are already frozen.
+    """Exclude all existing objects from garbage collection in the `with` body.
 
-    The collector takes 40 ms for the 300,000 objects of the imported libraries, longer than a frame.
+    Otherwise, garbage collection of the imported libraries (300,000 objects) takes 40 ms, longer than a frame. Nothing
+    changes if objects are already frozen.
     """
     if gc.get_freeze_count():
         yield

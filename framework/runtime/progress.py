@@ -1,4 +1,4 @@
-"""Progress of long operations: a bar in a terminal, otherwise periodic log lines."""
+"""Progress of long operations, as a bar in a terminal or as log lines."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ MIN_INTERVAL, MAX_INTERVAL = 3.0, 60.0  # s, minimum and maximum interval of log
 
 
 class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
-    """Progress bar of `total` items (None = unknown), or timer of log lines if no bar is shown."""
+    """Progress bar, or timer for log lines if no bar is shown.
+
+    The total number of items may be unknown (None).
+    """
 
     def __init__(self, total: int | None, unit: str, **options: Any) -> None:
         # tqdm ignores TQDM_DISABLE if `disable` is given; a program without a console has no stderr
         self.quiet = os.environ.get("TQDM_DISABLE") == "1" or sys.stderr is None
-        wide = self.quiet or not sys.stderr.isatty() or _columns() > 0
+        wide = self.quiet or not sys.stderr.isatty() or _columns() > 0  # tqdm shows nothing in a terminal of width 0
         super().__init__(total=total, unit=unit, disable=self.quiet or None, dynamic_ncols=wide, **options)
         self._begun = self._spoken = time.monotonic()
 
     def line_is_due(self) -> bool:
-        """Return True if no bar is shown and a log line is due.
+        """Return True if no bar is shown and it is time for a log line.
 
         The interval is 10 % of the elapsed time, limited to [MIN_INTERVAL, MAX_INTERVAL].
         """
@@ -36,7 +39,7 @@ class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
 
 
 def _columns() -> int:
-    """Return the width of the terminal at standard error; 0 = unknown, for which tqdm shows nothing."""
+    """Return the width of the terminal, or 0 if unknown."""
     try:
         return os.get_terminal_size(sys.stderr.fileno()).columns
     except (OSError, ValueError):

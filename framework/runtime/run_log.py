@@ -1,4 +1,4 @@
-"""Journal of a pipeline: timings, poses, errors and progress."""
+"""Journal of a run: timings, poses, errors and progress."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ COUNT_INTERVAL_S = 1.0  # s, update interval of the number of instances in the p
 
 @dataclass(frozen=True)
 class StageTime:
-    """The time of one stage for one frame."""
+    """The run time of one stage for one frame."""
 
     frame: int  # Frame.index
     stage: str  # one of STAGES, or FUSION
@@ -60,7 +60,7 @@ class LiveFigures:
 
 @dataclass(frozen=True)
 class RunResult:
-    """The result of a run in memory."""
+    """The result of a run, in memory."""
 
     scene: SceneMap
     frames: int  # number of mapped, lost and skipped frames
@@ -78,17 +78,17 @@ class RunResult:
 
     @property
     def frames_lost(self) -> int:
-        """Return the number of frames without an estimated pose, which are not fused."""
+        """Number of frames without an estimated pose. These frames are not fused."""
         return sum(frame.pose.lost for frame in self.tracked)
 
     @property
     def fps(self) -> float:
-        """Return the frames per second of wall-clock time, including reading and detection."""
+        """Frames per second of wall-clock time, including reading and detection."""
         return self.frames / self.seconds
 
     @property
     def fps_median(self) -> float:
-        """Return the frames per second of the median frame, without outliers such as kernel compilation."""
+        """Frames per second of the median frame, which excludes outliers such as kernel compilation."""
         return 1 / float(np.median(self.intervals)) if self.intervals else self.fps
 
 
@@ -135,16 +135,17 @@ class Journal:
 
     @contextmanager
     def timed(self, frame: int, stage: str) -> Iterator[None]:
-        """Record the run time of the body as a stage time of the frame with index `frame`, unless the body raises."""
+        """Record the run time of the `with` body as the time of a stage, unless the body raises."""
         started = time.perf_counter()
         yield
         self.timings.append(StageTime(frame, stage, 1e3 * (time.perf_counter() - started)))
 
     @contextmanager
     def fusing(self, frame: int) -> Iterator[StageTimer]:
-        """Record the stage times that the fuser measures with the yielded timer, unless the body raises.
+        """Record the stage times that the fuser measures with the yielded timer.
 
-        If the fuser measures none, the run time of the body is recorded as FUSION.
+        Without measured times, the run time of the `with` body is recorded as FUSION. Nothing is recorded if the body
+        raises.
         """
         seconds: defaultdict[str, float] = defaultdict(float)
 
@@ -160,11 +161,11 @@ class Journal:
         self.timings += [StageTime(frame, stage, 1e3 * spent) for stage, spent in of_stages.items()]
 
     def digest(self, frame: int, **results: object) -> None:
-        """Record the digests of the results of stages for a frame index."""
+        """Record the digests of stage results for the frame with index `frame`."""
         self.digests += [StageDigest(frame, stage, digest_of(result)) for stage, result in results.items()]
 
     def stage_ms(self, frame: int) -> dict[str, float]:
-        """Return the stage times of the last frame, ms; `frame` is its index."""
+        """Return the stage times of the last frame, ms, given its index."""
         of_last = takewhile(lambda time: time.frame == frame, reversed(self.timings))
         return {time.stage: time.milliseconds for time in of_last}
 
@@ -198,7 +199,7 @@ class Journal:
 
     @property
     def _errors(self) -> int:
-        """Return the number of skipped frames that have a pose."""
+        """Number of skipped frames that have a pose."""
         return self.frames_skipped - self.without_pose
 
     def frame_tracked(self, frame: Frame, pose: Pose) -> None:

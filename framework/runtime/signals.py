@@ -1,4 +1,7 @@
-"""Handling of signals: the first signal ends a run after the current step, the second signal immediately."""
+"""Signal handling.
+
+The first signal ends a run after the current step. The second signal ends it immediately.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 class Interrupted(KeyboardInterrupt):
-    """End of a run by a signal. Code that handles Ctrl-C also handles the other signals."""
+    """End of a run by a signal. Code that handles Ctrl-C also handles this exception."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -38,7 +41,10 @@ OURS_TO_HANDLE = (signal.SIG_DFL, signal.default_int_handler, _raise_interrupted
 
 
 def raise_on_signals() -> None:
-    """Let the signals of ENDING raise Interrupted in this process. Handlers of other programs are kept."""
+    """Raise Interrupted when this process receives a signal of ENDING.
+
+    Handlers of other programs are not replaced.
+    """
     for number in ENDING:
         if signal.getsignal(number) in OURS_TO_HANDLE:
             signal.signal(number, _raise_interrupted)
@@ -46,7 +52,7 @@ def raise_on_signals() -> None:
 
 @dataclass
 class Interruption:
-    """Record of the signals received while signals are deferred."""
+    """The signal received while signals are deferred, if any."""
 
     received: Interrupted | None = None
     quiet: bool = False  # true if another process prints messages
@@ -60,10 +66,12 @@ class Interruption:
 
     @contextmanager
     def second_ends_at_once(self, when: str) -> Iterator[None]:
-        """Let the second signal raise Interrupted in the body.
+        """Raise Interrupted at the second signal in the `with` body.
 
-        The message about the first signal contains `when`, the end of the step, such as "after this frame". Outside
-        such bodies, signals do not raise, so that no result is lost between two bodies.
+        Signals outside of such bodies do not raise, so that no result is lost between two steps.
+
+        Args:
+            when: End of the current step, for the message at the first signal, such as "after this frame".
         """
         self._when, self._at_once = when, True
         try:
@@ -81,7 +89,7 @@ class Interruption:
 
 
 def _print(text: str) -> None:
-    """Write to stderr directly, because the signal may have interrupted a buffered write or the log."""
+    """Write to stderr directly, because the signal may have interrupted a buffered write."""
     if sys.__stderr__ is not None:
         with suppress(OSError, ValueError):
             os.write(sys.__stderr__.fileno(), text.encode())
@@ -93,11 +101,9 @@ _in_worker = ExitStack()  # never closed
 
 @contextmanager
 def signals_deferred(*numbers: int) -> Iterator[Interruption]:
-    """Defer the signals `numbers`.
+    """Defer signals in the `with` body, and yield a record of the first signal.
 
-    Record the first signal in the yielded Interruption instead of raising an exception in the `with` body.
-
-    An exception within a frame would leave it partly integrated. A nested call yields the outer Interruption. Other
+    Without deferral, an exception could leave a frame partly integrated. A nested call yields the outer record. Other
     threads, ignored signals and signals with other handlers are not affected.
     """
     global _deferring
@@ -124,9 +130,9 @@ def signals_deferred(*numbers: int) -> Iterator[Interruption]:
 
 
 def received_from_sweep() -> Interruption:
-    """Return the Interruption of this worker process. It records a SIGTERM sent by the sweep since the first job.
+    """Return the record of a SIGTERM sent to this worker process by the sweep.
 
-    A terminal sends the other signals to the sweep and to all workers. The workers ignore these signals.
+    A terminal sends all other signals to both the sweep and its workers. The workers ignore these signals.
     """
     for number in set(ENDING) - {signal.SIGTERM}:
         signal.signal(number, signal.SIG_IGN)
@@ -143,10 +149,12 @@ def signal_received() -> bool:
 
 @contextmanager
 def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterator[None]:
-    """Forward the first signal in the body to the busy workers, and raise Interrupted after they have finished.
+    """Forward the first signal in the `with` body to the busy workers.
 
-    `at_work` returns the worker processes that are busy. Idle workers get no signal: they may have no handler yet, and
-    joblib kills all workers when one ends. The second signal raises immediately.
+    Interrupted is raised after these workers have finished, or immediately at the second signal.
+
+    Args:
+        at_work: Function that returns the busy worker processes.
     """
 
     def end_workers(number: int, _frame: FrameType | None) -> None:
@@ -157,6 +165,7 @@ def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterato
             f"{received}: stopping after the active runs have written their outputs; "
             "a second signal stops immediately\n"
         )
+        # idle workers get no signal: they may have no handler yet, and joblib kills all workers when one ends
         signaled: set[int | None] = set()
         while busy := at_work():
             for worker in busy:

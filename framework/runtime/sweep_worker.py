@@ -1,4 +1,4 @@
-"""Worker processes of a parallel sweep. A worker ends with its sweep, also if the sweep is killed."""
+"""Worker processes of a parallel sweep. A worker ends when its sweep ends or is killed."""
 
 from __future__ import annotations
 
@@ -20,9 +20,12 @@ _job = threading.Lock()  # held while this process executes a job
 
 @contextmanager
 def job_of_worker() -> Iterator[None]:
-    """Execute a job of the sweep in the body. SIGTERM, and the end of the parent process, end it with partial outputs.
+    """Run a job of the sweep in the `with` body.
 
-    Raises Interrupted if SIGTERM arrived before the job.
+    SIGTERM or the end of the parent process ends the job, with partial outputs.
+
+    Raises:
+        Interrupted: SIGTERM arrived before the job.
     """
     with _job:
         received_from_sweep().check()
@@ -30,9 +33,10 @@ def job_of_worker() -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """Start a thread that ends this process after the end of its parent process. joblib calls it in each new worker.
+    """Start a thread that ends this process after the end of its parent process.
 
-    Without it, workers of a killed sweep would wait for jobs until joblib's time limit.
+    joblib calls this function in each new worker. Otherwise, workers of a killed sweep would wait for jobs until the
+    time limit of joblib.
     """
     threading.Thread(target=_wait_for_end_of_parent, daemon=True).start()
 
@@ -48,7 +52,7 @@ def _wait_for_end_of_parent() -> None:
 
 
 def _parent_has_ended() -> bool:
-    """Return True if the parent process has ended. POSIX assigns another parent; Windows keeps the parent's id."""
     parent = parent_process()
     assert parent is not None
+    # POSIX assigns another parent to the process; Windows keeps the id of the parent
     return not parent.is_alive() if os.name == "nt" else os.getppid() != parent.pid

@@ -1,6 +1,7 @@
-"""Noise models of depth sensors: the standard deviation, m, of a depth reading at depth z, m.
+"""Noise models of depth sensors.
 
-For a surface at the angle theta, rad, to the image plane:
+A model returns the standard deviation sigma, m, of a depth reading z, m, on a surface at the angle theta, rad, to the
+image plane:
 
     sigma(z, theta) = max(FLOOR, least + growth (z - near)^2)
                       + (slant / sqrt(z) + far_slant z^1.5) theta^2 / (pi / 2 - theta)^2
@@ -14,8 +15,8 @@ For a surface at the angle theta, rad, to the image plane:
 | PHONE_LIDAR | 10 mm | Luetzenburg et al. 2021, Teo and Yang 2023 |
 
 - Nguyen, Izadi and Lovell, "Modeling Kinect Sensor Noise for Improved 3D Reconstruction and Tracking", 3DIMPVT 2012.
-- Grunnet-Jepsen, Sweetser and Woodfill, "Tuning depth cameras for best performance", Intel. Baseline 50 mm, 848 px
-  over 90 degrees (f = 424 px), subpixel 0.08 px, the value of the document's examples.
+- Grunnet-Jepsen, Sweetser and Woodfill, "Tuning depth cameras for best performance", Intel. Baseline 50 mm, 848 px over
+  90 degrees (f = 424 px), subpixel 0.08 px, the value of the document's examples.
 - Fankhauser et al., "Kinect v2 for Mobile Robot Navigation: Evaluation and Modeling", ICAR 2015. Indoors.
 - Luetzenburg, Kroon and Bjork, "Evaluation of the Apple iPhone 12 Pro LiDAR for an Application in Geosciences",
   Scientific Reports 11, 2021: 1 cm for objects of at least 10 cm. Teo and Yang, "Evaluating the accuracy and quality of
@@ -37,7 +38,10 @@ FLOOR = 0.001  # m, the usual step of stored depth; no reading is more accurate
 
 
 class DepthNoise(NamedTuple):
-    """Coefficients of a noise model, in a flat tuple, as kernels require."""
+    """Coefficients of a noise model.
+
+    They are numbers in a flat tuple, because kernels require this type.
+    """
 
     least: float  # m, standard deviation at `near`
     near: float  # m, depth of the smallest standard deviation
@@ -48,10 +52,7 @@ class DepthNoise(NamedTuple):
 
 
 class SensorKind(Enum):
-    """Kind of a depth sensor: EXACT, KINECT_V1, REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR.
-
-    The value of a member is the noise model of the sensor.
-    """
+    """Kind of a depth sensor, with its noise model as value."""
 
     EXACT = DepthNoise(0.0, 0.0, 0.0, full_weight_depth=math.inf)
     KINECT_V1 = DepthNoise(0.0012, 0.4, 0.0019, slant=0.0001)
@@ -62,16 +63,16 @@ class SensorKind(Enum):
 
     @property
     def noise(self) -> DepthNoise:
-        """The noise model."""
+        """The noise model of the sensor."""
         return self.value
 
     def sigma(self, z: float | NDArray[np.float32]) -> NDArray[np.floating]:
-        """Return the standard deviation, m, of readings at each depth in `z`, m, for surfaces that face the camera."""
+        """Return the standard deviation, m, of readings at depth `z`, m, on surfaces that face the camera."""
         least, near, growth = self.noise[:3]
         return np.maximum(FLOOR, least + growth * (z - near) ** 2)
 
     def __str__(self) -> str:
-        """Return the name and the standard deviations at depths of 1 m and 3 m, for messages."""
+        """Return the name and the standard deviations at depths of 1 m and 3 m."""
         near, far = (f"{1000 * self.sigma(z):.1f} mm at {z} m" for z in (1, 3))
         return f"{self.name}, standard deviation of depth {near}, {far}"
 
@@ -87,7 +88,7 @@ class SensorChoice(Enum):
     PHONE_LIDAR = "LiDAR of an iPhone or iPad"
 
     def kind(self, stored: SensorKind) -> SensorKind:
-        """Return the chosen kind of sensor; for AUTO, the `stored` kind."""
+        """Return the selected kind of sensor, or `stored` for AUTO."""
         return stored if self is SensorChoice.AUTO else SensorKind[self.name]
 
 
@@ -99,5 +100,5 @@ _DEVICES = {  # patterns for names of devices, ROS topics and drivers; the first
 
 
 def kind_of_device(name: str) -> SensorKind | None:
-    """Return the kind of the depth sensor for a device name or ROS topic; None = unknown."""
+    """Return the kind of the depth sensor for a device name or ROS topic, or None if unknown."""
     return next((kind for kind, words in _DEVICES.items() if re.search(words, name, re.IGNORECASE)), None)

@@ -1,7 +1,7 @@
 """Kernels of noise_models.py.
 
-They accept a `DepthNoise`, or another named tuple with the fields `least`, `near` and `growth`, as an argument. Do not
-change the order of multiplications. Otherwise, results differ in the last digit, and maps are no longer byte-identical.
+The noise model is a `DepthNoise`, or another named tuple with the fields `least`, `near` and `growth`. Do not change
+the order of multiplications. Otherwise, results differ in the last digit, and maps are no longer byte-identical.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fas
 
 @device
 def axial_sigma(z: float, noise: DepthNoise) -> float:
-    """Return the standard deviation sigma(z, 0), m, at depth `z`, m, in double precision; see noise_models.py."""
+    """Return the standard deviation, m, of a reading at depth `z`, m, on a surface that faces the camera."""
     return max(FLOOR, noise.least + noise.growth * (z - noise.near) ** 2)
 
 
 @device
 def axial_sigma_single(z: np.float32, noise: DepthNoise) -> np.float32:
-    """Return the standard deviation sigma(z, 0), m, at depth `z`, m, in single precision; see noise_models.py."""
+    """Compute `axial_sigma` in single precision."""
     beyond = z - np.float32(noise.near)
     return max(np.float32(FLOOR), np.float32(noise.least) + np.float32(noise.growth) * beyond * beyond)
 
 
 @device
 def axial_sigma_at_angle(z: np.float32, theta: np.float32, noise: DepthNoise) -> np.float32:
-    """Return the standard deviation sigma(z, theta), m, at depth `z`, m, in single precision; see noise_models.py.
+    """Return the standard deviation, m, of a reading at depth `z`, m, on a slanted surface.
 
-    `theta`: angle between the surface and the image plane, rad.
+    `theta` is the angle between the surface and the image plane, rad.
     """
     theta = min(theta, LARGEST_THETA)
     beyond = z - np.float32(noise.near)
@@ -50,5 +50,8 @@ def axial_sigma_at_angle(z: np.float32, theta: np.float32, noise: DepthNoise) ->
 
 @device
 def noise_ratio(z: float, noise: DepthNoise) -> float:
-    """Return the ratio of sigma(z, 0) to sigma(z, 0) of KINECT_V1, to scale limits that were tuned for KINECT_V1."""
+    """Return the ratio of the standard deviation at depth `z`, m, to that of a Kinect v1.
+
+    The ratio is used to scale limits that were tuned for a Kinect v1.
+    """
     return float(axial_sigma(z, noise) / axial_sigma(z, _KINECT_V1))

@@ -1,1 +1,1 @@
-"""Synthetic scenes: furniture, layout, light, camera trajectory and depth sensor."""
+"""Synthetic RGB-D sequences of furnished rooms."""

@@ -1,8 +1,8 @@
 """The ten scenes of the synthetic benchmark.
 
-`bedroom`, `couches`, `student` and `one_room` have objects on beds and couches. `living_chairs`, `meeting` and
-`kitchen` have rows of identical chairs. `books` and `office` have many books. Each of the nine classes occurs in
-several scenes. All scenes have clutter without a class on and next to the furniture.
+Each of the nine classes occurs in several scenes. Difficult cases are objects on beds and couches (`bedroom`,
+`couches`, `student`, `one_room`), rows of identical chairs (`living_chairs`, `meeting`, `kitchen`), and many books
+(`books`, `office`). All scenes have clutter without a class.
 """
 
 from __future__ import annotations
@@ -47,7 +47,10 @@ MakeGroup = Callable[[Rng], Group]
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """Description and contents of a scene, except for the contents that all scenes have (door, window and others)."""
+    """Specification of a scene.
+
+    All scenes also have a door, a window, a lamp and pictures.
+    """
 
     role: str  # description of the scene in messages
     groups: tuple[MakeGroup, ...]  # furniture groups, placed largest first
@@ -55,17 +58,17 @@ class SceneSpec:
 
 
 def bag(rng: Rng) -> Group:
-    """Return a random backpack as a group."""
+    """Return a group with a random backpack."""
     return single("bag", fixtures.backpack(rng))
 
 
 def cupboard(rng: Rng) -> Group:
-    """Return a random cupboard with objects on top."""
+    """Return a group with a random cupboard and objects on top."""
     return laden("cupboard", clutter.cupboard(rng), rng)
 
 
 def kitchen(rng: Rng) -> Group:
-    """Return a kitchen group with an object on top of the refrigerator."""
+    """Return a group with kitchen furniture and an object on top of the refrigerator."""
     group = kitchen_group(rng)
     fridge = next(piece for piece in group.pieces if piece.kind == "refrigerator")
     strew_on(group, fridge, rng, small_things.some(rng, small_things.ON_TOPS, 1))
@@ -73,7 +76,7 @@ def kitchen(rng: Rng) -> Group:
 
 
 def shelf(rng: Rng) -> Group:
-    """Return a random shelf as a group."""
+    """Return a group with a random shelf."""
     return single("shelf", small_things.shelf(rng))
 
 
@@ -134,7 +137,7 @@ SCENES: Mapping[str, SceneSpec] = {
 
 @dataclass(frozen=True)
 class Scene:
-    """A furnished room, a camera path through the room, and the random generator for later steps."""
+    """A furnished room with a camera path."""
 
     room: Room
     path: CameraPath
@@ -142,15 +145,16 @@ class Scene:
 
 
 def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: float) -> Scene:
-    """Return the candidate scene with the best visibility of its objects along the camera path.
-
-    Raises DataError if no candidate has space for the furniture and the camera path.
+    """Generate random candidates for a scene and return the one with the best visibility of its objects.
 
     Args:
-        spec: Scene specification.
-        stream: Seed of the random numbers.
-        frames: Number of frames of the camera path.
-        stride: Camera motion per frame, relative to the recommended speed at FRAME_RATE, as in walk.plan_path.
+        spec: The specification of the scene.
+        stream: The seed of the random numbers.
+        frames: The number of frames of the camera path.
+        stride: The camera motion per frame, relative to the recommended speed at FRAME_RATE.
+
+    Raises:
+        DataError: No candidate has space for the furniture and the camera path.
     """
     best: Scene | None = None
     most_shown = (-1.0, -1.0)
@@ -170,10 +174,7 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: floa
 
 
 def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[Scene, tuple[float, float]]:
-    """Return a random scene, and two fractions: of its classes and of its objects with a class that are visible.
-
-    An object counts as visible if it is visible in at least a fraction LONG_SEEN of the scored views.
-    """
+    """Return a random scene and the fractions of its classes and of its objects that are visible."""
     room = furnish_scene(spec, rng)
     surfaces = room.surfaces
     caster = RayCaster(surfaces.vertices, surfaces.triangles)
@@ -190,7 +191,11 @@ def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[
 
 
 def furnish_scene(spec: SceneSpec, rng: Rng) -> Room:
-    """Return a random room for a scene specification. Raises DataError if there is no layout for its furniture."""
+    """Return a random room for a scene specification.
+
+    Raises:
+        DataError: The furniture does not fit into the room.
+    """
     contents = [make(rng) for make in spec.groups]
     contents += [
         single("door", clutter.door(rng)),

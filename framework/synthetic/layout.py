@@ -1,7 +1,7 @@
-"""Furniture layout: groups against walls, without intersections, with free space for the camera path.
+"""Random furniture layouts.
 
-Groups are placed at random positions along the walls. Of several complete layouts, the one with the most free space is
-kept. If its free space is too small, the room is enlarged.
+Groups are placed against the walls without intersections. Of several layouts, the one with the most free space for the
+camera path is kept. If the space is too small, the room is enlarged.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CELL = 0.05  # m, cell size of the grid of free floor
 
 @dataclass(frozen=True)
 class Layout:
-    """Placement of all groups of a room."""
+    """A room with placed furniture."""
 
     width: float  # m, along x
     depth: float  # m, along y
@@ -43,10 +43,16 @@ class Layout:
 
 
 def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout:
-    """Return a layout of the groups in the smallest candidate room with space for a camera path.
+    """Place furniture groups in the smallest room with space for a camera path.
 
-    The sides of the candidate rooms are `width` and `depth` (m) times the factors in GROWTH. Raises DataError if the
-    largest candidate is too small.
+    Args:
+        groups: The groups.
+        width: The width of the smallest room, m.
+        depth: The depth of the smallest room, m.
+        rng: The random number generator.
+
+    Raises:
+        DataError: The groups do not fit into the largest room.
     """
     boxes = [group.boxes for group in groups]
     for factor in GROWTH:
@@ -75,10 +81,7 @@ class _Plan:
 def _try_layout(
     groups: list[Group], boxes_of_groups: list[Float64], width: float, depth: float, rng: Rng
 ) -> _Plan | None:
-    """Return a random layout of the groups, or None if a group does not fit.
-
-    Groups are rotated by quarter turns, which keeps their boxes exact.
-    """
+    """Return a random layout, or None if a group does not fit."""
     plan = _Plan()
     taken = np.zeros((0, 2, 3))
     walls: dict[str, tuple[int, float]] = {}
@@ -113,9 +116,13 @@ def _try_layout(
 
 
 def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
-    """Return the pose of a group at a wall of a room with sides of `width` and `depth` m.
+    """Return the position and angle of a group at a wall.
 
-    The group is `along` m from the middle of the wall. The wall at -y has the number `wall` = 0, +x 1, +y 2, and -x 3.
+    Args:
+        wall: The wall: 0 = -y, 1 = +x, 2 = +y, 3 = -x.
+        along: The offset from the middle of the wall, m.
+        width: The width of the room, m.
+        depth: The depth of the room, m.
     """
     if wall == 0:
         return along, -depth / 2, 0.0
@@ -127,7 +134,7 @@ def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
 
 
 def _turned_boxes(boxes: Float64, quarters: int, place: Place) -> Float64:
-    """Return the boxes (N, 2, 3), m, rotated about z by `quarters` quarter turns and then moved to x, y of `place`."""
+    """Rotate boxes (N, 2, 3), m, by quarter turns about z and move them to a place."""
     R = np.rint(axis_rotation("z", quarters * np.pi / 2))
     corners = boxes @ R.T + np.array([place[0], place[1], 0.0])
     return np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
@@ -145,14 +152,14 @@ def _inside(boxes: Float64, width: float, depth: float) -> bool:
 
 
 def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
-    """Return a lower bound of the distance, m, from each floor cell to the nearest box or wall.
+    """Return a lower bound, m, of the distance from each floor cell to the nearest box or wall.
 
     The result is a grid with one row per CELL along y and one column per CELL along x.
 
     Args:
-        boxes: (N, 2, 3) m, lower and upper corners of the boxes in the room frame.
-        width: Width of the room along x, m.
-        depth: Depth of the room along y, m.
+        boxes: The lower and upper corners (N, 2, 3) of the boxes, m.
+        width: The width of the room, m.
+        depth: The depth of the room, m.
     """
     rows, columns = int(depth / CELL), int(width / CELL)
     free = np.zeros((rows + 2, columns + 2), np.uint8)
@@ -166,10 +173,9 @@ def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
 
 
 def strew(layout: Layout, things: Sequence[Furniture], rng: Rng) -> Layout:
-    """Return the layout with `things` on the floor next to furniture.
+    """Place objects on the floor next to furniture.
 
-    Objects are omitted if they do not fit or block the camera path. They are rotated by quarter turns, which keeps
-    their boxes tight.
+    Objects that do not fit or block the camera path are omitted.
     """
     for thing in things:
         layout = _with_thing(layout, thing, rng)
@@ -199,10 +205,7 @@ def _with_thing(layout: Layout, thing: Furniture, rng: Rng) -> Layout:
 
 
 def _against(host: Float64, thing: Furniture, rng: Rng) -> Furniture:
-    """Return `thing`, placed on the floor at a random side of the box `host` (2, 3), m.
-
-    The center of `thing` is between the ends of this side.
-    """
+    """Place an object on the floor at a random side of a box (2, 3), m."""
     turned = thing.placed(0, 0, 0, np.pi / 2 * int(rng.integers(4)))
     low, high = turned.bounds()
     axis, sign = int(rng.integers(2)), (-1 if rng.uniform() < 0.5 else 1)
@@ -214,5 +217,5 @@ def _against(host: Float64, thing: Furniture, rng: Rng) -> Furniture:
 
 
 def _meets(box: Float64, others: Float64) -> bool:
-    """Return True if the box (2, 3) intersects any of the boxes `others` (N, 2, 3)."""
+    """Return True if a box (2, 3) intersects any of the boxes (N, 2, 3)."""
     return bool((np.minimum(box[1], others[:, 1]) > np.maximum(box[0], others[:, 0])).all(axis=1).any())

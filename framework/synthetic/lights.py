@@ -1,7 +1,8 @@
-"""Light baked into vertices: direct light with soft shadows from lamps and windows, and three diffuse bounces.
+"""Computation of the static light of a room, stored at the vertices.
 
-Light is static and surfaces are Lambertian, as assumed by photometric tracking. All vertices gather light along the
-same directions to avoid noise between neighbors.
+The light consists of direct light from lamps and windows with soft shadows, and of three diffuse reflections. Surfaces
+are Lambertian, as assumed by photometric tracking. All vertices use the same ray directions, which prevents noise
+between neighbors.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ WALL_BRIGHTNESS = 0.60  # mean irradiance of floor, walls and ceiling after scal
 
 @dataclass(frozen=True)
 class Lamp:
-    """Sample points of one light source."""
+    """A light source, represented by sample points."""
 
     points: Float64  # (S, 3) m
     normals: Float64  # (S, 3) unit vectors in the direction of emission; zero vector = emission in all directions
@@ -33,13 +34,13 @@ class Lamp:
 
 
 def globe(center: Float64, radius: float, power: Color, samples: int = 16) -> Lamp:
-    """Return a spherical lamp that emits in all directions.
+    """Return a spherical lamp.
 
     Args:
-        center: (3,) m.
-        radius: Radius of the sphere in m.
-        power: Total power, linear RGB.
-        samples: Number of sample points.
+        center: The center (3,), m.
+        radius: The radius, m.
+        power: The total power, linear RGB.
+        samples: The number of sample points.
     """
     k = np.arange(samples) + 0.5  # on a Fibonacci sphere
     z, angle = 1 - 2 * k / samples, np.pi * (1 + 5**0.5) * k
@@ -52,12 +53,12 @@ def rectangle(corner: Float64, along: Float64, up: Float64, normal: Float64, pow
     """Return a rectangular lamp, such as a window.
 
     Args:
-        corner: (3,) m, one corner of the rectangle.
-        along: (3,) m, first edge from the corner.
-        up: (3,) m, second edge from the corner.
-        normal: (3,) unit vector in the direction of emission.
-        power: Total power, linear RGB.
-        side: Number of sample points along each edge.
+        corner: A corner (3,) of the rectangle, m.
+        along: The first edge (3,) from the corner, m.
+        up: The second edge (3,) from the corner, m.
+        normal: The direction of emission (3,), a unit vector.
+        power: The total power, linear RGB.
+        side: The number of sample points along each edge.
     """
     f = (np.arange(side) + 0.5) / side
     s, t = np.meshgrid(f, f)
@@ -66,10 +67,14 @@ def rectangle(corner: Float64, along: Float64, up: Float64, normal: Float64, pow
 
 
 def bake(surfaces: Surfaces, caster: RayCaster, lamps: list[Lamp]) -> Float32:
-    """Return the irradiance (V, 3), linear RGB, of the vertices under all lamps.
+    """Compute the irradiance (V, 3), linear RGB, of the vertices.
 
-    It is scaled so that its mean on floor, walls and ceiling is WALL_BRIGHTNESS. `caster` contains the triangles of
-    `surfaces`.
+    The result is scaled so that the mean on floor, walls and ceiling is WALL_BRIGHTNESS.
+
+    Args:
+        surfaces: The surfaces of the room.
+        caster: The ray caster of the surfaces.
+        lamps: The lamps.
     """
     origins = surfaces.vertices + np.float32(LIFT) * surfaces.normals
     direct = np.zeros((len(origins), 3))
@@ -102,9 +107,9 @@ def _direct(origins: Float32, normals: Float32, caster: RayCaster, lamp: Lamp) -
 
 
 def _gather(origins: Float32, normals: Float32, caster: RayCaster) -> tuple[Int32, Float32]:
-    """Return the triangle (V, D) visible from each vertex in D directions, and the barycentric weights (V, D, 2).
+    """Cast rays from all vertices in D directions and return the hit triangles and barycentric weights.
 
-    The triangle is -1 in directions without a surface. The weights belong to the second and third vertex.
+    The triangles (V, D) are -1 without a hit. The weights (V, D, 2) belong to the second and third vertex.
     """
     local = _cosine_directions(GATHER_DIRECTIONS)
     triangle = np.empty((len(origins), len(local)), np.int32)
@@ -125,7 +130,7 @@ def _gather(origins: Float32, normals: Float32, caster: RayCaster) -> tuple[Int3
 
 
 def _cosine_directions(count: int) -> Float64:
-    """Return `count` cosine-distributed directions (D, 3), unit vectors about +z (Malley's method)."""
-    k = np.arange(count) + 0.5
+    """Return cosine-distributed unit vectors (D, 3) around +z."""
+    k = np.arange(count) + 0.5  # Malley's method
     r, angle = np.sqrt(k / count), np.pi * (1 + 5**0.5) * k
     return np.stack([r * np.cos(angle), r * np.sin(angle), np.sqrt(1 - r * r)], axis=1)

@@ -1,4 +1,7 @@
-"""Materials: textures and random colors. Colors are sRGB in [0, 1]."""
+"""Materials with textures and random colors.
+
+Colors are sRGB in [0, 1].
+"""
 
 from __future__ import annotations
 
@@ -72,9 +75,9 @@ class Material:
 
 
 def material_table(materials: list[Material]) -> Float32:
-    """Return a table of materials (M, 14).
+    """Return the materials as a table (M, 14) for kernels.
 
-    Columns: texture, linear color, linear second color, scale, extent, seed, emission, dark, shiny.
+    The columns are texture, linear color, linear second color, scale, extent, seed, emission, dark and shiny.
     """
     rows = np.zeros((len(materials), 14))
     for row, m in zip(rows, materials, strict=True):
@@ -85,28 +88,28 @@ def material_table(materials: list[Material]) -> Float32:
 
 
 def _to_linear(srgb: Float64) -> Float64:
-    """Convert sRGB to linear light (IEC 61966-2-1)."""
+    """Convert sRGB to linear light."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def absorbed(color: Color) -> float:
-    """Return the fraction of depth readings, in [0, ABSORBED], that are lost on a surface with this sRGB color."""
+    """Return the fraction of depth readings that are lost on a surface with an sRGB color."""
     return ABSORBED * max(0.0, 1 - sum(color) / 3 / DARKEST)
 
 
 def pick(rng: np.random.Generator, choices: tuple[Color, ...]) -> Color:
-    """Draw a random color from `choices`."""
+    """Return a random element of `choices`."""
     return choices[int(rng.integers(len(choices)))]
 
 
 def shade(color: Color, factor: float) -> Color:
-    """Return a darker (factor below 1) or lighter (factor above 1) color."""
+    """Scale the brightness of a color."""
     r, g, b = (min(1.0, factor * c) for c in color)
     return r, g, b
 
 
 def vivid(rng: np.random.Generator) -> Color:
-    """Draw a saturated color for books, bags and paintings."""
+    """Return a random saturated color."""
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(0.55, 0.9), rng.uniform(0.35, 0.85))
 
 
@@ -131,7 +134,7 @@ def leather(rng: np.random.Generator) -> Material:
 
 
 def patterned_cloth(rng: np.random.Generator) -> Material:
-    """Return striped, checked or plain bed linen."""
+    """Return a random fabric that is striped, checked or plain."""
     base, other = pick(rng, CLOTHS), (0.90, 0.88, 0.84)
     texture = (Texture.STRIPES, Texture.CHECKS, Texture.FABRIC)[int(rng.integers(3))]
     second = shade(base, 0.75) if texture is Texture.FABRIC else base
@@ -156,9 +159,16 @@ def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Materi
 
 
 def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
-    """Return the material of a picture, such as a painting or a screen, with sides of `width` and `height` m.
+    """Return the material of a painting or a screen.
 
-    Half of the screens are glossy and give no depth readings. `emission` is the emitted light, as in Material.
+    Half of the screens are glossy and have no depth readings.
+
+    Args:
+        rng: The random number generator.
+        texture: The texture of the picture.
+        width: The width of the picture, m.
+        height: The height of the picture, m.
+        emission: The emitted light, see Material.
     """
     first, second, seed = vivid(rng), vivid(rng), new_seed(rng)
     dark = (1.0, MATTE_SCREEN)[seed % 2] if texture is Texture.SCREEN else 0.0
@@ -166,5 +176,5 @@ def picture(rng: np.random.Generator, texture: Texture, width: float, height: fl
 
 
 def new_seed(rng: np.random.Generator) -> int:
-    """Draw a random seed for a texture."""
+    """Return a random seed for a texture."""
     return int(rng.integers(4096))

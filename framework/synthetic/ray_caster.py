@@ -1,4 +1,4 @@
-"""Open3D's Embree ray caster, with this project's pixel convention and deterministic results."""
+"""Ray casting with Open3D (Embree)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ Numbers = npt.NDArray[np.floating] | npt.NDArray[np.integer]
 
 @dataclass(frozen=True)
 class RayHits:
-    """Intersections of rays with the surface; the leading dimensions match the rays."""
+    """First intersections of rays with surfaces.
+
+    The leading dimensions are those of the rays.
+    """
 
     distance: Float32  # in units of the length of the ray's direction vector, inf = no intersection
     triangle: Int32  # NO_TRIANGLE = no intersection
@@ -27,7 +30,7 @@ class RayHits:
 
 
 class RayCaster:
-    """Thread-safe ray caster of a fixed triangle mesh that uses numba's number of threads."""
+    """A thread-safe ray caster for a triangle mesh, with deterministic results."""
 
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
         import open3d as o3d
@@ -39,15 +42,15 @@ class RayCaster:
         )
 
     def cast(self, rays: Float32) -> RayHits:
-        """Return the first intersections of rays (..., 6), each an origin (m) and a direction."""
+        """Return the first intersections of rays (..., 6), each with origin (m) and direction."""
         answer = self._scene.cast_rays(_tensor(np.ascontiguousarray(rays)), get_num_threads())
         triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's invalid id 2^32 - 1 becomes -1
         return RayHits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
 
     def occluded(self, origins: Float32, ends: Float32) -> Bool:
-        """Return the mask (...) of the pairs of points with a surface between them.
+        """Return True for each pair of points (..., 3), m, with a surface between them.
 
-        `origins` and `ends` are (..., 3), m. Surfaces at these points are ignored.
+        Surfaces at the points themselves are ignored.
         """
         rays = np.concatenate([origins, ends - origins], axis=-1).astype(np.float32)
         return np.asarray(self._scene.test_occlusions(_tensor(rays), 1e-3, 0.999, get_num_threads()).numpy())
@@ -60,10 +63,15 @@ def _tensor(array: Array) -> o3d.core.Tensor:
 
 
 def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) -> Float32:
-    """Return the rays (A, B, 6) in the world frame through image points u, v (px), broadcast to (A, B).
+    """Return the rays (A, B, 6) in the world frame through image points.
 
-    Pixel centers are at integers. Directions have length 1 along the optical axis, so that the distance of an
-    intersection equals its depth.
+    Directions have length 1 along the optical axis, so that the distance of an intersection is its depth.
+
+    Args:
+        camera: The camera.
+        T_world_camera: The pose (4, 4).
+        u: The horizontal coordinates, px, which can be broadcast to (A, B).
+        v: The vertical coordinates, px, which can be broadcast to (A, B).
     """
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     rays = np.empty((*np.broadcast_shapes(x.shape, y.shape), 6), np.float32)

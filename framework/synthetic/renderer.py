@@ -1,4 +1,4 @@
-"""Rendering of a lit room: antialiased color, exact depth and instance ids."""
+"""Renderer of furnished rooms."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.12
 
 @dataclass(frozen=True)
 class Rendering:
-    """Images of an ideal camera."""
+    """Rendered images without noise."""
 
     color: UInt8  # (H, W, 3) RGB
     depth: Float32  # (H, W) m along z, 0 = no surface
@@ -39,7 +39,10 @@ class Rendering:
 
 
 class Renderer:
-    """Thread-safe renderer of `surfaces` under `lamps`. The light is computed once, for all vertices."""
+    """A thread-safe renderer of surfaces and lamps.
+
+    The light is computed once for all vertices.
+    """
 
     def __init__(self, surfaces: Surfaces, lamps: list[Lamp]) -> None:
         self.surfaces = surfaces
@@ -59,9 +62,12 @@ class Renderer:
         self._rasterizer = Rasterizer(surfaces.vertices, surfaces.triangles)
 
     def render(self, camera: Camera, T_world_camera: Float64, material_table: Float32 | None = None) -> Rendering:
-        """Return images of the room from a camera at T_world_camera (4, 4).
+        """Render a view of the room.
 
-        `material_table` (M, 14) replaces the materials but not the light; None = materials of the room.
+        Args:
+            camera: The camera.
+            T_world_camera: The pose (4, 4).
+            material_table: Other materials (M, 14) for the surfaces, with unchanged light; None = those of the room.
         """
         surfaces = self._lit if material_table is None else self._lit._replace(table=material_table)
         buffer = self._rasterizer.draw(camera, T_world_camera)
@@ -82,23 +88,29 @@ class Renderer:
         return Rendering(to_srgb(light), depth, _ids_of(self.surfaces, triangle), incidence, unread)
 
     def depth_and_ids(self, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Return only the exact depth (H, W), m along z, and the instance ids (H, W); both are 0 without a surface."""
+        """Return the exact depth (H, W), m along z, and the instance ids (H, W) of a view.
+
+        Both are 0 without a surface.
+        """
         buffer = self._rasterizer.draw(camera, T_world_camera)
         return buffer.depth, _ids_of(self.surfaces, buffer.triangle)
 
 
 def cast_ids(surfaces: Surfaces, caster: RayCaster, camera: Camera, T_world_camera: Float64) -> Int32:
-    """Return the instance ids (H, W), 0 = none, from ray casting, which is faster than a Renderer for small images."""
+    """Return the instance ids (H, W) of a view, computed by ray casting.
+
+    For small images, this is faster than a Renderer.
+    """
     return _ids_of(surfaces, caster.cast(image_rays(camera, T_world_camera)).triangle)
 
 
 def _ids_of(surfaces: Surfaces, triangle: Int32) -> Int32:
-    """Return the instance ids (H, W) of the triangles with the indices `triangle` (H, W), 0 for NO_TRIANGLE (-1)."""
+    """Return the instance ids (H, W) of the triangles (H, W) in a view."""
     return np.append(surfaces.instance_ids, np.int32(0))[triangle]
 
 
 def to_srgb(light: Float32) -> UInt8:
-    """Convert linear light to 8-bit sRGB with Reinhard's tone curve and a white point (Reinhard et al. 2002, eq. 4)."""
+    """Convert linear light to 8-bit sRGB with the tone curve of Reinhard et al. 2002, eq. 4."""
     color = np.empty(light.shape, np.uint8)
     apply_tone_curve(light.reshape(-1), _tone_curve(), color.reshape(-1))
     return color

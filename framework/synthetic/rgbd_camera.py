@@ -1,9 +1,9 @@
-"""Error model of RGB-D cameras, by default similar to the Kinect v1.
+"""Error model of RGB-D cameras.
 
-- Axial depth noise follows the model of the sensor (`framework.sensors.noise_models`).
-- Disparity of a Kinect v1 is quantized to 1/8 px, so that the step of depth z (m) is 2.9e-3 z^2 m: Khoshelham and Oude
-  Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2), 2012. The
-  disparity of a RealSense D400 is quantized to 1/32 px. The depth of other sensors has steps of 1 mm.
+- Axial depth noise follows the noise model of the sensor (`framework.sensors.noise_models`).
+- The disparity of a Kinect v1 is quantized to 1/8 px. The step of the depth z in m is therefore 2.9e-3 z^2 m
+  (Khoshelham and Oude Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors
+  12(2), 2012). The disparity of a RealSense D400 is quantized to 1/32 px. The depth of other sensors has steps of 1 mm.
 - Lateral noise moves readings across edges by about a pixel (Nguyen et al.). It is applied as in Handa et al., "A
   Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
 - Readings are missing where the projector or second camera is occluded, at many pixels along depth edges, and at
@@ -43,7 +43,7 @@ class Triangulation(NamedTuple):
     """Geometry of a sensor that measures disparity."""
 
     baseline: float  # m, distance to the projector or the second camera; 0 = no triangulation
-    steps_depth: float  # m, depth times disparity, in quantization steps of disparity; 0 = constant steps of depth
+    steps_depth: float  # product of depth (m) and disparity (quantization steps); 0 = constant steps of depth
 
 
 TRIANGULATION = {  # focal lengths: 580 px (Kinect v1, at 640 px width) and 424 px (D435, at 848 px width)
@@ -54,7 +54,7 @@ TRIANGULATION = {  # focal lengths: 580 px (Kinect v1, at 640 px width) and 424 
 
 @dataclass(frozen=True)
 class DepthSensor:
-    """Model of a depth sensor that adds the measurement errors to exact depth."""
+    """Simulated depth sensor."""
 
     noise: float  # 0 = exact, 1 = as measured; scales standard deviations and probabilities
     max_range: float  # m, maximum depth of a reading
@@ -68,14 +68,14 @@ class DepthSensor:
         rng: np.random.Generator,
         unread: Float32 | None = None,
     ) -> Float32:
-        """Return the simulated depth readings (H, W), m along z; 0 = no reading.
+        """Simulate the depth readings (H, W), m along z, 0 = no reading.
 
         Args:
-            depth: (H, W) m along z, exact depth, 0 = no surface.
-            incidence: (H, W) in [0, 1], cosine of the angle of incidence.
-            camera: Camera of the depth image.
-            rng: Random generator of the noise.
-            unread: (H, W) fraction of the readings lost in patches on dark and shiny materials; None = no loss.
+            depth: The exact depth (H, W), m along z, 0 = no surface.
+            incidence: The cosine of the angle of incidence (H, W).
+            camera: The camera of the depth image.
+            rng: The random number generator.
+            unread: The fraction of readings (H, W) that are lost on dark and shiny materials; None = 0.
         """
         if self.noise == 0 or self.kind is SensorKind.EXACT:
             return np.where(depth <= self.max_range, depth, np.float32(0))
@@ -98,7 +98,10 @@ class DepthSensor:
 
 
 def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
-    """Return `color` (H, W, 3), RGB, with the image noise of a camera in indoor light; `noise` scales it, 0 = none."""
+    """Add image noise to a color image (H, W, 3).
+
+    A noise of 1 is typical of indoor light.
+    """
     if noise == 0:
         return color
     noisy = np.empty_like(color)
@@ -110,10 +113,15 @@ def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
 def blurred(
     color: UInt8, depth: Float32, camera: Camera, T_world_camera: Float64, T_world_open: Float64, T_world_close: Float64
 ) -> UInt8:
-    """Return `color` (H, W, 3), rendered at T_world_camera, with the motion blur of an exposure.
+    """Add motion blur to a color image.
 
-    The camera moves from T_world_open to T_world_close during the exposure. The motion of a pixel is computed from the
-    exact `depth` (H, W) m of the static scene; depth 0 = no blur.
+    Args:
+        color: The color image (H, W, 3), RGB.
+        depth: The exact depth (H, W), m, 0 = no blur.
+        camera: The camera.
+        T_world_camera: The pose (4, 4) of the color image.
+        T_world_open: The pose (4, 4) at the start of the exposure.
+        T_world_close: The pose (4, 4) at the end of the exposure.
     """
     picture = np.empty_like(color)
     K = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
@@ -125,7 +133,10 @@ def blurred(
 
 
 def random_bits(shape: tuple[int, ...], rng: np.random.Generator) -> UInt16:
-    """Draw 16 random bits per element, several times faster than sampling a distribution."""
+    """Return an array of 16-bit random numbers.
+
+    This is several times faster than sampling a distribution.
+    """
     count = math.prod(shape)
     words = rng.integers(0, 2**64, -(-count // 4), np.uint64)
     return words.view(np.uint16)[:count].reshape(shape)
@@ -133,7 +144,7 @@ def random_bits(shape: tuple[int, ...], rng: np.random.Generator) -> UInt16:
 
 @lru_cache
 def normal_quantiles() -> Float32:
-    """Return equally likely values (2^QUANTILE_BITS,) of a standard normal distribution."""
+    """Return evenly spaced quantiles (2^QUANTILE_BITS,) of the standard normal distribution."""
     count = 1 << QUANTILE_BITS
     quantiles = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
     return np.asarray(quantiles / quantiles.std(), np.float32)

@@ -1,4 +1,4 @@
-"""Numba kernels of rgbd_camera.py, in single precision."""
+"""Kernels of rgbd_camera.py, in single precision."""
 
 from __future__ import annotations
 
@@ -22,16 +22,19 @@ SHARP = np.float32(0.5)  # px, minimum path length for blur
 
 @njit(cache=True, nogil=True)
 def depth_step(z: np.float32, steps_depth: np.float32) -> np.float32:
-    """Return the quantization step of depth, m, at depth z (m).
+    """Return the quantization step, m, at depth z, m.
 
-    `steps_depth` (m) is depth times disparity, in quantization steps of disparity; 0 = constant steps of depth.
+    `steps_depth` is the product of depth (m) and disparity (quantization steps). If it is 0, the step is constant.
     """
     return np.float32(z * z / steps_depth) if steps_depth > 0 else np.float32(FLOOR)
 
 
 @njit(cache=True, nogil=True)
 def quantized(z: np.float32, steps_depth: np.float32) -> np.float32:
-    """Return depth z (m), rounded to a quantization step of disparity, or of depth if `steps_depth` is 0; in m."""
+    """Round depth z, m, to a quantization step.
+
+    `steps_depth` is described in `depth_step`.
+    """
     if steps_depth > 0:
         steps = np.rint(steps_depth / max(z, np.float32(0.1)))
         return np.float32(steps_depth / max(steps, np.float32(1)))
@@ -52,20 +55,23 @@ def read_depth(
     max_range: np.float32,
     reading: Float32,
 ) -> None:
-    """Write the depth readings, m along z, to `reading`; pixels without a reading remain unchanged.
+    """Simulate depth readings.
+
+    Pixels without a reading remain unchanged in the output.
 
     Args:
-        depth: (H, W) m along z, exact depth, 0 = no surface.
-        theta: (H, W) rad, angle of incidence.
-        random: (H, W, 4) random bits for the loss of a reading, the lateral error along y and x, and the axial error.
-        normal: (N,) quantiles from `normal_quantiles`.
-        noise: Scale of the noise model, 1 = as measured.
-        lateral_sigma: Standard deviation of the lateral error, px.
-        disparity_scale: Product of disparity and depth, px m.
-        steps_depth: Depth times disparity, in quantization steps of disparity, m; see `depth_step`.
-        model: Model of the axial noise.
-        max_range: Maximum depth of a reading, m.
-        reading: (H, W) output.
+        depth: The exact depth (H, W), m along z, 0 = no surface.
+        theta: The angle of incidence (H, W), rad.
+        random: The random bits (H, W, 4) for the loss of readings, the lateral error along y and x, and the axial
+            error.
+        normal: The quantiles (N,) from `normal_quantiles`.
+        noise: The scale of the noise model, 1 = as measured.
+        lateral_sigma: The standard deviation of the lateral error, px.
+        disparity_scale: The product of disparity (px) and depth (m).
+        steps_depth: The product of depth (m) and disparity (quantization steps), see `depth_step`.
+        model: The model of the axial noise.
+        max_range: The maximum depth of a reading, m.
+        reading: The output depth (H, W), m.
     """
     height, width = depth.shape
     near_edge = _near_edge(depth)
@@ -104,13 +110,18 @@ def read_depth(
 def drop_patches(
     unread: Float32, field: Float32, cell: np.float32, normal: Float32, largest_loss: np.float32, reading: Float32
 ) -> None:
-    """Remove a fraction `largest_loss` * `unread` (H, W) of the readings `reading` (H, W), in patches.
+    """Remove depth readings in random patches.
 
-    A reading is lost if a smooth random field is below the quantile of the fraction. The field interpolates the
-    normally distributed numbers `field` (R, C), which are `cell` px apart. The interpolated value is divided by the
-    norm of the interpolation weights, so it is also normally distributed in each pixel. `normal` (N,) contains the
-    quantiles from `normal_quantiles`.
+    Args:
+        unread: The fraction of lost readings (H, W).
+        field: Normally distributed random numbers (R, C) on a coarse grid.
+        cell: The distance between the grid points, px.
+        normal: The quantiles (N,) from `normal_quantiles`.
+        largest_loss: A factor for the fraction of lost readings.
+        reading: The depth readings (H, W), m, input and output.
     """
+    # A reading is lost if an interpolated random field is below the quantile of the fraction of lost readings. The
+    # interpolated value is divided by the norm of the weights, so that it is normally distributed at each pixel.
     one, count = np.float32(1), np.float32(len(normal))
     for v in range(reading.shape[0]):
         y = np.float32(v) / cell
@@ -132,11 +143,8 @@ def drop_patches(
 
 @njit(cache=True, nogil=True)
 def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> np.float32:
-    """Return the depth, m, at the offset (dv, du) px if a depth edge lies in between, otherwise the depth at (v, u).
-
-    The offset is rounded. Smooth surfaces have no lateral error, because the axial noise model already includes its
-    effect.
-    """
+    """Return the depth at a pixel, m, or at an offset from the pixel if a depth edge is in between."""
+    # smooth surfaces have no lateral error, because the axial noise model already includes the effect
     y = min(max(v + int(np.rint(dv)), 0), depth.shape[0] - 1)
     x = min(max(u + int(np.rint(du)), 0), depth.shape[1] - 1)
     own, neighbor = depth[v, u], depth[y, x]
@@ -146,7 +154,7 @@ def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> 
 
 @njit(cache=True, nogil=True)
 def _near_edge(depth: Float32) -> Bool:
-    """Return a mask (H, W) of the pixels on both sides of a depth edge."""
+    """Return the mask (H, W) of the pixels at depth edges."""
     height, width = depth.shape
     edge = np.zeros((height, width), np.bool_)
     for v in range(height):
@@ -162,14 +170,14 @@ def _near_edge(depth: Float32) -> Bool:
 
 @njit(cache=True, nogil=True)
 def add_noise(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, noisy: UInt8) -> None:
-    """Write `color` (N,) with normally distributed noise to `noisy` (N,), rounded.
+    """Add normally distributed noise to color values.
 
     Args:
-        color: (N,) values of all channels.
-        random: (N,) 16 random bits per value.
-        normal: Quantiles from `normal_quantiles`.
-        sigma: Standard deviation, gray levels from 0 to 255.
-        noisy: (N,) output.
+        color: The values (N,) of all channels.
+        random: The random numbers (N,) from `random_bits`.
+        normal: The quantiles from `normal_quantiles`.
+        sigma: The standard deviation, in gray levels from 0 to 255.
+        noisy: The output values (N,).
     """
     for n in range(len(color)):
         value = np.rint(np.float32(color[n]) + sigma * normal[random[n] >> SPARE_BITS])
@@ -180,17 +188,17 @@ def add_noise(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, 
 def blur(
     color: UInt8, depth: Float32, K: Float32, T_open_camera: Float32, T_close_camera: Float32, picture: UInt8
 ) -> None:
-    """Write `color` with motion blur to `picture`: the mean of up to MAX_SAMPLES samples for each pixel.
+    """Add motion blur to a color image.
 
-    The samples are evenly spaced along the path of the pixel during the exposure.
+    Each pixel becomes the mean of samples along its path during the exposure.
 
     Args:
-        color: (H, W, 3) RGB.
-        depth: (H, W) m along z, 0 = no blur.
-        K: (4,) fx, fy, cx, cy, px.
-        T_open_camera: (4, 4) transform from the color camera to the camera at the start of the exposure.
-        T_close_camera: (4, 4) transform from the color camera to the camera at the end of the exposure.
-        picture: (H, W, 3) output, RGB.
+        color: The color image (H, W, 3), RGB.
+        depth: The depth (H, W), m along z, 0 = no blur.
+        K: The intrinsics (fx, fy, cx, cy), px.
+        T_open_camera: The transform (4, 4) from the camera to the camera at the start of the exposure.
+        T_close_camera: The transform (4, 4) from the camera to the camera at the end of the exposure.
+        picture: The output image (H, W, 3), RGB.
     """
     height, width = depth.shape
     for v in range(height):
@@ -226,10 +234,9 @@ def blur(
 
 @njit(cache=True, nogil=True, inline="always")
 def _reprojected(T, K, u, v, z):
-    """Return the image coordinates u, v, px, in another camera of the point at pixel u, v with depth z (m).
+    """Return the image coordinates, px, of a pixel with depth z, m, in another camera.
 
-    T (4, 4) transforms points to the frame of the other camera. If z is 0 or the point is behind the other camera,
-    return u, v unchanged.
+    The coordinates are unchanged if z is 0 or the point is behind the other camera.
     """
     px, py = (np.float32(u) - K[2]) / K[0] * z, (np.float32(v) - K[3]) / K[1] * z
     z_other = T[2, 0] * px + T[2, 1] * py + T[2, 2] * z + T[2, 3]

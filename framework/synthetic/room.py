@@ -1,6 +1,6 @@
-"""Furnished room: shell (floor, walls and ceiling), furniture and lamps.
+"""Random furnished rooms.
 
-The world frame has x, y along the walls, z up, and its origin at the center of the floor.
+In the world frame, x and y are along the walls, z is up, and the origin is at the center of the floor.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear RGB colors of lamps a
 
 
 class RoomKind(StrEnum):
-    """Kinds of rooms. A studio contains all nine classes."""
+    """Kind of a room."""
 
     STUDIO = "studio"
     LIVING_ROOM = "living_room"
@@ -56,14 +56,19 @@ class Room:
 
 
 def furnish(kind: RoomKind, rng: Rng) -> Room:
-    """Return a random room of the given kind."""
+    """Return a random room of a given kind."""
     return furnish_with(_groups(kind, rng), *MIN_ROOM_SIZES[kind], rng)
 
 
 def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, strewn: Sequence[Furniture] = ()) -> Room:
-    """Return a room with sides of at least `width` and `depth` m and with `contents`, placed largest first.
+    """Return a room with given furniture.
 
-    `strewn` objects are placed on the floor next to furniture if they fit.
+    Args:
+        contents: The furniture groups, largest first.
+        width: The minimum width of the room, m.
+        depth: The minimum depth of the room, m.
+        rng: The random number generator.
+        strewn: Objects that are placed on the floor next to furniture if they fit.
     """
     layout = strew(arrange(contents, width, depth, rng), strewn, rng)
     globe_lamp = clutter.ceiling_lamp(rng).placed(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), HEIGHT)
@@ -73,7 +78,7 @@ def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, st
 
 
 def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
-    """Return the contents of a room, largest first."""
+    """Return the furniture groups of a room, largest first."""
     door, window = single("door", clutter.door(rng)), single("window", clutter.window(rng), z=0.95, hung=True)
     bag = single("backpack", fixtures.backpack(rng))
     extras = [
@@ -103,7 +108,7 @@ def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
 
 
 def _shell(width: float, depth: float, rng: Rng) -> Furniture:
-    """Return the shell: floor, ceiling and four walls with baseboards; one wall has wallpaper."""
+    """Return the floor, the ceiling and the walls of a room."""
     shell = Furniture("shell")
     shell.add(panel(width, depth).turned("x", np.pi / 2), _floor(rng), y=depth / 2)
     ceiling = panel(width, depth).turned("x", -np.pi / 2).moved(y=-depth / 2, z=HEIGHT)
@@ -135,7 +140,7 @@ def _floor(rng: Rng) -> Material:
 
 
 def _lamps(pieces: list[Furniture]) -> list[Lamp]:
-    """Return the lamps of all objects that emit light."""
+    """Return the light sources of all objects that emit light."""
     lamps: list[Lamp] = []
     for piece in pieces:
         low, high = piece.bounds()
@@ -154,10 +159,7 @@ def _lamps(pieces: list[Furniture]) -> list[Lamp]:
 
 
 def _daylight(low: Float64, high: Float64) -> Lamp:
-    """Return the daylight that enters between the curtains of a window.
-
-    `low` and `high` (3,), m, are the corners of the window's bounding box.
-    """
+    """Return the light source of a window with the bounding box from `low` (3,) to `high` (3,), m."""
     thin = int(np.argmin((high - low)[:2]))
     wide = 1 - thin
     normal = np.zeros(3)

@@ -1,4 +1,4 @@
-"""Labeled ground-truth mesh of a sequence: the visible part of the exact surfaces, in small triangles."""
+"""Ground-truth mesh of a synthetic sequence."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ LONGEST_EDGE = 0.02  # m, maximum edge length of the mesh
 
 @dataclass(frozen=True)
 class RoomMesh:
-    """Triangle mesh with an instance id per vertex."""
+    """Triangle mesh with an instance id for each vertex."""
 
     vertices: Float32  # (V, 3) m, world frame
     triangles: Int32  # (F, 3) vertex indices, counterclockwise as seen from outside
     instance_ids: Int32  # (V,), 0 = floor, wall or ceiling
 
     def only(self, kept: Bool) -> RoomMesh:
-        """Return the mesh of the vertices in the mask `kept` (V,), in order, with the triangles between them."""
+        """Return the submesh of the vertices in a mask (V,)."""
         number = np.cumsum(kept, dtype=np.int32) - 1
         triangles = self.triangles[kept[self.triangles].all(axis=1)]
         return RoomMesh(self.vertices[kept], number[triangles], self.instance_ids[kept])
@@ -38,33 +38,30 @@ def visible_mesh(
     reach: tuple[float, float],
     longest_edge: float = LONGEST_EDGE,
 ) -> RoomMesh:
-    """Return the mesh of the surfaces that are visible from at least one pose. Its edges are at most `longest_edge` m.
+    """Return the mesh of the surfaces that are visible from at least one pose.
 
-    Surfaces without depth readings, and surfaces behind them, are invisible.
+    Surfaces without depth readings count as invisible, and so do surfaces behind them.
 
     Args:
-        surfaces: Surfaces of the room.
-        caster: Ray caster of `surfaces`.
-        camera: Camera of all poses.
-        poses: (4, 4) T_world_camera of each view.
-        reach: Minimum and maximum depth of a visible surface, m.
-        longest_edge: Maximum edge length, m.
+        surfaces: The surfaces of the room.
+        caster: The ray caster of the surfaces.
+        camera: The camera of all poses.
+        poses: The pose T_world_camera (4, 4) of each view.
+        reach: The minimum and maximum depth of a visible surface, m.
+        longest_edge: The maximum edge length of the mesh, m.
     """
     mesh = tessellate(surfaces, longest_edge)
     return mesh.only(seen_from(mesh.vertices, caster, camera, poses, reach, surfaces.unreadable))
 
 
 def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
-    """Return the surfaces, subdivided into triangles with edges of at most `longest_edge` m.
-
-    Longer edges are halved repeatedly in all adjacent triangles, so that the mesh has no gaps.
-    """
+    """Subdivide the surfaces into triangles with a maximum edge length in m."""
     instance_ids = np.zeros(len(surfaces.vertices), np.int32)
     instance_ids[surfaces.triangles.ravel()] = np.repeat(surfaces.instance_ids, 3)
     mesh = _welded(RoomMesh(surfaces.vertices, surfaces.triangles, instance_ids))
     vertices, instance_ids, open_triangles = mesh.vertices, mesh.instance_ids, mesh.triangles
     done: list[Int32] = []
-    while len(open_triangles):
+    while len(open_triangles):  # long edges are halved in all adjacent triangles, so that the mesh has no gaps
         corners = vertices[open_triangles]
         square = ((np.roll(corners, -1, axis=1) - corners) ** 2).sum(axis=2)  # (F, 3)
         too_long = square.max(axis=1) > np.float32(longest_edge) ** 2
@@ -81,7 +78,7 @@ def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
 
 
 def _welded(mesh: RoomMesh) -> RoomMesh:
-    """Return the mesh with coincident vertices of each instance merged, and without degenerate triangles."""
+    """Merge equal vertices of each instance and remove degenerate triangles."""
     rows = np.empty((len(mesh.vertices), 4), np.int32)
     rows[:, :3] = (mesh.vertices + np.float32(0)).view(np.int32)  # converts -0 to 0
     rows[:, 3] = mesh.instance_ids
@@ -106,16 +103,16 @@ def seen_from(
     reach: tuple[float, float],
     unreadable: Bool,
 ) -> Bool:
-    """Return the mask (V,) of the visible vertices: in view from a pose, not occluded, at a depth within `reach`.
+    """Return the mask (V,) of the vertices that are visible from at least one pose.
 
     Args:
-        vertices: (V, 3) m, world frame.
-        caster: Ray caster of the surfaces.
-        camera: Camera of all poses.
-        poses: (4, 4) T_world_camera of each view.
-        reach: Minimum and maximum depth of a visible vertex, m.
-        unreadable: (F,) mask of the caster's triangles without depth readings. Vertices on or closely behind these
-            triangles count as occluded.
+        vertices: The vertices (V, 3) in the world frame, m.
+        caster: The ray caster of the surfaces.
+        camera: The camera of all poses.
+        poses: The pose T_world_camera (4, 4) of each view.
+        reach: The minimum and maximum depth of a visible vertex, m.
+        unreadable: The mask (F,) of the caster's triangles without depth readings. Vertices on these triangles or
+            closely behind them are not visible.
     """
     seen = np.zeros(len(vertices), np.bool_)
     for T_world_camera in poses:
@@ -132,10 +129,7 @@ def seen_from(
 def _in_view(
     vertices: Float32, skip: Bool, camera: Camera, T_world_camera: Float64, reach: tuple[float, float]
 ) -> Int64:
-    """Return the indices (N,) of the vertices in view, occluded or not, without the vertices in the mask `skip` (V,).
-
-    `vertices` (V, 3) are in m in the world frame. `reach` contains the minimum and maximum depth, m.
-    """
+    """Return the indices (N,) of the vertices in the field of view, without those in the mask `skip` (V,)."""
     index = np.flatnonzero(~skip)
     dx, dy, dz = vertices[index].T - T_world_camera[:3, 3:]
     x, y, z = (R[0] * dx + R[1] * dy + R[2] * dz for R in T_world_camera[:3, :3].T)

@@ -1,7 +1,7 @@
-"""Parallel writing of the scenes in a benchmark folder; existing files are kept.
+"""Parallel writing of benchmark scenes.
 
-A process writes one scene until the scene is complete, because furnishing and lighting a room takes seconds. When all
-scenes have been started, a free process helps to write a scene of another process.
+Each process writes one scene, because creating a room takes seconds. When all scenes have been started, free processes
+help with the remaining scenes.
 """
 
 from __future__ import annotations
@@ -39,9 +39,19 @@ Piece = Callable[[SceneNNScene], int]  # task that writes some files and returns
 
 
 def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: BenchmarkSettings, jobs: int) -> None:
-    """Write the scenes into `root` with `jobs` processes; existing files of these scenes are kept.
+    """Write the scenes of a benchmark in parallel.
 
-    Raises ConfigError if `root` has other content, and DataError if a file or a process fails.
+    Existing files of these scenes are kept.
+
+    Args:
+        root: The output folder.
+        specs: The specification of each scene by name.
+        recording: The settings of the benchmark.
+        jobs: The number of processes.
+
+    Raises:
+        ConfigError: `root` has other content.
+        DataError: A file cannot be written, or a process fails.
     """
     _begin(root, recording)
     scenes = [_Scene(root / name, spec, recording) for name, spec in specs.items()]
@@ -73,10 +83,7 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Benchmar
 
 
 def _begin(root: Path, recording: BenchmarkSettings) -> None:
-    """Write the files common to all scenes.
-
-    Raises ConfigError for a folder with other content, and DataError for a damaged file.
-    """
+    """Write the files that are common to all scenes."""
     made_by = root / MADE_BY
     wanted = {"generation": GENERATION, **asdict(recording)}
     if made_by.exists():
@@ -104,7 +111,7 @@ def _begin(root: Path, recording: BenchmarkSettings) -> None:
 
 
 class _Scene:
-    """Tasks for the missing files of one scene. The trajectory, which marks a complete scene, is the last file."""
+    """The missing files of a scene."""
 
     def __init__(self, folder: Path, spec: SceneSpec, recording: BenchmarkSettings) -> None:
         self.folder, self.spec = folder, spec
@@ -112,7 +119,7 @@ class _Scene:
         self.touched = False
         self.missing = 0  # number of missing frames
         self._left: list[Piece] = []
-        self._complete = trajectory_file(folder).exists()
+        self._complete = trajectory_file(folder).exists()  # the trajectory is written last
         if self._complete:
             return
         files = (frame_files(folder, index) for index in range(recording.frames))
@@ -123,7 +130,7 @@ class _Scene:
 
     @property
     def ready(self) -> int:
-        """Number of tasks that can start now."""
+        """The number of tasks that can be started."""
         waiting_for_walk = not self._left and not self.running and not self._complete
         return len(self._left) + waiting_for_walk
 
@@ -137,9 +144,9 @@ class _Scene:
 
 
 def _choose(scenes: list[_Scene], last: _Scene | None) -> _Scene | None:
-    """Return the next scene for a process, or None if no task can start.
+    """Return the next scene for a process, or None if no task can be started.
 
-    In order of preference, this is its `last` scene, an unstarted scene, or the scene with the most remaining tasks.
+    The order of preference is the last scene, a scene that is not started, and the scene with the most remaining tasks.
     """
     if last is not None and last.ready:
         return last
@@ -159,7 +166,7 @@ def _result(future: Future[int], folder: Path) -> int:
 
 
 def _begin_process() -> None:
-    """Limit the process to one thread, ignore Ctrl-C between tasks, and exit with the parent process."""
+    """Initialize a writer process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     numba.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -178,7 +185,7 @@ _in_memory: list[SceneNNScene] = []  # the latest scene of this process, if any
 
 
 def _write(folder: Path, spec: SceneSpec, recording: BenchmarkSettings, piece: Piece) -> int:
-    """Run a task of a scene in a writer process."""
+    """Run a task in a writer process."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         if not _in_memory or _in_memory[0].folder != folder:

@@ -1,6 +1,6 @@
-"""Scene of the synthetic benchmark as a recording in SceneNN's format.
+"""Scenes of the synthetic benchmark, written in SceneNN's format.
 
-In SceneNN's world frame, y is up. In the room frame, z is up. All output is therefore rotated by 90 degrees about x.
+The room frame has z up, and SceneNN's world frame has y up. The output is therefore rotated.
 """
 
 from __future__ import annotations
@@ -94,17 +94,17 @@ class BenchmarkSettings:
 
     @property
     def stride(self) -> float:
-        """Camera motion per frame, relative to the motion per frame at the recommended speed and FRAME_RATE."""
+        """Camera motion per frame, relative to the recommended speed at FRAME_RATE."""
         return self.camera_speed * FRAME_RATE / self.rate
 
     @property
     def release(self) -> str:
-        """Name of the annotation in tables."""
+        """Name of the annotation release."""
         return f"synthetic {GENERATION}, seed {self.seed}, {self.frames} frames"
 
 
 class SceneNNScene:
-    """A furnished room and its camera path, with methods that write the files of the scene."""
+    """Writer of a scene."""
 
     def __init__(self, folder: Path, spec: SceneSpec, recording: BenchmarkSettings) -> None:
         self.folder, self.recording = folder, recording
@@ -122,13 +122,13 @@ class SceneNNScene:
         self.colors = scene.rng.integers(64, 256, (len(ids), 3))  # RGB by instance id
 
     def write_frames(self, frames: Sequence[int]) -> int:
-        """Write the color and depth images of `frames` (0 = first); return the number of frames."""
+        """Write the images of several frames and return the number of frames."""
         for index in frames:
             self.write_frame(index)
         return len(frames)
 
     def write_frame(self, index: int) -> None:
-        """Write the color and depth images of the frame `index` (0 = first)."""
+        """Write the color and depth images of a frame."""
         T_world_camera = self.path.pose(index)
         picture = self.renderer.render(self.camera, T_world_camera)
         rng = np.random.default_rng([*self._stream, index])
@@ -141,7 +141,7 @@ class SceneNNScene:
         _write_png(color_file, cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
 
     def write_truth(self) -> int:
-        """Write the labeled mesh and its annotation; return 0, the number of written frames."""
+        """Write the labeled mesh and its annotation, and return 0 as the number of frames."""
         frames, name = self.recording.frames, self.folder.name
         every = -(-frames // TRUTH_VIEWS)
         views = (self.path.pose(index) for index in range(0, frames, every))
@@ -153,11 +153,11 @@ class SceneNNScene:
         return 0
 
     def _annotated(self, vertices: Float32, instance_ids: Int32) -> list[Annotated]:
-        """Return the annotated objects in the mesh, sorted by label.
+        """Return the annotation of each object in the mesh, sorted by label.
 
         Args:
-            vertices: (V, 3) m, world frame of SceneNN.
-            instance_ids: (V,) 0 = none.
+            vertices: The vertices (V, 3) in SceneNN's world frame, m.
+            instance_ids: The instance ids (V,), 0 = no instance.
         """
         annotated = []
         for instance, piece in self.room.objects[1:]:
@@ -180,7 +180,7 @@ class SceneNNScene:
         return sorted(annotated, key=lambda one: one.id)
 
     def write_walk(self) -> int:
-        """Write the timestamps, and then the trajectory, which marks the scene as complete; return 0."""
+        """Write the timestamps and the trajectory, and return 0 as the number of frames."""
         frames = range(self.recording.frames)
         with atomic_write(self.folder / "timestamp.txt") as temporary:
             times = [round(1e6 * index / self.recording.rate) for index in frames]
@@ -191,12 +191,12 @@ class SceneNNScene:
 
 
 def frame_files(folder: Path, index: int) -> tuple[Path, Path]:
-    """Return the color and depth files of the frame `index` (0 = first). The numbers in file names start at 1."""
+    """Return the paths of the color and depth images of a frame."""
     return folder / "image" / f"image{index + 1:05d}.png", folder / "depth" / f"depth{index + 1:05d}.png"
 
 
 def trajectory_file(folder: Path) -> Path:
-    """Return the trajectory file of a scene."""
+    """Return the path of the trajectory of a scene."""
     return folder / "trajectory.log"
 
 

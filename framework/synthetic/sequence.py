@@ -1,4 +1,4 @@
-"""Synthetic sequence: a random furnished room, rendered frame by frame in memory, with complete ground truth."""
+"""Synthetic RGB-D sequences, rendered on demand."""
 
 from __future__ import annotations
 
@@ -30,9 +30,10 @@ TRUTH_VIEWS = 60  # maximum number of frames for the ground-truth surface; views
 
 @dataclass
 class Synthetic(RGBDSequence):
-    """RGB-D sequence of a hand-held camera in a random furnished room. `room.surfaces` is the exact geometry.
+    """RGB-D sequence of a hand-held camera in a random furnished room.
 
-    Frames are bit-identical for equal parameters, in any order and from any thread.
+    Frames are bit-identical for equal parameters, in any order and from any thread. `room.surfaces` is the exact
+    geometry.
     """
 
     seed: int = 0  # seed of the scene and the camera path, >= 0; combined with the scene name
@@ -119,18 +120,14 @@ class Synthetic(RGBDSequence):
         )
 
     def exact_view(self, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Return the exact depth (H, W), m along z, and the instance ids (H, W) at T_world_camera (4, 4).
+        """Return the exact depth (H, W), m along z, and the instance ids (H, W) of a view.
 
         Both are 0 for pixels without a surface.
         """
         return self._renderer.depth_and_ids(self.camera, T_world_camera)
 
     def scene_truth(self) -> SceneTruth:
-        """Return the labeled surface points within the range of the sensor.
-
-        The points are fused from the exact depth of about TRUTH_VIEWS of the selected frames, or of all if there are
-        fewer.
-        """
+        """Return labeled surface points, fused from the exact depth of selected frames."""
         every = max(1, -(-len(self._chosen) // TRUTH_VIEWS))
         chosen = sorted({*self._chosen[::every], self._chosen[-1]})
         return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.ground_truth_spacing)

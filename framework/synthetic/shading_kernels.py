@@ -1,4 +1,4 @@
-"""Numba kernels of lights.py and renderer.py."""
+"""Kernels of lights.py and renderer.py."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GRAZING = np.float32(0.05)  # lower limit of the cosine of the angle of incidenc
 
 
 class LitSurfaces(NamedTuple):
-    """Triangles of a room with baked light."""
+    """Triangles of a room with precomputed light."""
 
     texture: Float32  # (V, 3) m, texture coordinates
     irradiance: Float32  # (V, 3) linear RGB
@@ -44,17 +44,17 @@ class Viewpoint(NamedTuple):
 def gather_light(
     triangle: Int32, uv: Float32, triangles: Int32, materials: Int32, reflectance: Float32, irradiance: Float32
 ) -> Float32:
-    """Return the mean light (V, 3), linear RGB, that the points visible from each vertex reflect.
+    """Compute the mean light (V, 3), linear RGB, that each vertex receives from other surfaces.
 
-    For cosine-distributed directions, this is the irradiance of the vertex.
+    For cosine-distributed directions, the mean is the irradiance.
 
     Args:
-        triangle: (V, D) triangle visible from each vertex in D directions, -1 = none.
-        uv: (V, D, 2) barycentric weights of the second and third vertex.
-        triangles: (F, 3) vertex indices.
-        materials: (F,) rows of `reflectance`.
-        reflectance: (M, 3) linear RGB.
-        irradiance: (V, 3) linear RGB.
+        triangle: The triangle (V, D) that is visible from each vertex in D directions, -1 = none.
+        uv: The barycentric weights (V, D, 2) of the second and third vertex.
+        triangles: The vertex indices (F, 3).
+        materials: The row of `reflectance` (F,) of each triangle.
+        reflectance: The reflectance (M, 3), linear RGB.
+        irradiance: The irradiance (V, 3), linear RGB.
     """
     out = np.zeros((len(triangle), 3), np.float32)
     for v in range(len(triangle)):
@@ -78,16 +78,18 @@ def gather_light(
 def shade(
     s: LitSurfaces, view: Viewpoint, triangle: Int32, depth: Float32, uv: Float32, light: Float32, incidence: Float32
 ) -> None:
-    """Write the light and the cosine of the angle of incidence of each pixel; both are 0 without a surface.
+    """Compute the light and the angle of incidence at each pixel.
+
+    Both outputs are 0 for pixels without a surface.
 
     Args:
-        s: Surfaces in view.
-        view: Camera.
-        triangle: (H, W) visible triangle, NO_TRIANGLE = none.
-        depth: (H, W) m along z.
-        uv: (H, W, 2) barycentric weights of the second and third vertex.
-        light: (H, W, 3) output, linear RGB.
-        incidence: (H, W) output, cosine of the angle of incidence.
+        s: The surfaces.
+        view: The camera.
+        triangle: The visible triangle (H, W), NO_TRIANGLE = none.
+        depth: The depth (H, W), m along z.
+        uv: The barycentric weights (H, W, 2) of the second and third vertex.
+        light: The output light (H, W, 3), linear RGB.
+        incidence: The output cosine of the angle of incidence (H, W).
     """
     texture, irradiance, triangles, normals, materials, _, table = s
     fx = np.float32(view.fx)
@@ -106,16 +108,14 @@ def shade(
 
 @njit(cache=True, nogil=True)
 def lose_readings(materials: Int32, table: Float32, triangle: Int32, incidence: Float32, lost: Float32) -> None:
-    """Write the fraction of lost depth readings to `lost`: dark + (1 - dark) * shiny * slant.
-
-    The slant of a surface is 0 at perpendicular incidence and 1 from an angle of incidence of GLANCED_OFF on.
+    """Compute the fraction of depth readings that are lost on dark and shiny materials.
 
     Args:
-        materials: (F,) rows of `table`.
-        table: (M, 14) see paints.material_table.
-        triangle: (H, W) visible triangle, NO_TRIANGLE = none.
-        incidence: (H, W) cosine of the angle of incidence.
-        lost: (H, W) output in [0, 1].
+        materials: The row of `table` (F,) of each triangle.
+        table: The materials (M, 14), see paints.material_table.
+        triangle: The visible triangle (H, W), NO_TRIANGLE = none.
+        incidence: The cosine of the angle of incidence (H, W).
+        lost: The output fraction (H, W).
     """
     one = np.float32(1)
     mirrored_away = one - np.cos(GLANCED_OFF)
@@ -126,13 +126,14 @@ def lose_readings(materials: Int32, table: Float32, triangle: Int32, incidence: 
             if f == NO_TRIANGLE:
                 continue
             dark, shiny = table[materials[f], DARK], table[materials[f], SHINY]
+            # 0 at perpendicular incidence, 1 from the angle GLANCED_OFF on
             slant = min((one - incidence[v, u]) / mirrored_away, one)
             lost[v, u] = dark + (one - dark) * shiny * slant
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _cosine(view, normals, f, u, v):
-    """Return the cosine of the angle between the ray through image point u, v (px) and the normal of triangle f."""
+    """Return the cosine of the angle between a ray and the normal of triangle f."""
     T, x, y = view.T_world_camera, (u - view.cx) / view.fx, (v - view.cy) / view.fy
     along = 0.0
     for axis in range(3):
@@ -145,7 +146,6 @@ def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, 
     """Return the emitted and reflected light, linear RGB, at a point of triangle f.
 
     b and c are the barycentric weights of the second and third vertex. `pixel` is the width of a pixel at the point, m.
-    `cosine` is the cosine of the angle of incidence.
     """
     i, j, k = triangles[f, 0], triangles[f, 1], triangles[f, 2]
     a = np.float32(1) - b - c
@@ -169,12 +169,12 @@ def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, 
 
 @njit(cache=True, nogil=True)
 def find_edges(triangle: Int32, parts: Int32, depth: Float32) -> Bool:
-    """Return the mask (H, W) of the pixels on both sides of a border between two parts or of a depth step.
+    """Return the mask (H, W) of the pixels at the border between two parts or at a depth step.
 
     Args:
-        triangle: (H, W) visible triangle, NO_TRIANGLE = none.
-        parts: (F,) index of each triangle's part.
-        depth: (H, W) m along z.
+        triangle: The visible triangle (H, W), NO_TRIANGLE = none.
+        parts: The part (F,) of each triangle.
+        depth: The depth (H, W), m along z.
     """
     height, width = depth.shape
     edge = np.zeros((height, width), np.bool_)
@@ -205,22 +205,20 @@ def smooth_edges(
     depth: Float32,
     light: Float32,
 ) -> None:
-    """Write the mean light of several samples to the N pixels u, v of `light`; each sample is clipped to WHITE.
-
-    A sample gets the light of the pixel center if it is on the same part and at a similar depth.
+    """Antialias N pixels at edges by averaging S samples.
 
     Args:
-        s: Surfaces in view.
-        view: Camera.
-        u: (N,) columns of the pixels.
-        v: (N,) rows of the pixels.
-        offsets: (S, 2) px, offsets u, v of the samples from the pixel center.
-        triangle: (N, S) visible triangle of each sample, NO_TRIANGLE = none.
-        distance: (N, S) m along z, depth of each sample.
-        uv: (N, S, 2) barycentric weights of the second and third vertex.
-        own: (H, W) visible triangle at the pixel center, NO_TRIANGLE = none.
-        depth: (H, W) m along z, depth at the pixel center.
-        light: (H, W, 3) linear RGB, input and output.
+        s: The surfaces.
+        view: The camera.
+        u: The columns (N,) of the pixels.
+        v: The rows (N,) of the pixels.
+        offsets: The offsets (S, 2) of the samples from the pixel center, px.
+        triangle: The visible triangle (N, S) of each sample, NO_TRIANGLE = none.
+        distance: The depth (N, S) of each sample, m along z.
+        uv: The barycentric weights (N, S, 2) of the second and third vertex.
+        own: The visible triangle (H, W) at the pixel center, NO_TRIANGLE = none.
+        depth: The depth (H, W) at the pixel center, m along z.
+        light: The light (H, W, 3), linear RGB, input and output.
     """
     texture, irradiance, triangles, normals, materials, parts, table = s
     white, fx = np.float32(WHITE), np.float32(view.fx)
@@ -232,6 +230,7 @@ def smooth_edges(
             if f == NO_TRIANGLE:
                 continue
             step = abs(z - depth[y, x])
+            # a sample on the same part and at a similar depth has the light of the pixel center
             if own[y, x] != NO_TRIANGLE and parts[f] == parts[own[y, x]] and step <= EDGE_STEP * depth[y, x]:
                 r, g, b = light[y, x, 0], light[y, x, 1], light[y, x, 2]
             else:
@@ -245,12 +244,12 @@ def smooth_edges(
 
 @njit(cache=True, nogil=True)
 def apply_tone_curve(light: Float32, curve: UInt8, color: UInt8) -> None:
-    """Write the nearest entry of the tone curve `curve` for each value of `light` to `color`.
+    """Convert linear light to sRGB with a lookup table.
 
     Args:
-        light: (N,) linear light; values are clipped to [0, WHITE].
-        curve: (K,) sRGB values at K evenly spaced values of light from 0 to WHITE.
-        color: (N,) output, sRGB from 0 to 255.
+        light: The linear light (N,).
+        curve: The sRGB values (K,) for evenly spaced values of light from 0 to WHITE.
+        color: The output values (N,), sRGB from 0 to 255.
     """
     white, entries = np.float32(WHITE), np.float32((len(curve) - 1) / WHITE)
     for n in range(len(light)):

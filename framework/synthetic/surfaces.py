@@ -1,4 +1,4 @@
-"""The triangles of a furnished room as arrays for ray casting and shading."""
+"""Triangle arrays of a furnished room."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from framework.synthetic.paints import DARK, Material, material_table
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Exact geometry of a room, the ground truth for reconstructions."""
+    """Exact geometry of a room, with materials and instance ids."""
 
     vertices: Float32  # (V, 3) m, world frame
     normals: Float32  # (V, 3) unit vectors, smoothed over each part
@@ -34,7 +34,7 @@ class Surfaces:
 
 
 def assemble(objects: Iterable[tuple[int, Furniture]]) -> Surfaces:
-    """Return the surfaces of all (instance id, object) pairs. The objects are in their final poses."""
+    """Combine objects in their final poses, given as pairs of instance id and object."""
     vertices: list[Float64] = []
     normals: list[Float64] = []
     texture: list[Float64] = []

@@ -1,8 +1,8 @@
-"""Procedural textures, evaluated per pixel.
+"""Procedural textures, evaluated for each pixel.
 
 Procedural textures need no image files, have no seams, and have sufficient gradients for photometric alignment. Solid
 textures (wood, fabric, paint, metal) use all three texture coordinates. Planar textures (planks, tiles, rug, painting)
-use the first two. Detail below the size of a pixel is faded out to prevent flicker between frames.
+use the first two. Detail that is finer than a pixel is faded out, which prevents flicker between frames.
 
 Lengths are in m unless stated otherwise. `footprint` is the width of a pixel on the surface. A *color mix* of 0 is the
 first color of the material, and a color mix of 1 is the second color. A *brightness factor* scales the mixed color.
@@ -27,7 +27,7 @@ STEP_Z, STEP_SEED = np.uint64(0x165667B19E3779F9), np.uint64(0x27D4EB2F165667C5)
 
 @njit(cache=True, nogil=True)
 def _mixed(h: np.uint64) -> float:
-    """Hash all bits of `h` to a number in [0, 1)."""
+    """Hash an integer to a number in [0, 1)."""
     h ^= h >> np.uint64(32)
     h *= np.uint64(0xD6E8FEB86659FD93)
     h ^= h >> np.uint64(29)
@@ -36,14 +36,15 @@ def _mixed(h: np.uint64) -> float:
 
 @njit(cache=True, nogil=True)
 def _lattice(i: int, j: int, k: int, seed: int) -> float:
-    """Return a pseudorandom number in [0, 1) for the lattice point (i, j, k)."""
+    """Return a pseudorandom number in [0, 1) for a lattice point."""
     h = np.uint64(i) * STEP_X ^ np.uint64(j) * STEP_Y ^ np.uint64(k) * STEP_Z ^ np.uint64(seed) * STEP_SEED
     return float(_mixed(h))
 
 
 @njit(cache=True, nogil=True)
 def _noise(x: float, y: float, z: float, seed: int) -> float:
-    """Return smooth value noise in [0, 1] with a lattice spacing of 1 and Perlin's fade curve of 1985."""
+    """Return smooth value noise in [0, 1] with a lattice spacing of 1."""
+    # Perlin's fade curve of 1985
     i, j, k = float(np.floor(x)), float(np.floor(y)), float(np.floor(z))
     fx, fy, fz = x - i, y - j, z - k
     fx, fy, fz = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy), fz * fz * (3 - 2 * fz)
@@ -59,16 +60,15 @@ def _noise(x: float, y: float, z: float, seed: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _visible(wavelength: float, footprint: float) -> float:
-    """Return the visible fraction, in [0, 1], of detail with this wavelength in a pixel."""
+    """Return the visible fraction of detail with a given wavelength."""
     return min(1.0, max(0.0, wavelength / (2.0 * footprint) - 0.75))
 
 
 @njit(cache=True, nogil=True)
 def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, footprint: float, seed: int) -> float:
-    """Return a sum of noise octaves, in [-1, 1], at the point (x, y, z).
+    """Return fractal noise in [-1, 1].
 
-    `wavelength` is the wavelength of the first octave. It is halved for each further octave. Octaves that are too fine
-    for a pixel are omitted.
+    `wavelength` is the wavelength of the first octave. Octaves that are too fine for a pixel are omitted.
     """
     value, amplitude, total = 0.0, 1.0, 0.0
     x, y, z = x / wavelength, y / wavelength, z / wavelength
@@ -85,7 +85,7 @@ def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, foot
 
 @njit(cache=True, nogil=True)
 def _step(low: float, high: float, x: float) -> float:
-    """Return the value at x of a smooth step from 0 at `low` to 1 at `high`."""
+    """Return a smooth step from 0 at `low` to 1 at `high`."""
     t = min(1.0, max(0.0, (x - low) / (high - low)))
     return t * t * (3 - 2 * t)
 
@@ -94,7 +94,7 @@ def _step(low: float, high: float, x: float) -> float:
 def _line(x: float, width: float, footprint: float) -> float:
     """Return the antialiased coverage, in [0, 1], of lines at integer x.
 
-    `x`, `width` and `footprint` are in periods of the pattern.
+    All arguments are in periods of the pattern.
     """
     d = abs(x - float(np.floor(x + 0.5)))
     blur = max(footprint, 0.25 * width)
@@ -103,7 +103,7 @@ def _line(x: float, width: float, footprint: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _within(x: float, low: float, high: float, soft: float) -> float:
-    """Return 1 for x between the limits and 0 elsewhere, with smooth transitions of width `soft`."""
+    """Return 1 between two limits and 0 elsewhere, with smooth transitions of width `soft`."""
     soft = max(soft, 1e-4)
     inside = _step(low - 0.5 * soft, low + 0.5 * soft, x) * (1.0 - _step(high - 0.5 * soft, high + 0.5 * soft, x))
     return float(inside)
@@ -111,10 +111,7 @@ def _within(x: float, low: float, high: float, soft: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: int) -> float:
-    """Return the color mix of wood with its grain along x: growth rings distorted by noise, and fibers.
-
-    `scale` is the spacing of the rings.
-    """
+    """Return the color mix of wood with grain along x and growth rings with spacing `scale`."""
     bend = 2.2 * _noise(0.9 * x, 5 * y, 5 * z, seed)
     rings = 0.5 + 0.5 * float(np.sin(2 * np.pi * (0.7 * (y + 0.6 * z) / scale + bend)))
     mix = 0.3 + 0.45 * rings * _visible(scale, footprint)
@@ -128,9 +125,9 @@ def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: in
 
 @njit(cache=True, nogil=True)
 def _landscape(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """Return the linear RGB color of a painting: a sunset over three ranges of hills in the material's two colors.
+    """Return the linear RGB color of a painted landscape with u and v in [0, 1].
 
-    The painting covers u and v in [0, 1]. `row` is the row of the material table.
+    `row` is the row of the material table.
     """
     sun_u, sun_v = 0.25 + 0.5 * _lattice(1, 2, 3, seed), 0.6 + 0.15 * _lattice(3, 2, 1, seed)
     glow = np.exp(-8 * ((u - sun_u) ** 2 + (v - sun_v) ** 2))
@@ -157,7 +154,7 @@ def _cloth(x: float, y: float, z: float, footprint: float, seed: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _planks(x: float, y: float, width: float, footprint: float, seed: int) -> tuple[float, float]:
-    """Return the color mix and brightness factor of a floor of boards along x, each with its own grain."""
+    """Return the color mix and brightness factor of a plank floor."""
     length, gap = 1.1, 0.004
     board = np.int64(np.floor(y / width))
     shift = _lattice(board, 3, 5, seed)
@@ -170,7 +167,7 @@ def _planks(x: float, y: float, width: float, footprint: float, seed: int) -> tu
 
 @njit(cache=True, nogil=True)
 def _tiles(x: float, y: float, side: float, footprint: float, seed: int) -> tuple[float, float]:
-    """Return the color mix and brightness factor of square tiles; the mix of the grout is 1."""
+    """Return the color mix and brightness factor of square tiles."""
     i, j = np.int64(np.floor(x / side)), np.int64(np.floor(y / side))
     grout = 0.006 / side
     mix = max(_line(x / side, grout, footprint / side), _line(y / side, grout, footprint / side))
@@ -180,7 +177,7 @@ def _tiles(x: float, y: float, side: float, footprint: float, seed: int) -> tupl
 
 @njit(cache=True, nogil=True)
 def _rug(x: float, y: float, scale: float, width: float, height: float, footprint: float) -> float:
-    """Return the color mix of a rug: diamonds within border bands."""
+    """Return the color mix of a rug with diamonds and a border."""
     edge = min(min(x, width - x), min(y, height - y))
     if edge < 0.16:
         return float(0.5 + 0.5 * np.sin(2 * np.pi * edge / 0.08))
@@ -192,9 +189,9 @@ def _rug(x: float, y: float, scale: float, width: float, height: float, footprin
 
 @njit(cache=True, nogil=True)
 def _book(u: float, v: float, soft: float) -> float:
-    """Return the color mix of a book cover: a frame, a title in several lines and an emblem.
+    """Return the color mix of a book cover with u and v in [0, 1].
 
-    The cover has u and v in [0, 1]. `soft` is the width of the transitions, relative to the cover.
+    `soft` is the width of the transitions, relative to the cover.
     """
     frame = _within(u, 0.07, 0.93, soft) * _within(v, 0.05, 0.95, soft)
     inner = _within(u, 0.10, 0.90, soft) * _within(v, 0.07, 0.93, soft)
@@ -205,7 +202,7 @@ def _book(u: float, v: float, soft: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _wallpaper(x: float, y: float, scale: float, footprint: float) -> float:
-    """Return the color mix of wallpaper: stripes with flowers; every second column is shifted."""
+    """Return the color mix of wallpaper with stripes and flowers."""
     u, v = x / scale, y / (1.6 * scale)
     cell = np.floor(u)
     v += 0.5 * (cell % 2)
@@ -219,7 +216,7 @@ def _wallpaper(x: float, y: float, scale: float, footprint: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _sky(u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """Return the linear RGB color of the view through a window, with u and v in [0, 1]: clouds, with trees below."""
+    """Return the linear RGB color of the view through a window, with u and v in [0, 1]."""
     line = 0.30 + 0.22 * _noise(5 * u, 0.5, 0.5, seed) + 0.08 * _noise(23 * u, 0.5, 0.5, seed)
     tree = 1 - _step(line - 0.02, line + 0.02, v)
     leaf = 0.45 + 0.4 * _noise(40 * u, 40 * v, 0.0, seed)
@@ -233,7 +230,7 @@ def _sky(u: float, v: float, seed: int) -> tuple[float, float, float]:
 
 @njit(cache=True, nogil=True)
 def _screen(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """Return the linear RGB color of a television screen, with u and v in [0, 1]: a landscape with a caption."""
+    """Return the linear RGB color of a television screen, with u and v in [0, 1]."""
     r, g, b = _landscape(row, u, v, seed)
     caption = 1.0 if (0.07 < v < 0.16 and 0.06 < u < 0.55) else 0.0
     return r * (1 - caption) + 0.02 * caption, g * (1 - caption) + 0.05 * caption, b * (1 - caption) + 0.35 * caption
@@ -241,7 +238,7 @@ def _screen(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, 
 
 @njit(cache=True, nogil=True)
 def surface_color(row, x, y, z, footprint):
-    """Return the linear RGB color of a material at the texture coordinates x, y, z (m).
+    """Return the linear RGB color of a material at the texture coordinates x, y, z.
 
     `row` (14,) is the row of the material in paints.material_table.
     """

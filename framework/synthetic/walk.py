@@ -1,4 +1,7 @@
-"""Hand-held camera path: an ellipse above free floor; the camera faces the furniture on the opposite side."""
+"""Path of a hand-held camera in a room.
+
+The path is an ellipse above free floor. The camera faces the furniture on the opposite side.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ PHASES = 48  # number of positions on the ellipse for the visibility score
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A smooth closed path, traversed at constant phase speed."""
+    """A smooth closed camera path."""
 
     center: Float64  # (2,) m, x y in the world frame
     radii: Float64  # (2,) m, along x and y
@@ -34,7 +37,10 @@ class CameraPath:
     phase_speed: float = 1.0  # rad/s
 
     def pose(self, frame: float) -> Float64:
-        """Return T_world_camera (4, 4) at the time `frame` / FRAME_RATE; fractional values are between two frames."""
+        """Return the pose T_world_camera (4, 4) at a frame.
+
+        Fractional values are between two frames.
+        """
         return self.pose_at(self.start + self.turn * self.phase_speed * frame / FRAME_RATE)
 
     def pose_at(self, phase: float) -> Float64:
@@ -42,11 +48,8 @@ class CameraPath:
         return look(position[0], float(yaw[0]), float(pitch[0]), float(roll[0]))
 
     def _state(self, phase: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-        """Return the positions (N, 3), m, and the yaw, pitch and roll angles (N,), rad, at the phases (N,), rad.
-
-        The hand motion consists of integer harmonics, so that the path is closed.
-        """
-        a, b, c, d = self.sway
+        """Return the positions (N, 3), m, and the yaw, pitch and roll angles (N,), rad, at phases (N,), rad."""
+        a, b, c, d = self.sway  # the hand motion has integer harmonics, so that the path is closed
         position = np.empty((len(phase), 3))
         position[:, 0] = self.center[0] + self.radii[0] * np.cos(phase)
         position[:, 1] = self.center[1] + self.radii[1] * np.sin(phase)
@@ -60,7 +63,7 @@ class CameraPath:
 
 
 class LabelView(Protocol):
-    """Function that renders a small image (H, W) of instance ids, 0 = none."""
+    """A function that renders a small image (H, W) of instance ids."""
 
     def __call__(self, T_world_camera: Float64) -> Int32: ...
 
@@ -68,17 +71,19 @@ class LabelView(Protocol):
 def plan_path(
     layout: Layout, frames: int, labels: LabelView, wanted: set[int], rng: np.random.Generator, stride: float = 1.0
 ) -> CameraPath:
-    """Return the path with the best visibility of the wanted instances.
-
-    Raises DataError if the free floor is too small.
+    """Return the camera path with the best visibility of the wanted instances.
 
     Args:
-        layout: Layout of the room.
-        frames: Number of frames of the path.
-        labels: Function that renders the instance ids at a pose.
-        wanted: Ids of the instances that should be visible.
-        rng: Random generator.
-        stride: Camera speed, relative to the recommended speed, which is the highest within MAX_SPEED and MAX_TURN.
+        layout: The layout of the room.
+        frames: The number of frames of the path.
+        labels: A function that renders the instance ids at a pose.
+        wanted: The ids of the instances that should be visible.
+        rng: The random number generator.
+        stride: The camera speed, relative to the recommended speed. The recommended speed is the highest within
+            MAX_SPEED and MAX_TURN.
+
+    Raises:
+        DataError: The free floor is too small.
     """
     center, radii = _widest_ellipse(layout)
     turn = 1 if rng.uniform() < 0.5 else -1
@@ -89,10 +94,7 @@ def plan_path(
 
 
 def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
-    """Return the center (2,) and the radii (2,), m, of the largest ellipse above free floor.
-
-    The radii are values of RADII. The distance from the ellipse to furniture and walls is at least DISTANCE.
-    """
+    """Return the center (2,) and the radii (2,), m, of the largest ellipse above free floor."""
     angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
     free, width, depth = layout.free, layout.width, layout.depth
     rows, columns = free.shape
@@ -117,7 +119,7 @@ def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
 
 
 def _allowed_phase_speed(path: CameraPath) -> float:
-    """Return the highest phase speed, rad/s, at which the whole path is within MAX_SPEED and MAX_TURN."""
+    """Return the highest phase speed, rad/s, within MAX_SPEED and MAX_TURN."""
     phase = np.linspace(0, 2 * np.pi, 721)
     step = phase[1]
     position, yaw, pitch, roll = path._state(phase)
@@ -128,10 +130,7 @@ def _allowed_phase_speed(path: CameraPath) -> float:
 
 
 def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[int]) -> float:
-    """Return the start phase, rad, from which most wanted instances are visible along `sweep` rad of the path.
-
-    If several start phases have the same number of instances, the one with the most visible pixels is returned.
-    """
+    """Return the start phase, rad, from which most wanted instances are visible along the path."""
     phases = 2 * np.pi * np.arange(PHASES) / PHASES
     ids = sorted(wanted)
     pixels = np.array(
@@ -146,9 +145,13 @@ def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[i
 
 
 def look(position: Float64, yaw: float, pitch: float, roll: float) -> Float64:
-    """Return T_world_camera (4, 4) of a camera at `position` (3,), m; angles are in rad.
+    """Return the pose T_world_camera (4, 4) of a camera with given position and angles.
 
-    In the world frame, z is up. A camera with a yaw of 0 faces +x.
+    Args:
+        position: The position (3,), m.
+        yaw: The yaw about z, rad. A camera with a yaw of 0 faces +x.
+        pitch: The pitch, rad. A camera with a positive pitch faces up.
+        roll: The roll about the optical axis, rad.
     """
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])

@@ -1,4 +1,4 @@
-"""Table of the 2D metrics of several detectors: the jobs of `instancemap detect -m`."""
+"""Table of the 2D metrics of several detectors, for sweeps of `instancemap detect`."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from framework.files.json_file import read_json, write_json
 from framework.runs.stored_runs import is_number
 from framework.tables.grid import TextTable, decimals, figure, latex_grid, markdown_grid
 
-METRICS = "detection_metrics.json"  # in the folder of each job
-OVERRIDES = "overrides"  # key of the job's overrides in METRICS
+METRICS = "detection_metrics.json"  # file in the folder of each job
+OVERRIDES = "overrides"  # key of the overrides in this file
 
 DetectionMetrics = Mapping[str, float | int | str]
-"""Metrics of one result file by name; NaN = undefined."""
+"""Metrics of one result file by name. Undefined values are NaN."""
 
 COLUMNS = {
     "mask_ap": "mask AP",
@@ -33,7 +33,7 @@ COLUMNS = {
     "correct class": "correct class",
     "false detections per image": "false per image",
 }
-"""Headings by metric."""
+"""Column headings by metric."""
 
 COUNTS = ("frames", "detections", "objects", "classes")
 
@@ -47,18 +47,18 @@ class Job:
     metrics: Mapping[str, Any]  # None = undefined
 
     def called(self, swept: Collection[str]) -> str:
-        """Return the values of the swept keys, or the job's folder if there are none."""
+        """Return the overrides of the swept keys, or the folder of the job if there are none."""
         return " ".join(one for one in self.overrides if one.lstrip("+~").partition("=")[0] in swept) or self.folder
 
     def value(self, key: str) -> float:
-        """Return a metric; NaN = undefined."""
+        """Return a metric, or NaN if it is undefined."""
         return float(found) if is_number(found := self.metrics.get(key)) else math.nan
 
 
 def detection_metrics(
     sequence: str, frames: int, detections: int, precision: DetectionAp, errors: DetectionErrors
 ) -> DetectionMetrics:
-    """Return the metrics of a result file. Without evaluated objects, all but the counts are NaN."""
+    """Return the metrics of a result file. Without evaluated objects, only the counts are defined."""
     return {
         "sequence": sequence,
         "frames": frames,
@@ -81,12 +81,15 @@ def write_metrics(folder: Path, overrides: Sequence[str], metrics: DetectionMetr
 
 
 def write_detection_table(directory: Path, swept: Collection[str], min_pixels: int) -> str:
-    """Write table.md, table.tex and table.csv of a sweep into its folder, and return the Markdown text.
+    """Write table.md, table.tex and table.csv of a sweep into its folder.
 
     Args:
         directory: The folder of the sweep.
-        swept: The keys with several values, which name the rows.
-        min_pixels: Minimum area of an evaluated object, px, for the notes.
+        swept: The keys with several values. Their overrides are the names of the rows.
+        min_pixels: The minimum area of an evaluated object, px, for the notes.
+
+    Returns:
+        The Markdown text.
 
     Raises:
         DataError: No job is complete, or the metrics of a job are invalid.
@@ -151,7 +154,7 @@ def _notes(jobs: Sequence[Job], incomplete: Sequence[str], min_pixels: int) -> I
 
 
 def _comma_separated(jobs: Sequence[Job]) -> str:
-    """Return a CSV table with one line per job and all metrics, with all digits. Undefined values are empty."""
+    """Return a CSV table of all metrics with one line per job. Undefined values are empty."""
     keys = list(dict.fromkeys(key for job in jobs for key in job.metrics))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -26,6 +26,15 @@ def write_tables(directory: Path) -> str:
     table.csv is the data frame of the runs in the table (`load_runs`). Raises DataError if no run is complete, and
     ConfigError for an invalid table.
     """
+    tables = rendered_tables(directory)
+    for name, content in tables.items():
+        with atomic_write(directory / name) as temporary:
+            temporary.write_text(content, "utf-8")
+    return tables["table.md"]
+
+
+def rendered_tables(directory: Path) -> dict[str, str]:
+    """Return the contents of table.md, table.tex and table.csv as in `write_tables`, by file name."""
     comparison = ComparisonTable.below(directory)
     grids = list(_grids(comparison))
     explained = list(notes(comparison))
@@ -34,10 +43,7 @@ def write_tables(directory: Path) -> str:
     latex = "\n".join([*(f"% {note}" for note in explained), *(line for grid in grids for line in latex_grid(grid))])
     runs = sorted(comparison.records, key=lambda record: record.directory)
     separated = data_frame(runs, directory).to_csv(index=False, lineterminator="\n")
-    for name, content in (("md", text), ("tex", latex), ("csv", separated)):
-        with atomic_write(directory / f"table.{name}") as temporary:
-            temporary.write_text(content, "utf-8")
-    return text
+    return {"table.md": text, "table.tex": latex, "table.csv": separated}
 
 
 LAYOUTS: dict[str, tuple[Callable[[ComparisonTable], TextTable], Callable[[ComparisonTable], TextTable]]] = {

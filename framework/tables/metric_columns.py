@@ -1,4 +1,4 @@
-"""Columns of metrics: the heading with its unit, and the direction of better values."""
+"""Column headings of metrics, and the direction in which each metric improves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 
 class Direction(IntEnum):
-    """The direction of better values of a metric."""
+    """The direction in which a metric improves."""
 
     LOWER = -1
     NONE = 0  # neither, such as a number of frames
@@ -36,10 +36,10 @@ HEADS = {
     "map.bytes": "map (bytes)",
     "peak_rss_bytes": "peak memory (bytes)",
 }
-"""Column headings by key. `head` derives those of classes and stages; all other columns have their key."""
+"""Column headings by key. The function `head` also returns headings of classes and stages."""
 
 CLASS_HEADS = {"ap": ", AP", "ap25": ", AP25", "ap50": "", "true_count": ", ground truth"}
-"""End of the headings of a class's metrics, by the second part of the key."""
+"""Ends of the headings of the metrics of one class, by the second part of the key."""
 
 SCENENN_NAMES = {coco: name for name, coco in SCENENN_TO_COCO.items()}
 
@@ -49,11 +49,11 @@ DIRECTIONS = {
     **dict.fromkeys(("trajectory", "stage_ms", "latency_ms", "map.bytes", "peak_rss_bytes"), Direction.LOWER),
     **dict.fromkeys(("frames_lost", "frames_skipped", "frames_dropped"), Direction.LOWER),
 }
-"""Direction by the first parts of a key; the longest match applies. Other metrics have none."""
+"""Directions by prefix of the key. The longest prefix applies. Other metrics have no direction."""
 
 
 def head(key: str) -> str:
-    """Return the heading of a metric's column, with its unit."""
+    """Return the column heading of a metric, with its unit."""
     parts = key.split(".", 2)
     if key in HEADS or len(parts) < 3:
         return HEADS.get(key, key)
@@ -65,7 +65,7 @@ def head(key: str) -> str:
 
 
 def direction(key: str) -> Direction:
-    """Return the direction of better values of a metric."""
+    """Return the direction in which a metric improves."""
     parts = key.split(".")
     prefixes = (".".join(parts[:k]) for k in range(len(parts), 0, -1))
     return next((DIRECTIONS[prefix] for prefix in prefixes if prefix in DIRECTIONS), Direction.NONE)

@@ -1,4 +1,4 @@
-"""Published results with their sources, from published.yaml."""
+"""Published results of other systems, from published.yaml."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from framework.errors import ConfigError
 FILE = Path(__file__).with_suffix(".yaml")
 DATASET = "scenenn"  # dataset of the published results
 SYNTHETIC = "synthetic"  # first word of the annotation release of scenes written by `instancemap synthesize`
-NOT_KNOWN = "not known"  # text in place of numbers that were not looked up
+NOT_KNOWN = "not known"  # text for values that were not looked up
 
-Key = tuple[str, ...]  # ("fps",), ("011",) or ("011", "instances.ap50.bed"), depending on the layout
+Key = tuple[str, ...]  # metric, sequence, or both, e.g. ("011", "instances.ap50.bed"); depends on the layout
 
 
 @dataclass(frozen=True)
@@ -29,15 +29,15 @@ class PublishedRow:
     remark: str  # conditions of the measurement
     poses: str  # source of the poses
     annotation: str  # release of the annotation
-    decimals: int  # number of known decimals of the values, in the unit of metrics.json
+    decimals: int  # number of published decimals, in the unit of metrics.json
     values: Mapping[Key, float | None] | None  # in the unit of metrics.json; None = not looked up
 
     def has_any(self, keys: Iterable[Key]) -> bool:
-        """Return True if the number for at least one of the keys is known."""
+        """Return True if the value of at least one key is known."""
         return any((self.values or {}).get(key) is not None for key in keys)
 
     def lacks_any(self, keys: Iterable[Key]) -> bool:
-        """Return True if the number for at least one of the keys was not looked up."""
+        """Return True if the value of at least one key was not looked up."""
         return self.values is None or any(key in self.values and self.values[key] is None for key in keys)
 
 
@@ -55,7 +55,11 @@ NOTHING_PUBLISHED = Published("rows", (), ())
 
 @cache
 def read_published(section: str) -> Published:
-    """Return the published results in a section of published.yaml. Raises ConfigError for an unknown section."""
+    """Read a section of published.yaml.
+
+    Raises:
+        ConfigError: The section does not exist.
+    """
     sections: dict[str, Any] = yaml.safe_load(FILE.read_text("utf-8"))
     if section not in sections:
         raise ConfigError(f"table.published: expected null or one of {', '.join(sections)}, got {section}")

@@ -1,8 +1,7 @@
 """Statistics of paired differences between two rows of a table.
 
-The independent units, such as scenes, are those of the table. Runs of one unit, such as its seeds, are averaged first,
-because they are not independent. Holm's correction is for the comparisons of one metric; statsmodels provides it, too,
-but is not a dependency.
+The statistics are over independent units, such as scenes. The runs of a unit, such as its seeds, are averaged first,
+because they are not independent. Holm's correction covers the comparisons of one metric.
 """
 
 from __future__ import annotations
@@ -25,16 +24,16 @@ ALPHA = 1 - CONFIDENCE  # significance level of the tests
 POWER = 0.8  # probability of p < ALPHA for `units_needed`
 RESAMPLES = 9999  # number of bootstrap samples
 SEED = 0  # seed of the bootstrap
-MIN_TESTED = 3  # minimum number of units of a test; from two, a deviation is hardly known
-MIN_UNITS = 6  # minimum of a bootstrap interval, and of Wilcoxon's p < 0.05 (2 / 2^6 = 0.03)
-FEW_UNITS = 10  # below: bootstrap intervals contain the true mean in less than about 90% of the cases
+MIN_TESTED = 3  # minimum number of units of a test; the deviation of two units is too uncertain
+MIN_UNITS = 6  # minimum number of units of a bootstrap interval; also needed for p < 0.05 by Wilcoxon (2 / 2^6)
+FEW_UNITS = 10  # with fewer units, bootstrap intervals contain the true mean in less than about 90% of the cases
 MAX_UNITS = 1_000_000  # maximum of `units_needed`
-MAX_EFFECT = 20.0  # from here on, two units suffice; scipy's noncentral t returns NaN for extreme effects
-EQUAL = 1e-9  # maximum relative deviation of equal differences, which differ only by rounding
+MAX_EFFECT = 20.0  # limit of the effect; two units suffice here, and SciPy returns NaN for extreme effects
+EQUAL = 1e-9  # maximum relative deviation of differences that are equal except for rounding
 
 
 class PairedValues(NamedTuple):
-    """The mean values of a row and of its base in one unit, such as a scene."""
+    """The mean values of a row and its base row in one unit, such as a scene."""
 
     value: float
     base: float
@@ -45,7 +44,7 @@ class PairedValues(NamedTuple):
 
 
 Pairs = Mapping[Run, PairedValues]
-"""The values of two rows in one metric, by unit: the values of the table's unit keys."""
+"""Values of two rows in one metric, by unit. A unit is identified by the values of the unit keys."""
 
 Key = tuple[str, str]
 """Row and metric of a comparison."""
@@ -53,14 +52,14 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True)
 class PairedStatistics:
-    """Statistics of the differences between two rows in one metric. NaN = undefined.
+    """Statistics of the differences between two rows in one metric.
 
-    With fewer than MIN_TESTED units or with equal differences, everything but `units` and `mean` is undefined.
+    Undefined values are NaN. For fewer than MIN_TESTED units or equal differences, only `units` and `mean` are defined.
     """
 
     units: int  # number of units with values of both rows
     mean: float  # mean difference over the units, first row minus second row
-    interval: tuple[float, float] = (math.nan, math.nan)  # bootstrap interval of the mean, from MIN_UNITS units on
+    interval: tuple[float, float] = (math.nan, math.nan)  # bootstrap interval of the mean; requires MIN_UNITS units
     t_p: float = math.nan  # two-sided p of the paired t-test
     wilcoxon_p: float = math.nan  # two-sided p of Wilcoxon's signed-rank test
     units_needed: float = math.nan  # number of units for POWER; infinite = more than MAX_UNITS
@@ -107,7 +106,7 @@ class TableStatistics:
 
     @classmethod
     def of(cls, comparisons: Mapping[Key, Pairs], unit_keys: Sequence[str]) -> TableStatistics:
-        """Return the statistics of the comparisons, with Holm's correction over the rows of each metric."""
+        """Return the statistics of all comparisons, with Holm's correction for each metric."""
         results = {key: PairedStatistics.of(pairs) for key, pairs in comparisons.items()}
         for metric in {metric for _, metric in results}:
             family = [key for key, result in results.items() if key[1] == metric and result.tested]
@@ -119,20 +118,20 @@ class TableStatistics:
 
     @cached_property
     def tested(self) -> dict[Key, PairedStatistics]:
-        """Comparisons with tests."""
+        """Comparisons with defined tests."""
         return {key: result for key, result in self.results.items() if result.tested}
 
     @property
     def comparisons(self) -> int:
-        """The largest number of tested rows of a metric."""
+        """Largest number of tested rows of a metric."""
         metrics = [metric for _, metric in self.tested]
         return max(map(metrics.count, metrics), default=0)
 
     def grid(self, title: str, rows: Mapping[str, str], heads: Mapping[str, str]) -> TextTable:
-        """Return a table with a line per tested comparison, grouped by metric.
+        """Return a table with one line per tested comparison, grouped by metric.
 
         Args:
-            title: Heading of the rows: "minus BASE".
+            title: Heading of the row names, e.g. "minus BASE".
             rows: Display names of the rows, in order.
             heads: Headings of the metrics, in order.
         """
@@ -148,7 +147,7 @@ class TableStatistics:
         return TextTable(["metric", title, *columns], body, 2, groups=frozenset(groups - {0, len(body)}))
 
     def notes(self) -> Iterator[str]:
-        """Yield the notes below the table: definitions, assumptions and limits."""
+        """Yield the notes below the table."""
         units = f"values of {', '.join(self.unit_keys)}"
         if not self.tested:
             if self.results:
@@ -172,7 +171,7 @@ class TableStatistics:
         yield from self._limits(units)
 
     def _limits(self, units: str) -> Iterator[str]:
-        """Yield the conclusions that the number of units does not permit."""
+        """Yield notes on the limitations of few units."""
         fewest = min(result.units for result in self.tested.values())
         necessary = math.ceil(math.log2(2 * self.comparisons / ALPHA))
         if fewest < necessary:
@@ -195,13 +194,16 @@ class TableStatistics:
 
 
 def bootstrap_interval(differences: Float64) -> tuple[float, float]:
-    """Return the BCa bootstrap interval (Efron 1987) of the mean of at least MIN_UNITS differences, otherwise NaN."""
+    """Return the BCa bootstrap interval (Efron 1987) of the mean difference.
+
+    The limits are NaN for fewer than MIN_UNITS differences.
+    """
     if len(differences) < MIN_UNITS:
         return math.nan, math.nan
     from scipy.stats import bootstrap
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a degenerate sample has the interval NaN
+        warnings.simplefilter("ignore")  # the interval of a degenerate sample is NaN
         interval = bootstrap(
             (differences,), np.mean, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, method="BCa", rng=SEED
         ).confidence_interval
@@ -209,7 +211,8 @@ def bootstrap_interval(differences: Float64) -> tuple[float, float]:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Return p-values with the correction of Holm (1979), which bounds the probability of any false rejection."""
+    """Return the p-values with Holm's correction for multiple comparisons (Holm 1979)."""
+    # statsmodels also provides it, but is not a dependency
     order = np.argsort(p_values)
     factors = np.arange(len(order), 0, -1)
     corrected = np.empty(len(order))
@@ -218,13 +221,15 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def units_needed(effect: float) -> float:
-    """Return the least number of units for which a two-sided paired t-test at ALPHA has POWER.
+    """Return the number of units that a paired t-test needs for the power POWER.
+
+    The test is two-sided with the significance level ALPHA.
 
     Args:
-        effect: The true mean of the differences, divided by their standard deviation (Cohen's d_z).
+        effect: The mean of the differences, divided by their standard deviation (Cohen's d_z).
 
     Returns:
-        The number of units, at least 2; infinite above MAX_UNITS.
+        The least number of units, at least 2, or infinity above MAX_UNITS.
     """
     from scipy.stats import nct, t
 

@@ -117,7 +117,7 @@ class TableChoice:
 
     @classmethod
     def of_stored_sweep(cls, node: Any) -> TableChoice:
-        """Return the choice of a stored sweep, which may have keys of an older version."""
+        """Return the table settings of a stored sweep. Keys of earlier versions are accepted."""
         if isinstance(node, Mapping):
             node = {(new_name(f"table.{key}") or f"table.{key}").removeprefix("table."): node[key] for key in node}
         return cls.of_sweep(node)

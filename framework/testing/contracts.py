@@ -1,4 +1,7 @@
-"""Contract tests of plugins and their options, by stage. viewer.py contains the tests of viewers."""
+"""Contract tests of plugins and their options, by stage.
+
+The tests of viewers are in viewer.py.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,7 @@ ODOMETRY_START = exp_se3(np.array([3.0, -2.0, 1.0, 0.3, -1.2, 0.5]))  # pose of 
 
 
 class OptionContract:
-    """Tests of a config option, which build the plugin as in a run.
+    """Tests of a config option. The plugin is built as in a run.
 
     Use this class as the first base class of a test class, followed by the contract of the stage.
     """
@@ -118,7 +121,7 @@ class DetectorContract:
         assert same(frame, frame_at(0)), "the frame was changed"
 
     def test_detector_uses_ground_truth_only_if_required(self) -> None:
-        """A detector that depends on ground truth is unusable without it, so that it is not mistaken for a real one."""
+        """A detector that depends on ground truth must raise an error without ground truth."""
         detector = self.plugin()
         frame = frame_at(0)
         if not same(detector.detect(frame), detector.detect(misleading(frame))):
@@ -157,7 +160,7 @@ class DetectorContract:
 
 
 def assert_valid(found: Detections, detector: Detector, frame: Frame) -> None:
-    """Raise AssertionError unless the detections of a frame fulfill the detector contract."""
+    """Assert that the detections of a frame are valid."""
     assert found.classes == detector.classes
     assert found.masks.shape == (len(found), *frame.camera.shape)
     assert found.class_probabilities.shape == (len(found), len(detector.classes))
@@ -176,7 +179,7 @@ def assert_valid(found: Detections, detector: Detector, frame: Frame) -> None:
 
 
 class TrackerContract:
-    """Tests of a tracker with an immutable map, so that changes of the map raise an error."""
+    """Tests of a tracker with an immutable map. Changes of the map raise an error."""
 
     stage = "tracker"
 
@@ -318,7 +321,7 @@ class RefinerContract:
 
 
 def readings(frame: Frame) -> Float64:
-    """Return the point (H, W, 3), m, world frame, of each pixel of a frame; NaN where depth is missing."""
+    """Return the world point (H, W, 3) of each pixel of a frame, m. Pixels without depth are NaN."""
     whole = replace(spheres_in(frame), masks=np.ones((2, *CAMERA.shape), np.bool_))
     lifted = lift(whole, frame, Pose(pose_at(frame.index)))
     points = np.full((*CAMERA.shape, 3), np.nan)
@@ -464,7 +467,7 @@ class FuserContract:
 
 
 def fused(fuser: MapFuser, frames: int = 5) -> MapFuser:
-    """Fuse the first `frames` frames of the corner room with exact clusters and poses, and return the fuser."""
+    """Fuse the first frames of the corner room with exact clusters and poses, and return the fuser."""
     for k in range(frames):
         frame = frame_at(k)
         fuser.fuse(frame, Pose(pose_at(k)), exact_clusters(frame))
@@ -483,7 +486,7 @@ def same(a: Any, b: Any) -> bool:
 
 
 def assert_data_error(call: Callable[[], object], words: str) -> None:
-    """Raise AssertionError unless `call` raises a one-line DataError that contains `words`."""
+    """Assert that `call` raises a one-line DataError that contains `words`."""
     try:
         call()
     except DataError as error:

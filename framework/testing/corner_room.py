@@ -1,7 +1,7 @@
-"""A synthetic scene with exact ground truth, for the contract tests.
+"""A synthetic scene with exact ground truth, for contract tests.
 
-The scene is a textured corner of a room (two walls and a floor) with a chair and a couch, both spheres. The world frame
-is the frame of the first camera: x right, y down, z forward.
+The scene is a textured corner of a room, with two walls and a floor. It contains a chair and a couch, which are both
+spheres. The world frame is the frame of the first camera: x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -43,9 +43,11 @@ SPHERES = (((-0.5, 0.7, 2.2), 0.35), ((0.5, 0.6, 2.5), 0.45))  # centers and rad
 
 
 def look(camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float64, UInt8, Int32]:
-    """Return exact depth (H, W), m, world-frame normals (H, W, 3), color (H, W, 3) and instance ids (H, W).
+    """Render the room from a pose.
 
-    Depth is 0 and color is black where no surface is visible; instance 0 = no instance.
+    Returns:
+        Depth (H, W), m, world-frame normals (H, W, 3), color (H, W, 3) and instance ids (H, W). Without a visible
+        surface, depth and color are 0. Instance 0 = no instance.
     """
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
@@ -74,12 +76,20 @@ def look(camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float64, UIn
 
 
 def pose_at(k: int) -> Float64:
-    """Return T_world_camera (4, 4) of frame k, about 1 cm and 0.3 degrees from the pose of the previous frame."""
+    """Return the camera pose (4, 4) of frame k.
+
+    The camera moves about 1 cm and 0.3 degrees per frame.
+    """
     return exp_se3(np.array([0.010, -0.003, 0.006, 0.002, -0.005, 0.001]) * k)
 
 
 def frame_at(k: int, truth: bool = True) -> Frame:
-    """Return frame k of a moving camera; `truth`: with the ground-truth pose and instances."""
+    """Return frame k of a moving camera.
+
+    Args:
+        k: Frame number.
+        truth: Include the ground-truth pose and instances.
+    """
     depth, _, color, ids = look(CAMERA, pose_at(k))
     if not truth:
         return Frame(k, k / RATE, color, depth, CAMERA)
@@ -87,10 +97,12 @@ def frame_at(k: int, truth: bool = True) -> Frame:
 
 
 def misleading(frame: Frame) -> Frame:
-    """Return the frame with a wrong ground-truth pose, 10 cm and 6 degrees off, and exchanged instances.
+    """Return a frame with a wrong ground-truth pose, 10 cm and 6 degrees off, and exchanged instances.
 
-    A plugin that must not depend on the ground truth has the same result for both frames. Raises DataError for a frame
-    without ground truth.
+    A plugin that does not depend on the ground truth has the same result for both frames.
+
+    Raises:
+        DataError: The frame has no ground truth.
     """
     if frame.T_world_camera is None or frame.truth is None:
         raise DataError(f"frame {frame.index}: expected ground truth, got none; pass frame_at(k, truth=True)")
@@ -101,7 +113,11 @@ def misleading(frame: Frame) -> Frame:
 
 
 def spheres_in(frame: Frame) -> Detections:
-    """Return the ground-truth masks of both spheres. Raises DataError for a frame without ground-truth instances."""
+    """Return the ground-truth masks of both spheres as detections.
+
+    Raises:
+        DataError: The frame has no ground-truth instances.
+    """
     if frame.truth is None:
         raise DataError(f"frame {frame.index}: expected ground-truth instances, got none; choose another detector")
     masks = frame.truth.instance_ids == np.array([1, 2], np.int32)[:, None, None]
@@ -110,12 +126,12 @@ def spheres_in(frame: Frame) -> Detections:
 
 
 def exact_clusters(frame: Frame) -> PointClusters:
-    """Return the clusters of both spheres, lifted with ground-truth masks and pose."""
+    """Return the point clusters of both spheres, lifted with exact masks and the exact pose."""
     return lift(spheres_in(frame), frame, Pose(pose_at(frame.index)))
 
 
 def bleeding_clusters(frame: Frame) -> PointClusters:
-    """Return the clusters of both spheres, lifted with masks that extend 3 px onto the wall and with the exact pose."""
+    """Return the point clusters of both spheres, lifted with masks that extend 3 px onto the wall."""
     exact = spheres_in(frame)
     masks = exact.masks | np.roll(exact.masks, 3, axis=2)
     return lift(replace(exact, masks=masks), frame, Pose(pose_at(frame.index)))
@@ -123,7 +139,7 @@ def bleeding_clusters(frame: Frame) -> PointClusters:
 
 @dataclass(frozen=True)
 class RoomMap(SceneMap):
-    """Read-only map of the room with exact views, and without a mesh and instances."""
+    """Read-only map of the room with exact views, but without a mesh and instances."""
 
     classes: tuple[str, ...] = CLASSES
 

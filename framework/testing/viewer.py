@@ -63,7 +63,7 @@ class WatchedMap(RoomMap):
 
     @contextmanager
     def call(self) -> Iterator[None]:
-        """Allow reads of the map in the body of the with statement."""
+        """Allow reads of the map in the `with` body."""
         self.within_a_call.set()
         yield
         self.within_a_call.clear()
@@ -137,7 +137,7 @@ def frame_with_found(k: int) -> tuple[Frame, Detections]:
 
 
 def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detections]], directory: Path) -> None:
-    """Show the frames, with their detections, as a run does. Frame LOST is lost, and frame SKIPPED is skipped."""
+    """Show frames and their detections, as in a run. Frame LOST is lost, and frame SKIPPED is skipped."""
     viewer.begin_run(directory, CONFIG)
     with scene.call():
         viewer.begin(scene, "a room", directory)
@@ -165,5 +165,5 @@ def shown_with(k: int) -> tuple[Pose, dict[str, float]]:
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """Return the messages of all log records of at least WARNING level, including those from threads of viewers."""
+    """Return the messages of all log records with a level of at least WARNING."""
     return [record.message for record in caplog.records if record.levelno >= logging.WARNING]

@@ -1,1 +1,1 @@
-"""Frame-to-model camera tracking: image pyramids and the alignment of a frame to a view of the map."""
+"""Camera tracking: image pyramids, alignment of frames to the map, and relocalization."""

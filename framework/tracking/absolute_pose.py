@@ -1,4 +1,7 @@
-"""Camera pose from 2D-3D matches: P3P in LO-RANSAC with refinement, by pycolmap."""
+"""Camera pose from 2D-3D matches, estimated by pycolmap.
+
+The method is P3P in LO-RANSAC with refinement.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,9 @@ from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64
 from framework.geometry import inverse, nearest_rotation, transform
 
-COLMAP_PIXEL_CENTER = 0.5  # coordinate of the first pixel's center in COLMAP, px; it is 0 in this project
-REFERENCE_SIDE = 640  # longer image side up to which max_error applies, px; max_error is proportional to larger sides
-CONFIDENCE = 0.9999  # RANSAC's probability of a sample without outliers
+COLMAP_PIXEL_CENTER = 0.5  # coordinate of the center of the first pixel in COLMAP, px; 0 in this project
+REFERENCE_SIDE = 640  # longer image side for max_error, px; for larger images, max_error increases proportionally
+CONFIDENCE = 0.9999  # probability that RANSAC draws a sample without outliers
 MAX_DEPTH_ERROR = 0.05  # maximum depth error of an inlier, fraction of its depth
 
 
@@ -26,7 +29,7 @@ class AbsolutePose:
 
 @dataclass
 class AbsolutePoseEstimator:
-    """Deterministic estimator of an `AbsolutePose` from 2D-3D matches."""
+    """Deterministic estimator of the camera pose from 2D-3D matches."""
 
     max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0, for images of at most 640 px
     min_inliers: int = 15  # minimum number of inliers, >= 4; wrong poses have 4 to 8
@@ -48,11 +51,15 @@ class AbsolutePoseEstimator:
     def estimate(
         self, camera: Camera, pixels: Float32, points_world: Float32, depth: Float32 | None = None
     ) -> AbsolutePose | None:
-        """Return the pose of `camera` from M matches of `points_world` (M, 3), m, with `pixels` (M, 2).
+        """Return the camera pose, or None if there are too few inliers.
 
-        `pixels` are u, v in px, with pixel centers at integers. `depth` (M,), m, contains the readings at these pixels,
-        0 = no reading. Returns None if there are too few inliers. An inlier has finite coordinates, is in front of the
-        camera, reprojects within `max_error` and agrees with its depth reading.
+        An inlier reprojects within `max_error` and agrees with its depth reading.
+
+        Args:
+            camera: The camera.
+            pixels: The pixels (M, 2), u and v, with pixel centers at integers.
+            points_world: The matching points (M, 3), m.
+            depth: The depth reading (M,) at each pixel, m, 0 = none.
         """
         import pycolmap
 
@@ -96,10 +103,7 @@ class AbsolutePoseEstimator:
         T_camera_world: Float64,
         max_error: float,
     ) -> Bool:
-        """Return an array (M,), True for matches that reproject within `max_error`, px, and agree with their depth.
-
-        Non-finite matches are False.
-        """
+        """Return a Boolean array (M,), True for matches with a small reprojection error that agree with their depth."""
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             x, y, z = transform(T_camera_world, points_world.astype(np.float64)).T
             u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy

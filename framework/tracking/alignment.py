@@ -1,25 +1,26 @@
-"""Alignment of a frame to a view of the map: point-to-plane and photometric terms, as in ElasticFusion (Whelan 2015).
+"""Alignment of a frame to a view of the map.
+
+The energy has a point-to-plane and a photometric term, as in ElasticFusion (Whelan et al., 2015):
 
     E(xi) = sum_i w_i (n_i . (T p_i - q_i))^2 + lambda sum_i v_i (I(pi(T p_i)) - I_frame,i)^2
 
-T = T_view_camera moves the frame's points p_i into the view. p_i is compared with the model point q_i, its normal n_i
-and the model intensity at the pixel pi(T p_i) of the view, where pi is the projection. w_i and v_i are Tukey's
-biweights, lambda is `color_weight`, and I and I_frame are intensities in [0, 1]. Residuals are divided by their
-expected noise, so that both terms are in standard deviations. Beyond `FAR` the standard deviation of a depth is its
-noise times depth / FAR. Errors of structured-light cameras at this range cover whole image regions and do not average
-out. `RANGE` is the maximum depth of these cameras. Beyond it, standard deviations and gates are proportional to depth,
-so that the balance of the two terms does not depend on depth. A Gauss-Newton step is a twist xi in the view's frame,
-which changes T to exp(xi) T.
+T = T_view_camera moves the points p_i of the frame into the view. The pixel of a point in the view is pi(T p_i), where
+pi is the projection. There, the model has the point q_i, the normal n_i and the intensity I in [0, 1]. A Gauss-Newton
+step is a twist xi in the camera frame of the view, which changes T to exp(xi) T.
 
-`LinearWeights` replaces Tukey's weights by the weights in VoxelHashing's published code, for residuals in m and in
-[0, 1]. With the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:
+The weights w_i and v_i are Tukey's biweights, and lambda is `color_weight`. Residuals are divided by their expected
+noise. Beyond the depth FAR, depth errors are correlated over whole image regions and do not average out, so their
+standard deviation is increased. Beyond RANGE, the maximum depth of structured-light cameras, standard deviations and
+gates are proportional to depth.
+
+`LinearWeights` replaces Tukey's weights by those in the published code of VoxelHashing, for residuals in m and in [0,
+1]. They depend on the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:
 
     w_i = max(0, ((1 - d / max_distance) + (1 - z / max_depth)) / 2)
     v_i = max(0, 1 - |dI| / max_intensity_difference)
 
-The kernels process points in batches of a fixed size. Branch-free loops over fields of one array are vectorized by the
-compiler. Image values are fetched in separate loops. Ignored points have weight 0. Sums are kept in lanes, so that
-vector code needs no reordered additions (fast math) and every compilation rounds identically.
+The kernels process points in batches of a fixed size, in loops without branches that the compiler vectorizes. Each sum
+has several lanes, so that every compilation rounds identically.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from framework.tracking.pyramid import PyramidLevel, intrinsics
 
 
 def _matrix_sums() -> npt.NDArray[np.int64]:
-    """Return the indices (6, 6) of the elements of the symmetric matrix A in the array of sums."""
+    """Return the index (6, 6) of each matrix element in the array of sums."""
     indices = np.empty((6, 6), np.int64)
     for row in range(6):
         columns = (row + np.arange(4)) % 6
@@ -62,7 +63,7 @@ class ModelView(NamedTuple):
     """A view of the map, to which frames are aligned."""
 
     depth: Float32  # (H, W) m, 0 = nothing mapped
-    normals: Float32  # (3, H, W) unit normals in the view's camera frame; 0 = nothing mapped
+    normals: Float32  # (3, H, W) unit normals in the camera frame of the view; 0 = nothing mapped
     fx: np.float32  # px, as cx, cy and fy
     fy: np.float32
     cx: np.float32
@@ -70,7 +71,10 @@ class ModelView(NamedTuple):
 
 
 class FrameView(NamedTuple):
-    """One pyramid level of the frame. The tuple is flat, because parallel kernels do not accept nested tuples."""
+    """One pyramid level of a frame.
+
+    The tuple is flat because parallel kernels do not accept nested tuples.
+    """
 
     depth: Float32  # (H, W) m, 0 = no reading
     intensity: Float32  # (H, W) in [0, 1]
@@ -82,30 +86,31 @@ class FrameView(NamedTuple):
 
 
 def model_view(view: SurfaceView) -> ModelView:
-    """Return the `ModelView` of a view of the map, with normals rotated to the view's camera frame."""
+    """Return the model view for a rendered view of the map."""
     normals = np.empty((3, *view.depth.shape), np.float32)
     turn_normals(view.normals_world, np.ascontiguousarray(view.T_world_camera[:3, :3].T, np.float32), normals)
     return ModelView(view.depth, normals, *intrinsics(view.camera))
 
 
 def smoothed(model: ModelView, level: int) -> ModelView:
-    """Return the model for pyramid level `level`, with normals averaged over squares of side 2^(level + 1) - 1 px.
+    """Return the model with smoothed normals for a pyramid level.
 
-    The resolution stays the same. In a new map, normals are noisy. Noisy normals penalize motion along the surface.
+    In a new map, normals are noisy, and noisy normals penalize motion along the surface.
     """
     if level == 0:
         return model
+    # mean over squares of side 2^(level + 1) - 1 px
     row_sums, normals = np.empty_like(model.normals), np.empty_like(model.normals)
     smooth_normals(model.normals, 2**level - 1, row_sums, normals)
     return model._replace(normals=normals)
 
 
 class Weights(NamedTuple):
-    """Weights of residuals and gates of correspondences."""
+    """Weights of residuals and limits for matching points."""
 
     max_distance: np.float32  # maximum distance of a point from its model point, m; proportional to depth beyond RANGE
     close_distance: np.float32  # maximum depth difference for agreement with the model, m; at least 3 sigma
-    min_normal_dot: np.float32  # minimum cosine between the frame's and the model's normal
+    min_normal_dot: np.float32  # minimum cosine between the normals of frame and model
     geometric_scale: np.float32  # geometric residual with Tukey's weight 0, in standard deviations
     photometric_scale: np.float32  # photometric residual with Tukey's weight 0, in standard deviations
     intensity_noise: np.float32  # standard deviation of an intensity difference; intensities are in [0, 1]
@@ -114,7 +119,7 @@ class Weights(NamedTuple):
 
 
 class LinearWeights(NamedTuple):
-    """Limits of VoxelHashing's weights, which replace Tukey's weights."""
+    """Limits of the linear weights, which replace Tukey's weights."""
 
     max_depth: np.float32  # maximum depth z_max, m
     # intensity difference at which the weight reaches 0; intensities are in [0, 1]
@@ -122,7 +127,10 @@ class LinearWeights(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """The normal equations A xi = -b for the twist xi (m, rad) of a Gauss-Newton step, and counts of points."""
+    """The normal equations A xi = -b of a Gauss-Newton step, and counts of points.
+
+    The twist xi is in m and rad.
+    """
 
     A: Float64  # (6, 6) J^T W J of the weighted residuals
     b: Float64  # (6,) J^T W r
@@ -141,11 +149,17 @@ def linearize(
     level: PyramidLevel, model: ModelView, model_intensity: Float32, T_view_camera: Float64, weights: Weights,
     brightness: float, linear: LinearWeights | None = None,
 ) -> NormalEquations:  # fmt: skip
-    """Return the normal equations of E at T_view_camera for one pyramid level of the frame.
+    """Return the normal equations for one pyramid level of a frame.
 
-    `model_intensity` (h, w) in [0, 1] is the view's intensity at the resolution of this level, negative where nothing
-    is mapped. `brightness` is the mean of frame minus model intensity, which is compensated. `linear`: the limits of
-    linear weights; None = Tukey's weights.
+    Args:
+        level: The pyramid level of the frame.
+        model: The view of the map.
+        model_intensity: The intensity (h, w) of the view at the resolution of the level, in [0, 1]; negative = not
+            mapped.
+        T_view_camera: The current pose (4, 4) of the frame in the view.
+        weights: The weights and limits.
+        brightness: The mean difference of frame and model intensity, which is compensated.
+        linear: The limits of the linear weights, or None for Tukey's weights.
     """
     sums = np.empty((CHUNKS, TERMS))
     scale = 1 << round(math.log2(model.depth.shape[1] / model_intensity.shape[1]))  # halving drops odd columns

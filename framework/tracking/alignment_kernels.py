@@ -17,14 +17,14 @@ COLOR = ENERGY + 1  # index of the first sum of the photometric term, after thos
 BRIGHTNESS = 2 * COLOR  # index of the sum of frame minus model intensity
 SUMS = BRIGHTNESS + 1  # number of sums over points, each of LANES lanes
 TERMS = SUMS + 6  # number of values of a chunk: its sums, then its six counts
-# offsets of a batch's point fields: in the frame, in the view, and in the model ...
+# offsets of the point fields of a batch: in the frame, in the view, and in the model ...
 DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00, I10, I01, I11 = (
     field * BATCH for field in range(21)
 )
 POINT_FIELDS = 21
-# ... and of its residual terms
+# ... and offsets of its residual terms
 J0, J1, J2, J3, J4, J5, W, ERROR, DARKER, ADDED = (field * BATCH for field in range(10))
-TERM_SIZE = ADDED + COLOR * LANES  # after the fields, the batch's sums of one term by lane
+TERM_SIZE = ADDED + COLOR * LANES  # the fields are followed by the sums of one term over the batch, by lane
 FAR = 2.0  # depth above which depth errors are correlated, m
 RANGE = 5.0  # largest depth of structured-light cameras, m; errors and gates are proportional to depth beyond it
 NEAREST = 0.05  # minimum depth of projected points in the view, m
@@ -33,9 +33,15 @@ NEAREST = 0.05  # minimum depth of projected points in the view, m
 # Not cv2.blur: other threads that use OpenCV change the split of its running sums, and thus the rounding.
 @njit(cache=True, nogil=True, parallel=True)
 def smooth_normals(normals, reach, row_sums, smooth):
-    """Set `smooth` (3, H, W) to the normalized means of `normals` (3, H, W) over squares of side 2 `reach` + 1 px.
+    """Average normals over squares and normalize them.
 
-    The result is 0 where all normals of a square are 0. `row_sums` (3, H, W) is a buffer.
+    The result is 0 if a square has no normals.
+
+    Args:
+        normals: The normals (3, H, W).
+        reach: The radius of a square: its side is 2 * reach + 1 px.
+        row_sums: A buffer (3, H, W).
+        smooth: The output (3, H, W).
     """
     _, height, width = normals.shape
     for v in prange(height):
@@ -59,7 +65,7 @@ def smooth_normals(normals, reach, row_sums, smooth):
 
 @njit(cache=True, nogil=True, parallel=True)
 def turn_normals(normals_world, R, normals):
-    """Set `normals` (3, H, W) to `normals_world` (H, W, 3) rotated by `R` (3, 3)."""
+    """Rotate normals (H, W, 3) by `R` (3, 3), and write them to `normals` (3, H, W)."""
     for v in prange(normals.shape[1]):
         for u in range(normals.shape[2]):
             x, y, z = normals_world[v, u, 0], normals_world[v, u, 1], normals_world[v, u, 2]
@@ -69,7 +75,7 @@ def turn_normals(normals_world, R, normals):
 
 @device
 def _tukey(r, scale):
-    """Return Tukey's biweight of the residual `r`, which is 0 beyond `scale`; both in standard deviations."""
+    """Return Tukey's biweight of a residual, which is 0 beyond `scale`."""
     s = r / scale
     s = max(np.float32(1.0) - s * s, np.float32(0.0))
     return s * s
@@ -77,9 +83,9 @@ def _tukey(r, scale):
 
 @device
 def _load(frame, v, u0, points):
-    """Copy depth, intensity and normals of BATCH pixels of row `v`, starting at column `u0`, to `points`.
+    """Copy a batch of pixels of row v, starting at column u0, to `points`.
 
-    Past the end of the row, depth is 0.
+    Past the end of the row, the depth is 0.
     """
     depth, intensity, normals = frame.depth, frame.intensity, frame.normals
     for n in range(BATCH):
@@ -93,10 +99,10 @@ def _load(frame, v, u0, points):
 
 @device
 def _project(frame, v, u0, model, shape, R, t, points, pixel):
-    """Project the points of a batch into the view, whose image has the `shape` (height, width).
+    """Project the points of a batch into the view.
 
-    Set the points PX, PY, PZ, m, and their image positions U, V, px from the image corner. Set `pixel` (BATCH,) to
-    their flat pixel indices, -1 = outside. `R` and `t`: T_view_camera.
+    Sets the position of each point, m, its image position, px from the image corner, and its flat pixel index, -1 =
+    outside.
     """
     fx, fy, cx, cy = frame.fx, frame.fy, frame.cx, frame.cy
     one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
@@ -123,10 +129,7 @@ def _project(frame, v, u0, model, shape, R, t, points, pixel):
 
 @device
 def _gather_model(depth, normals, size, pixel, points):
-    """Set QZ and MX, MY, MZ to the model's depth, m, and normal at the pixel of each point; depth 0 = no surface.
-
-    `size`: number of pixels of the view.
-    """
+    """Read the depth and normal of the model at the pixel of each point, depth 0 = no surface."""
     for n in range(BATCH):
         i = pixel[n]
         if i >= 0:
@@ -140,13 +143,13 @@ def _gather_model(depth, normals, size, pixel, points):
 
 @device
 def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
-    """Set the term of point `n` in `J`: weight, error, and derivative with respect to a twist of the view's frame.
+    """Write the weight, the error and the derivative of the error for one point.
 
-    (gx, gy, gz) is the derivative of the error with respect to the point (px, py, pz). Values of points with weight 0
-    may be NaN.
+    The derivative is with respect to a left twist (translation, rotation) of T_view_camera. (gx, gy, gz) is the
+    derivative with respect to the point (px, py, pz).
     """
     zero = np.float32(0.0)
-    weighted = weight > zero
+    weighted = weight > zero  # values of points with weight 0 may be NaN
     J[W + n] = weight
     J[ERROR + n] = error if weighted else zero
     J[J0 + n] = gx if weighted else zero
@@ -159,10 +162,10 @@ def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
 
 @device
 def _add_geometry(model, R, weights, linear, noise_model, points, J):
-    """Set the point-to-plane terms of a batch in `J`; return the counts (visible, matched, close, behind).
+    """Compute the point-to-plane terms of a batch, and return the counts (visible, matched, close, behind).
 
-    The counts are those of `NormalEquations`. points[NEAR] is set to 1 if a point is within max_distance of its model
-    point, otherwise to 0. With linear weights, the normals must also match.
+    See NormalEquations for the counts. points[NEAR] is set to 1 for the points that the photometric term uses,
+    otherwise to 0.
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     inv_fx, inv_fy = one / model.fx, one / model.fy
@@ -177,7 +180,7 @@ def _add_geometry(model, R, weights, linear, noise_model, points, J):
     for n in range(BATCH):
         q = points[QZ + n]
         px, py, pz = points[PX + n], points[PY + n], points[PZ + n]
-        # the model point is on the ray of the pixel's center
+        # the model point is on the ray through the center of the pixel
         qx = (np.floor(points[U + n]) + half - cx) * inv_fx * q
         qy = (np.floor(points[V + n]) + half - cy) * inv_fy * q
         ex, ey, ez = px - qx, py - qy, pz - q
@@ -220,10 +223,9 @@ def _add_geometry(model, R, weights, linear, noise_model, points, J):
 
 @device
 def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
-    """Set I00, I10, I01, I11 to the model intensities around each point, and A, B to its bilinear weights.
+    """Read the four model intensities around each point, and compute its bilinear weights.
 
-    I00 is -1 for points outside of the image or with NEAR = 0. `inverse_scale`: width of the intensity image divided by
-    the width of the view.
+    I00 is -1 for points without a photometric term.
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     width = np.int32(shape[1])
@@ -246,10 +248,9 @@ def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
 
 @device
 def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J):
-    """Set the photometric terms of a batch in `J`; return the counts (matched, compared).
+    """Compute the photometric terms of a batch, and return the counts (matched, compared).
 
-    The error is model minus frame intensity plus `brightness`. `compared` is the number of points with a model
-    intensity, and `matched` is the number of these with a nonzero weight.
+    Compared points have a model intensity. Matched points also have a nonzero weight.
     """
     one, zero = np.float32(1.0), np.float32(0.0)
     noise, scale = weights.intensity_noise, weights.photometric_scale
@@ -268,7 +269,7 @@ def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J
         gx = (du0 + b * (du1 - du0)) * fx * inv_z
         gy = (low - top) * fy * inv_z
         gz = -(gx * px + gy * py) * inv_z
-        error = change + brightness
+        error = change + brightness  # model minus frame, with compensation
         if linear is None:
             weight = _tukey(error / noise, scale) * strength
         else:
@@ -283,10 +284,7 @@ def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J
 
 @device
 def _multiply(J, a, b, c, d, row):
-    """Set the five sums of `row` in `J`, each of LANES lanes, to weighted products summed over a batch.
-
-    They are the products of the field at offset `a` with the fields at `a`, `b`, `c` and `d` and with the error.
-    """
+    """Compute five weighted sums over a batch, by lane: products of field `a` with four fields and the error."""
     zero = np.float32(0.0)
     added = ADDED + row * ROW * LANES
     for lane in range(LANES):
@@ -308,10 +306,8 @@ def _multiply(J, a, b, c, d, row):
 
 @device
 def _add_products(J, lanes, first):
-    """Add the sums of one term over a batch to `lanes` from index `first` on, in double precision.
-
-    The sums are w J^T J (upper triangle and three more elements), w J^T r and w r^2.
-    """
+    """Add the sums of one term over a batch to `lanes`, in double precision."""
+    # w J^T J (upper triangle and three more elements), w J^T r and w r^2
     _multiply(J, J0, J1, J2, J3, 0)
     _multiply(J, J1, J2, J3, J4, 1)
     _multiply(J, J2, J3, J4, J5, 2)
@@ -330,7 +326,7 @@ def _add_products(J, lanes, first):
 
 @device
 def _add_brightness(J, lanes):
-    """Add the sum of frame minus model intensity over a batch to `lanes`, in double precision."""
+    """Add the intensity differences of a batch to `lanes`, in double precision."""
     for lane in range(LANES):
         change = np.float32(0.0)
         for step in range(BATCH // LANES):
@@ -341,12 +337,20 @@ def _add_brightness(J, lanes):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, linear, noise_model, brightness, sums):
-    """Set `sums` (CHUNKS, TERMS) to the sums of the normal equations over each chunk of rows of a FrameView.
+    """Compute the sums of the normal equations over each chunk of image rows.
 
-    `model` is a ModelView, and `model_intensity` (h, w) is its intensity at the resolution of the frame. `R` (3, 3) and
-    `t` (3,), m, are the rotation and the translation of T_view_camera. `inverse_scale` is the width of model_intensity
-    divided by the width of the view. `linear` is a LinearWeights, or None for Tukey's weights. `noise_model` is the
-    DepthNoise of the frame's sensor.
+    Args:
+        frame: The frame, a FrameView.
+        model: The view of the map, a ModelView.
+        model_intensity: The intensity (h, w) of the view at the resolution of the frame.
+        inverse_scale: The width of `model_intensity` divided by the width of the view.
+        R: The rotation (3, 3) of T_view_camera.
+        t: The translation (3,) of T_view_camera, m.
+        weights: The weights and limits, a Weights.
+        linear: The limits of the linear weights, or None for Tukey's weights.
+        noise_model: The noise parameters of the depth sensor.
+        brightness: The mean difference of frame and model intensity.
+        sums: The output (CHUNKS, TERMS).
     """
     height, width = frame.depth.shape
     shape, level_shape = model.depth.shape, model_intensity.shape

@@ -1,16 +1,16 @@
-"""Estimation of the delay between color and depth, from edges and the camera's motion.
+"""Estimation of the delay between color and depth.
 
-Depth edges of a frame, moved by the camera's motion over a time d, coincide with color edges if d is the time between
-the two images. For each compared frame k, the delay d_k has the largest mean color gradient at the moved depth edges.
-Its error, measured as a distance in the image, does not depend on the speed. An inaccurate registration adds a constant
-offset o in the image. With the mean image motion v_k of the edges and its direction n_k, in image widths and s:
+If the camera moves, depth edges coincide with color edges only after they are moved by the camera motion during the
+delay. For each compared frame k, the delay d_k has the largest mean color gradient at the moved depth edges.
+
+The error of d_k, as a distance in the image, does not depend on the speed. An inaccurate registration of the cameras
+adds a constant offset o in the image. With the mean image motion v_k of the edges and its direction n_k:
 
     |v_k| d_k = |v_k| d + n_k . o + noise
 
-Robust regression (Tukey's biweight) over the compared frames gives the delay d, with a normal prior on the offset.
-Errors of nearby frames are correlated: CORRELATED frames count as one, and the standard deviation is at least that of
-a jackknife over blocks of frames. Slow frames are not compared. If a camera turns in one direction at a constant
-rate, only the prior separates d from o.
+Robust regression with Tukey's biweight and a normal prior on the offset gives the delay d. Errors of nearby frames are
+correlated, so CORRELATED frames count as one. The standard deviation is at least that of a jackknife over blocks of
+frames. Slow frames are not compared.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ UNKNOWN = DelayEstimate(0.0, np.inf, 0)
 
 
 def is_usable(estimate: DelayEstimate) -> bool:
-    """Return True if the estimated delay is accurate enough to register color with it."""
+    """Return True if the estimated delay is accurate enough to register color."""
     return estimate.deviation <= max(MAX_DEVIATION, MAX_RELATIVE_DEVIATION * abs(estimate.seconds))
 
 
@@ -60,7 +60,10 @@ class _Tracked(NamedTuple):
 
 
 class DelayEstimator:
-    """Online estimator of the delay of color behind depth at equal timestamps, s; positive = color captured later."""
+    """Online estimator of the delay of color relative to depth with equal timestamps.
+
+    The delay is positive if color is captured later.
+    """
 
     def __init__(self) -> None:
         self.estimate = UNKNOWN
@@ -85,13 +88,13 @@ class DelayEstimator:
             self.estimate = regress(np.array(self._comparisons), start)
 
     def interrupt(self) -> None:
-        """Discard the recent frames, because the motion to the next frame is unknown."""
+        """Discard recent frames, because the motion to the next frame is unknown."""
         self._recent.clear()
 
     def _compare(self) -> bool:
-        """Compare color and depth of the middle one of the recent frames and store the delay; return True on success.
+        """Compare color and depth of the middle one of the recent frames, and return True if its delay was found.
 
-        There is no result if the frame is slow, has too few edges, or has a delay outside of the tested range.
+        The delay is not found if the frame is slow, has too few edges, or has a delay outside the tested range.
         """
         before, (frame, T_world_camera), after = (self._recent[HISTORY // 2 + k] for k in (-1, 0, 1))
         camera = frame.camera
@@ -127,7 +130,7 @@ class DelayEstimator:
 
 
 def edge_points(frame: Frame) -> Float32:
-    """Return P points (P, 3), m, camera frame, on the nearer side of depth edges, with P <= MAX_EDGES."""
+    """Return at most MAX_EDGES points (P, 3) on the nearer side of depth edges, camera frame, m."""
     edges = np.empty((frame.depth.size // 8, 3), np.float32)
     edges = edges[: find_edges(frame.depth, edges)]
     edges = edges[:: len(edges) // MAX_EDGES + 1]
@@ -135,9 +138,9 @@ def edge_points(frame: Frame) -> Float32:
 
 
 def normalized_gradient(frame: Frame) -> tuple[Float32, float]:
-    """Return the magnitude (h, w) of the smoothed intensity gradient, and the ratio of w to the image width.
+    """Return the normalized intensity gradient (h, w) of a reduced image, and the reduction factor.
 
-    The image is reduced to w <= WIDTH px. The values have mean 0 and standard deviation 1.
+    The gradient magnitude has mean 0 and standard deviation 1.
     """
     scale = min(WIDTH / frame.camera.width, 1.0)
     small = cv2.resize(frame.color, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -149,10 +152,12 @@ def normalized_gradient(frame: Frame) -> tuple[Float32, float]:
 
 
 def poses_at(times: Float64, poses: Float64, at: Float64) -> Float64:
-    """Return the poses (A, 4, 4) at the times `at` (A,), s, from `poses` (P, 4, 4) at increasing `times` (P,), s.
+    """Return the interpolated or extrapolated poses (A, 4, 4) at the times `at` (A,), s.
 
-    Translations are interpolated linearly and rotations spherically between neighboring poses, and extrapolated beyond
-    the first and the last pose.
+    Args:
+        times: The times (P,) of the poses, increasing, s.
+        poses: The poses (P, 4, 4).
+        at: The times (A,) of the results, s.
     """
     k = np.clip(np.searchsorted(times, at) - 1, 0, len(times) - 2)
     fractions = (at - times[k]) / (times[k + 1] - times[k])
@@ -165,9 +170,11 @@ def poses_at(times: Float64, poses: Float64, at: Float64) -> Float64:
 
 
 def regress(comparisons: Float64, start: float) -> DelayEstimate:
-    """Return the estimate of the delay from K comparisons (K, 3): delay, s, and image motion (x, y), image widths / s.
+    """Return the estimated delay by robust regression.
 
-    The regression starts at the delay `start`, s, and an offset of 0.
+    Args:
+        comparisons: The delay, s, and the image motion (x, y), image widths / s, of each compared frame (K, 3).
+        start: The initial delay, s.
     """
     delays, speeds = comparisons[:, 0], np.hypot(comparisons[:, 1], comparisons[:, 2])
     shifts = speeds * delays  # image widths
@@ -190,6 +197,6 @@ def regress(comparisons: Float64, start: float) -> DelayEstimate:
 
 
 def _information(X: Float64, weights: Float64, variance: float) -> Float64:
-    """Return X^T W X (3, 3) with the prior on the offset, for residuals of this variance (squared image widths)."""
+    """Return the information matrix (3, 3) of the regression, including the prior on the offset."""
     prior = np.array([0.0, 1.0, 1.0]) * variance / OFFSET_DEVIATION**2
     return np.asarray((X * weights[:, None]).T @ X + np.diag(prior))

@@ -13,9 +13,11 @@ SEARCHED_ROWS = 120  # number of searched rows of an image
 
 @njit(cache=True, nogil=True)
 def find_edges(depth, edges):
-    """Write u, v, px, and z, m, of pixels on the nearer side of depth steps to `edges` (N, 3). Return their number.
+    """Find pixels on the nearer side of depth edges, and return their number.
 
-    `depth`: (H, W), m, 0 = no reading. At most N pixels are written.
+    Args:
+        depth: The depth image (H, W), m, 0 = no reading.
+        edges: The output (N, 3): u, v, px, and depth, m. At most N pixels are written.
     """
     height, width = depth.shape
     count = 0
@@ -40,10 +42,17 @@ def find_edges(depth, edges):
 
 @njit(cache=True, nogil=True, parallel=True)
 def mean_gradients(points, transforms, intrinsics, scale, gradient, means):
-    """Set `means` (D,) to the mean of `gradient` at `points` (P, 3), m, moved by each of the `transforms` (D, 3, 4).
+    """Compute the mean gradient at the projections of points, for several camera motions.
 
-    `gradient` (h, w) is at `scale` times the resolution of the `intrinsics` (fx, fy, cx, cy), px. Points outside of the
-    image are ignored. The mean is 0 if there are no others.
+    Points outside the image are ignored.
+
+    Args:
+        points: The points (P, 3), m.
+        transforms: The transforms (D, 3, 4) of the points into the camera frame.
+        intrinsics: The intrinsics fx, fy, cx, cy, px.
+        scale: The resolution of `gradient` relative to the intrinsics.
+        gradient: The gradient image (h, w).
+        means: The output (D,), 0 if no point is inside the image.
     """
     fx, fy, cx, cy = intrinsics
     half, one = np.float32(0.5), np.float32(1.0)

@@ -1,15 +1,14 @@
-"""Registration of color images to depth images taken at other times, from the camera's motion.
+"""Registration of color images to depth images taken at other times.
 
-Color is taken dt = t_color + delay - t_depth after depth, with the timestamps t_color and t_depth of the images and a
-constant delay. With the last two poses, at the times t_last and t_depth, and constant velocity:
+The color image is taken dt = t_color + delay - t_depth after the depth image, where t_color and t_depth are the
+timestamps. Its pose is extrapolated from the last two poses at constant velocity:
 
     T_world_color = interpolate(T_world_last, T_world_camera, 1 + dt / (t_depth - t_last))
 
 Each depth reading is projected into the color image at this pose. Depth is not resampled.
 
-The tracker gets color registered at the mean velocity of the last PREDICTING_STEPS steps. With the velocity of a single
-step, poses that depend on color oscillate: errors e_1 and e_2 of successive poses displace the next color image by
-(e_2 - e_1) dt / (t_2 - t_1), and thus the next pose in the opposite direction.
+Before tracking, the motion is predicted from the mean velocity of the last PREDICTING_STEPS steps. The velocity of a
+single step would amplify pose errors, so that poses could oscillate.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ from framework.tracking.color_to_depth_kernels import register_colors
 from framework.tracking.pyramid import intrinsics
 
 MIN_SHIFT = 1.0  # px, minimum image motion between color and depth for a registration
-PREDICTING_STEPS = 2  # number of steps in the velocity of a prediction; a single step amplifies errors of poses
-NEAR = 1.0  # m, assumed depth of the points for this image motion
+PREDICTING_STEPS = 2  # number of steps in the velocity of a prediction
+NEAR = 1.0  # m, assumed depth to compute the image motion
 MIN_DISPLACING_DELAY = 0.003  # s, minimum delay with a visible effect on the colors of earlier frames
 STRIDE = 8  # px, step between the depth readings used for their median
 
@@ -41,17 +40,17 @@ class RegisteredFrame(NamedTuple):
 
     frame: Frame  # color is registered to the depth pixels
     T_world_color: Float64  # (4, 4) pose of the color camera at the time of the color image
-    color_pixels: Int32 | None = None  # (H, W) flat index of each reading's color pixel, -1 = none; None = same pixel
+    color_pixels: Int32 | None = None  # (H, W) flat index of the color pixel of each reading, -1 = none; None = same
 
 
 class ColorToDepth:
-    """Registration of color to depth, with a given or an estimated delay.
+    """Registration of color to depth with a given or an estimated delay.
 
-    Without a velocity (at the start, and after lost frames) and for motion below MIN_SHIFT, frames are not changed.
+    Frames are not changed if the velocity is unknown or if the image motion is small.
     """
 
     def __init__(self, delay: float | None) -> None:
-        """Set the delay of color behind depth at equal timestamps, s; None = estimated from the tracked frames."""
+        """Set the delay of color at equal timestamps, s, or None to estimate it from tracked frames."""
         self._estimator = DelayEstimator() if delay is None else None
         self._usable = False  # True once the estimate was accurate enough
         self._given = 0.0 if delay is None else delay
@@ -60,16 +59,16 @@ class ColorToDepth:
 
     @property
     def estimate(self) -> DelayEstimate | None:
-        """The estimated delay, None if the delay is given."""
+        """Estimated delay, or None if the delay is given."""
         return None if self._estimator is None else self._estimator.estimate
 
     @property
     def delay(self) -> float:
-        """The delay in use, s; 0 until it is known."""
+        """Delay in use, s, 0 until it is known."""
         return self._given if self._estimator is None or not self._usable else self._estimator.estimate.seconds
 
     def predicted(self, frame: Frame) -> Frame:
-        """Return the frame with color registered by the mean velocity of the last steps, for tracking."""
+        """Return the frame with color registered by the predicted motion, for tracking."""
         if not self._is_next(frame):
             return frame
         T_depth_color = self._motion_to_color(frame, PREDICTING_STEPS)
@@ -78,7 +77,7 @@ class ColorToDepth:
         return frame.with_color(register(frame, inverse(T_depth_color))[0])
 
     def tracked(self, frame: Frame, pose: Pose) -> RegisteredFrame:
-        """Return the frame with color registered by the motion to its pose, and store the pose for later frames."""
+        """Return the frame with color registered by the tracked motion, and store its pose for later frames."""
         self.displaced_before = False
         if pose.lost or not self._is_next(frame):
             self._poses.clear()
@@ -100,7 +99,7 @@ class ColorToDepth:
         return RegisteredFrame(frame.with_color(color), T_world_color, pixels)
 
     def _use(self, frame: Frame, estimate: DelayEstimate) -> None:
-        """Use the estimate from its first accurate value on, and log this value."""
+        """Start to use the estimate when it is accurate enough, and log it."""
         if self._usable or not is_usable(estimate):
             return
         self._usable = True
@@ -109,11 +108,11 @@ class ColorToDepth:
         log.info(message, frame.index, 1e3 * estimate.seconds, 1e3 * estimate.deviation)
 
     def _is_next(self, frame: Frame) -> bool:
-        """Return True if the frame is at most MAX_STEP later than the last tracked frame."""
+        """Return True if the frame follows the last tracked frame within MAX_STEP."""
         return bool(self._poses) and 0 < frame.depth_time - self._poses[-1][0] <= MAX_STEP
 
     def _motion_to_color(self, frame: Frame, steps: int) -> Float64 | None:
-        """Return the motion T_depth_color (4, 4) at the mean velocity of the last `steps` steps; None = unknown."""
+        """Return the motion T_depth_color (4, 4) at the mean velocity of the last steps, or None if it is unknown."""
         if len(self._poses) < 2:
             return None
         (start, T_world_start), (end, T_world_end) = self._poses[-min(steps + 1, len(self._poses))], self._poses[-1]
@@ -125,16 +124,16 @@ class ColorToDepth:
 
 
 def _shift(frame: Frame, T_a_b: Float64) -> float:
-    """Return the approximate image motion, px, of points at the depth NEAR for the small camera motion T_a_b."""
+    """Return the approximate image motion of points at the depth NEAR for a small camera motion, px."""
     return frame.camera.fx * (rotation_angle(T_a_b[:3, :3]) + math.hypot(*T_a_b[:3, 3]) / NEAR)
 
 
 def register(frame: Frame, T_color_depth: Float64) -> tuple[UInt8, Int32]:
-    """Return the nearest color (H, W, 3) of each depth pixel, and its flat index (H, W) in the color image.
+    """Return the nearest color (H, W, 3) of each depth pixel, and its flat index (H, W).
 
-    `T_color_depth`: (4, 4), motion from the depth camera to the color camera. The index is -1 outside of the color
-    image and without a reading. A pixel outside of the color image gets the color of the nearest pixel. A pixel without
-    a reading gets the color at the median depth.
+    The index is -1 outside the color image and without a depth reading. These pixels get the color of the nearest color
+    pixel. Pixels without a reading are projected at the median depth. `T_color_depth` is the motion (4, 4) from the
+    depth to the color camera.
     """
     color, pixels = np.empty_like(frame.color), np.empty(frame.camera.shape, np.int32)
     readings = frame.depth[::STRIDE, ::STRIDE]

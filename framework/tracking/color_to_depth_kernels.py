@@ -11,11 +11,16 @@ MIN_DEPTH = 0.05  # minimum depth of projected points in the color image, m
 # Not parallel: on two cores, its second thread would wait for the thread that reads the next frame.
 @njit(cache=True, nogil=True, error_model="numpy")
 def register_colors(depth, otherwise, intrinsics, T_color_depth, color, registered, pixels):
-    """Set `registered` (H, W, 3) to the nearest color of each pixel of `depth` (H, W), m, and `pixels` to its index.
+    """Set the color of each depth pixel to the nearest color.
 
-    `pixels` (H, W) is the flat index in `color` (H, W, 3), -1 outside of the color image and without a reading.
-    `T_color_depth`: (3, 4). Positions outside of the color image are moved to its border. Pixels without a reading are
-    projected at the depth `otherwise`, m.
+    Args:
+        depth: The depth image (H, W), m, 0 = no reading.
+        otherwise: The assumed depth of pixels without a reading, m.
+        intrinsics: The intrinsics fx, fy, cx, cy, px.
+        T_color_depth: The motion (3, 4) from the depth to the color camera.
+        color: The color image (H, W, 3).
+        registered: The output (H, W, 3). Outside the color image, the color of its border is used.
+        pixels: The output (H, W), the flat index of the color pixel, -1 = no reading or outside the color image.
     """
     fx, fy, cx, cy = intrinsics
     R, t = T_color_depth[:, :3], T_color_depth[:, 3]

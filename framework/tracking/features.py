@@ -1,10 +1,8 @@
-"""Sparse RootSIFT features with depth at half resolution, and their matching.
+"""Sparse RootSIFT features with depth, and their matching.
 
-SIFT at half resolution matches more distant and more blurred views than ORB. At full resolution SIFT is three times
-slower and finds fewer matches, because of blur and sensor noise at the finest scale.
-
-Descriptors are integers, as in COLMAP. So scalar products are exact in float32 in any order of summation, and matches
-do not depend on the number of threads.
+SIFT at half resolution matches more distant and more blurred views than ORB. At full resolution, SIFT is three times
+slower and finds fewer matches. Descriptors are integers, as in COLMAP. Therefore, scalar products are exact, and
+matches do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ DEPTH_GAP = 0.05  # minimum depth difference between surfaces in a patch, fracti
 
 @dataclass(frozen=True)
 class Features:
-    """The F features of an image, strongest first."""
+    """The features of an image, strongest first."""
 
     pixels: Float32  # (F, 2) (u, v) in the full-resolution image
     depth: Float32  # (F,) m along z, 0 = no reading or at the edge of a surface
@@ -44,18 +42,21 @@ class Features:
 
 @dataclass
 class FeatureExtractor:
-    """Extractor of the `Features` of a frame, independent of the number of threads."""
+    """Extractor of features, independent of the number of threads."""
 
     max_features: int = 800  # maximum number of features, >= 1
-    contrast: float = 0.015  # SIFT's contrast threshold, in (0, 1]; a lower value finds more and weaker features
+    contrast: float = 0.015  # contrast threshold of SIFT, in (0, 1]; a lower value finds more and weaker features
 
     def __post_init__(self) -> None:
         check_bounds(self, max_features=(1, 100_000), contrast=(1e-6, 1.0))
 
     def extract(self, frame: Frame) -> Features:
-        """Return the features of the color image, none for an image without texture. This method is thread-safe."""
+        """Return the features of a color image.
+
+        This method is thread-safe.
+        """
         gray, scale = _reduced(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY))
-        # without precise upscaling, OpenCV's keypoints are off by a quarter of a pixel
+        # without precise upscaling, keypoints of OpenCV are off by a quarter of a pixel
         sift = cv2.SIFT.create(self.max_features, contrastThreshold=self.contrast, enable_precise_upscale=True)
         keypoints, descriptors = sift.detectAndCompute(gray, None)
         if not keypoints:
@@ -86,15 +87,18 @@ class FrameFeatures:
 
 
 def match(query: UInt8, reference: UInt8, max_ratio: float) -> Int32:
-    """Return the M index pairs (M, 2) of mutual nearest neighbors in `query` (Q, 128) and `reference` (R, 128).
+    """Return the index pairs (M, 2) of descriptors that are mutual nearest neighbors.
 
-    A pair is dropped if its distance is above `max_ratio` times the distance from the query descriptor to the
-    second-nearest reference descriptor (Lowe 2004).
+    Args:
+        query: The first descriptors (Q, 128).
+        reference: The second descriptors (R, 128).
+        max_ratio: The maximum ratio of the distances to the nearest and the second-nearest reference descriptor (Lowe,
+            2004).
     """
     if len(query) == 0 or len(reference) < 2:
         return np.zeros((0, 2), np.int32)
     a, b = query.astype(np.float32), reference.astype(np.float32)
-    # OpenCV's product runs in this thread; BLAS threads wait for each other on busy cores
+    # the product of OpenCV runs in this thread; BLAS threads wait for each other on busy cores
     squared = cv2.gemm(a, b, -2, None, 0, flags=cv2.GEMM_2_T)
     squared += (a * a).sum(axis=1)[:, None]
     squared += (b * b).sum(axis=1)
@@ -108,9 +112,13 @@ def match(query: UInt8, reference: UInt8, max_ratio: float) -> Int32:
 
 
 def surface_depth(depth: Float32, pixels: Float32) -> Float32:
-    """Return the median depth (F,), m, of the patches around `pixels` (F, 2), u and v; 0 at surface edges and in holes.
+    """Return the median depth (F,) of the patch around each pixel, m.
 
-    `depth`: (H, W), m, 0 = no reading.
+    The depth is 0 at surface edges and in holes.
+
+    Args:
+        depth: The depth image (H, W), m, 0 = no reading.
+        pixels: The pixels (F, 2), u and v.
     """
     height, width = depth.shape
     offsets = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
@@ -129,7 +137,7 @@ def surface_depth(depth: Float32, pixels: Float32) -> Float32:
 
 
 def _reduced(gray: UInt8) -> tuple[UInt8, int]:
-    """Return the image, halved until its width is at most FINEST_WIDTH, and the total reduction factor."""
+    """Return the image, halved until its width is at most FINEST_WIDTH, and the reduction factor."""
     scale = 1
     while gray.shape[1] > FINEST_WIDTH:
         height, width = gray.shape[0] // 2, gray.shape[1] // 2
@@ -139,7 +147,7 @@ def _reduced(gray: UInt8) -> tuple[UInt8, int]:
 
 
 def _root_sift(descriptors: Float32) -> UInt8:
-    """Return RootSIFT descriptors (Arandjelovic and Zisserman 2012): their L2 distance is SIFT's Hellinger distance."""
+    """Return the RootSIFT descriptors (Arandjelovic and Zisserman, 2012)."""
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1)
     rooted: UInt8 = np.minimum(np.rint(DESCRIPTOR_NORM * np.sqrt(descriptors / total)), 255).astype(np.uint8)
     return rooted

@@ -1,7 +1,7 @@
-"""Keyframes with features and known poses for relocalization of a lost camera.
+"""Keyframes for the relocalization of a lost camera.
 
-After PTAM (Klein and Murray 2007) and ORB-SLAM (Mur-Artal et al. 2015). A bag of visual words selects candidate
-keyframes for a lost frame. Matched features with depth and P3P in RANSAC give its pose.
+Visual words select candidate keyframes for a lost frame. Matched features with depth give its pose by P3P in RANSAC.
+See PTAM (Klein and Murray, 2007) and ORB-SLAM (Mur-Artal et al., 2015).
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ SAVED: Mapping[str, tuple[tuple[int | None, ...], type]] = {
 }
 """Shapes and types of the arrays of saved keyframes."""
 
-MIN_RETRY_SEPARATION = 0.25  # minimum separation from a frame with too few features; 1 = limit for new keyframes
-WORD_BITS = 12  # 4096 visual words; fewer do not distinguish views, and more rarely recur
+MIN_RETRY_SEPARATION = 0.25  # minimum separation from a frame with too few features; new keyframes need 1
+WORD_BITS = 12  # number of bits of a visual word, i.e. 4096 words
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """The F features with depth of one frame with a reliable pose."""
+    """The features with depth of a frame with a reliable pose."""
 
     T_world_camera: Float64  # (4, 4)
     points_world: Float32  # (F, 3) m
@@ -52,10 +52,9 @@ class Keyframe:
 class Keyframes:
     """A bounded database of keyframes.
 
-    Call `add` for every frame that has a reliable pose. It extracts the features of new views in a background thread. A
-    view is new if distance / min_distance + angle / min_angle >= 1 for all keyframes. All other methods wait for the
-    thread first, so that results do not depend on timing. The cost of `relocalize` does not depend on the number of
-    keyframes, except for the comparison of bag-of-words vectors.
+    Call `add` for every frame with a reliable pose. Features of new views are extracted in a background thread. A view
+    is new if distance / min_distance + angle / min_angle >= 1 for all keyframes. All other methods wait for the thread
+    first, so that results do not depend on timing.
     """
 
     max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is removed
@@ -85,7 +84,7 @@ class Keyframes:
         self._offered: tuple[Float64, Future[Keyframe | None]] | None = None  # pose and keyframe under construction
 
     def __getstate__(self) -> dict[str, Any]:
-        """Wait for the background thread, which cannot be pickled, and return the state."""
+        """Return the state after waiting for the background thread."""
         self._settle()
         return vars(self)
 
@@ -94,7 +93,10 @@ class Keyframes:
         return len(self._keyframes)
 
     def saved(self) -> dict[str, Array]:
-        """Return the keyframes as arrays for `restore`; empty if there are none."""
+        """Return the keyframes as arrays.
+
+        The result is empty if there are no keyframes.
+        """
         self._settle()
         if not self._keyframes:
             return {}
@@ -106,9 +108,11 @@ class Keyframes:
         }
 
     def restore(self, arrays: Mapping[str, Array]) -> None:
-        """Add the `saved` keyframes of another database.
+        """Add the saved keyframes of another database.
 
-        Raises ConfigError if the arrays are empty, and DataError if they are invalid.
+        Raises:
+            ConfigError: If there are no keyframes.
+            DataError: If the arrays are invalid.
         """
         if not arrays:
             raise ConfigError("resume_from or localize_in: expected a run with stored keyframes, got no keyframes")
@@ -134,9 +138,9 @@ class Keyframes:
         self._poses = np.concatenate([self._poses, poses])
 
     def add(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Make `frame` a keyframe, in a background thread, if its view is new and has enough features.
+        """Add the frame as a keyframe if its view is new and has enough features.
 
-        An exception of that thread is raised by the next method that waits for it.
+        Features are extracted in a background thread. The next method that waits for this thread raises its exceptions.
         """
         if self._offered is not None and self._is_retry(self._offered[0], T_world_camera):
             return  # too close to the frame under construction, even if that frame has too few features for a keyframe
@@ -147,7 +151,7 @@ class Keyframes:
         worker.shutdown(wait=False)  # the thread ends after this frame
 
     def _settle(self) -> None:
-        """Wait for the frame under construction. Raises the exception of its thread."""
+        """Wait for the background thread, and add its keyframe."""
         if self._offered is None:
             return
         T_world_camera, keyframe_future = self._offered
@@ -161,7 +165,10 @@ class Keyframes:
             self._append(keyframe)
 
     def add_with(self, frame: Frame, features: Features, T_world_camera: Float64) -> bool:
-        """Make `frame` a keyframe if its view is new and has enough features; return True if it became a keyframe."""
+        """Add the frame with the given features as a keyframe, and return True if it was added.
+
+        The frame is added if its view is new and it has enough features.
+        """
         features = features.with_depth()
         if len(features) < self.min_features or not self.is_new(T_world_camera):
             return False
@@ -169,18 +176,18 @@ class Keyframes:
         return True
 
     def _extracted(self, frame: Frame, T_world_camera: Float64) -> Keyframe | None:
-        """Return the frame as a keyframe; None if it has too few features."""
+        """Return the frame as a keyframe, or None if it has too few features."""
         features = self.extractor.extract(frame).with_depth()
         return self.keyframe(frame, features, T_world_camera) if len(features) >= self.min_features else None
 
     def _append(self, keyframe: Keyframe) -> None:
-        """Add a keyframe. If there are more than `max_keyframes`, remove the older one of the nearest two keyframes."""
+        """Add a keyframe, and remove the most redundant keyframe if there are too many."""
         self._keyframes.append(keyframe)
         self._poses = np.concatenate([self._poses, keyframe.T_world_camera[None]])
         if len(self._keyframes) > self.max_keyframes:
             separation = np.stack([self._separation(self._poses, T) for T in self._poses])
             np.fill_diagonal(separation, np.inf)
-            redundant = int(separation.min(axis=1).argmin())
+            redundant = int(separation.min(axis=1).argmin())  # the older one of the nearest pair
             del self._keyframes[redundant]
             self._poses = np.delete(self._poses, redundant, axis=0)
 
@@ -193,23 +200,23 @@ class Keyframes:
         return Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag)
 
     def is_new(self, T_world_camera: Float64) -> bool:
-        """Return True if the pose T_world_camera (4, 4) is far enough from all keyframes for a new keyframe."""
+        """Return True if a camera pose (4, 4) is far enough from all keyframes."""
         self._settle()
         return bool((self._separation(self._poses, T_world_camera) >= 1).all())
 
     def _is_retry(self, T_world_other: Float64 | None, T_world_camera: Float64) -> bool:
-        """Return True if a pose is too close to another pose (None = no pose) to extract features again."""
+        """Return True if a pose is too close to another pose to extract features again."""
         if T_world_other is None:
             return False
         return bool(self._separation(T_world_other[None], T_world_camera)[0] < MIN_RETRY_SEPARATION)
 
     def relocalize(self, frame: Frame) -> AbsolutePose | None:
-        """Return the pose of `frame` without a prior pose; None if it is not found."""
+        """Return the pose of a frame without a prior pose, or None if it is not found."""
         features = self.extractor.extract(frame)
         return self.locate(frame, features, self.alike(features))
 
     def alike(self, features: Features) -> list[Keyframe]:
-        """Return the `candidates` keyframes with visual words most similar to those of `features`, best first."""
+        """Return the keyframes whose visual words are most similar to those of the features, best first."""
         self._settle()
         if not self._keyframes:
             return []
@@ -218,13 +225,13 @@ class Keyframes:
         return [self._keyframes[k] for k in order[: self.candidates]]
 
     def nearest(self, T_world_camera: Float64) -> list[Keyframe]:
-        """Return the `candidates` keyframes nearest to the pose T_world_camera (4, 4), nearest first."""
+        """Return the keyframes nearest to a camera pose (4, 4), nearest first."""
         self._settle()
         order = np.argsort(self._separation(self._poses, T_world_camera), kind="stable")
         return [self._keyframes[k] for k in order[: self.candidates]]
 
     def locate(self, frame: Frame, features: Features, keyframes: Sequence[Keyframe]) -> AbsolutePose | None:
-        """Return the pose of `frame` from its matches with all `keyframes`; None if they do not determine it."""
+        """Return the pose of a frame from its matches with the given keyframes, or None if it is not found."""
         if not keyframes:
             return None
         matches = [match(features.descriptors, keyframe.descriptors, self.max_ratio) for keyframe in keyframes]
@@ -235,10 +242,8 @@ class Keyframes:
         return self._estimator.estimate(frame.camera, features.pixels[query], points_world, features.depth[query])
 
     def _separation(self, poses: Float64, T_world_camera: Float64) -> Float64:
-        """Return the separations (K,) of a pose (4, 4) from K other poses (K, 4, 4).
-
-        The separation is distance / min_distance + angle / min_angle; 1 = far enough for a new keyframe.
-        """
+        """Return the separation (K,) of a camera pose from other poses (K, 4, 4)."""
+        # 1 = far enough for a new keyframe
         distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
         cosine = (np.einsum("kij,ij->k", poses[:, :3, :3], T_world_camera[:3, :3]) - 1) / 2
         return np.asarray(distance / self.min_distance + np.arccos(np.clip(cosine, -1, 1)) / self.min_angle)
@@ -247,8 +252,7 @@ class Keyframes:
 class VisualWords:
     """A vocabulary of visual words that depends only on a random seed.
 
-    The word of a feature consists of the signs of its descriptor's scalar products with a few random vectors
-    (locality-sensitive hashing, Charikar 2002). Images are compared by tf-idf (Sivic and Zisserman 2003).
+    The bits of a word are the signs of the scalar products of the descriptor with random vectors (Charikar, 2002).
     """
 
     def __init__(self, seed: int) -> None:
@@ -258,17 +262,18 @@ class VisualWords:
         self._directions = np.ascontiguousarray(rng.permuted(np.tile(half, (WORD_BITS, 1)), axis=1).T)
 
     def bag(self, descriptors: UInt8) -> Float32:
-        """Return the bag of words of descriptors (F, 128): the square root (2^WORD_BITS,) of the count of each word."""
+        """Return the bag of words (2^WORD_BITS,) of descriptors (F, 128)."""
         if len(descriptors) == 0:
             return np.zeros(1 << WORD_BITS, np.float32)
         signs = cv2.gemm(descriptors.astype(np.float32), self._directions, 1, None, 0) > 0
         words = signs @ (1 << np.arange(WORD_BITS))
+        # square roots of the word counts
         return np.sqrt(np.bincount(words, minlength=1 << WORD_BITS)).astype(np.float32)
 
 
 def similarity(bag: Float32, bags: Float32) -> Float32:
-    """Return the tf-idf cosine similarity (K,) in [0, 1] of a bag (2^WORD_BITS,) to K other bags (K, 2^WORD_BITS)."""
-    document_counts = np.count_nonzero(bags, axis=0)
+    """Return the tf-idf similarity (K,), in [0, 1], of a bag of words to other bags (K, 2^WORD_BITS)."""
+    document_counts = np.count_nonzero(bags, axis=0)  # Sivic and Zisserman, 2003
     idf = np.log((1 + len(bags)) / (1 + document_counts)).astype(np.float32)
     if not idf.any():
         idf[:] = 1  # every word occurs in all images
@@ -278,12 +283,18 @@ def similarity(bag: Float32, bags: Float32) -> Float32:
 
 
 def write_keyframes(path: Path, keyframes: Mapping[str, Array]) -> None:
-    """Write the arrays of `Keyframes.saved` atomically."""
+    """Write the arrays of `Keyframes.saved` to a file."""
     write_map(path, {"format": FILE_FORMAT, "names": sorted(keyframes)}, keyframes)
 
 
 def read_keyframes(path: Path) -> dict[str, Array]:
-    """Return the arrays written by `write_keyframes`; empty if there is no file. Raises DataError if it is invalid."""
+    """Return the arrays in a file of `write_keyframes`.
+
+    The result is empty if there is no file.
+
+    Raises:
+        DataError: If the file is invalid.
+    """
     if not path_exists(path):
         return {}
     return read_arrays(path, FILE_FORMAT)

@@ -15,15 +15,15 @@ from framework.tracking.pyramid_kernels import compute_normals, find_distinct, h
 
 SAMPLED = 4  # stride of the depth readings for the quantization estimate, px
 FEWEST_VALUES = 16  # minimum number of distinct depths for the quantization estimate
-SCATTERED = 0.15  # minimum fraction of missing neighbors of readings in scattered depth; Kinects have at most 0.02
+SCATTERED = 0.15  # minimum fraction of missing neighbors of readings in scattered depth; a Kinect has at most 0.02
+COARSE = 2.5  # maximum step between depth values of fine depth, in standard deviations of the sensor
 NORMALS = "normals"  # key in Frame.depth_cache
-COARSE = 2.5  # largest step between depth values of fine depth, in standard deviations of the sensor
 
 _normals_lock = threading.Lock()  # one lock for all frames, because frames are pickled and kernels use all cores
 
 
 def intrinsics(camera: Camera) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Return fx, fy, cx and cy (px) in single precision for kernels."""
+    """Return fx, fy, cx and cy, px, in single precision."""
     return np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx), np.float32(camera.cy)
 
 
@@ -42,10 +42,17 @@ def build_pyramid(
     camera: Camera, depth: Float32, color: UInt8, finest: float, levels: int,
     sensor: SensorKind = SensorKind.KINECT_V1,
 ) -> list[PyramidLevel]:  # fmt: skip
-    """Return the image at `finest` times its size and at `levels` - 1 further halvings, finest first.
+    """Return the image pyramid, finest level first.
 
-    `depth`: (H, W), m, 0 = no reading. `color`: (H, W, 3) RGB. `finest` is 1 or a power of 1/2. Intensities are
-    averaged over all pixels, and depths over pixels of one surface.
+    Intensities are averaged over all pixels, and depths only over pixels of one surface.
+
+    Args:
+        camera: The camera.
+        depth: The depth image (H, W), m, 0 = no reading.
+        color: The color image (H, W, 3), RGB.
+        finest: The scale of the finest level: 1 or a power of 1/2.
+        levels: The number of levels.
+        sensor: The depth sensor.
     """
     intensity = _intensity(color)
     pyramid: list[PyramidLevel] = []
@@ -83,31 +90,33 @@ def normals_of(frame: Frame) -> Float32:
 
 
 def is_coarse(depth: Float32, otherwise: bool, sensor: SensorKind = SensorKind.KINECT_V1) -> bool:
-    """Return True if depth (H, W) m is quantized too coarsely for normals from neighboring pixels, as in 8 bits.
+    """Return True if a depth image is quantized too coarsely to compute normals from neighboring pixels.
 
-    Steps are the gaps between distinct values in the nearer half, in standard deviations of the sensor. A Kinect has
-    steps of 1.5 to 1.9 at any distance. Returns `otherwise` if there are too few distinct values.
+    The step is the gap between neighboring distinct depth values. It is compared with the noise of the sensor.
+
+    Args:
+        depth: The depth image (H, W), m, 0 = no reading.
+        otherwise: The result if there are too few distinct values.
+        sensor: The depth sensor.
     """
     values = _distinct(depth[::SAMPLED, ::SAMPLED])
     if len(values) < FEWEST_VALUES:
         return otherwise
-    steps = np.diff(values) / sensor.sigma(values[:-1])
+    steps = np.diff(values) / sensor.sigma(values[:-1])  # 1.5 to 1.9 for a Kinect
     nearer = steps[: len(steps) // 2]
     return bool(np.partition(nearer, len(nearer) // 4)[len(nearer) // 4] > COARSE)  # a gap may span several steps
 
 
 def is_scattered(depth: Float32) -> bool:
-    """Return True if neighbors of many readings in depth (H, W) m have no depth, as with isolated missing pixels."""
+    """Return True if many readings of a depth image (H, W) have a neighbor without depth."""
     known = depth[::SAMPLED] > 0
     pairs = np.count_nonzero(known[:, :-1]) + np.count_nonzero(known[:, 1:])
     return bool(np.count_nonzero(known[:, :-1] ^ known[:, 1:]) > SCATTERED * pairs)
 
 
 def _distinct(depth: Float32) -> Float32:
-    """Return the distinct positive values (N,), m, of `depth` in ascending order.
-
-    For few distinct values, a hash table is faster than np.unique.
-    """
+    """Return the distinct positive values of a depth image in ascending order."""
+    # for few distinct values, a hash table is faster than np.unique
     bits = np.ascontiguousarray(depth).view(np.int32)
     table = np.zeros(1 << (2 * bits.size).bit_length(), np.int32)
     found = np.empty(bits.size, np.int32)
@@ -137,7 +146,7 @@ def _intensity(color: UInt8) -> Float32:
 
 
 def model_intensities(view: SurfaceView, levels: int) -> list[Float32]:
-    """Return the intensity of the view in [0, 1], at its own resolution and at `levels` - 1 halvings; -1 = unmapped."""
+    """Return the intensity of a view at several resolutions, finest first, -1 = not mapped."""
     intensity = _intensity(view.color)
     intensity[view.depth == 0] = -1
     pyramid = [intensity]

@@ -5,15 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-DEPTH_GAP = 0.05  # minimum depth difference between surfaces, fraction of the depth; depth is not averaged across it
+DEPTH_GAP = 0.05  # minimum depth difference between surfaces, fraction of the depth
 MIN_MAPPED = np.float32(2.0)  # minimum number of mapped pixels among four for a mean intensity
 
 
 @njit(cache=True, nogil=True)
 def find_distinct(bits, table, found):
-    """Write the distinct positive values of `bits` (N,) to `found` (N,) and return their number.
+    """Write the distinct positive values to `found` (N,), and return their number.
 
-    `table` (2^k,) is a hash table filled with zeros, more than twice as large as `bits`.
+    Args:
+        bits: The values (N,).
+        table: A hash table filled with zeros. Its size is a power of two and more than twice N.
+        found: The output (N,).
     """
     count = 0
     mask = np.uint64(table.shape[0] - 1)
@@ -32,9 +35,15 @@ def find_distinct(bits, table, found):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve(depth, intensity, half_depth, half_intensity):
-    """Set `half_intensity` and `half_depth` (h, w) to means of `intensity` and `depth` (H, W), m, over 2x2 px.
+    """Halve the resolution of an RGB-D image.
 
-    Depth is averaged only over those of the four pixels that are on the nearest surface; 0 = no reading.
+    Depth is averaged only over the pixels on the nearest surface.
+
+    Args:
+        depth: The depth image (H, W), m, 0 = no reading.
+        intensity: The intensity image (H, W).
+        half_depth: The output (h, w), m.
+        half_intensity: The output (h, w).
     """
     for v in prange(half_depth.shape[0]):
         for u in range(half_depth.shape[1]):
@@ -61,10 +70,14 @@ def halve(depth, intensity, half_depth, half_intensity):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def compute_normals(depth, intrinsics, normals):
-    """Set `normals` (3, H, W), unit length in the camera frame, from the depth, m, of the four neighbors of each pixel.
+    """Compute the surface normal at each pixel from the depth of its four neighbors.
 
-    A normal is 0 unless all neighbors have a reading on the surface of the pixel. `intrinsics`: fx, fy, cx, cy, px. The
-    loop over a row has no branches, so that the compiler vectorizes it.
+    A normal is 0 unless all neighbors have a reading on the same surface.
+
+    Args:
+        depth: The depth image (H, W), m, 0 = no reading.
+        intrinsics: The intrinsics fx, fy, cx, cy, px.
+        normals: The output (3, H, W), unit normals in the camera frame.
     """
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
@@ -75,7 +88,7 @@ def compute_normals(depth, intrinsics, normals):
         normals[0, v, width - 1] = normals[1, v, width - 1] = normals[2, v, width - 1] = zero
         above, below = max(v - 1, 0), min(v + 1, height - 1)
         y = (np.float32(v) - cy) * inv_fy
-        for u in range(1, width - 1):
+        for u in range(1, width - 1):  # without branches, so that the compiler vectorizes the loop
             z = depth[v, u]
             left, right, up, down = depth[v, u - 1], depth[v, u + 1], depth[above, u], depth[below, u]
             x = (np.float32(np.int32(u)) - cx) * inv_fx
@@ -95,9 +108,9 @@ def compute_normals(depth, intrinsics, normals):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve_mapped(intensity, half):
-    """Set `half` to means of the mapped intensities of 2x2 px; -1 = fewer than MIN_MAPPED mapped pixels.
+    """Halve the resolution of an intensity image with holes, -1 = not mapped.
 
-    A new map has many holes of one pixel.
+    Only mapped pixels are averaged, because a new map has many holes of one pixel.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     for v in prange(half.shape[0]):

@@ -1,15 +1,14 @@
-"""Raw keyframes: a frame as a second model of the alignment, next to the view of the map.
+"""Raw keyframes: a recent frame as a second model of the alignment.
 
-The map smooths structure below its voxel size, always in the same direction. This biases each alignment by a constant.
-Integration at the biased poses moves the map in turn, so that the pose of a stationary camera drifts. A raw keyframe
-has no such bias. Its normal equations are added to those of the map's view. With T_key_view and its adjoint Ad, a twist
-xi of the view's frame is Ad xi in the keyframe's frame:
+The map smooths structure below its voxel size, which biases each alignment. Because the map is updated at the biased
+poses, the estimated pose of a stationary camera drifts. A raw keyframe has no such bias. Its normal equations are added
+to those of the map. The adjoint Ad of T_key_view converts them to a twist of the view:
 
     A <- A + w Ad^T A_key Ad,    b <- b + w Ad^T b_key
 
-The keyframe is compared at half the finest resolution, where averaged depth is less noisy and the cost is a quarter. At
-the finest level, w = 4 compensates for the missing points. The coarsest level is aligned to the map alone. Beyond
-NEW_DISTANCE, w falls to 0 at USED_DISTANCE, so that sparse frames are aligned to the map alone.
+The keyframe is compared at half the finest resolution, which is less noisy and faster. At the finest level, w = 4
+compensates for the smaller number of points. The coarsest level uses the map alone. The weight decreases with the
+distance from the keyframe, so that sparse frames are aligned to the map alone.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ COMPARED = 1  # level at which frames and the keyframe are compared: halvings of
 
 @dataclass(frozen=True)
 class RawKeyframe:
-    """A frame at its estimated pose, as a model for the alignment of later frames."""
+    """A frame at its estimated pose, used as a model for the alignment of later frames."""
 
     T_world_camera: Float64  # (4, 4)
     model: ModelView  # at level COMPARED
@@ -41,9 +40,12 @@ class RawKeyframe:
 
     @classmethod
     def of(cls, levels: Sequence[PyramidLevel], T_world_camera: Float64, scattered: bool = False) -> RawKeyframe:
-        """Return the raw keyframe of a frame with the image pyramid `levels`, finest level first.
+        """Return the raw keyframe for a frame.
 
-        `scattered`: True = normals are averaged over 3x3 px, because many isolated pixels have no depth.
+        Args:
+            levels: The image pyramid of the frame, finest level first.
+            T_world_camera: The camera pose (4, 4).
+            scattered: True to smooth the normals, because many isolated pixels have no depth.
         """
         level = levels[COMPARED]
         model = smoothed(ModelView(level.depth, level.normals, *intrinsics(level.camera)), int(scattered))
@@ -51,7 +53,7 @@ class RawKeyframe:
 
 
 class KeyframeTerm(NamedTuple):
-    """The term of a raw keyframe in the normal equations of one alignment."""
+    """The term of a raw keyframe in the normal equations."""
 
     keyframe: RawKeyframe
     T_key_view: Float64  # (4, 4)
@@ -60,9 +62,9 @@ class KeyframeTerm(NamedTuple):
 
     @classmethod
     def at(cls, keyframe: RawKeyframe | None, T_world_view: Float64, scale: DepthScale) -> KeyframeTerm | None:
-        """Return the keyframe's term for aligning a frame to the model view at T_world_view.
+        """Return the term for aligning a frame to a view of the map.
 
-        Returns None without a keyframe, or if its `scale.distance` to the view is at least USED_DISTANCE.
+        Return None without a keyframe, or if the keyframe is too far away.
         """
         if keyframe is None:
             return None
@@ -77,10 +79,15 @@ class KeyframeTerm(NamedTuple):
         self, levels: Sequence[PyramidLevel], level: int, T_view_camera: Float64, weights: Weights, brightness: float,
         linear: LinearWeights | None,
     ) -> NormalEquations:  # fmt: skip
-        """Return the keyframe's weighted normal equations for a twist in the view's coordinate frame.
+        """Return the weighted normal equations of the keyframe for a twist of the view.
 
-        `levels`: the image pyramid of the aligned image, finest first. `level`: the level of the alignment, at most
-        COMPARED. See `linearize` for the other arguments.
+        Args:
+            levels: The image pyramid of the frame, finest level first.
+            level: The level of the alignment, at most COMPARED.
+            T_view_camera: The current pose (4, 4) of the frame in the view.
+            weights: The weights and limits.
+            brightness: The mean difference of frame and model intensity.
+            linear: The limits of the linear weights, or None for Tukey's weights.
         """
         own = linearize(
             levels[COMPARED], self.keyframe.model, self.keyframe.intensity, self.T_key_view @ T_view_camera, weights,

@@ -1,12 +1,12 @@
-"""Uncertainty of an aligned pose, from the normal equations and their residuals.
+"""Uncertainty of an aligned pose.
 
-With weights that are inverse variances, the covariance of a least-squares estimate is A^-1. Residuals correct the
-assumed variances: each term's factor is s^2 = sum w r^2 / n for its n matched points. Errors of neighboring pixels are
-correlated, and the errors of a frame are common to the map and the keyframe. CORRELATED points count as one:
+If the weights are inverse variances, the covariance of a least-squares estimate is A^-1. The assumed variances are
+corrected by the residuals: the factor of each term is s^2 = sum w r^2 / n for its n matched points. Errors of
+neighboring pixels are correlated, so that CORRELATED points count as one:
 
     C = CORRELATED A^-1 (sum over terms of s^2 A_term) A^-1
 
-The covariance is that of a pose given the map. It does not contain the drift of the map.
+The covariance is relative to the map. It does not include the drift of the map.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ MIN_VARIANCE = 1e-18  # minimum variance of a motion, m^2 and rad^2, for data wi
 
 
 def pose_covariance(terms: Sequence[NormalEquations], T_view_camera: Float64) -> Float64:
-    """Return the covariance (6, 6) of a pose: translation in m and rotation in rad, as defined by `Pose.covariance`.
+    """Return the covariance (6, 6) of a pose, as defined by `Pose.covariance`.
 
-    `terms`: the normal equations of the map and of the keyframe, if any, at T_view_camera for twists of the view's
-    frame.
+    Args:
+        terms: The normal equations of the map and, if used, of the keyframe.
+        T_view_camera: The aligned pose (4, 4) of the frame in the view.
     """
     A, spread = np.zeros((6, 6)), np.zeros((6, 6))
     for term in terms:
@@ -40,13 +41,13 @@ def pose_covariance(terms: Sequence[NormalEquations], T_view_camera: Float64) ->
 
 
 def is_significant(T_a_b: Float64, covariance: Float64) -> bool:
-    """Return True if a small motion exceeds its uncertainty: xi^T C^-1 xi > 6, the expected value for noise alone.
+    """Return True if a small motion is larger than expected from noise alone.
 
     Args:
-        T_a_b: The motion exp(xi) (4, 4).
-        covariance: The covariance C (6, 6) of xi.
+        T_a_b: The motion (4, 4).
+        covariance: The covariance (6, 6) of its twist, m and rad.
     """
     R = T_a_b[:3, :3]
     xi = np.array([*T_a_b[:3, 3], *(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2)])
-    variances, directions = np.linalg.eigh(covariance)
+    variances, directions = np.linalg.eigh(covariance)  # xi^T C^-1 xi > 6, its expected value for noise
     return bool(((directions.T @ xi) ** 2 / np.maximum(variances, MIN_VARIANCE)).sum() > len(xi))

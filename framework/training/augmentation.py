@@ -1,4 +1,4 @@
-"""Random augmentation of images and masks."""
+"""Random augmentation of training images."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # fractions of blurred, noisy and gray im
 
 
 def augmented(example: Example, rng: np.random.Generator) -> Example:
-    """Return a copy of an example that is mirrored, zoomed, recolored, blurred and made noisy at random.
+    """Apply random mirroring, zoom, color changes, blur and noise to a training image.
 
-    Objects with fewer than MIN_PIXELS pixels, or a fraction below MIN_REMAINING, in the crop are removed.
+    Small and mostly cropped objects are removed.
     """
     color, masks = example.color, example.masks
     if rng.uniform() < 0.5:
         color, masks = color[:, ::-1], masks[:, :, ::-1]
-    areas = masks.sum(axis=(1, 2))
+    areas = masks.sum(axis=(1, 2)).astype(np.float64)
     if rng.uniform() < ZOOMED:
         color, masks, scale = _zoomed(color, masks, rng)
         areas = areas * scale
@@ -36,7 +36,10 @@ def augmented(example: Example, rng: np.random.Generator) -> Example:
 
 
 def _zoomed(color: UInt8, masks: np.ndarray, rng: np.random.Generator) -> tuple[UInt8, np.ndarray, float]:
-    """Return a random crop resized to the image size (H, W, 3), its masks (N, H, W) and the scale factor of areas."""
+    """Crop an image and its masks at random and resize them to the original size.
+
+    The third result is the scale factor of areas.
+    """
     height, width = color.shape[:2]
     fraction = rng.uniform(*ZOOM)
     h, w = round(fraction * height), round(fraction * width)

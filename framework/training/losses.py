@@ -1,7 +1,6 @@
-"""The loss of Mask R-CNN (He et al. 2017) on Faster R-CNN's anchors (Ren et al. 2015).
+"""Loss functions of Mask R-CNN (He et al. 2017, Ren et al. 2015).
 
-Boxes are x1 y1 x2 y2, px, with extent 0 (width = x2 - x1). `own` (N,) contains the index of the object assigned to each
-box, BACKGROUND or IGNORED.
+Boxes are x1 y1 x2 y2, px, and have the width x2 - x1.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ BACKGROUND, IGNORED = -1, -2
 
 @dataclass(frozen=True)
 class Objects:
-    """The N objects in one image."""
+    """The ground-truth objects in an image."""
 
-    boxes: Tensor  # (N, 4) px, extent 0
+    boxes: Tensor  # (N, 4) px
     labels: Tensor  # (N,) class labels, from 1
     masks: Tensor  # (N, H, W) bool
 
@@ -38,7 +37,7 @@ class Objects:
 
 @dataclass(frozen=True)
 class Budget:
-    """Limits per image in a training step."""
+    """Limits for the proposals of an image in a training step."""
 
     before_nms: int = 500  # maximum number of decoded anchors per level
     after_nms: int = 300  # maximum number of proposals after non-maximum suppression
@@ -48,9 +47,20 @@ class Budget:
 def losses(
     network: MaskRCNN, images: Tensor, objects: Sequence[Objects], budget: Budget, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Return the five terms of the loss by name, each the mean over the `images` (N, 3, H, W), RGB 0..255.
+    """Compute the loss terms of a batch.
 
-    The loss is the sum of the terms: objectness and deltas of anchors; classes, box deltas and masks of proposals.
+    The terms are the objectness and box deltas of anchors, and the classes, box deltas and masks of proposals. The loss
+    is the sum of the terms.
+
+    Args:
+        network: The network.
+        images: The images (N, 3, H, W), RGB, 0 to 255.
+        objects: The ground-truth objects of each image.
+        budget: The limits for the proposals.
+        generator: The random number generator.
+
+    Returns:
+        The mean of each term over the images, by name.
     """
     shape = (images.shape[2], images.shape[3])
     pyramid = network.extract(network.normalize(images))
@@ -111,7 +121,7 @@ def _proposal_losses(
 
 
 def box_iou(a: Tensor, b: Tensor) -> Tensor:
-    """Return the intersection over union (N, M) of each of N boxes `a` (N, 4) with each of M boxes `b` (M, 4)."""
+    """Return the intersection over union (N, M) for each pair of boxes `a` (N, 4) and `b` (M, 4)."""
     low = torch.maximum(a[:, None, :2], b[None, :, :2])
     high = torch.minimum(a[:, None, 2:], b[None, :, 2:])
     shared = (high - low).clamp(min=0).prod(dim=2)
@@ -120,10 +130,19 @@ def box_iou(a: Tensor, b: Tensor) -> Tensor:
 
 
 def match(iou: Tensor, foreground: float, background: float, each_object: bool) -> Tensor:
-    """Return `own` (N,), the object assigned to each of N boxes by their `iou` (N, M) with M objects.
+    """Assign ground-truth objects to boxes.
 
-    A box gets its best object at an IoU of at least `foreground`, BACKGROUND below `background`, otherwise IGNORED.
-    With `each_object`, the boxes with the highest IoU with an object also get their best object, if this IoU is > 0.
+    A box is assigned to its best object if their IoU is at least `foreground`. It becomes BACKGROUND if the IoU is
+    below `background`, otherwise IGNORED.
+
+    Args:
+        iou: The IoU (N, M) of N boxes with M objects.
+        foreground: The minimum IoU for an assignment.
+        background: The IoU below which a box is background.
+        each_object: True = also assign the boxes with the highest IoU of each object, even below `foreground`.
+
+    Returns:
+        The index of the assigned object, BACKGROUND or IGNORED for each box (N,).
     """
     if iou.shape[1] == 0:
         return torch.full((len(iou),), BACKGROUND, device=iou.device)
@@ -139,9 +158,16 @@ def match(iou: Tensor, foreground: float, background: float, each_object: bool) 
 
 
 def sample(own: Tensor, count: int, positive_fraction: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return the indices of random boxes with an object, and of random background boxes, at most `count` in total.
+    """Draw a random sample of boxes with an object and of background boxes.
 
-    `own`: (N,). `positive_fraction`: maximum fraction of `count` for boxes with an object.
+    Args:
+        own: The assigned object (N,) of each box, from `match`.
+        count: The maximum number of boxes.
+        positive_fraction: The maximum fraction of boxes with an object.
+        generator: The random number generator.
+
+    Returns:
+        The indices of the boxes with an object, and of the background boxes.
     """
     positive = _draw(torch.nonzero(own >= 0)[:, 0], int(count * positive_fraction), generator)
     negative = _draw(torch.nonzero(own == BACKGROUND)[:, 0], count - len(positive), generator)
@@ -154,18 +180,27 @@ def _draw(indices: Tensor, count: int, generator: torch.Generator) -> Tensor:
 
 
 def encode(boxes: Tensor, objects: Tensor) -> Tensor:
-    """Return the deltas dx dy dw dh (N, 4) from `boxes` to `objects` (N, 4), the inverse of boxes.decode."""
+    """Return the deltas (N, 4) dx dy dw dh that move boxes (N, 4) to objects (N, 4).
+
+    This is the inverse of `framework.detection.masks.boxes.decode`.
+    """
     sizes, wanted = boxes[:, 2:] - boxes[:, :2], objects[:, 2:] - objects[:, :2]
     centers, targets = boxes[:, :2] + sizes / 2, objects[:, :2] + wanted / 2
     return torch.cat([(targets - centers) / sizes, torch.log(wanted / sizes)], dim=1)
 
 
 def mask_targets(masks: Tensor, boxes: Tensor, own: Tensor, bins: int) -> Tensor:
-    """Return the target masks (N, bins, bins) of boxes (N, 4): 1 in bins at least half covered by the object, else 0.
+    """Return the target masks (N, bins, bins) of boxes.
 
-    `masks`: (M, H, W) bool, of the M objects. `own`: (N,), the object of each box. Pixel centers are at half-integer
-    coordinates, as in boxes with extent 0.
+    The target is 1 in bins that are at least half covered by the object, and 0 in other bins.
+
+    Args:
+        masks: The masks (M, H, W) of the objects.
+        boxes: The boxes (N, 4), px.
+        own: The index of the object (N,) of each box.
+        bins: The number of bins per side.
     """
+    # pixel centers are at half-integer coordinates
     targets = torch.empty((len(boxes), bins, bins), device=boxes.device)
     for k in torch.unique(own).tolist():
         of_object = own == k

@@ -1,10 +1,7 @@
-"""Training images of synthetic scenes with instance ids.
+"""Training images of synthetic rooms, rendered from random poses.
 
-Each room has its own random stream and is rendered from random poses towards its objects. Domain randomization (Tobin
-et al. 2017) changes the colors of all surfaces in most images, so that a network learns shapes.
-
-The folder of a room contains 000000.jpg, 000000.png (16-bit instance ids), ... and classes.json. It is written
-atomically.
+The colors of surfaces are randomized in most images (domain randomization, Tobin et al. 2017), so that a network learns
+shapes. The folder of a room contains 000000.jpg, 000000.png (16-bit instance ids), ... and classes.json.
 """
 
 from __future__ import annotations
@@ -49,7 +46,7 @@ TRIES = 20  # maximum number of candidate views for each image
 
 @dataclass(frozen=True)
 class Example:
-    """One image with N objects of known class."""
+    """A training image with N objects."""
 
     color: UInt8  # (H, W, 3) RGB
     masks: Bool  # (N, H, W)
@@ -57,9 +54,14 @@ class Example:
 
 
 def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: int) -> None:
-    """Render `views` images of each of `rooms` rooms, from number `first` on, into `folder`; existing rooms are kept.
+    """Render the images of rooms that do not exist yet.
 
-    `processes`: number of rendering processes.
+    Args:
+        folder: The output folder.
+        first: The number of the first room.
+        rooms: The number of rooms.
+        views: The number of images per room.
+        processes: The number of rendering processes.
     """
     folder.mkdir(parents=True, exist_ok=True)
     missing = [number for number in range(first, first + rooms) if not room_folder(folder, number).is_dir()]
@@ -73,12 +75,12 @@ def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: in
 
 
 def room_folder(folder: Path, number: int) -> Path:
-    """Return the folder of training room `number` in `folder`."""
+    """Return the folder of a room."""
     return folder / f"room_{number:06d}"
 
 
 def render_room(folder: Path, views: int, number: int) -> None:
-    """Render `views` images of room `number`, and write them atomically to its folder in `folder`."""
+    """Render the images of a room and write them to a new folder atomically."""
     with tempfile.TemporaryDirectory(dir=folder, prefix=".room_") as unfinished:
         target = Path(unfinished) / "room"
         target.mkdir()
@@ -91,7 +93,15 @@ def render_room(folder: Path, views: int, number: int) -> None:
 
 
 def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[int, str]]]:
-    """Yield color (H, W, 3), instance ids (H, W) uint16 and COCO classes by id for random views of room `number`."""
+    """Render random views of a room.
+
+    Args:
+        number: The number of the room, which determines its content.
+        views: The number of views.
+
+    Yields:
+        The color (H, W, 3), the instance ids (H, W), and the COCO class of each instance id.
+    """
     rng = np.random.default_rng([STREAM, number])
     kinds = list(RoomKind)
     room = furnish(RoomKind.STUDIO if rng.uniform() < STUDIOS else kinds[int(rng.integers(len(kinds)))], rng)
@@ -105,7 +115,7 @@ def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[
 def _random_views(
     room: Room, renderer: Renderer, names: Mapping[int, str], views: int, rng: np.random.Generator
 ) -> Iterator[tuple[Camera, Float64]]:
-    """Yield the camera and T_world_camera (4, 4) of `views` random views of objects with a class (`names` by id)."""
+    """Yield the camera and pose T_world_camera (4, 4) of random views of objects."""
     centers = [_centers(room, [i for i in names if names[i] == name]) for name in sorted(set(names.values()))]
     for _ in range(views):
         for _ in range(TRIES):
@@ -119,16 +129,16 @@ def _random_views(
 
 
 def _centers(room: Room, ids: Sequence[int]) -> Float64:
-    """Return the centers (N, 3), m, of the axis-aligned bounding boxes of N objects, world frame."""
+    """Return the centers (N, 3), m, of the bounding boxes of N objects."""
     surfaces = room.surfaces
     corners = [surfaces.vertices[surfaces.triangles[surfaces.instance_ids == i]].reshape(-1, 3) for i in ids]
     return np.array([(c.min(axis=0) + c.max(axis=0)) / 2 for c in corners], np.float64)
 
 
 def _view(room: Room, centers: Sequence[Float64], rng: np.random.Generator) -> Float64:
-    """Return a random T_world_camera (4, 4) above free floor, roughly towards an object of a random class.
+    """Return a random camera pose (4, 4) above free floor, roughly towards a random object.
 
-    `centers`: for each class, the centers (N, 3), m, of its objects.
+    `centers` contains the centers (N, 3), m, of the objects of each class.
     """
     layout = room.layout
     rows, columns = np.nonzero(layout.free >= CLEAR)
@@ -143,10 +153,7 @@ def _view(room: Room, centers: Sequence[Float64], rng: np.random.Generator) -> F
 
 
 def _tinted(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the material table with the colors of each material multiplied by random factors.
-
-    The colors stay the same in a fraction 1 - TINTED of the calls.
-    """
+    """Multiply the colors of each material by random factors in most calls."""
     if rng.uniform() > TINTED:
         return table
     gains = np.exp(rng.uniform(-TINT, TINT, (len(table), 1)) + rng.uniform(-TINT, TINT, (len(table), 3)))

@@ -1,4 +1,4 @@
-"""Training run: render rooms, train, evaluate on held-out rooms.
+"""Training of a detector on synthetic rooms, with evaluation on held-out rooms.
 
 Outputs: network.safetensors (for `detector=mask_rcnn detector.weights=...`), checkpoint.pt (to resume), losses.csv,
 losses.png and average_precision.json.
@@ -46,9 +46,11 @@ NETWORK, PRECISION = "network.safetensors", "average_precision.json"
 
 
 def train(config: DictConfig, folder: Path) -> AveragePrecision:
-    """Render missing rooms, run the remaining training steps, and return the mask AP on the held-out rooms.
+    """Render missing rooms, train a network and return its mask AP on held-out rooms.
 
-    `folder`: output folder; training resumes from its checkpoint, if any.
+    Args:
+        config: The training config.
+        folder: The output folder. Training resumes from the checkpoint in this folder, if any.
     """
     Settings.of(config).apply()
     torch.manual_seed(config.seed)
@@ -91,10 +93,7 @@ def train(config: DictConfig, folder: Path) -> AveragePrecision:
 
 
 def _started(config: DictConfig) -> MaskRCNN:
-    """Return the initial network of the section `network`: random weights, or those of `start_from`.
-
-    Raises ConfigError if `start_from` has another architecture.
-    """
+    """Return the initial network, with random weights or those of `start_from`."""
     network = MaskRCNN(architecture(config))
     if config.start_from:
         start = load_network(Path(config.start_from))
@@ -110,7 +109,7 @@ def _started(config: DictConfig) -> MaskRCNN:
 
 
 def architecture(network: DictConfig) -> Architecture:
-    """Return the architecture configured in the section `network`, for the classes of synthetic scenes."""
+    """Return the architecture that is configured in the section `network`."""
     require(network.backbone in DEPTHS, "network.backbone", network.backbone, f"one of {', '.join(DEPTHS)}")
     return Architecture(
         classes=tuple(name for name in COCO if name in SCENENN_TO_COCO.values()),
@@ -126,13 +125,13 @@ def architecture(network: DictConfig) -> Architecture:
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values with None for non-finite numbers, which JSON cannot represent."""
+    """Replace non-finite numbers by None, because JSON does not support them."""
     inner = {name: _known(value) if isinstance(value, Mapping) else value for name, value in values.items()}
     return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in inner.items()}
 
 
 def _detected(detector: Detector, pictures: RoomPictures) -> Iterator[tuple[Bool, Sequence[str], Detections]]:
-    """Yield the ground-truth masks, their classes and the detections of each image."""
+    """Yield the ground-truth masks, the class names and the detections of each image."""
     for k in tqdm(range(len(pictures)), desc="evaluating", unit="image", disable=None):
         example = pictures[k]
         height, width = example.color.shape[:2]

@@ -1,6 +1,7 @@
-"""Training loop: batches, steps, checkpoints and the loss curve.
+"""Training loop with checkpoints and a plot of the losses.
 
-The random numbers of a step depend only on the seed and the step, so that a resumed run equals an uninterrupted run.
+The random numbers of a step depend only on the seed and the step. The result of a resumed run therefore equals that of
+an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -53,7 +54,10 @@ class Schedule:
         require(0 <= self.ema_decay < 1, "schedule.ema_decay", self.ema_decay, "a value in [0, 1)")
 
     def rate(self, step: int) -> float:
-        """Return the learning rate of a step: linear warmup, then a cosine decay to a hundredth of the maximum."""
+        """Return the learning rate of a step.
+
+        It increases linearly during the warmup, then follows a cosine decay to 1% of the maximum.
+        """
         if step < self.warmup:
             return self.learning_rate * (step + 1) / self.warmup
         done = (step - self.warmup) / max(1, self.steps - self.warmup)
@@ -61,7 +65,10 @@ class Schedule:
 
 
 class Trainer:
-    """Trainer of a network on images; resumes from the last checkpoint in `folder`, if any."""
+    """Trainer of a Mask R-CNN.
+
+    Training resumes from the last checkpoint in `folder`, if any.
+    """
 
     def __init__(
         self, network: MaskRCNN, pictures: RoomPictures, schedule: Schedule, folder: Path, device: str
@@ -85,7 +92,10 @@ class Trainer:
             self._resume()
 
     def run(self) -> None:
-        """Run the remaining steps; Ctrl-C discards the steps after the last checkpoint."""
+        """Run the remaining training steps.
+
+        If interrupted, the steps after the last checkpoint are lost.
+        """
         with tqdm(total=self.schedule.steps, initial=self.step, desc="training", unit="step", disable=None) as bar:
             while self.step < self.schedule.steps:
                 terms = self._learn()
@@ -97,13 +107,13 @@ class Trainer:
                     self._save()
 
     def trained(self) -> MaskRCNN:
-        """Return the network with averaged weights, on the CPU, for evaluation."""
+        """Return the network with averaged weights, on the CPU."""
         network = MaskRCNN(self.network.architecture)
         network.load_state_dict({name: value.cpu() for name, value in self.averaged.items()})
         return network.eval()
 
     def _learn(self) -> dict[str, float]:
-        """Run one training step and return the terms of the loss by name."""
+        """Run one training step and return the loss terms by name."""
         rng = np.random.default_rng([self.schedule.seed, self.step])
         chosen = rng.integers(len(self.pictures), size=self.schedule.batch)
         examples = [augmented(self.pictures[int(k)], rng) for k in chosen]
@@ -131,7 +141,7 @@ class Trainer:
         unknown = sorted(set(example.class_names) - set(index))
         if unknown:
             raise DataError(
-                f"pictures.folder: expected only classes of the network in the rendered rooms, got "
+                f"pictures.folder: expected rendered scenes with only the classes of the network, got "
                 f"{', '.join(unknown)}; set pictures.folder to an empty folder"
             )
         boxes = tight_boxes(example.masks) + np.array([0, 0, 1, 1], np.float32)  # from pixel centers to borders
@@ -183,7 +193,7 @@ class Trainer:
 
 
 def draw_losses(history: Sequence[dict[str, float]], path: Path) -> None:
-    """Plot the running means of the loss terms over the steps on a logarithmic scale."""
+    """Plot the running means of the loss terms."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
     width = max(1, len(history) // 60)

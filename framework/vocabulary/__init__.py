@@ -1,1 +1,1 @@
-"""Label spaces, color names and text queries."""
+"""Class names, color names and text queries."""

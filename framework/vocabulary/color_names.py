@@ -1,4 +1,4 @@
-"""Color names: the basic color terms of English (Berlin and Kay 1969) and beige."""
+"""Color names: the basic color terms of English (Berlin and Kay 1969), and beige."""
 
 from __future__ import annotations
 
@@ -30,33 +30,31 @@ OTHER_SPELLINGS = {"grey": "gray", "violet": "purple", "turquoise": "blue", "tea
 
 
 def lab(srgb: Float32) -> Float32:
-    """Return sRGB colors (N, 3) in [0, 1] as CIELAB (N, 3), in which distances are approximately perceptual."""
+    """Convert sRGB colors (N, 3) in [0, 1] to CIELAB (N, 3)."""
     return np.asarray(cv2.cvtColor(srgb.reshape(1, -1, 3).astype(np.float32), cv2.COLOR_RGB2LAB)[0], np.float32)
 
 
 def nearest_names(srgb: Float32) -> Int32:
-    """Return the indices (N,) in COLOR_NAMES of the names nearest to sRGB colors (N, 3) in [0, 1]."""
+    """Return the index (N,) of the nearest color name for each sRGB color (N, 3) in [0, 1]."""
     distances = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
     return np.asarray(_NAME_OF_SAMPLE[distances.argmin(axis=1)], np.int32)
 
 
 def fits(srgb: Float32, name: str) -> Float32:
-    """Return the fit (N,) in [0, 1] of a name of COLOR_NAMES to sRGB colors (N, 3) in [0, 1].
+    """Rate how well a color name describes each sRGB color (N, 3) in [0, 1].
 
-    The fit is exp(-d^2 / (2 CONFUSED^2)), where d is the distance to this name minus the distance to the nearest name,
-    both in CIELAB. So it is 1 for the nearest name.
+    The scores (N,) are in [0, 1]. The score is 1 if the name is the nearest name.
     """
     distances = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
+    # distance to this name minus the distance to the nearest name, in CIELAB
     additional = distances[:, COLOR_NAMES.index(name) == _NAME_OF_SAMPLE].min(axis=1) - distances.min(axis=1)
     return np.asarray(np.exp(-0.5 * (additional / CONFUSED) ** 2), np.float32)
 
 
 @cache
 def _samples_lab() -> Float32:
-    """Return the CIELAB colors (S, 3) of all S samples, in the order of COLOR_NAMES.
-
-    They are computed on demand, because the first conversion in OpenCV is slow.
-    """
+    """Return the CIELAB colors (S, 3) of all samples."""
+    # computed on demand, because the first conversion in OpenCV is slow
     samples = [sample for samples in _SAMPLES.values() for sample in samples]
     return lab(np.array(samples, np.float32) / np.float32(255))
 

@@ -1,4 +1,7 @@
-"""Label spaces. Datasets and detectors use COCO names; `label_spaces.yaml` maps the names of other spaces to them."""
+"""Label spaces and their mapping to COCO names.
+
+Datasets and detectors use COCO names. `label_spaces.yaml` maps the names of other label spaces to COCO names.
+"""
 
 from __future__ import annotations
 
@@ -41,17 +44,23 @@ MEANINGS: Mapping[str, str | None] = {name: coco for names in _SECTIONS.values()
 
 @dataclass(frozen=True)
 class LabelMapping:
-    """The mapping from the labels of a detector to COCO names."""
+    """Mapping from the C labels of a detector to C' COCO names."""
 
     classes: tuple[str, ...]  # (C',) COCO names of the labels, in COCO's order
     meaning: Int32  # (C,) index of each label in `classes`; -1 = no object class of COCO
 
     def apply(self, probabilities: Float32) -> tuple[Float32, Bool]:
-        """Return the float32 distributions (N, C') over `classes`, and an array (N,), True where they are meaningful.
+        """Convert label probabilities to distributions over COCO names.
 
-        `probabilities` (N, C) are nonnegative weights of the labels. Labels with the same COCO name are summed, labels
-        without a COCO name are removed, and the result is normalized. The array is True for rows whose best label has a
-        COCO name. A row whose sum is 0 becomes uniform, and its entry is False.
+        Probabilities of labels with the same COCO name are added. Labels without a COCO name are removed, and the
+        result is normalized.
+
+        Args:
+            probabilities: The probabilities or nonnegative weights (N, C) of the labels.
+
+        Returns:
+            The distributions (N, C') over `classes`, and an array (N,) that is True if the best label has a COCO name.
+            A row without COCO names is a uniform distribution.
         """
         has_meaning = self.meaning >= 0
         sums = np.zeros((len(probabilities), len(self.classes)))
@@ -63,9 +72,13 @@ class LabelMapping:
 
 
 def read_labels(name_or_path: str) -> tuple[str, ...]:
-    """Return the names of a label space ("coco", "nyu40", ...), or the lines of a text file with one name per line.
+    """Return the names of a label space, or the lines of a text file with one name per line.
 
-    Raises ConfigError for other values.
+    Args:
+        name_or_path: The name of a label space, such as "coco" or "nyu40", or the path of a text file.
+
+    Raises:
+        ConfigError: The label space or file does not exist, or the file is invalid.
     """
     if name_or_path in SPACES:
         return SPACES[name_or_path]
@@ -89,10 +102,16 @@ def read_labels(name_or_path: str) -> tuple[str, ...]:
 
 
 def to_coco(labels: Sequence[str], key: str = "detector.label_space") -> LabelMapping:
-    """Map `labels` from the config key `key` to COCO names with `label_spaces.yaml`.
+    """Map labels to COCO names.
 
-    Case, leading and trailing spaces, and text after a comma are ignored: "Sofa, couch, lounge" is "sofa". Raises
-    ConfigError with all unknown labels, or if no label is an object class of COCO.
+    Case and text after a comma are ignored, so that "Sofa, couch, lounge" is "sofa".
+
+    Args:
+        labels: The labels.
+        key: The config key, for messages.
+
+    Raises:
+        ConfigError: Labels are unknown, or no label is a COCO class.
     """
     keys = [label.partition(",")[0].strip().lower() for label in labels]
     unknown = [label for label, key in zip(labels, keys, strict=True) if key not in MEANINGS]

@@ -34,10 +34,14 @@ class ObjectWords:
 
 
 def object_words(query: str, classes: Collection[str]) -> ObjectWords:
-    """Return the names of `classes`, the colors and the unknown words in a text query.
+    """Parse a text query.
 
     Case, articles, plurals and shades of colors are ignored. Names of other label spaces are mapped to COCO names (sofa
-    = couch). An ambiguous word (orange) is a color if a class follows, otherwise a class.
+    = couch). An ambiguous word, such as orange, is a color if a class follows, otherwise a class.
+
+    Args:
+        query: The text query.
+        classes: The known class names.
     """
     words = re.findall(r"[^\W_]+(?:[-'][^\W_]+)*", query.lower())
     known = {name.lower(): name for name in classes}
@@ -62,14 +66,20 @@ def object_words(query: str, classes: Collection[str]) -> ObjectWords:
 
 
 def _color(word: list[str]) -> str:
-    """Return the first word of a list, in the spelling of COLOR_NAMES if it is a color; "" for an empty list."""
+    """Return the first word, with the spelling of COLOR_NAMES if it is a color."""
     return OTHER_SPELLINGS.get(word[0], word[0]) if word else ""
 
 
 def _class_at(words: list[str], at: int, known: dict[str, str]) -> tuple[int, str]:
-    """Return the number of words and the name of the longest class name that starts at word `at`; 0 and "" = none.
+    """Find the longest class name that starts at a word of the query.
 
-    `known`: the names of the classes by lower-case name.
+    Args:
+        words: The words of the query.
+        at: The index of the first word.
+        known: The class names by lower-case name.
+
+    Returns:
+        The number of words and the class name, or 0 and "" if there is none.
     """
     for length in range(min(MAX_WORDS, len(words) - at), 0, -1):
         phrase = words[at : at + length]
@@ -82,7 +92,7 @@ def _class_at(words: list[str], at: int, known: dict[str, str]) -> tuple[int, st
 
 
 def _singulars(word: str) -> list[str]:
-    """Return the possible singulars of a word, starting with the word itself."""
+    """Return the possible singulars of a word, including the word itself."""
     endings = (("ies", "y"), ("es", ""), ("s", ""))
     regular = [word.removesuffix(plural) + singular for plural, singular in endings if word.endswith(plural)]
     return [word, IRREGULAR.get(word, word), *regular]

@@ -1,1 +1,1 @@
-"""Detectors: object instances in one image."""
+"""Detectors of object instances in images."""

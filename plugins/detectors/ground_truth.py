@@ -1,4 +1,4 @@
-"""Ground truth as detections, the upper bound of detection accuracy."""
+"""Detector that returns the ground truth, an upper bound of detection accuracy."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from framework.vocabulary.label_spaces import COCO
 
 @dataclass
 class GroundTruthDetector(Detector):
-    """Visible ground-truth instances of known class, with exact masks, score 1 and class probability 1.
+    """Visible ground-truth instances of known class, with exact masks.
 
-    Raises DataError for a sequence without instance ground truth.
+    The score and the probability of the class are 1. The detector raises DataError if the sequence has no instance
+    ground truth.
     """
 
     # minimum number of pixels of a detected instance, >= 1; 64 is about the limit of real detectors

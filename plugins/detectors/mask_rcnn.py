@@ -1,4 +1,4 @@
-"""Mask R-CNN with a ResNet and a feature pyramid, the common baseline detector of semantic mapping."""
+"""Mask R-CNN with a ResNet and a feature pyramid, a common baseline detector."""
 
 from __future__ import annotations
 
@@ -31,13 +31,15 @@ from framework.interfaces import Detector
 
 @dataclass
 class MaskRCNNDetector(Detector):
-    """Mask R-CNN (He et al. 2017) with ResNet-50 or ResNet-101 and a feature pyramid, on the CPU or with CUDA.
+    """Mask R-CNN (He et al., 2017) with ResNet-50 or ResNet-101 and a feature pyramid, on the CPU or with CUDA.
 
-    The network is torchvision's or detectron2's published COCO network, downloaded once, or a network trained or
-    converted with this project. The class distribution of a detection is the box head's softmax, renormalized without
-    the background. Its score is the probability of its class, including the background. After suppression within a
-    class, `agnostic_nms_iou` removes duplicates across classes: an ambiguous object is returned once, with both classes
-    in its distribution. After construction, `weights` is the file and `domain` its image domain.
+    The network is a published COCO network of torchvision or detectron2, which is downloaded once, or a network trained
+    or converted with this project.
+
+    The class distribution of a detection is the softmax over the class scores, renormalized without the background. The
+    score of a detection is the probability of its class, including the background. Non-maximum suppression across
+    classes removes duplicates of ambiguous objects. After construction, `weights` is the path of the file, and `domain`
+    is the domain of its training images.
     """
 
     weights: Path = Path("resnet50_fpn_coco")  # published name, or file relative to the working or project folder
@@ -112,7 +114,7 @@ class MaskRCNNDetector(Detector):
         return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms_iou)
 
     def _resize(self, frame: Frame) -> Tensor:
-        """Return the resized image (1, 3, H, W), RGB, 0..255, the input of the network before normalization."""
+        """Return the resized image (1, 3, H, W), RGB, in [0, 255]."""
         height, width = frame.camera.shape
         scale = min(self._short_side / min(height, width), self._long_side / max(height, width))
         size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -122,9 +124,9 @@ class MaskRCNNDetector(Detector):
         return image.contiguous(memory_format=torch.channels_last)
 
     def _mask_grids(self, pyramid: list[Tensor], boxes: Float32, label: Int32) -> Float32:
-        """Return grids (N, 28, 28) over boxes (N, 4), px, of the probability that a point is inside the object.
+        """Return the mask probabilities (N, 28, 28) on a grid over each box (N, 4), px.
 
-        `label`: the class (N,) of the object in each box, from 1.
+        `label` (N,) is the class of each box, from 1.
         """
         logits = self._network.segment(pyramid, self._on_device(boxes))
         own = logits[torch.arange(len(label), device=self._device), self._on_device(label).long()]
@@ -134,7 +136,7 @@ class MaskRCNNDetector(Detector):
         return torch.from_numpy(array).to(self._device)
 
     def _finite(self, tensor: Tensor) -> Float32:
-        """Return the tensor as an array in single precision. Raises DataError if the network overflowed."""
+        """Return the tensor as an array in single precision, after checking that it is finite."""
         array: Float32 = tensor.float().cpu().numpy()
         if not np.isfinite(array).all():
             fix = "; set detector.half_precision=false" if self._network.dtype == torch.float16 else ""

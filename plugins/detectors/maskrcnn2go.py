@@ -51,7 +51,7 @@ SHA256 = {
 }
 STRIDE = 16  # side of a cell of the feature map, px of the resized image
 BINS = 6  # number of bins of RoIAlign per side
-PRE_NMS_PROPOSALS = 3000  # number of best anchors that are decoded, as in the graph
+PRE_NMS_PROPOSALS = 3000  # number of anchors that are decoded, best first, as in the graph
 EXTENT = 1.0  # extent of the boxes; see framework.detection.masks.boxes
 
 log = logging.getLogger(__name__)
@@ -59,13 +59,14 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class MaskRCNN2Go(Detector):
-    """Mask R-CNN 2Go (Facebook, Apache-2.0; COCO 2014 minival mask AP 20.9 as published), on the CPU or with CUDA.
+    """Mask R-CNN 2Go (Facebook, Apache-2.0), on the CPU or with CUDA.
 
-    On x86 CPUs with VNNI (since about 2020) the network computes with 8-bit integers, in one thread per frame. On other
-    devices it computes in float with the same weights. The class distribution of a detection is the box head's softmax
-    over 80 classes, renormalized without the background. Its score is the probability of its class, including the
-    background. After suppression within a class, `agnostic_nms_iou` removes duplicates across classes, so that an
-    ambiguous object does not create two instances.
+    The published mask AP on COCO 2014 minival is 20.9. On x86 CPUs with VNNI (since about 2020), the network computes
+    with 8-bit integers, in one thread per frame. On other devices, it computes in floating point with the same weights.
+
+    The class distribution of a detection is the softmax over the class scores of 80 classes, renormalized without the
+    background. The score of a detection is the probability of its class, including the background. Non-maximum
+    suppression across classes removes duplicates of ambiguous objects.
     """
 
     # folder of the network, absolute or relative to the working directory or the project folder
@@ -119,7 +120,8 @@ class MaskRCNN2Go(Detector):
         self._mask_upsampling = tensors["mask_fcn_logits_up_w_int8"], tensors["mask_fcn_logits_up_b_int8"]
 
     def fingerprint(self) -> str:
-        """Return a hash that includes the arithmetic, because integer and float results differ slightly."""
+        """Return a hash that includes the arithmetic."""
+        # integer and floating-point results differ slightly
         return f"{fingerprint(self)} {'int8' if self._integers else 'float32'}"
 
     @torch.inference_mode()
@@ -153,7 +155,7 @@ class MaskRCNN2Go(Detector):
         return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms_iou)
 
     def _resize(self, frame: Frame) -> Tensor:
-        """Return the resized image (1, 3, H, W), RGB, 0..255, the input of the network."""
+        """Return the resized image (1, 3, H, W), RGB, in [0, 255]."""
         height, width = frame.camera.shape
         scale = min(self.short_side / min(height, width), self.long_side / max(height, width))
         size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -164,9 +166,9 @@ class MaskRCNN2Go(Detector):
         return roi_align(features, torch.from_numpy(boxes).to(self._device), BINS, 1 / STRIDE)
 
     def _mask_grids(self, pooled: Tensor, label: Int32) -> Float32:
-        """Return grids (N, 24, 24) over N boxes of the probability that a point is inside the object.
+        """Return the mask probabilities (N, 24, 24) on a grid over each box.
 
-        `pooled`: the features of the boxes. `label`: the class (N,) of the object in each box, from 1.
+        `label` (N,) is the class of each box, from 1.
         """
         (features,) = self._mask_head(pooled)
         own = torch.from_numpy(label).long().to(self._device)
@@ -179,7 +181,7 @@ class MaskRCNN2Go(Detector):
 
 
 def _find_weights(folder: Path) -> Path:
-    """Return the existing folder of the network. Raises DataError if the folder is missing.
+    """Return the existing folder of the network.
 
     A relative path is searched in the working directory, then in the project folder.
     """
@@ -191,7 +193,7 @@ def _find_weights(folder: Path) -> Path:
 
 
 def _read_network(folder: Path) -> tuple[list[Operator], dict[str, Tensor], dict[str, float]]:
-    """Return the operators in order, the float32 tensors by name, and the quantization steps of quantized tensors."""
+    """Return the operators, the float32 tensors by name, and the quantization steps of quantized tensors."""
     content = {name: _read_checked(folder / name, sha256) for name, sha256 in SHA256.items()}
     description = json.loads(content["graph.json"])
     quantization: Mapping[str, tuple[float, int]] = description["quant"]

@@ -1,4 +1,4 @@
-"""No detections: reconstruction without instances."""
+"""Detector without detections."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from framework.vocabulary.label_spaces import COCO
 
 @dataclass
 class NoDetections(Detector):
-    """Detector without detections, for a geometry-only map and for run times without instances."""
+    """Detector without detections, for maps without instances."""
 
     def __post_init__(self) -> None:
         self.classes = COCO

@@ -1,4 +1,4 @@
-"""Box detector (YOLO, SSD) from an ONNX file, with masks from depth."""
+"""Box detectors (YOLO, SSD) in ONNX files, with masks from depth."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ SOURCE = "yolox_nano.onnx (3.7 MB, COCO, Apache-2.0) is at https://github.com/Me
 
 @dataclass
 class OnnxBoxes(Detector):
-    """YOLO or SSD from an ONNX file, run by onnxruntime, with masks from depth.
+    """YOLO or SSD in an ONNX file, with masks from depth; needs the extra `onnx`.
 
-    The class distribution of a detection consists of the normalized products of its class scores and objectness. Its
-    score is the largest of these products before normalization. A mask is the connected foreground of its box; see
-    `framework.detection.masks.masks_from_boxes`. A box with too few depth readings is dropped and counted in
-    `boxes_without_depth`. The defaults match Megvii's YOLOX.
+    The class scores of a detection are multiplied by its objectness. Its class distribution is their normalized
+    product, and its score is the largest product. The mask is the connected foreground in the box; see
+    `framework.detection.masks.masks_from_boxes`. Boxes with too few depth readings are dropped and counted in
+    `boxes_without_depth`. The defaults are for YOLOX.
     """
 
     weights: Path = field(metadata={"source": SOURCE})  # ONNX file, relative to the working or project folder
@@ -88,8 +88,9 @@ class OnnxBoxes(Detector):
         return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms_iou)
 
     def _report_dropped(self, frame: Frame, found: Bool) -> None:
-        """Count and log dropped boxes, the first time as a warning and then at debug level."""
+        """Count and log dropped boxes."""
         missing = int((~found).sum())
+        # only the first frame with dropped boxes is a warning
         level = logging.DEBUG if self.boxes_without_depth else logging.WARNING
         self.boxes_without_depth += missing
         log.log(

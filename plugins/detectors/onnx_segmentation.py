@@ -1,4 +1,4 @@
-"""Instance segmentation network of the YOLO family from an ONNX file."""
+"""Instance segmentation networks of the YOLO family in ONNX files."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ log = logging.getLogger(__name__)
 class OnnxSegmentation(Detector):
     """YOLO-style instance segmentation with mask coefficients and prototypes; needs the extra `onnx`.
 
-    The network has K candidates, each with a box, C class scores and M coefficients of the prototypes. The outputs are
-    (1, 4 + C + M, K) or its transpose, and (1, M, h, w) or (1, h, w, M). If suppression is part of the network (exports
-    with `nms=True`, networks without duplicates), the first output is (1, K, 6 + M), with x1 y1 x2 y2, score and label.
-    Boxes are in px of the input or in 0..1. The layout is detected from shapes and from the outputs for a black image,
-    see `framework.detection.segmentation_output`. An ambiguous layout raises DataError.
+    The network has K candidates with a box, C class scores and M mask coefficients each. Its outputs have the shapes
+    (1, 4 + C + M, K), or transposed, and (1, M, h, w) or (1, h, w, M). If the network includes non-maximum suppression,
+    the first output is (1, K, 6 + M) with x1, y1, x2, y2, score and label. Boxes are in px of the input or in [0, 1].
+    The layout is detected automatically; see `framework.detection.segmentation_output`. The detector raises DataError
+    if the layout is ambiguous.
 
-    The class distribution of a detection is its normalized class scores. Its score is the largest class score before
-    normalization. Suppression in the network discards the scores of the other classes. Then the other classes get equal
-    parts of `class_spread` * (1 - score), so that ambiguous objects contribute less to the map. The defaults match
-    Ultralytics' exports. Ultralytics' code and weights (AGPL) are not part of this project.
+    The class distribution of a detection is its normalized class scores, and its score is the largest class score. If
+    the network reports only one class, the other classes share `class_spread` * (1 - score) equally. Uncertain
+    detections then contribute less to the map. The defaults are for exports of Ultralytics. The code and weights of
+    Ultralytics (AGPL) are not part of this project.
     """
 
     weights: Path  # ONNX file, relative to the working or project folder
@@ -99,7 +99,7 @@ class OnnxSegmentation(Detector):
         return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms_iou)
 
     def _log_classes(self) -> None:
-        """Log that the network reports one class per detection, and class names that differ from `label_space`."""
+        """Log if the network reports one class per detection, or if its class names differ from `label_space`."""
         if self._layout.suppressed:
             log.info(
                 "detector.class_spread: %s reports one class per detection; the other classes get %g of 1 - score",

@@ -1,4 +1,4 @@
-"""Text-prompted detection with boxes from OWLv2, and masks from the SAM family or from depth."""
+"""Detection of text queries, with boxes from OWLv2 and masks from the SAM family or from depth."""
 
 from __future__ import annotations
 
@@ -26,10 +26,9 @@ SIGNIFICANCE, MAX_SLANT, MIN_READINGS = 0.4, 85.0, 0.1  # parameters of masks fr
 class OpenVocabulary(Detector):
     """Boxes from OWLv2 for text queries, and masks from SAM, SAM 2 or EdgeTAM; needs the extra `transformers`.
 
-    The classes are the text queries as written, and `something else`. OWLv2 estimates an independent probability p of
-    each query for each box. The distribution of a detection is proportional to the odds p / (1 - p). For `something
-    else`, p is `score_threshold`. The score is the largest p of a query. Queries that are COCO names are evaluated as
-    these classes. Other queries are not evaluated.
+    The classes are the text queries and `something else`. OWLv2 estimates an independent probability p of each query
+    for each box. The class distribution is proportional to the odds p / (1 - p), with p = `score_threshold` for
+    `something else`. The score is the largest probability of a query. Only queries with COCO names are evaluated.
     """
 
     text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # distinct text queries
@@ -81,10 +80,13 @@ class OpenVocabulary(Detector):
 
 
 def word_distributions(probabilities: Float32, threshold: float) -> Float32:
-    """Return the distributions (N, W + 1) over W queries and `something else` from independent `probabilities` (N, W).
+    """Return the class distributions (N, W + 1) over the queries and `something else`.
 
-    They are proportional to the odds p / (1 - p); p of `something else` is `threshold`.
+    Args:
+        probabilities: The probability (N, W) of each query.
+        threshold: The probability of `something else`.
     """
     p = np.clip(probabilities.astype(np.float64), 1e-6, 1 - 1e-6)
+    # proportional to the odds
     odds = np.hstack([p / (1 - p), np.full((len(p), 1), threshold / (1 - threshold))])
     return np.asarray(odds / odds.sum(axis=1, keepdims=True), np.float32)

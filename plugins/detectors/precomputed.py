@@ -1,4 +1,4 @@
-"""Detections of other programs from files."""
+"""Detections of other programs, read from files."""
 
 from __future__ import annotations
 
@@ -32,15 +32,17 @@ FRAMES_IN_DOUBT = 30  # number of initial frames without an entry after which a 
 class Precomputed(Detector):
     """Detections from a COCO results file or a mask folder, by frame number.
 
-    `instancemap detect` and programs for COCO's evaluation write COCO results files. A mask folder contains for each
-    frame NNNNNN an image NNNNNN.png of 16-bit instance ids, and NNNNNN.json with a list of {"id", "class", "score"}.
-    Both formats may contain `class_probabilities` over the names in `label_space`. `label_spaces.yaml` maps these names
-    to COCO names. A detection is dropped if its best label has no COCO name. Without `class_probabilities`, the label
-    of a detection with the score s gets the probability 1 - class_spread * (1 - s), but at least 1 / (number of
-    classes). The other classes share the remainder equally.
+    COCO results files are written by `instancemap detect` and by other programs. A mask folder contains two files for
+    each frame NNNNNN. NNNNNN.png is an image of 16-bit instance ids, and NNNNNN.json is a list of {"id", "class",
+    "score"}.
 
-    A frame without an entry has no detections. Raises DataError if no requested frame up to the last frame in the file
-    had an entry, because the file then belongs to another sequence.
+    Both formats may contain `class_probabilities` over the names in `label_space`. Without them, a detection with the
+    score s gets the probability 1 - class_spread * (1 - s) for its class. The minimum is 1 / (number of classes). The
+    other classes share the rest equally. Labels are mapped to COCO names by `label_spaces.yaml`. A detection is dropped
+    if its best label has no COCO name.
+
+    A frame without an entry has no detections. If none of the requested frames has an entry, the detector raises
+    DataError, because the file belongs to another sequence.
     """
 
     # COCO results file (e.g. from `instancemap detect`), or folder with NNNNNN.png and NNNNNN.json
@@ -89,7 +91,7 @@ class Precomputed(Detector):
         self._requested: set[int] = set()
 
     def fingerprint(self) -> str:
-        """Return a hash that includes the labels, because they may come from a file."""
+        """Return a hash that includes the labels, which may come from a file."""
         return hashlib.sha256(repr((fingerprint(self), self._labels)).encode()).hexdigest()
 
     def detect(self, frame: Frame) -> Detections:
@@ -109,9 +111,9 @@ class Precomputed(Detector):
         )
 
     def _distributions(self, stored: Sequence[StoredDetection]) -> tuple[Float32, Bool]:
-        """Return distributions (N, C) over COCO names for N detections, and set `classes` to these names.
+        """Return the class distributions (N, C) over COCO names, and set `classes` to these names.
 
-        Also return an array (N,), True for detections whose best label has a COCO name.
+        The second result is a Boolean array (N,), True for detections whose best label has a COCO name.
         """
         index = {name: k for k, name in enumerate(self._labels)}
         one_hot = np.eye(len(index), dtype=np.float32)

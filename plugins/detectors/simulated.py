@@ -1,4 +1,4 @@
-"""Detector of adjustable quality: ground truth degraded by a seeded model of the errors of real detectors."""
+"""Simulated detector of adjustable quality, which adds random errors to the ground truth."""
 
 from __future__ import annotations
 
@@ -58,7 +58,10 @@ INTERVALS = {
 
 
 class Draw(IntEnum):
-    """The purpose of a random number. Each purpose has its own random stream, so that errors are independent."""
+    """Purpose of a random number.
+
+    Each purpose has its own random stream, so that errors are independent.
+    """
 
     MERGE = 0
     MISS = 1
@@ -76,7 +79,7 @@ class Draw(IntEnum):
 
 @dataclass(frozen=True)
 class Candidate:
-    """An object, or a part of an object, that becomes a detection."""
+    """An object, or a part of an object, that may be detected."""
 
     instance: int  # id in the ground truth; negative for a false detection
     part: int  # 0; 1 for the second half of a split object
@@ -87,24 +90,24 @@ class Candidate:
 
 @dataclass
 class SimulatedDetector(Detector):
-    """The ground truth with the errors of a mid-quality detector. Each error is a parameter; all 0 = ground truth.
+    """The ground truth with the errors of a mid-quality detector.
 
-    The errors are applied in this order:
+    Each error has a parameter. If all are 0, the detections are the ground truth. The errors are applied in this order:
 
     - Objects of unknown class are detected as an arbitrary class (`clutter_rate`).
-    - The mask of an object includes a touching object of unknown class, such as the cupboard of a sink (`attach_rate`).
+    - The mask of an object includes a touching object of unknown class, e.g. the cupboard of a sink (`attach_rate`).
     - Touching objects share one mask (`merge_rate`).
-    - Objects are missed, more often if small (`miss_size_scale`) or cut by the image border. Some objects are missed
-      nearly always and others never (`miss_spread`).
+    - Objects are missed, more often if they are small (`miss_size_scale`) or at the image border. Some objects are
+      nearly always missed, and others never (`miss_spread`).
     - Objects are split in two (`split_rate`).
-    - Masks are shifted, extend beyond the object, have a noisy border and are resampled on a coarse grid.
-    - The class becomes a random distribution with a mean from a confusion matrix of similar classes (`confusion`). For
-      a fraction of the frames, an object always has the same distribution (`confusion_consistency`).
-    - The score depends on mask quality and class certainty.
-    - False detections appear, some repeatedly at the same locations (`recurring_fraction`, if poses are known).
+    - Masks are shifted, extend beyond the object, have a noisy border and have a coarse resolution.
+    - The class distribution is random, with similar classes more likely (`confusion`). In a fraction of the frames, an
+      object has the same distribution (`confusion_consistency`).
+    - The score depends on the quality of the mask and the certainty of the class.
+    - False detections occur, some of them repeatedly at the same locations (`recurring_fraction`, needs poses).
 
-    Errors of an object or location do not average out over a video, as with real detectors. Every number is drawn from
-    (seed, purpose, frame, instance), independent of the order of calls. Raises DataError without ground truth.
+    As with real detectors, the errors of an object do not average out over a video. Random numbers depend on the seed,
+    purpose, frame and instance, but not on the order of calls. The detector raises DataError without ground truth.
     """
 
     seed: int = 0  # seed of the simulated errors, >= 0
@@ -174,7 +177,7 @@ class SimulatedDetector(Detector):
         return np.random.default_rng([self.seed, int(draw), *(k & 0xFFFFFFFF for k in key)])
 
     def _clutter(self, things: Mapping[int, Bool]) -> list[Candidate]:
-        """Return the objects of unknown class that are detected; they are the same in all frames."""
+        """Return the detected objects of unknown class, which are the same in all frames."""
         candidates = []
         for instance, mask in things.items():
             random = self._random(Draw.CLUTTER, instance)
@@ -184,7 +187,7 @@ class SimulatedDetector(Detector):
         return candidates
 
     def _things(self, frame: Frame) -> dict[int, Bool]:
-        """Return the masks (H, W) of the objects of unknown class with at least `min_pixels` pixels, by id."""
+        """Return the masks (H, W) of the objects of unknown class by id."""
         assert frame.truth is not None
         names = frame.truth.class_names
         found, areas = np.unique(frame.truth.instance_ids, return_counts=True)
@@ -192,9 +195,12 @@ class SimulatedDetector(Detector):
         return {i: frame.truth.instance_ids == i for i in chosen}
 
     def _attached(self, truth: TrueInstances, things: Mapping[int, Bool], pairs: list[list[int]]) -> list[Candidate]:
-        """Return the instances of known class, largest first; some masks include touching objects of unknown class.
+        """Return the instances of known class, largest first, some with touching objects of unknown class.
 
-        `things`: the masks of objects of unknown class by id. `pairs`: the ids of touching instances.
+        Args:
+            truth: The ground-truth instances.
+            things: The masks of the objects of unknown class by id.
+            pairs: The ids of touching instances.
         """
         candidates = {
             i: Candidate(i, 0, c, mask, mask)
@@ -212,7 +218,7 @@ class SimulatedDetector(Detector):
         return list(candidates.values())
 
     def _merge(self, instances: list[Candidate], pairs: list[list[int]], frame: Frame) -> list[Candidate]:
-        """Return the instances after merging touching pairs into the larger one; each instance merges at most once."""
+        """Merge some of the touching pairs into the larger instance, each instance at most once."""
         candidates = {candidate.instance: candidate for candidate in instances}
         rank = {i: k for k, i in enumerate(candidates)}  # 0 = the largest
         taken: set[int] = set()
@@ -240,7 +246,7 @@ class SimulatedDetector(Detector):
         return bool(self._random(Draw.MISS, frame.index, candidate.instance).random() < p)
 
     def _split(self, candidate: Candidate, frame: Frame) -> list[Candidate]:
-        """Return the object, or its two parts on both sides of a random line through its centroid."""
+        """Return the object, or its two parts on the sides of a random line."""
         random = self._random(Draw.SPLIT, frame.index, candidate.instance)
         if random.random() >= self.split_rate:
             return [candidate]
@@ -255,7 +261,7 @@ class SimulatedDetector(Detector):
         return halves
 
     def _reshape(self, candidate: Candidate, frame: Frame) -> Candidate:
-        """Return the candidate with the mask errors of a network: shift, bleeding, noise and coarse resolution."""
+        """Return the candidate with a shifted, enlarged, noisy and coarse mask."""
         if not candidate.mask.any():
             return candidate
         random = self._random(Draw.SHAPE, frame.index, candidate.instance, candidate.part)
@@ -277,7 +283,7 @@ class SimulatedDetector(Detector):
         return replace(candidate, mask=self._coarsen(_placed(shape, x1 - margin, y1 - margin, (height, width))))
 
     def _coarsen(self, mask: Bool) -> Bool:
-        """Return the mask (H, W) resampled on a grid of `mask_grid` cells per side over its box, as in Mask R-CNN."""
+        """Return the mask (H, W), resampled on a coarse grid over its box."""
         if self.mask_grid == 0 or not mask.any():
             return mask
         x1, y1, x2, y2 = tight_boxes(mask[None])[0].astype(int)
@@ -287,10 +293,10 @@ class SimulatedDetector(Detector):
         return np.asarray(paste_masks(grid[None], borders, (mask.shape[0], mask.shape[1]))[0], np.bool_)
 
     def _false_positives(self, frame: Frame) -> list[Candidate]:
-        """Return false positives: ellipses with a noisy border.
+        """Return false positives, which are ellipses with a noisy border.
 
-        A false positive has any class at any pixel, or is recurring: it has one class at a fixed location of the world
-        frame. Visible locations are used in the same order in all frames.
+        Recurring false positives have a fixed class at a fixed location in the world. Others have a random class at a
+        random pixel.
         """
         random = self._random(Draw.FALSE_POSITIVES, frame.index)
         height, width = frame.camera.shape
@@ -315,7 +321,7 @@ class SimulatedDetector(Detector):
         return candidates
 
     def _classify(self, candidate: Candidate, frame: Frame) -> Float64:
-        """Return a random class distribution (C,) whose mean is the confusion kernel's row of the candidate's class."""
+        """Return a random class distribution (C,) for the candidate."""
         mean = self._kernel[candidate.class_id]
         random = self._random(Draw.CLASS, frame.index, candidate.instance, candidate.part)
         if random.random() < self.confusion_consistency:
@@ -324,12 +330,9 @@ class SimulatedDetector(Detector):
         return np.asarray((1 - EVEN_FRACTION) * drawn + EVEN_FRACTION * mean, np.float64)
 
     def _score(self, candidate: Candidate, probabilities: Float64, frame: Frame) -> float:
-        """Return a sample of a Beta distribution: the score in [0, 1].
-
-        The mean is `score_scale` times mask IoU times largest class probability, or `false_positive_score` for a
-        candidate without a ground-truth mask.
-        """
+        """Return a random score in [0, 1]."""
         mean = self.false_positive_score
+        # otherwise proportional to the mask IoU and the largest class probability
         if candidate.true_mask.any():
             union = np.count_nonzero(candidate.mask | candidate.true_mask)
             iou = np.count_nonzero(candidate.mask & candidate.true_mask) / union
@@ -341,10 +344,11 @@ class SimulatedDetector(Detector):
 
 
 def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
-    """Return the confusion kernel (C, C) of C classes.
+    """Return the confusion matrix (C, C): the mean class distribution of objects of each class.
 
-    Row t is the mean class distribution of objects of class t: 1 - `confusion` for t itself, and more for similar
-    classes (LOOKALIKES) than for other classes.
+    Args:
+        classes: The names of the classes.
+        confusion: The total probability of the wrong classes. Similar classes get most of it.
     """
     index = {name: k for k, name in enumerate(classes)}
     alike = np.zeros((len(classes), len(classes)), np.bool_)
@@ -360,23 +364,23 @@ def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
 
 
 def touching_pairs(frame: Frame) -> Int32:
-    """Return the M pairs (M, 2) of ids of instances that touch: neighboring pixels without a depth step.
+    """Return the ids (M, 2) of touching instances, the smaller id first.
 
-    The smaller id of a pair comes first.
+    Instances touch if they have neighboring pixels without a depth step.
     """
     assert frame.truth is not None
     return np.asarray(np.unique(contacts(frame.truth.instance_ids, frame.depth), axis=0), np.int32)
 
 
 def signed_distance(mask: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> Float32:
-    """Return the distances (H, W) px of pixel centers to the border of a mask (H, W) of 0 and 1, positive inside."""
+    """Return the distance (H, W) of each pixel to the border of a mask, px, positive inside."""
     inside = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(np.where(mask > 0, inside - 0.5, 0.5 - outside), np.float32)
 
 
 def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: float) -> Float32:
-    """Return Gaussian noise (H, W) with zero mean, unit variance and a correlation length of `scale` px."""
+    """Return Gaussian noise (H, W) with zero mean, unit variance and the correlation length `scale`, px."""
     sigma, margin = 2.0, 6  # cells of a coarse grid, for fast blurring
     rows, columns = (int(np.ceil(side * sigma / scale)) + 2 for side in shape)
     white = random.standard_normal((rows + 2 * margin, columns + 2 * margin)).astype(np.float32)
@@ -388,18 +392,23 @@ def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: flo
 
 
 def _dirichlet(random: np.random.Generator, alpha: Float64) -> Float64:
-    """Return a sample (C,) of a Dirichlet distribution with the parameters `alpha` (C,).
+    """Return a sample (C,) of a Dirichlet distribution.
 
-    If the sampled weights are all 0, the mean of the distribution is returned.
+    The result is its mean if the sampled weights are all 0.
     """
     weights = random.gamma(alpha)
     return np.asarray(weights / weights.sum(), np.float64) if weights.sum() > 0 else alpha / alpha.sum()
 
 
 def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
-    """Return the mask (H, W) of an axis-aligned ellipse at (x, y) with half axes a and b, all in px.
+    """Return the mask (H, W) of an axis-aligned ellipse with a noisy border.
 
-    At each pixel, the radius of the ellipse is reduced by `wobble` (H, W), relative to the radius.
+    Args:
+        x: The column of the center, px.
+        y: The row of the center, px.
+        a: The half axis along x, px.
+        b: The half axis along y, px.
+        wobble: The reduction (H, W) of the radius at each pixel, relative to the radius.
     """
     mask = np.zeros(wobble.shape, np.bool_)
     reach = max(0.0, 1.0 - float(wobble.min()))  # maximum radius, in radii
@@ -414,10 +423,7 @@ def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
 
 
 def _placed(crop: Bool, x: int, y: int, shape: tuple[int, int]) -> Bool:
-    """Return a mask of `shape` (H, W), empty except for `crop`, whose first pixel is at (x, y), px.
-
-    Parts of the crop outside of the image are ignored.
-    """
+    """Return an empty mask of the given shape with `crop` at (x, y)."""
     image = np.zeros(shape, np.bool_)
     height, width = shape
     top, left = max(0, -y), max(0, -x)

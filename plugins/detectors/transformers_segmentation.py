@@ -1,4 +1,7 @@
-"""Query-based segmentation networks of Hugging Face transformers, with a mask and a class distribution per query."""
+"""Segmentation networks of Hugging Face transformers.
+
+The networks have a number of queries. Each query returns a mask and a class distribution.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +34,13 @@ PLACEHOLDER = re.compile(r"LABEL_\d+|N/A", re.IGNORECASE)  # name of an unnamed 
 
 @dataclass(frozen=True)
 class Family:
-    """The conventions of a family of architectures with Q queries and C labels."""
+    """Conventions of a family of architectures with Q queries and C labels."""
 
     auto_class: str  # auto class of transformers
     logits: str  # output with the class logits, (1, Q, C or C + 1)
     masks: str  # output with the mask logits, (1, Q, h, w)
     any_size: bool  # True = the network accepts images of any size
-    mask_quality: bool  # True = the score is multiplied by the mean probability of the mask's pixels, as published
+    mask_quality: bool  # True = the score is multiplied by the mean probability inside the mask, as published
 
 
 UNIVERSAL, INSTANCE = "AutoModelForUniversalSegmentation", "AutoModelForInstanceSegmentation"
@@ -58,15 +61,15 @@ FAMILIES = {
 class TransformersSegmentation(Detector):
     """Mask2Former, MaskFormer, EoMT, RF-DETR-Seg or DETR by model id or local folder; needs the extra `transformers`.
 
-    A model id that is not in the cache of huggingface_hub is downloaded, unless HF_HUB_OFFLINE=1. Use checkpoints for
-    instance or panoptic segmentation. Semantic checkpoints have one mask for all chairs of an image. Labels are mapped
-    to COCO names (framework/vocabulary/label_spaces.yaml). Detections of other labels, such as walls, are dropped.
+    A model that is not in the cache of huggingface_hub is downloaded, unless HF_HUB_OFFLINE=1. Use checkpoints for
+    instance or panoptic segmentation, because semantic checkpoints have one mask for all objects of a class. Labels are
+    mapped to COCO names (framework/vocabulary/label_spaces.yaml). Detections of other labels, such as walls, are
+    dropped.
 
-    The class distribution of a detection is the softmax over the labels' logits without no-object. For a softmax head,
-    it is the distribution given an object. For independent sigmoids p_c, it is the distribution given that exactly one
-    label is true: P(c) ~ p_c prod_{j != c} (1 - p_j) ~ p_c / (1 - p_c) = exp(logit_c). The score is the probability of
-    the best label, including no-object for a softmax head. MaskFormer, Mask2Former and EoMT multiply the score by the
-    mean probability of the mask's pixels, as published.
+    The class distribution of a detection is the softmax over the logits of the labels, without "no object". For
+    networks with independent sigmoids, it is the distribution under the condition that exactly one label is true. The
+    score is the probability of the best label, including "no object" if the network has it. For MaskFormer, Mask2Former
+    and EoMT, the score is multiplied by the mean probability inside the mask, as published.
     """
 
     model: str = "facebook/mask2former-swin-tiny-coco-instance"  # model: id on huggingface.co or folder
@@ -128,7 +131,7 @@ class TransformersSegmentation(Detector):
         return without_duplicates(masks, scores, class_probabilities[candidates], self.classes, self.agnostic_nms_iou)
 
     def _predict(self, pixels: Tensor) -> tuple[Float32, Tensor]:
-        """Return the queries' class logits (Q, C or C + 1) and mask logits (Q, h, w), float32 on the device."""
+        """Return the class logits (Q, C or C + 1) and the mask logits (Q, h, w) of the queries."""
         half = self.half_precision and self._device.type == "cuda"
         with torch.autocast(self._device.type, torch.float16, enabled=half):
             output = self._network(pixel_values=pixels)
@@ -140,13 +143,17 @@ class TransformersSegmentation(Detector):
 
 
 def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]:
-    """Return the distributions (Q, C) over C labels for Q queries, and the probability (Q,) of the best label.
+    """Return the class distribution (Q, C) of each query, and the probability (Q,) of its best label.
 
-    The logits are (Q, K). K = C + 1 means a softmax with no-object as the last label. K = C means independent sigmoids.
-    See TransformersSegmentation for the formulas.
+    Args:
+        logits: The class logits of the queries: (Q, C + 1) with "no object" as the last label, or (Q, C) for
+            independent sigmoids.
+        labels: The number of labels C.
     """
     if logits.shape[1] not in (labels, labels + 1):
         raise DataError(f"detector.model: expected {labels} class logits (as in config.json), got {logits.shape[1]}")
+    # Softmax without "no object". For independent sigmoids p_c, the distribution with exactly one true label is
+    # P(c) ~ p_c prod_{j != c} (1 - p_j) ~ p_c / (1 - p_c) = exp(logit_c).
     objects = logits[:, :labels]
     highest = objects.max(axis=1, keepdims=True)
     weights = np.exp(objects - highest, dtype=np.float64)
@@ -159,10 +166,12 @@ def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]
 
 
 def resample_masks(grids: Tensor, covered: tuple[float, float], shape: tuple[int, int]) -> Tensor:
-    """Return the mask logits (N, H, W) at the pixels of an image of `shape`, interpolated from `grids` (N, h, w).
+    """Return the mask logits (N, H, W) at the pixels of an image.
 
-    The grids cover the input of the network. `covered` contains the fractions of its height and width that the image
-    covers, from the upper left. The rest is padding.
+    Args:
+        grids: The mask logits (N, h, w) over the input of the network.
+        covered: The fractions of the height and width of the input that the image covers, from the upper left.
+        shape: The height and width of the image.
     """
     axes = [
         (torch.arange(size, device=grids.device, dtype=torch.float32) + 0.5) * (2 * fraction / size) - 1
@@ -174,9 +183,11 @@ def resample_masks(grids: Tensor, covered: tuple[float, float], shape: tuple[int
 
 
 def mean_probability(mask_logits: Tensor, inside: Tensor) -> Float32:
-    """Return the mean mask probability (N,) over the pixels inside each of N masks; 0 for an empty mask.
+    """Return the mean mask probability (N,) inside each mask, 0 for an empty mask.
 
-    `mask_logits`: (N, H, W). `inside`: (N, H, W), True for pixels inside the mask.
+    Args:
+        mask_logits: The mask logits (N, H, W).
+        inside: A Boolean array (N, H, W), True inside the mask.
     """
     total = (torch.sigmoid(mask_logits) * inside).sum(dim=(1, 2))
     return np.asarray((total / inside.sum(dim=(1, 2)).clamp(min=1)).cpu().numpy(), np.float32)
@@ -184,9 +195,9 @@ def mean_probability(mask_logits: Tensor, inside: Tensor) -> Float32:
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Preprocessing of an image by the model's preprocessor_config.json.
+    """Preprocessing of images according to preprocessor_config.json.
 
-    It replaces transformers' image processors, because they require torchvision.
+    The image processors of transformers are not used, because they require torchvision.
     """
 
     size: Mapping[str, int] | None  # target size, px, with the keys in the file; None = original size
@@ -199,7 +210,15 @@ class Preprocessing:
 
     @classmethod
     def parse(cls, content: Mapping[str, Any], where: str) -> Preprocessing:
-        """Return the settings in the content of a file. Raises DataError for missing or unsupported settings."""
+        """Return the settings in the content of a file.
+
+        Args:
+            content: The content of the file.
+            where: The path of the file, for error messages.
+
+        Raises:
+            DataError: If settings are missing or unsupported.
+        """
         if content.get("do_split_image"):
             raise DataError(
                 f"{where}: expected an instance segmentation model, got a model for semantic segmentation "
@@ -233,7 +252,7 @@ class Preprocessing:
         )
 
     def resized(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """Return the (height, width) px to which an image of `shape` (height, width) px is resized."""
+        """Return the height and width of the resized image, px, given those of the original image."""
         if self.size is None:
             return shape
         height, width = shape
@@ -247,7 +266,10 @@ class Preprocessing:
         return -(-height // self.divisor) * self.divisor, -(-width // self.divisor) * self.divisor
 
     def __call__(self, color: UInt8, device: torch.device) -> tuple[Tensor, tuple[float, float]]:
-        """Return the input (1, 3, H, W) of an image (h, w, 3), and the fractions of H and W covered by the image."""
+        """Return the network input (1, 3, H, W) for an image (h, w, 3).
+
+        The second result is the fractions of H and W that the image covers.
+        """
         pixels = torch.from_numpy(color).to(device).permute(2, 0, 1)[None].float()
         height, width = self.resized((color.shape[0], color.shape[1]))
         if (height, width) != color.shape[:2]:
@@ -263,22 +285,21 @@ class Preprocessing:
 
 
 def _with_short_side(shape: tuple[int, int], short: int, long: int) -> tuple[int, int]:
-    """Return the resized (height, width), px, with the aspect ratio of `shape` (height, width).
-
-    The shorter side is `short`, or less if the longer side would exceed `long`. Sides are rounded as in DETR's
-    transforms.
-    """
+    """Return the resized height and width, px, for a given shorter side and a maximum longer side."""
     smaller, larger = min(shape), max(shape)
     exact: float = short
     if larger / smaller * short > long:
         exact = long * smaller / larger
-    side = round(exact)
+    side = round(exact)  # rounding as in the transforms of DETR
     other = larger if smaller == side else int(exact * larger / smaller)
     return (side, other) if shape[0] <= shape[1] else (other, side)
 
 
 class Checkpoint:
-    """A model on huggingface.co or in a folder. Code in the model is never run."""
+    """A model on huggingface.co or in a folder.
+
+    Code in the model is never run.
+    """
 
     def __init__(self, model: str, revision: str) -> None:
         transformers = imported_transformers()
@@ -291,10 +312,10 @@ class Checkpoint:
 
     @property
     def labels(self) -> Sequence[str]:
-        """The names of the model's classes; unnamed classes are NO_CLASS."""
+        """Names of the classes, NO_CLASS for unnamed classes."""
         named = {k: name for k, name in self.config.id2label.items() if not PLACEHOLDER.fullmatch(name)}
         names = [named.get(k, NO_CLASS) for k in range(max(self.config.id2label) + 1)]
-        # RF-DETRs trained on COCO use its annotation ids; their configs have no names, or COCO's names without gaps
+        # RF-DETR models for COCO use annotation ids; their configs have no names, or the COCO names without gaps
         known = {name.lower() for name in names} - {NO_CLASS}
         if self.config.model_type == "rf_detr" and len(names) == len(COCO_BY_ID) and known in (set(COCO), set()):
             return COCO_BY_ID
@@ -305,7 +326,11 @@ class Checkpoint:
         return names
 
     def read_network(self) -> torch.nn.Module:
-        """Return the network in float32 on the CPU. Raises DataError unless the weights fit and are complete."""
+        """Return the network in float32 on the CPU.
+
+        Raises:
+            DataError: If weights are missing or do not fit.
+        """
         network, loading = read_part(
             "detector.model", self.folder, "the weights", self._auto_class, output_loading_info=True
         )

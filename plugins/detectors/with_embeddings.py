@@ -1,4 +1,4 @@
-"""Wrapper that adds image embeddings to the detections of any detector, for text queries."""
+"""Image embeddings for the detections of any detector, for text queries."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from framework.interfaces import Detector
 
 @dataclass
 class WithEmbeddings(Detector):
-    """Detections from another detector with image embeddings from CLIP or SigLIP; needs the extra `transformers`.
+    """Detections of another detector with image embeddings from CLIP or SigLIP; needs the extra `transformers`.
 
-    An embedding is computed from a square crop around the object. Detections without an embedding have zeros.
+    An embedding is computed from a square crop around the object. It is zero for detections without an embedding.
     """
 
     detector: Detector  # wrapped detector; replace it with detector@detector.detector=NAME

@@ -1,1 +1,1 @@
-"""Map fusers, which associate clusters with instances and integrate the frame."""
+"""Map fusers, which integrate each frame and associate its clusters with instances."""

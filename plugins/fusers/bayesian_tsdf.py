@@ -20,11 +20,12 @@ MIN_LIKELIHOOD = 1e-3  # minimum of score and 1 - score, so that no single detec
 
 @dataclass
 class BayesianTsdf(MapFuser):
-    """Two independent Bayesian recursions per voxel, eqs. (7) and (8) of docs/method.md, as sums of log-likelihoods.
+    """TSDF with two independent Bayesian recursions per voxel, one for the instance and one for the class.
 
-    The likelihood of the matched instance in eq. (8) is the score of the detection (our interpretation). The paper does
-    not state the likelihood of other instances. Here, it is `instance_floor`. With `instance_floor=0`, 1 - score is
-    divided equally among all other instances and "no instance".
+    The recursions are eqs. (7) and (8) of docs/method.md, computed as sums of log-likelihoods. The likelihood of the
+    matched instance is the score of the detection (our interpretation). The paper does not state the likelihood of the
+    other instances. Here, it is `instance_floor`. If `instance_floor` is 0, 1 - score is divided equally among the
+    other instances and "no instance".
     """
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
@@ -60,10 +61,13 @@ class BayesianTsdf(MapFuser):
             self.association.merge(self.scene, matches)
 
     def evidence(self, clusters: PointClusters, instances: int) -> DetectionEvidence:
-        """Return the evidence of the clusters, log P(O_u | I_t) of eqs. (7) and (8).
+        """Return the log-likelihoods of the clusters.
 
-        The evidence for an instance is relative to any other instance. `instances` is the number of instances in the
-        map.
+        The evidence for an instance is relative to any other instance.
+
+        Args:
+            clusters: The clusters of the frame.
+            instances: The number of instances of the map.
         """
         if self.instance_floor > 0:  # a score counts as at least twice the floor, so that no match lowers the log-odds
             log_odds = np.log(np.maximum(clusters.scores, 2 * self.instance_floor) / self.instance_floor)

@@ -1,4 +1,4 @@
-"""Class-only baseline: class fusion after SemanticFusion, with connected components as instances."""
+"""Class-only baseline: class fusion in voxels, with connected components as instances."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from framework.mapping.voxels.tsdf_volume import VoxelHashing
 
 @dataclass
 class ClassOnlyFusion(MapFuser):
-    """Class fusion in voxels, with distributions over classes and background and without data association.
+    """Class fusion in voxels without data association.
 
-    The baseline follows SemanticFusion (McCormac et al. 2017) and Pham et al. (WACV 2019). These systems label every
-    pixel. Here, the distributions come from masks. A pixel gets the distribution of the mask with the highest score at
-    this pixel. In this distribution, the background has the probability that the detector assigns to no class. A pixel
-    outside all masks is evidence for the background. This evidence is limited by `missed`, because the detector may
-    have missed an object. Two touching objects of one class become one instance. Both systems regularize with a CRF.
-    Here, `smoothness` is the weight of a Potts model over the mesh. It is off by default, because it did not improve
-    AP50.
+    The baseline follows SemanticFusion (McCormac et al., 2017) and Pham et al. (WACV 2019). Each voxel has a
+    distribution over the classes and the background. Instances are connected components of one class, so that two
+    touching objects of one class become one instance.
+
+    The original systems label every pixel. Here, a pixel gets the distribution of the mask with the highest score. A
+    pixel outside all masks is evidence for the background. This evidence is limited by `missed`, because the detector
+    may have missed an object. The original systems regularize with a CRF. Here, `smoothness` is the weight of a Potts
+    model over the mesh. It is off by default, because it did not improve AP50.
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
@@ -57,12 +58,9 @@ class ClassOnlyFusion(MapFuser):
             self.scene.labels.update(seen, masks)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
-        """Return the log ratios (N, C), log P(O_u = c) / P(O_u = background), of eq. (7) for a pixel inside each mask.
-
-        A score is the probability of the best class, but the distribution excludes the background. Therefore, the score
-        divided by the entry of the best class is the probability of all classes together. The result is mixed with a
-        fraction `class_floor` of the uniform distribution.
-        """
+        """Return the log ratio (N, C) of each class to the background for a pixel inside each mask."""
+        # A score is the probability of the best class, but the distribution excludes the background. Therefore, the
+        # score divided by the largest entry is the probability of all classes together.
         p = clusters.class_probabilities.astype(np.float64)
         objects = np.minimum(clusters.scores[:, None] / p.max(axis=1, keepdims=True, initial=1e-6), 1.0)
         uniform = self.class_floor / (1 + p.shape[1])

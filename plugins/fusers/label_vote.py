@@ -1,4 +1,4 @@
-"""Label rules without distributions: each detection votes for its instance and its most likely class."""
+"""Label voting: each detection votes for its instance and its most likely class."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from framework.mapping.labels.label_rule import LabeledVoxels, LabelRule, vote_f
 
 
 class Vote(Enum):
-    """Rule for selecting the label of a voxel from the votes."""
+    """Rule for selecting the label of a voxel."""
 
     COUNT = "count"  # number of detections (Voxblox++, Grinvald et al. 2019)
     LAST = "last"  # last detection only; among overlapping masks, the last mask
@@ -32,7 +32,10 @@ RULES = {
 
 @dataclass
 class LabelVote(MapFuser):
-    """Votes of the detections for the labels of voxels, without evidence against a label."""
+    """TSDF with votes of the detections for the labels of voxels.
+
+    There is no evidence against a label.
+    """
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
     association: Association = field(default_factory=Association)

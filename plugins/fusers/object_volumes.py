@@ -1,4 +1,4 @@
-"""Baseline with one volume per object, after Fusion++ and MaskFusion."""
+"""Baseline with one volume per object, based on Fusion++ and MaskFusion."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from framework.mapping.voxels.tsdf_volume import VoxelHashing
 
 
 def existence(record: InstanceRecord) -> float:
-    """Return the existence probability of an object in Fusion++: the mean of Beta(1 + n, 1 + m).
+    """Return the existence probability of an object.
 
-    n is the number of frames with a detection, and m is the number of frames in view without a detection.
+    The definition follows Fusion++.
     """
+    # mean of Beta(1 + n, 1 + m): n frames with a detection, m frames in view without a detection
     return (1 + record.observations) / (2 + max(record.visible, record.observations))
 
 
@@ -30,10 +31,10 @@ def existence(record: InstanceRecord) -> float:
 class ObjectVolumes(MapFuser):
     """One TSDF with foreground probabilities per object, and one TSDF of the whole scene.
 
-    A detection belongs to the object with the largest overlap. If several detections belong to one object, the union of
-    their masks is used. The defaults are the rule of Fusion++. Set `overlap_rule=CLUSTER min_overlap=0.05
-    require_same_class=true` for the rule of MaskFusion. `framework/baselines/object_map.py` lists the differences from
-    the original systems.
+    A detection is matched with the object of largest overlap. If several detections match one object, the union of
+    their masks is used. The defaults are the rule of Fusion++. For the rule of MaskFusion, set `overlap_rule=CLUSTER
+    min_overlap=0.05 require_same_class=true`. See `framework/baselines/object_map.py` for the differences from the
+    original systems.
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
@@ -76,14 +77,14 @@ class ObjectVolumes(MapFuser):
             self._remove_unlikely()
 
     def _look_up(self, frame: Frame, T_world_camera: Float64, clusters: PointClusters) -> Overlaps:
-        """Return the overlaps of the clusters with the objects of the map at the measured surface."""
+        """Return the overlaps of the clusters with the objects at the measured surface."""
         stride = vote_stride(frame.camera)
         points = list_points_by_pixel(clusters, frame.depth.shape)
         seen = self.scene.instances_seen(frame.camera, T_world_camera, frame.depth, stride)
         return count_overlaps(points, seen, stride)
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Matches:
-        """Return the matches: the object with the largest overlap, or a new object if score and size are sufficient."""
+        """Match each cluster with the object of largest overlap, and create new objects for other clusters."""
         ratios = overlaps.by(self.overlap_rule, self.create_points)
         ratios[~self._agree(clusters, overlaps.instance_ids)] = 0
         instance_ids = np.zeros(len(clusters), np.int32)
@@ -96,34 +97,27 @@ class ObjectVolumes(MapFuser):
         return Matches(frame.index, clusters, overlaps, instance_ids)
 
     def _agree(self, clusters: PointClusters, instance_ids: Int32) -> Bool:
-        """Return a Boolean array (N, M), True where the classes of cluster n and object m allow a match."""
+        """Return a Boolean array (N, M), True where the classes of a cluster and an object allow a match."""
         if not self.require_same_class or not len(instance_ids):
             return np.ones((len(clusters), len(instance_ids)), np.bool_)
         known = np.array([self.scene.table.records[k].class_evidence.argmax() for k in instance_ids.tolist()])
         return np.asarray(clusters.class_probabilities.argmax(axis=1)[:, None] == known[None, :])
 
     def _remove_empty(self, instance_ids: Int32) -> None:
-        """Remove new objects without depth readings in range, because objects without voxels can never be matched.
-
-        Sets their entries in instance_ids (N,) to 0.
-        """
+        """Remove new objects without voxels, and set their entries in `instance_ids` (N,) to 0."""
         for instance_id in set(instance_ids[instance_ids > 0].tolist()):
             if not self.scene.volumes[instance_id].block_count:
                 self.scene.remove(instance_id)
                 instance_ids[instance_ids == instance_id] = 0
 
     def _remove_unlikely(self) -> None:
-        """Remove the objects with an existence probability below `min_existence`."""
         for record in list(self.scene.table.records.values()):
             if existence(record) < self.min_existence:
                 self.scene.remove(record.id)
 
 
 def _masks(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> dict[int, Bool]:
-    """Return the union (H, W) of the cluster masks of each object, by id.
-
-    `instance_ids` (N,) holds the object of each cluster, 0 = none.
-    """
+    """Return the union of the cluster masks of each object by id."""
     masks: dict[int, Bool] = {}
     for k in np.flatnonzero(instance_ids):
         u, v = clusters.pixels[clusters.cluster == k].T

@@ -1,4 +1,4 @@
-"""Off-the-shelf baseline: Open3D's VoxelBlockGrid with one vote counter per voxel."""
+"""Off-the-shelf baseline: Open3D's VoxelBlockGrid with a majority vote per voxel."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Open3DVoxelBlockGrid(MapFuser):
-    """Open3D's TSDF with a majority label per voxel.
+    """TSDF of Open3D with a majority vote for the instance of each voxel.
 
     The class distribution of an instance is the product of the distributions of its detections.
     """
@@ -68,7 +68,7 @@ class Open3DVoxelBlockGrid(MapFuser):
 
 
 def _paint(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> Int32:
-    """Return the instance ids (H, W), 0 = none; pixels of several clusters go to the one with the highest score."""
+    """Return the instance (H, W) at each pixel, 0 = none, from the cluster with the highest score."""
     image = np.zeros(shape, np.int32)
     for k in np.argsort(clusters.scores, kind="stable"):
         if instance_ids[k]:

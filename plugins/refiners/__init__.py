@@ -1,1 +1,1 @@
-"""Cluster refiners, which clean, split or merge the point clusters of one frame."""
+"""Cluster refiners, which improve the point clusters of a frame."""

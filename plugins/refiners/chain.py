@@ -1,4 +1,4 @@
-"""Chain of cluster refiners."""
+"""Sequence of cluster refiners."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from framework.refinement.refine import refine
 
 @dataclass
 class Chain(ClusterRefiner):
-    """Refiners applied in order: each refines the clusters from the previous one.
+    """Refiners that are applied one after the other.
 
     `refiner.links.gmm_em=null` removes the refiner `gmm_em`. `refiner@refiner.links.gmm_em=kmeans` replaces it.
     """

@@ -1,4 +1,4 @@
-"""Cluster refinement by connectivity. A large depth step separates objects."""
+"""Cluster refinement by connectivity and depth."""
 
 from __future__ import annotations
 
@@ -16,13 +16,12 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class Connected(ClusterRefiner):
-    """Selection of the largest 3D-connected component of each cluster, and of components at a similar depth.
+    """Selection of the largest connected component of each cluster, and of components at a similar depth.
 
     Connected components are defined as in `largest_component`. A component is kept if most of its points agree in depth
-    with the nearest kept point. The allowed difference is the maximum depth step plus `max_depth_slope` times the
-    lateral distance. This removes background, such as the carpet between the slats of a chair. It keeps object parts
-    that are separated by occlusion or missing readings. All points of a component are compared. If only the nearest
-    quarter of them were compared, the leaves of plants would be removed.
+    with the nearest kept point. The allowed difference increases with the lateral distance. This removes background,
+    such as the carpet between the slats of a chair. Object parts that are separated by occlusion or missing readings
+    are kept.
     """
 
     max_gap: float = 0.1  # maximum depth step between connected pixels at depth 0, m, >= 0

@@ -1,4 +1,4 @@
-"""Cluster refinement by density. An object is one dense component."""
+"""Cluster refinement by density (DBSCAN)."""
 
 from __future__ import annotations
 
@@ -15,16 +15,14 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class Dbscan(ClusterRefiner):
-    """Selection of the largest dense component of each cluster; ties go to the first in the image.
+    """Selection of the largest dense component of each cluster.
 
-    The refiner runs scikit-learn's DBSCAN (Ester, Kriegel, Sander and Xu, "A Density-Based Algorithm for Discovering
-    Clusters in Large Spatial Databases with Noise", KDD 1996). The radius is eps = `eps` + `eps_per_depth` * the
-    cluster's median depth. The refiner keeps the component with the most core points, and all points within eps of
-    these core points, even if the points border other components. A cluster without core points stays unchanged.
+    The refiner runs the DBSCAN of scikit-learn (Ester et al., KDD 1996). The radius increases with the median depth of
+    the cluster. The refiner keeps the component with the most core points, and all points within the radius of these
+    core points. Ties go to the first component in the image. A cluster without core points is not changed.
 
-    With a `stride` above 1, only the pixels of every `stride`-th row and column are searched for core points, and
-    `min_points` counts these pixels. If more than `max_points` pixels of a cluster remain, the stride is increased, and
-    each point is weighted by the number of points that it represents.
+    Only the pixels of every `stride`-th row and column are searched for core points. If more than `max_points` of them
+    are in a cluster, the stride is increased, and the points get a larger weight.
     """
 
     eps: float = 0.04  # neighborhood radius at depth 0, m, >= 0.001
@@ -54,21 +52,23 @@ class Dbscan(ClusterRefiner):
         return keep_points(clusters, kept)
 
     def _sampled(self, pixels: Int32) -> tuple[Bool, int]:
-        """Return an array (P,), True for the `pixels` (P, 2) in every step-th row and column, and the step.
-
-        The step is the smallest one of at least `stride` with at most `max_points` such pixels.
-        """
-        for step in range(self.stride, 1 << 16):
+        """Return a Boolean array (P,), True for the pixels to search for core points, and the sampling step, px."""
+        for step in range(self.stride, 1 << 16):  # smallest step with at most max_points pixels
             sampled = (pixels[:, 0] % step == 0) & (pixels[:, 1] % step == 0)
             if np.count_nonzero(sampled) <= self.max_points:
                 break
         return sampled, step
 
     def _near_largest_piece(self, points: Float32, sampled: Float32, eps: float, weight: float) -> Bool:
-        """Return an array (P,), True for points (P, 3) within `eps`, m, of the largest component's core points.
+        """Return a Boolean array (P,), True for the points near the core points of the largest component.
 
-        `sampled`: the points (S, 3), m, that are searched for core points, each with the weight `weight`. If there are
-        no core points, all entries are True.
+        If there are no core points, all entries are True.
+
+        Args:
+            points: The points (P, 3), m.
+            sampled: The points (S, 3) that are searched for core points, m.
+            eps: The radius, m.
+            weight: The weight of each sampled point.
         """
         from scipy.spatial import KDTree
         from sklearn.cluster import DBSCAN

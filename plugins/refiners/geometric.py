@@ -1,4 +1,4 @@
-"""Cluster refinement by convexity, with the geometric segments of Voxblox++."""
+"""Cluster refinement by convexity."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from framework.refinement.segmentation.segment_owners import owned_segments
 
 @dataclass
 class Geometric(ClusterRefiner):
-    """Clusters as unions of the convex depth segments covered by a mask.
+    """Clusters as unions of convex depth segments.
 
-    Voxblox++ (Grinvald et al., RA-L 2019) cuts the depth image at depth jumps and concave creases. It assigns each
-    segment to the mask with the largest overlap, if the mask covers more than `min_overlap` of the segment. Points of a
-    cluster outside its segments are removed. With `grow_to_segments`, the segments' pixels outside the mask are added,
-    if the cluster points determine the camera pose. All points of a mask without a segment are removed.
+    As in Voxblox++ (Grinvald et al., RA-L 2019), the depth image is cut at depth jumps and concave creases. Each
+    segment is assigned to the mask with the largest overlap, if the mask covers more than `min_overlap` of the segment.
+    Points of a cluster outside its segments are removed. With `grow_to_segments`, the pixels of its segments outside
+    the mask are added. A cluster without a segment becomes empty.
     """
 
     cell_size: int = 2  # side of the cells in which depth readings are averaged, px, >= 1

@@ -1,4 +1,4 @@
-"""Cluster refinement by a Gaussian mixture for each mask, with components for its surroundings."""
+"""Cluster refinement by one Gaussian mixture for each mask and its surroundings."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class GmmEm(ClusterRefiner):
-    """Removal of background and outliers by a Gaussian mixture of object, background and outliers.
+    """Removal of background and outliers by a Gaussian mixture for each mask.
 
-    The refiner applies eqs. (1) to (4) of docs/method.md to each mask. Object components start from groups of the
-    mask's points, and background components from groups of the points in a ring around the mask. A uniform component
+    The mixture is fitted by eqs. (1) to (4) of docs/method.md. Object components are initialized by groups of points in
+    the mask. Background components are initialized by groups of points in a ring around the mask. A uniform component
     can represent outliers.
 
-    The mask is also used as evidence. This is our choice: without it, object and background can swap. Log-odds for the
-    object decrease linearly from `mask_log_odds` inside the mask to -`mask_log_odds` in the ring. Pixels of the
-    `structure` from an earlier refiner are treated as pixels without a reading, so they are not part of the ring.
-    Clusters with fewer than `min_points` points in the mask or the ring remain unchanged. Without background
-    components, only outliers compete with the object.
+    The mask is also evidence for the object. This is our choice, because otherwise object and background can swap. The
+    log-odds decrease linearly from `mask_log_odds` inside the mask to -`mask_log_odds` in the ring. Pixels of known
+    structure, found by an earlier refiner, are not part of the ring. Clusters with too few points in the mask or the
+    ring are not changed. Without background components, only outliers are removed.
     """
 
     object_components: int = 3  # number of Gaussians of the object, >= 1; about one per visible face

@@ -1,4 +1,7 @@
-"""Cluster refinement by one Gaussian mixture over all masks of a frame, our first interpretation of the paper."""
+"""Cluster refinement by one Gaussian mixture over all masks of a frame.
+
+This is our first interpretation of the paper.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from framework.refinement.refine import keep_points
 
 
 class ForeignPoints(Enum):
-    """The treatment of points whose most probable Gaussian belongs to another mask."""
+    """Treatment of points whose most probable Gaussian belongs to another mask."""
 
     MOVE = "moved to the cluster of that mask"
     DROP = "removed"
@@ -29,12 +32,12 @@ class ForeignPoints(Enum):
 
 @dataclass
 class GmmFrame(ClusterRefiner):
-    """Assignment of the points of a frame's masks to the most probable mask, by hierarchical EM.
+    """Assignment of each point to the most probable mask of the frame by hierarchical EM.
 
-    The refiner applies eqs. (1) to (4) of docs/method.md to the points of all masks (section 3.2.2). A pixel in several
-    masks is one point of the mask with the best score. There is no background, and the masks only initialize the
+    Eqs. (1) to (4) of docs/method.md are applied to the points of all masks (section 3.2.2 of the paper). A pixel in
+    several masks belongs to the mask with the highest score. There is no background, and the masks only initialize the
     mixture. Therefore, a point leaves its cluster only if it fits another cluster better. The paper does not specify
-    the hierarchy. Levels, children and initialization are our choice (J = 8 after Eckart et al., CVPR 2016).
+    the hierarchy. The levels, the number of children (Eckart et al., CVPR 2016) and the initialization are our choice.
     """
 
     levels: int = 2  # number of levels of hierarchical EM, >= 1; 1 = flat mixture; 2 is our choice
@@ -88,9 +91,13 @@ class GmmFrame(ClusterRefiner):
 
 
 def best_of_pixels(clusters: PointClusters, shape: tuple[int, int]) -> Bool:
-    """Return an array (P,), True for points of the cluster with the highest score at their pixel.
+    """Return a Boolean array (P,), True for the points of the cluster with the highest score at their pixel.
 
-    `shape`: (height, width) of the frame, px. Ties go to the first cluster.
+    Ties go to the first cluster.
+
+    Args:
+        clusters: The clusters.
+        shape: The height and width of the frame.
     """
     rank = np.empty(len(clusters), np.int32)
     rank[np.argsort(-clusters.scores, kind="stable")] = np.arange(len(clusters), dtype=np.int32)

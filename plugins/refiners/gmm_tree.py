@@ -1,4 +1,4 @@
-"""Cluster refinement by a tree of Gaussian mixtures, for many small surface patches at low cost."""
+"""Cluster refinement by a tree of Gaussian mixtures."""
 
 from __future__ import annotations
 
@@ -17,17 +17,16 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class GmmTree(ClusterRefiner):
-    """Removal of the points on surface patches outside the object by hierarchical EM.
+    """Removal of surface patches outside the object by hierarchical EM.
 
     A tree of mixtures (Eckart et al., CVPR 2016) is fitted to the points of each mask and of the ring around it. Its
-    nodes are surface patches. They do not depend on the border of the mask, because a wrong assignment at the first
-    level could not be corrected at later levels.
+    nodes are surface patches. The fit ignores the border of the mask, because a wrong assignment at the first level
+    could not be corrected later.
 
-    The mask is used as evidence. Points have the log-odds of `gmm_em`. The object fraction of a node maximizes the
-    likelihood of the evidence of its points, with the fraction of its parent as a prior (our choice). A point stays if
-    the object fractions of its leaves and its own evidence give the object a posterior above `min_posterior`. Outliers
-    at the root do not belong to the object. Outliers below a node have the object fraction of this node. Clusters with
-    fewer than `min_points` points in the mask or the ring stay unchanged.
+    The mask is then used as evidence, as in `gmm_em`. The object fraction of a node is estimated from the evidence of
+    its points, with the fraction of its parent as a prior (our choice). A point is kept if the object fractions of its
+    nodes and its own evidence give a posterior above `min_posterior`. Outliers at the first level are removed. Clusters
+    with too few points in the mask or the ring are not changed.
     """
 
     levels: int = 2  # number of levels of the tree, >= 1

@@ -1,4 +1,4 @@
-"""No refinement, for ablations."""
+"""Refiner without refinement, for ablations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from framework.interfaces import ClusterRefiner
 
 @dataclass
 class Identity(ClusterRefiner):
-    """Unchanged clusters."""
+    """Refiner that returns the clusters unchanged."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return clusters

@@ -1,4 +1,7 @@
-"""Cluster refinement by k-means. In the paper, k-means is the usual initialization of a mixture, not a refiner."""
+"""Cluster refinement by k-means.
+
+In the paper, k-means only initializes a mixture.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +19,11 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class KMeans(ClusterRefiner):
-    """Removal of the points nearer to a background center than to an object center.
+    """Removal of points nearer to a background center than to an object center.
 
-    Lloyd's algorithm runs on the points of each mask and of the ring around it, as in `gmm_em`. The object centers
-    start at the means of groups of the mask's points, and the background centers at the means of groups of the ring's
-    points. The points are divided into these groups by depth, with equal numbers of points. Clusters with fewer than
-    `min_points` points in the mask or the ring stay unchanged.
+    K-means runs on the points of each mask and of the ring around it. The object centers are initialized by groups of
+    the points in the mask, and the background centers by groups of the points in the ring. Each group has the same
+    number of points at similar depths. Clusters with too few points in the mask or the ring are not changed.
     """
 
     object_centers: int = 5  # number of centers of the object, >= 1

@@ -1,4 +1,4 @@
-"""Cluster refinement by connectivity. An object is one connected component in 3D."""
+"""Cluster refinement by connectivity."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class LargestComponent(ClusterRefiner):
-    """Selection of the largest 3D-connected component of each cluster; ties go to the first in the image.
+    """Selection of the largest connected component of each cluster.
 
-    Points are connected if they are at most `connection_radius` pixels apart and their depths differ by less than
-    `max_gap` + `gap_per_depth` * depth of the nearer point, because the spacing and the noise of readings grow with
-    depth.
+    Two points are connected if their pixels are at most `connection_radius` apart and their depth difference is small.
+    The allowed difference increases with depth, because the spacing and the noise of readings do. Ties go to the first
+    component in the image.
     """
 
     max_gap: float = 0.03  # maximum depth step between connected pixels at depth 0, m, >= 0

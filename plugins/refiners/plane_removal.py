@@ -1,4 +1,4 @@
-"""Cluster refinement by removal of structure. Floors and walls are not part of an object."""
+"""Cluster refinement by removal of floors and walls."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from framework.refinement.segmentation.planes import Planes, find_planes, off_pl
 
 @dataclass
 class PlaneRemoval(ClusterRefiner):
-    """Removal of the points on the floor, a wall or another plane at the border of the scene.
+    """Removal of points on the floor, a wall or another plane at the border of the scene.
 
-    Planes are found in the depth of the whole frame, without the gravity direction. A plane is structure if it is large
-    (`min_area`, `min_frame_fraction`) and the frame has few readings behind it (`max_behind_ratio`). Table tops and
+    Planes are found in the depth of the whole frame. The gravity direction is not needed. A plane is structure if it is
+    large (`min_area`, `min_frame_fraction`) and if few readings are behind it (`max_behind_ratio`). Table tops and
     screens have more readings behind them. A cluster keeps its points on a plane if they are more than
-    `max_cluster_fraction` of the plane's points, for example for a table that fills the image. The refined clusters
-    pass the planes to later refiners as `structure`.
+    `max_cluster_fraction` of the plane, e.g. for a table that fills the image. The planes are passed to later refiners
+    as `structure`.
     """
 
     # maximum distance of a point from its plane, m, >= 0, in addition to 3 standard deviations of depth noise
@@ -55,8 +55,8 @@ class PlaneRemoval(ClusterRefiner):
         return replace(keep_points(clusters, kept), structure=structure)
 
     def structure(self, frame: Frame) -> Planes:
-        """Return the planes of the frame that are structure: floors, walls and other planes at the scene's border."""
+        """Return the planes of the frame that are structure, such as floors and walls."""
         planes = find_planes(frame, self.plane_distance, self.inverse_depth_noise, self.min_area)
-        upright = -planes.normals[:, 1] >= np.cos(np.deg2rad(self.max_tilt)) - 1e-9  # the camera's y axis points down
+        upright = -planes.normals[:, 1] >= np.cos(np.deg2rad(self.max_tilt)) - 1e-9  # the camera y axis points down
         large = planes.fractions >= self.min_frame_fraction
         return planes.chosen(large & (planes.behind <= self.max_behind_ratio) & upright)

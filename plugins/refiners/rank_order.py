@@ -1,4 +1,7 @@
-"""Cluster refinement by rank-order clustering, our interpretation of the paper's "ROC algorithm"."""
+"""Cluster refinement by rank-order clustering.
+
+This is our interpretation of the "ROC algorithm" in the paper.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +18,20 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class RankOrder(ClusterRefiner):
-    """Selection of the largest rank-order group of each cluster; ties go to the first in the image.
+    """Selection of the largest rank-order group of each cluster.
 
-    The paper names an alternative, "ROC algorithm [12]"; its reference list is not available. We interpret it as
-    rank-order clustering (Zhu, Wen and Sun, "A Rank-Order Distance Based Clustering Algorithm for Face Tagging", CVPR
-    2011): points belong together if they have the same neighbors. The distance is the approximation of Otto, Wang and
-    Jain ("Clustering Millions of Faces by Identity", PAMI 2018), eqs. 4 and 5. O_a(b) is the rank of b among the
-    neighbors of a, nearest first, and f_a(i) is the neighbor with rank i:
+    The paper names the alternative "ROC algorithm [12]", but its reference list is not available. We interpret it as
+    rank-order clustering (Zhu et al., CVPR 2011), where points belong together if they have the same neighbors. The
+    distance is the approximation of Otto et al. ("Clustering Millions of Faces by Identity", PAMI 2018), eqs. 4 and 5.
+    O_a(b) is the rank of b among the neighbors of a, nearest first, and f_a(i) is the neighbor with rank i:
 
         d(a, b) = number of i in 1 .. min(O_a(b), k) for which f_a(i) is not among the k nearest of b (or b itself),
         D(a, b) = (d(a, b) + d(b, a)) / min(O_a(b), O_b(a)).
 
     Two points are linked if D is at most `threshold` and one point is among the k nearest of the other. Groups are
-    connected components. A cluster of at most k points stays unchanged.
-
-    Only the first point of each block of s x s px is compared, with the smallest s that leaves at most `max_points`
-    points. Each other point joins the group of the nearest compared point.
+    connected components, and ties go to the first group in the image. A cluster of at most k points is not changed. In
+    large clusters, at most `max_points` evenly distributed points are compared. Every other point joins the group of
+    the nearest one.
     """
 
     neighbors: int = 16  # number k of nearest neighbors, in [2, 254]
@@ -58,10 +59,7 @@ class RankOrder(ClusterRefiner):
 
 
 def _firsts_of_blocks(pixels: Int32, max_points: int) -> Int64:
-    """Return the indices of the first of the `pixels` (P, 2) in each square block, in ascending order.
-
-    The blocks are the smallest ones with at most `max_points` results.
-    """
+    """Return the indices of at most `max_points` pixels, the first in each square block of pixels."""
     u, v = (pixels - pixels.min(axis=0)).T
     side = int(np.ceil(np.sqrt(len(pixels) / max_points)))
     while True:
@@ -74,9 +72,14 @@ def _firsts_of_blocks(pixels: Int32, max_points: int) -> Int64:
 
 
 def rank_order_groups(points: Float32, neighbors: int, threshold: float) -> Int32:
-    """Return the rank-order group (P,) of each of P points (P, 3), m; see `RankOrder` for k = `neighbors`.
+    """Return the rank-order group (P,) of each point.
 
-    Groups are numbered in the order of their first points.
+    Groups are numbered in the order of their first points. See `RankOrder`.
+
+    Args:
+        points: The points (P, 3), m.
+        neighbors: The number k of nearest neighbors.
+        threshold: The maximum rank-order distance of linked points.
     """
     n, k = len(points), neighbors
     if n <= k:  # all points have the same neighbors

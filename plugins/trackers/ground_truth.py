@@ -1,4 +1,4 @@
-"""Ground-truth poses, the upper bound of tracking accuracy."""
+"""Ground-truth poses, an upper bound of tracking accuracy."""
 
 from __future__ import annotations
 
@@ -12,12 +12,19 @@ from framework.interfaces import PoseTracker, SceneMap
 
 @dataclass
 class GroundTruth(PoseTracker):
-    """Ground-truth poses of the sequence. Frames without a pose are skipped."""
+    """Ground-truth poses of the sequence.
+
+    Frames without a pose are skipped.
+    """
 
     pose_source = "ground_truth"
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        """Return the ground-truth pose of the frame. Raises NoPoseError for a frame without a pose."""
+        """Return the ground-truth pose of the frame.
+
+        Raises:
+            NoPoseError: If the frame has no pose.
+        """
         if frame.T_world_camera is None:
             raise NoPoseError(f"frame {frame.index}: expected a ground-truth pose at {frame.timestamp:.3f} s, got none")
         return Pose(frame.T_world_camera)

@@ -1,4 +1,4 @@
-"""Open3D's RGB-D odometry, between frames or against the map."""
+"""RGB-D odometry of Open3D, relative to the map or to the previous frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Method(Enum):
-    """The minimized error."""
+    """Error that is minimized."""
 
     POINT_TO_PLANE = "PointToPlane"  # depth only (KinectFusion)
     INTENSITY = "Intensity"  # color only (Steinbruecker et al. 2011)
@@ -26,7 +26,7 @@ class Method(Enum):
 
 
 class Reference(Enum):
-    """The target to which a frame is aligned."""
+    """Image to which a frame is aligned."""
 
     PREVIOUS_FRAME = "previous frame"
     MAP = "view of the map from the last pose"
@@ -34,7 +34,7 @@ class Reference(Enum):
 
 @dataclass(frozen=True)
 class _Seen:
-    """The Open3D image of a frame, and the pose of the frame."""
+    """A frame as an Open3D image, with its pose."""
 
     image: o3d.t.geometry.RGBDImage
     T_world_camera: Float64  # (4, 4)
@@ -42,7 +42,7 @@ class _Seen:
 
 @dataclass
 class Open3dOdometry(PoseTracker):
-    """Open3D's multi-scale RGB-D odometry relative to a view of the map or to the previous frame.
+    """Multi-scale RGB-D odometry of Open3D, relative to a view of the map or to the previous frame.
 
     Use POINT_TO_PLANE with the map. Use HYBRID and INTENSITY with the previous frame, because the colors of the map are
     blurred.
@@ -98,7 +98,7 @@ class Open3dOdometry(PoseTracker):
     def _aligned(
         self, image: o3d.t.geometry.RGBDImage, reference: o3d.t.geometry.RGBDImage, frame: Frame
     ) -> tuple[Float64, str]:
-        """Return T_last_camera (4, 4) and a one-line reason for rejection; "" = the pose is accepted."""
+        """Return T_last_camera (4, 4) and the reason for rejecting it, "" = accepted."""
         from open3d.t.pipelines import odometry
 
         readings = np.count_nonzero((frame.depth > 0) & (frame.depth <= self.max_depth))
@@ -131,7 +131,8 @@ def _rgbd_image(color: UInt8, depth: Float32) -> o3d.t.geometry.RGBDImage:
 
 
 def _tensor(array: Array) -> o3d.core.Tensor:
-    """Return a tensor with a copy of the array, because Open3D does not keep the array alive."""
+    """Return a tensor with a copy of the array."""
     import open3d as o3d
 
+    # Open3D does not keep the array alive
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array)).clone()

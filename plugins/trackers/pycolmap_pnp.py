@@ -1,4 +1,4 @@
-"""Sparse tracking: image features with depth are matched with keyframes, and pycolmap estimates the pose."""
+"""Sparse tracking by matching image features with keyframes."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from framework.tracking.keyframes import Keyframes
 
 @dataclass
 class PycolmapPnp(PoseTracker):
-    """Feature matching with the nearest keyframes and pose estimation by pycolmap's PnP with RANSAC.
+    """Matching of features with the nearest keyframes, and pose estimation by the PnP RANSAC of pycolmap.
 
-    If matching fails, the tracker relocalizes among all keyframes. It does not use the map. See `Keyframes` for the
+    If tracking fails, the tracker relocalizes among all keyframes. It does not use the map. See `Keyframes` for the
     parameters.
     """
 
@@ -63,7 +63,7 @@ class PycolmapPnp(PoseTracker):
         self._keyframes.restore(keyframes)
 
     def _begin(self, frame: Frame, features: Features) -> Pose:
-        """Return the pose that defines the world frame, or a lost pose if the frame has too few features."""
+        """Return the first pose, which defines the world frame, or a lost pose if the frame has too few features."""
         T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
         if not self._keyframes.add_with(frame, features, T_world_camera):
             reason = f"the frame has fewer than {self.min_features} features with depth"

@@ -1,4 +1,4 @@
-"""Poses of another SLAM system from a file."""
+"""Poses of another SLAM system, read from a file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from framework.interfaces import PoseTracker, SceneMap
 
 
 class World(Enum):
-    """The world frame of the poses."""
+    """World frame of the poses."""
 
     FIRST_FRAME = "ground-truth pose of the first frame, or the identity"
     FILE = "frame of the file"
@@ -26,12 +26,12 @@ class World(Enum):
 
 @dataclass
 class TrajectoryFile(PoseTracker):
-    """Poses from a TUM file: each frame gets the pose nearest in time. Frames without such a pose are skipped.
+    """Poses from a trajectory file in TUM format.
 
-    By default the trajectory is moved rigidly so that the first frame with a pose defines the world frame, as in
-    `PoseTracker`. `world_frame=FILE` keeps the world frame of the file, in which the ground-truth poses of the sequence
-    are invalid. Raises DataError with the file and the line for poses that are not finite or not rigid, and for
-    timestamps that do not increase.
+    Each frame gets the pose nearest in time. Frames without such a pose are skipped. By default, the trajectory is
+    moved rigidly, so that the first frame with a pose defines the world frame. `world_frame=FILE` keeps the world frame
+    of the file. The ground-truth poses of the sequence are then invalid. The tracker raises DataError if a pose is not
+    finite or not rigid, or if timestamps do not increase.
     """
 
     path: Path  # trajectory in TUM format
@@ -50,7 +50,11 @@ class TrajectoryFile(PoseTracker):
         self._T_world_file: Float64 | None = np.eye(4) if self.world_frame is World.FILE else None
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        """Return the pose from the file. Raises NoPoseError for a frame without a pose in the file."""
+        """Return the pose from the file.
+
+        Raises:
+            NoPoseError: If the file has no pose for the frame.
+        """
         nearest = int(np.abs(self._timestamps - frame.timestamp).argmin())
         difference = abs(float(self._timestamps[nearest]) - frame.timestamp)
         if difference > self.max_time_difference:

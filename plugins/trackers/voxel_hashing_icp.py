@@ -1,4 +1,4 @@
-"""Frame-to-model tracking by alignment of each frame to a ray-cast view of the map, by geometry and color."""
+"""Frame-to-model tracking: geometric and photometric alignment of each frame to a view of the map."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from framework.tracking.uncertainty import is_significant, pose_covariance
 
 LEVELS = 3
 CONVERGED = 1e-4  # maximum last step of the finest level, m and rad; the limit is four times larger per coarser level
-# maximum motion of a possibly stationary camera, m and rad; larger motions are used even if they are not significant
+# maximum motion of a possibly stationary camera, m and rad; larger motions always change the pose
 STANDING = 1e-3
 SAME_POSE = 0.05  # maximum difference between poses that count as equal, m and rad
 SMALLEST = 8  # minimum side of the coarsest level, px
-# minimum agreement_in_front near the prediction, which replaces min_agreement, because an object may have been removed
+# minimum agreement_in_front near the predicted pose; replaces min_agreement, because an object may have been removed
 CHANGED_SCENE = 0.95
-EXPECTED_AGREEMENT = 0.8  # replaces min_agreement near the prediction of a steady motion
-EXPECTED_BEHIND = 0.1  # replaces max_occluded near the prediction of a steady motion
+EXPECTED_AGREEMENT = 0.8  # minimum agreement near the predicted pose in a steady motion
+EXPECTED_BEHIND = 0.1  # maximum fraction behind the surface near the predicted pose in a steady motion
 STEADY = 5  # minimum number of consecutive frames with a correct prediction in a steady motion
 VISITED = 64  # number of visited poses that are tried for a lost camera, one per frame
 VISITED_SEPARATION = 0.1  # minimum separation of these poses, m and rad
@@ -43,20 +43,26 @@ ODOMETRY_INFORMATION = 5.0
 
 
 class ResidualWeights(Enum):
-    """Weights of residuals; see framework/tracking/alignment.py."""
+    """Weights of residuals.
+
+    See framework/tracking/alignment.py.
+    """
 
     TUKEY = "weights by residual over expected noise, with larger noise at coarse levels and exposure compensation"
     LINEAR = "weights of VoxelHashing's code, equal at all levels, without noise model and exposure compensation"
 
 
 class Alignment(NamedTuple):
-    """Result of the alignment of a frame. Fractions are relative to the visible points unless stated otherwise."""
+    """Result of the alignment of a frame.
+
+    Fractions are relative to the visible points unless stated otherwise.
+    """
 
     T_world_camera: Float64  # (4, 4)
     matched: float  # fraction of points with a nonzero weight
     agreement: float  # fraction of points that agree with the map
-    behind: float  # fraction of points behind the map's surface
-    agreement_in_front: float  # fraction of the points not behind the map's surface that agree with the map
+    behind: float  # fraction of points behind the surface of the map
+    agreement_in_front: float  # fraction of points that agree with the map, among those not behind its surface
     reason: str  # reason for rejection, empty if the pose is possible
     doubt: str  # reason to require confirmation by a second source, empty if it is not required
     covariance: Float64 | None = None  # (6, 6) Pose.covariance; None = unknown
@@ -76,18 +82,18 @@ class Directions(NamedTuple):
 
 @dataclass
 class VoxelHashingIcp(PoseTracker):
-    """Frame-to-model ICP plus RGB, coarse to fine, with lost detection (after VoxelHashing and ElasticFusion).
+    """Coarse-to-fine ICP with color against a view of the map, as in VoxelHashing and ElasticFusion.
 
-    A pose needs agreement with the map. Near the prediction of a steady motion, less agreement is sufficient. Agreement
-    alone does not separate correct from wrong poses (docs/guides/trackers.md). Therefore, every other pose is also
-    compared with the pose from features, if there is one.
+    The tracker detects lost poses. A pose is accepted if most points agree with the map. Near the predicted pose of a
+    steady motion, less agreement is sufficient. Because wrong poses can also agree with the map
+    (docs/guides/trackers.md), all other poses are compared with the pose from features, if there is one.
 
     The prediction is the motion measured by odometry, if the frames have odometry, and otherwise constant velocity. A
     frame near the prediction of odometry may determine only a part of the motion. Odometry determines the rest.
 
-    A frame is always lost if too few points match, if the step is implausible, or if the points do not determine the
-    step. All other checks are our additions. min_agreement=0 and max_occluded=1 disable the checks of agreement, also
-    for a lost camera. relocalize=false disables the comparison with features.
+    A frame is always lost if too few points match, if the motion is implausible, or if the points do not determine the
+    motion. All other checks are our additions. Set min_agreement=0 and max_occluded=1 to disable the checks of
+    agreement, and relocalize=false to disable the comparison with features.
     """
 
     residual_weights: ResidualWeights = ResidualWeights.TUKEY  # weights of residuals
@@ -189,9 +195,9 @@ class VoxelHashingIcp(PoseTracker):
         return self._accept(seen, alignment.T_world_camera, alignment.covariance)
 
     def _held(self, alignment: Alignment) -> Alignment:
-        """Return the alignment, with the last pose if the motion from it is small and does not exceed its uncertainty.
+        """Return the alignment, with the last pose if the motion is too small to be significant.
 
-        The last pose changes only with a significant motion, so slow motions add up until they are significant.
+        Slow motions add up until they are significant.
         """
         assert self._T_world_last is not None
         if self._lost_frames or alignment.covariance is None:
@@ -222,25 +228,25 @@ class VoxelHashingIcp(PoseTracker):
         return levels
 
     def _finest_scale(self, camera: Camera) -> float:
-        """Return the scale of the finest level relative to the image: `finest_scale`, halved for large images.
-
-        The longer side of the level is at most `finest_side` px. Otherwise, the coarsest level would be too fine for
-        large motions.
-        """
-        scale = self.finest_scale
+        """Return the scale of the finest level relative to the image, which is smaller for large images."""
+        scale = self.finest_scale  # otherwise, the coarsest level would be too fine for large motions
         while self.finest_side and max(camera.shape) * scale > self.finest_side:
             scale /= 2
         return scale
 
     def _loss(self, alignment: Alignment, frame: Frame) -> str:
-        """Return the reason for a loss; if many isolated pixels have no depth, it includes the fraction with depth."""
+        """Return the reason for a lost pose."""
         reason = alignment.reason or alignment.doubt
+        # mention the fraction of pixels with depth if many isolated pixels have none
         if not is_scattered(frame.depth):
             return reason
         return f"{reason}; only {np.mean(frame.depth > 0):.0%} of the pixels have depth, most without neighbors"
 
     def _relocalize_in_stored(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
-        """Return the pose in a stored map from features, confirmed by alignment, or a lost pose if it is not found."""
+        """Return the pose in a stored map from features, or a lost pose.
+
+        The pose must be confirmed by an alignment.
+        """
         alignment = Alignment(np.eye(4), 0, 0, 0, 0, "not relocalized in the stored map yet", "")
         found = self._keyframes.relocalize(seen.frame)
         if found is not None:
@@ -275,9 +281,9 @@ class VoxelHashingIcp(PoseTracker):
         self, levels: list[PyramidLevel], scene: SceneMap, T_world_predicted: Float64, T_world_from: Float64,
         completed: bool = False,
     ) -> Alignment:  # fmt: skip
-        """Return the alignment that starts at the predicted pose. A result near the prediction needs less agreement.
+        """Return the alignment that starts at the predicted pose.
 
-        See `_align` for the other arguments.
+        Near the prediction, less agreement with the map is sufficient. See `_align` for the other arguments.
         """
         alignment = self._align(levels, scene, T_world_predicted, T_world_from, completed)
         if not self._scale.near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
@@ -294,9 +300,9 @@ class VoxelHashingIcp(PoseTracker):
     def _align_lost(
         self, levels: list[PyramidLevel], scene: SceneMap, T_world_odometry: Float64 | None
     ) -> Alignment:  # fmt: skip
-        """Return the alignment that starts at the pose predicted by odometry, if any, or at the last reliable pose.
+        """Return the alignment that starts at the prediction of odometry, the last pose or the unconfirmed pose.
 
-        If it is not reliable, start at the unconfirmed pose of the last frame, if any.
+        The unconfirmed pose is that of the last frame, if only its confirmation failed.
         """
         assert self._T_world_last is not None
         if T_world_odometry is not None:
@@ -310,7 +316,7 @@ class VoxelHashingIcp(PoseTracker):
         return alignment if again.reason else again
 
     def _initialize(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
-        """Return the pose that defines the world frame, or a lost pose if the frame has too little depth."""
+        """Return the first pose, which defines the world frame, or a lost pose if the frame has too little depth."""
         frame = seen.frame
         if min(frame.camera.shape) * self._finest_scale(frame.camera) < SMALLEST * 2 ** (LEVELS - 1):
             side = min(frame.camera.shape) * self._finest_scale(frame.camera) / 2 ** (LEVELS - 1)
@@ -330,7 +336,7 @@ class VoxelHashingIcp(PoseTracker):
         return self._accept(seen, T_world_camera, np.zeros((6, 6)))
 
     def _update_raw_keyframe(self, levels: list[PyramidLevel], T_world_camera: Float64) -> None:
-        """Replace the raw keyframe by a frame with a reliable pose if it is missing or too far from this pose."""
+        """Replace the raw keyframe if it is missing or too far away."""
         key = self._raw_keyframe
         if key is None or not self._scale.near(key.T_world_camera, T_world_camera, NEW_DISTANCE):
             self._raw_keyframe = RawKeyframe.of(levels, T_world_camera, self._scattered_depth)
@@ -358,9 +364,9 @@ class VoxelHashingIcp(PoseTracker):
     def _relocalized(
         self, alignment: Alignment, seen: FrameFeatures, levels: list[PyramidLevel], scene: SceneMap
     ) -> Alignment:
-        """Return the alignment, confirmed or replaced by the pose from features, if any.
+        """Return the alignment, confirmed or replaced by the pose from features.
 
-        For a lost camera without a reliable pose, an alignment from a visited pose is also tried.
+        If the camera is lost, an alignment from a visited pose is also tried.
         """
         if not self.relocalize:
             return alignment
@@ -377,9 +383,9 @@ class VoxelHashingIcp(PoseTracker):
     def _confirmed(
         self, alignment: Alignment, T_world_found: Float64, levels: list[PyramidLevel], scene: SceneMap
     ) -> Alignment:
-        """Return the alignment, or an alignment that starts at the pose `T_world_found` from features.
+        """Return the alignment, or an alignment that starts at the pose from features.
 
-        A pose is reliable if alignment and features agree.
+        The result is reliable if alignment and features agree.
         """
         if alignment.reliable and self._scale.near(alignment.T_world_camera, T_world_found, self.max_distance):
             return alignment
@@ -394,8 +400,9 @@ class VoxelHashingIcp(PoseTracker):
         return alignment._replace(doubt=alignment.doubt or "features and alignment with the map disagree")
 
     def _pose_from_features(self, seen: FrameFeatures) -> AbsolutePose | None:
-        """Return the pose from the last reliable frame and nearby keyframes, otherwise from similar keyframes."""
+        """Return the pose from the features of the last frame and of keyframes, or None."""
         assert self._T_world_last is not None
+        # nearby keyframes first, then keyframes with similar features
         near = self._keyframes.nearest(self._T_world_last)
         if self._last is not None:
             near = [self._keyframes.keyframe(self._last.frame, self._last.found, self._T_world_last), *near]
@@ -405,9 +412,9 @@ class VoxelHashingIcp(PoseTracker):
         return found
 
     def _align_twice(self, levels: list[PyramidLevel], scene: SceneMap, T_world_from: Float64) -> Alignment:
-        """Align from the pose `T_world_from`, then from the result, and return the second alignment.
+        """Align the frame, align it again from the result, and return the second alignment.
 
-        If the two results differ, it needs confirmation.
+        If the two differ, the result needs confirmation.
         """
         alignment = self._align(levels, scene, T_world_from, T_world_from)
         if not alignment.reliable or self.min_agreement == 0:
@@ -421,10 +428,14 @@ class VoxelHashingIcp(PoseTracker):
         self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64,
         completed: bool = False,
     ) -> Alignment:  # fmt: skip
-        """Return the alignment of a frame to the view of the map at T_world_view, computed coarse to fine.
+        """Return the alignment of a frame to a view of the map, computed coarse to fine.
 
-        `levels`: the image pyramid of the frame, finest first. `T_world_from`: the pose from which the motion of the
-        camera is limited. `completed`: True = T_world_view determines the motion that the points do not determine.
+        Args:
+            levels: The image pyramid of the frame, finest level first.
+            scene: The map.
+            T_world_view: The pose (4, 4) of the view, where the alignment starts.
+            T_world_from: The pose (4, 4) relative to which the motion is limited.
+            completed: True = T_world_view determines the motion that the points do not determine.
         """
         view = scene.render_near(levels[0].camera, T_world_view, levels[0].depth, levels[0].sensor)
         model, intensities = model_view(view), model_intensities(view, LEVELS)
@@ -482,16 +493,13 @@ class VoxelHashingIcp(PoseTracker):
         return Alignment(T_world_camera, matched, agreement, behind, agreement_in_front, reason, doubt, covariance)
 
     def _linear_weights(self, scene: SceneMap) -> LinearWeights | None:
-        """Return the limits of linear weights; None = Tukey's weights."""
+        """Return the limits of the linear weights, or None for Tukey's weights."""
         if self.residual_weights is ResidualWeights.TUKEY:
             return None
         return LinearWeights(np.float32(scene.depth_range[1]), np.float32(self.max_intensity_difference))
 
     def _weights_at(self, level: int) -> Weights:
-        """Return the weights of pyramid level `level`, 0 = finest.
-
-        Coarse levels start from less accurate poses. Therefore, Tukey's weights tolerate larger residuals there.
-        """
+        """Return the weights of a pyramid level, 0 = finest."""
         normals_known = not (self._coarse_depth or self._scattered_depth)
         weights = self._weights._replace(
             min_normal_dot=self._weights.min_normal_dot if normals_known else np.float32(-1),
@@ -499,6 +507,7 @@ class VoxelHashingIcp(PoseTracker):
         )
         if self.residual_weights is ResidualWeights.LINEAR:
             return weights
+        # larger residuals are allowed at coarse levels, which start from less accurate poses
         return weights._replace(
             max_distance=self._weights.max_distance * np.float32(1 + level),
             geometric_scale=self._weights.geometric_scale * np.float32(2**level),
@@ -506,10 +515,12 @@ class VoxelHashingIcp(PoseTracker):
         )
 
     def _rejection(self, frame: PyramidLevel, equations: NormalEquations, T_from_camera: Float64) -> str:
-        """Return a one-line reason for rejection of the pose; "" = the pose is possible.
+        """Return the reason for rejecting a pose, "" = the pose is possible.
 
-        `frame`: the level of the frame whose points are counted in `equations`. `T_from_camera`: the motion from the
-        last pose.
+        Args:
+            frame: The level of the frame whose points are counted in `equations`.
+            equations: The normal equations at the pose.
+            T_from_camera: The motion (4, 4) since the last pose.
         """
         points = int(np.count_nonzero(frame.depth))
         if points == 0:
@@ -525,11 +536,9 @@ class VoxelHashingIcp(PoseTracker):
         return ""
 
     def _directions(self, equations: NormalEquations, factor: float) -> Directions:
-        """Return the principal directions of motion, and those with `factor` times the minimum information or more.
-
-        These are the eigenvectors of A with translations in units of the typical depth. The photometric term is not
-        multiplied by lambda, because only the geometric term contains false information from the noise of normals.
-        """
+        """Return the principal directions of motion, and those with `factor` times the minimum information or more."""
+        # The photometric term is not multiplied by lambda, because only the geometric term contains false information
+        # from noisy normals.
         color = (1 / self.color_weight - 1) * equations.A_color if self.color_weight > 0 else 0.0
         information, directions = np.linalg.eigh(self._scale.without_units(equations.A + color))
         return Directions(directions, information >= factor * self.min_information * information.mean())
@@ -546,6 +555,7 @@ class VoxelHashingIcp(PoseTracker):
 
 
 def _solved(A: Float64, b: Float64) -> Float64:
-    """Return the Gauss-Newton step xi (6,), m and rad, with A xi = -b; damping keeps undetermined components near 0."""
+    """Return the Gauss-Newton step (6,), m and rad."""
+    # solves A xi = -b; damping keeps undetermined components near 0
     damping = 1e-6 * max(float(np.trace(A)), 1e-12) * np.eye(6)
     return np.asarray(np.linalg.solve(A + damping, -b))

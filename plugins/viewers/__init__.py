@@ -1,1 +1,1 @@
-"""Viewers of a run in progress."""
+"""Viewers for runs in progress."""

@@ -1,4 +1,4 @@
-"""Logs for MLflow (https://mlflow.org, Apache-2.0)."""
+"""Viewer that logs to MLflow (https://mlflow.org, Apache-2.0)."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class MLflowViewer(Viewer):
         self._client.set_terminated(self._run, "FAILED" if error else "FINISHED")
 
     def _experiment_id(self) -> str:
-        """Return the id of the experiment, which is created if it does not exist."""
+        """Return the id of the experiment, which is created if necessary."""
         found = self._client.get_experiment_by_name(self.experiment)
         return str(found.experiment_id if found else self._client.create_experiment(self.experiment))
 

@@ -1,4 +1,7 @@
-"""Live view with rerun (https://rerun.io, Apache-2.0 and MIT) in a window, in a browser, or recorded to a file."""
+"""Viewer based on rerun (https://rerun.io, Apache-2.0 and MIT).
+
+The output is a window, a web page or a file.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ class Mode(Enum):
 
 @dataclass
 class RerunViewer(Viewer):
-    """Viewer of the camera path, the newest frame with masks and depth, the mesh, object boxes, and stage times.
+    """Viewer of the camera path, images with masks, the mesh, object boxes and stage times.
 
     If drawing is slower than mapping, some images are omitted. Poses, stage times and lost frames are always shown.
     """
@@ -102,10 +105,7 @@ class RerunViewer(Viewer):
             self._page.close()
 
     def _sinks(self, rr: Any, directory: Path) -> list[Any]:
-        """Open the outputs chosen by `mode` and `file`, and return their rerun sinks.
-
-        `directory`: the run directory, to which `file` is relative.
-        """
+        """Open the outputs, and return their rerun sinks."""
         sinks = []
         file = self.file or (RECORDING if self.mode is Mode.RECORD else "")
         if file:
@@ -128,7 +128,7 @@ def _file_sink(rr: Any, path: Path) -> Any:
 
 
 def _server(rr: Any, port: int, memory_limit: str) -> Any:
-    """Start a server of the data on 127.0.0.1 and return its rerun sink."""
+    """Start a local data server, and return its rerun sink."""
     with _named_errors(f"viewer.port: expected a free port, got {port}"):
         with socket.socket() as probe:  # rerun would report this only on stderr
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -1,4 +1,4 @@
-"""Logs for TensorBoard (https://www.tensorflow.org/tensorboard, Apache-2.0)."""
+"""Viewer that logs to TensorBoard (https://www.tensorflow.org/tensorboard, Apache-2.0)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs for Weights & Biases (https://wandb.ai, MIT)."""
+"""Viewer that logs to Weights & Biases (https://wandb.ai, MIT)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class WandbViewer(Viewer):
                 dir=place,
                 config=parameter_values(config),
                 mode=self.mode.value,
-                reinit="create_new",  # without wandb's global run, which belongs to the host application
+                reinit="create_new",  # the global run of wandb belongs to the host application
                 settings=wandb.Settings(silent=True, console="off", disable_code=True),
             )
         except wandb.Error as error:

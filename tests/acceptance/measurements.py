@@ -1,4 +1,4 @@
-"""The acceptance measurements. Each function returns its value, and True if the value is within the bound."""
+"""The acceptance measurements. Each function returns the measured value and whether the value is within the bound."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ PIPELINE = ("framework", "plugins", "conf", "tests/acceptance")
 
 @functools.cache
 def mapped(*overrides: str) -> dict[str, Any]:
-    """Map a sequence and return its metrics. Measurements in one process share the metrics of equal overrides."""
+    """Map a sequence and return the metrics.
+
+    Repeated calls with the same overrides in one process reuse the metrics.
+    """
     with tempfile.TemporaryDirectory() as directory:
         command = [sys.executable, "-m", "framework", *overrides, f"hydra.run.dir={directory}/run"]
         subprocess.run(command, cwd=CHECKOUT, check=True)
@@ -29,7 +32,7 @@ def mapped(*overrides: str) -> dict[str, Any]:
 
 
 def failures(*arguments: str, **variables: str) -> Measured:
-    """Run pytest with arguments; the measured value is its exit status, which is 0 if all tests pass."""
+    """Run pytest with arguments and return its exit status, which is 0 if all tests pass."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", *arguments]
     status = subprocess.run(command, cwd=CHECKOUT, env=os.environ | variables, check=False).returncode
     return status, status == 0
@@ -117,7 +120,7 @@ def long_tests() -> Measured:
     "0 failing commands, fresh virtual environment", "framework", "plugins", "conf", "instancemap.py", "pyproject.toml"
 )
 def wheel() -> Measured:
-    """Install the wheel in a new environment and use it from an empty folder, as the README does."""
+    """Install the wheel in a new environment and use the package from an empty folder, as described in the README."""
     example = (CHECKOUT / "README.md").read_text().split("```python\n")[1].split("```")[0]
     with tempfile.TemporaryDirectory() as directory:
         wheels, environment, empty = (Path(directory, name) for name in ("wheels", "environment", "empty"))

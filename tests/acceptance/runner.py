@@ -1,4 +1,4 @@
-"""Registered acceptance measurements, and the page with their latest values: docs/results/acceptance.md."""
+"""Acceptance measurements and the page with their latest values, docs/results/acceptance.md."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HEADER = """# Acceptance
 `make acceptance MEASUREMENT=NAME` runs one. `tests/acceptance/measurements.py` defines them.
 
 """
-Measured = tuple[float, bool]  # the value, and True if it is within the bound
+Measured = tuple[float, bool]  # the value, and whether it is within the bound
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Measurement:
     """One acceptance criterion."""
 
     name: str
-    bound: str  # text for the page, with unit
-    paths: Sequence[str]  # the code that the value depends on, relative to the checkout
+    bound: str  # as shown on the page, with its unit
+    paths: Sequence[str]  # paths of the code that affects the value, relative to the checkout
     measure: Callable[[], Measured]
 
 
@@ -36,7 +36,7 @@ MEASUREMENTS: dict[str, Measurement] = {}
 
 
 def measurement(bound: str, *paths: str) -> Callable[[Callable[[], Measured]], Callable[[], Measured]]:
-    """Register a function as the acceptance measurement of its name."""
+    """Register a function as the acceptance measurement `name`."""
 
     def register(measure: Callable[[], Measured]) -> Callable[[], Measured]:
         MEASUREMENTS[measure.__name__] = Measurement(measure.__name__, bound, paths, measure)
@@ -46,7 +46,7 @@ def measurement(bound: str, *paths: str) -> Callable[[Callable[[], Measured]], C
 
 
 def read_rows(page: Path = PAGE) -> dict[str, list[str]]:
-    """Return the table cells of each measurement on the page, by name."""
+    """Return the table cells of each measurement on the page, keyed by the name of the measurement."""
     if not page.exists():
         return {}
     rows = [

@@ -1,4 +1,4 @@
-"""Tests of the acceptance page: rows are kept, and outdated rows are detected."""
+"""Tests for the acceptance page."""
 
 from __future__ import annotations
 

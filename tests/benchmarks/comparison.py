@@ -10,7 +10,7 @@ NOTHING = "-"  # a cell without a number: not measured, or not defined
 
 @dataclass
 class Table:
-    """Table with text cells. The notes below the table state how the values were measured."""
+    """Table with text cells and notes that state how the values were measured."""
 
     title: str
     columns: Sequence[str]
@@ -18,7 +18,7 @@ class Table:
     notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """Return the lines of the table in Markdown; text is aligned left, and numbers are aligned right."""
+        """Return the lines of the table in Markdown. Text is aligned left, numbers are aligned right."""
         table = [list(self.columns), *map(list, self.rows)]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         numbers = [all(_is_number(row[k]) for row in self.rows) for k in range(len(self.columns))]
@@ -47,5 +47,5 @@ def mib(count: float) -> str:
 
 
 def times(theirs: float, ours: float) -> str:
-    """Return the ratio of the two times as text: the speedup of ours over theirs."""
+    """Return the ratio of two times as text, i.e. the speedup of ours over theirs."""
     return f"{theirs / ours:.1f}" if ours else NOTHING

@@ -1,4 +1,7 @@
-"""Shared settings of the benchmarks: they run only when requested, and their tables are printed at the end."""
+"""Shared settings of the benchmarks.
+
+Benchmarks run only on request. The tables are printed at the end.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ TABLES = pytest.StashKey[list[Table]]()
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-benchmark reads its options
 def pytest_configure(config: pytest.Config) -> None:
-    """Enable the benchmarks if pytest is called on this folder; a plain `pytest` skips them."""
+    """Enable the benchmarks if pytest is called on this folder. A plain `pytest` skips them."""
     config.stash.setdefault(TABLES, [])
     named = [Path(config.invocation_params.dir, argument.split("::")[0]).resolve() for argument in config.args]
     if named and all(path.is_relative_to(HERE) for path in named):
@@ -23,7 +26,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session")
 def tables(pytestconfig: pytest.Config) -> list[Table]:
-    """Return the list of tables that are printed when all tests are done."""
+    """Return the list of tables that are printed after all tests."""
     return pytestconfig.stash[TABLES]
 
 

@@ -1,7 +1,8 @@
-"""Copy an RGB-D folder frame by frame, like a camera: `python -m tests.benchmarks.feeder SOURCE TARGET FRAMES HZ`.
+"""Copy an RGB-D folder frame by frame at a given rate, like a camera.
 
-The frames of the source are played forward and backward. Each file is written atomically. TARGET/feeder.csv contains
-the index of each frame and its Unix time, s.
+Usage: `python -m tests.benchmarks.feeder SOURCE TARGET FRAMES HZ`. The frames of the source are played forward and
+backward, and each file is written atomically. TARGET/feeder.csv contains the index of each frame and its Unix time in
+seconds.
 """
 
 from __future__ import annotations

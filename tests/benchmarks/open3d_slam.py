@@ -1,4 +1,4 @@
-"""Open3D's dense SLAM (t.pipelines.slam), called and timed as in its example `dense_slam.py`."""
+"""Open3D's dense SLAM (t.pipelines.slam), used and timed as in its example `dense_slam.py`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from framework.data import Detections, Float64, Frame, Pose
 Method = o3d.t.pipelines.odometry.Method
 
 DEPTH_SCALE = 1000.0  # depth units per meter; depth is passed in mm as uint16
-MIN_DEPTH, MAX_DEPTH = 0.1, 5.0  # m; MAX_DEPTH equals that of our fuser
+MIN_DEPTH, MAX_DEPTH = 0.1, 5.0  # m; MAX_DEPTH is equal to the maximum depth of our fuser
 MAX_DEPTH_DIFFERENCE = 0.07  # m, the default
 TRUNCATION = 8.0  # voxels, the default
 BLOCK = 16  # voxels per side, as in the example
@@ -18,7 +18,7 @@ BLOCKS = {0.01: 16_000, 0.02: 4_000}  # capacity by voxel size, m; sufficient fo
 
 
 class Open3DSlam:
-    """SLAM of one camera without labels. The steps of a frame are separate methods, so that each can be timed."""
+    """Open3D's SLAM for one camera, without labels. Each step of a frame is a separate method and can be timed."""
 
     def __init__(
         self, first: Frame, voxel_size: float, method: Method = Method.PointToPlane, device: str = "CPU:0"
@@ -74,7 +74,7 @@ class Open3DSlam:
         self._frames += 1
 
     def render(self) -> None:
-        """Render the inputs of the tracker: the depth of the full image, and color if the method uses it."""
+        """Render the images that the tracker needs: depth, and color if the method uses color."""
         self._model.synthesize_model_frame(self._view, DEPTH_SCALE, MIN_DEPTH, MAX_DEPTH, TRUNCATION, self._color)
 
     def render_all(self) -> None:
@@ -111,7 +111,7 @@ class Open3DSlam:
 
 
 def _rigid(T: Float64) -> Float64:
-    """Return T with an exact rotation; a product of many transforms accumulates rounding errors."""
+    """Return T with an exact rotation. Rounding errors accumulate in products of many transforms."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = U @ Vt, T[:3, 3]

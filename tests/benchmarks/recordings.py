@@ -1,4 +1,7 @@
-"""The videos of the benchmarks with their detections, in memory, so that reading and detection are not timed."""
+"""The videos of the benchmarks and their detections, kept in memory.
+
+Reading files and detection are therefore not part of the measured times.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +25,13 @@ class Recording:
 
 
 def red_kitchen(shared: Path, frames: int) -> Recording:
-    """Return the first `frames` frames of a real Kinect video, with the masks of a real detector."""
+    """Return the first `frames` frames of a Kinect video of a real kitchen, with masks of a real detector."""
     sequence = RgbdFolder(shared / "data" / "redkitchen", stop=frames)
     return _recorded("redkitchen", sequence, MaskRCNN2Go())
 
 
 def furnished_room(frames: int) -> Recording:
-    """Return `frames` frames of a synthetic room, with noisy Kinect depth and masks with simulated detector errors."""
+    """Return `frames` frames of a synthetic room with Kinect noise and simulated detection errors."""
     return _recorded("synthetic room", Synthetic(frames=240, stop=frames), SimulatedDetector())
 
 

@@ -1,7 +1,8 @@
-"""Camera path through a row of identical, furnished rooms. Every frame shows the same amount of new surface.
+"""Camera path through a row of identical, furnished rooms.
 
-World: x along the row, y to the left, z up. The path is periodic with the rooms. Two segments that are a whole number
-of rooms apart show the same images of different places, so any extra cost of the second one is due to the map.
+The amount of new surface is the same in every frame. The world has x along the row, y to the left and z up. The path
+repeats in every room. Two segments of the path that are a whole number of rooms apart show identical images of
+different places. A higher cost of the second segment is therefore caused by the size of the map.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ CAMERA_HEIGHT = 1.4  # m, above the floor
 PAN = np.deg2rad(35.0)  # rad, maximum angle of the camera to the left and to the right
 PITCH = np.deg2rad(12.0)  # rad, mean angle of the camera below the horizontal
 
-# Boxes of a room: lower corner, upper corner (m, x from the start of the room), class; None = a part of the building.
+# Boxes of a room: lower and upper corner (m, x from the start of the room) and class. None is a part of the building.
 FURNITURE = (
     ((-WALL, -HALF_WIDTH, 0.0), (WALL, -DOOR[0], HEIGHT), None),
     ((-WALL, DOOR[0], 0.0), (WALL, HALF_WIDTH, HEIGHT), None),
@@ -49,7 +50,7 @@ OBJECT_OF_BOX = np.array([OBJECTS.index(name) + 1 if name else 0 for *_, name in
 
 @dataclass
 class RoomRow(RGBDSequence):
-    """Sequence of frames along the path, without noise and with exact poses and instances."""
+    """Sequence of noise-free frames along the path, with exact poses and instances."""
 
     frames: int = 2000
 
@@ -71,7 +72,7 @@ class RoomRow(RGBDSequence):
 
 
 def pose_at(k: int) -> Float64:
-    """Return T_world_camera (4, 4) of frame k; the path leads through the doors, and the camera pans left and right."""
+    """Return T_world_camera (4, 4) of frame k. The path leads through the doors, and the camera pans left and right."""
     phase = 2 * np.pi * k / FRAMES_PER_ROOM
     yaw, pitch = PAN * np.sin(phase), -PITCH + np.deg2rad(2.0) * np.sin(3 * phase)
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
@@ -99,7 +100,7 @@ def _render(
     color: UInt8,
     ids: Int32,
 ) -> None:
-    """Render depth along z, m, color and instance ids of every pixel, in closed form."""
+    """Render the depth, the color and the instance id of every pixel."""
     ox, oy, oz = np.float32(T[0, 3]), np.float32(T[1, 3]), np.float32(T[2, 3])
     for v in prange(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -136,7 +137,7 @@ def _render(
 
 @njit(cache=True, nogil=True)
 def _entry(box, begin, ox, oy, oz, dx, dy, dz):
-    """Return the ray parameter where a ray enters a box of the room that starts at x = `begin`, m; inf = no hit."""
+    """Return the ray parameter where a ray enters a box of the room at x = `begin`, or inf without an intersection."""
     near, far = np.float32(1e-3), np.float32(np.inf)
     for axis in range(3):
         o = ox - begin if axis == 0 else (oy if axis == 1 else oz)
@@ -152,7 +153,7 @@ def _entry(box, begin, ox, oy, oz, dx, dy, dz):
 
 @njit(cache=True, nogil=True)
 def _paint(x, y, z, box, out):
-    """Write the color at a point, m, of a solid texture that repeats in each room and differs between boxes."""
+    """Write the color of a point of the solid texture, which is the same in each room and differs between boxes."""
     x -= LENGTH * np.floor(x / LENGTH)  # a room contains a whole number of waves along x
     turn = np.float32(2 * np.pi / LENGTH)
     one = np.sin(6 * turn * x + 5 * y + 3 * z + box)

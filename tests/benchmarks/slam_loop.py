@@ -21,7 +21,7 @@ def seconds(step: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
 
 
 class SlamLoop:
-    """Loop of tracking, lifting and fusion. It uses only public interfaces, so it can measure any tracker and fuser."""
+    """Loop of tracking, lifting and fusion. Any tracker and fuser can be measured."""
 
     def __init__(self, tracker: PoseTracker, fuser: MapFuser) -> None:
         self.tracker = tracker
@@ -51,7 +51,7 @@ class SlamLoop:
         self.fuser.scene.render(frame.camera, self.poses[-1].T_world_camera)
 
     def _watch_rendering(self) -> None:
-        """Accumulate the time that the tracker spends in the rendering functions of the map."""
+        """Measure the time that the tracker spends in the rendering functions of the map."""
         scene = self.fuser.scene
         for name in dir(type(scene)):
             if name.startswith(("render", "cast")) and callable(getattr(scene, name)):

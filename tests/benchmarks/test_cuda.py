@@ -1,6 +1,7 @@
-"""Detectors and SLAM on CUDA, compared with the CPU: `python -m pytest tests/benchmarks -k cuda` prints the tables.
+"""Detectors and SLAM on CUDA, compared with the CPU.
 
-docs/results/cuda.md has the results. No time is asserted.
+`python -m pytest tests/benchmarks -k cuda` prints the tables. The results are in docs/results/cuda.md. The tests assert
+no times.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ IMAGES, WARM_UP = 40, 10  # number of timed and of warm-up images per detector a
 LONGEST = 6.0  # s, maximum time per detector and device; the warm-up takes at most a quarter of it
 MATCH = 0.5  # minimum mask IoU of two detections of one object
 VOXEL_SIZE = 0.01  # m
-TURN, FIRST, LAST = 10, 20, 80  # frames per turn; frames in [FIRST, LAST) are evaluated
+TURN, FIRST, LAST = 10, 20, 80  # frames between two changes of the system; frames in [FIRST, LAST) are evaluated
 WEIGHTS = {"onnx_segmentation": "yolo11n_seg/yolo11n_seg.onnx", "onnx_boxes": "yolox_nano/yolox_nano.onnx"}
 NAMES = ["maskrcnn2go", "mask_rcnn_rooms", *WEIGHTS, *RANDOM]
 
@@ -46,16 +47,16 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="requires 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Matching detections of a detector on two devices, over all images."""
+    """Agreement of the detections of one detector on two devices, over all images."""
 
-    found: tuple[int, int]  # numbers of detections on the reference device and on the other device
+    found: tuple[int, int]  # number of detections on the reference device and on the other device
     overlaps: list[float]  # mask IoU of each match
-    score_differences: list[float]  # absolute, of each match
+    score_differences: list[float]  # absolute score difference of each match
     same_class: float  # fraction of the matches with equal classes
 
     @classmethod
     def of(cls, reference: Sequence[Detections], other: Sequence[Detections]) -> Agreement:
-        """Match each reference detection, best first, with the unmatched detection of the largest mask IoU."""
+        """Match the detections of both devices greedily by mask IoU, in the order of the reference scores."""
         overlaps, differences, same = [], [], []
         for a, b in zip(reference, other, strict=True):
             flat_a, flat_b = (d.masks.reshape(len(d), -1).astype(np.float32) for d in (a, b))
@@ -82,7 +83,7 @@ class Agreement:
 
 @pytest.fixture(scope="module")
 def images(shared: Path) -> Callable[[str], list[Frame]]:
-    """Return the images for a detector: real images, or rendered rooms for the network trained on rooms."""
+    """Return the images for a detector. The network trained on rendered rooms gets rendered rooms."""
     kitchen = list(RgbdFolder(shared / "data" / "redkitchen", stop=5 * IMAGES, stride=5))
     rooms = list(Synthetic(frames=240, stride=240 // IMAGES))
     return lambda name: rooms if name == "mask_rcnn_rooms" else kitchen
@@ -100,7 +101,7 @@ def tables_of_detectors(tables: list[Table]) -> tuple[Table, Table]:
 
 
 def settings(option: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield the name and the overrides of each device and precision; float32 on the CPU is first."""
+    """Yield the name and the overrides of each combination of device and precision, float32 on the CPU first."""
     parameters = registered.composed("detector", option).detector
     integers = ["detector.int8=false"] * ("int8" in parameters)
     yield "CPU, float32", ["device=cpu", *integers]
@@ -112,7 +113,10 @@ def settings(option: str) -> Iterator[tuple[str, list[str]]]:
 
 
 def run(detector: Any, frames: Sequence[Frame]) -> tuple[list[float], list[Detections]]:
-    """Return the time, s, and the detections of each image. Detections are on the CPU, so CUDA is synchronized."""
+    """Return the time, s, and the detections of each image.
+
+    The detections are copied to the CPU, which waits for CUDA.
+    """
     began = time.perf_counter()
     for frame in frames[:WARM_UP]:
         detector.detect(frame)
@@ -160,7 +164,7 @@ def test_cuda_detector_speed_and_agreement(
 
 
 def test_cuda_slam_speed(benchmark: BenchmarkFixture, shared: Path, tables: list[Table]) -> None:
-    """Our loop runs on the CPU and Open3D's on both devices, alternating on the same frames."""
+    """Our loop runs on the CPU, and Open3D runs on both devices. They alternate on the same frames."""
     kitchen = red_kitchen(shared, LAST)
     ours = SlamLoop(VoxelHashingIcp(), assemble(BayesianTsdf, voxel_size=VOXEL_SIZE))
     theirs = {device: Open3DSlam(kitchen.frames[0], VOXEL_SIZE, device=device) for device in ("CPU:0", "CUDA:0")}
@@ -190,7 +194,7 @@ def test_cuda_slam_speed(benchmark: BenchmarkFixture, shared: Path, tables: list
 
 
 def steps(slam: Open3DSlam, frame: Frame) -> list[float]:
-    """Return the times, s, of Open3D's whole loop and of each step."""
+    """Return the times, s, of the whole loop of Open3D and of each step."""
     calls = [partial(slam.load, frame), slam.track, slam.integrate, slam.render, slam.render_all]
     load, track, integrate, render, full = (seconds(synchronized, call)[0] for call in calls)
     return [track + integrate + render, load, track, integrate, render, full]

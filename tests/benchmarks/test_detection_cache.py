@@ -1,4 +1,7 @@
-"""Cost and savings of the detection cache at 640x480: `python -m pytest tests/benchmarks -k detection_cache`."""
+"""Cost and savings of the detection cache at 640x480.
+
+Run with `python -m pytest tests/benchmarks -k detection_cache`.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ def noise() -> Frame:
 
 
 def ellipses() -> Detections:
-    """Return detections whose masks are ellipses with axes of 60 to 260 px."""
+    """Return detections with elliptical masks. The axes are 60 to 260 px long."""
     random = np.random.default_rng(0)
     v, u = np.ogrid[:480, :640]
     half, center = random.uniform(30, 130, (OBJECTS, 2)), random.uniform(0, (640, 480), (OBJECTS, 2))
@@ -52,7 +55,6 @@ def test_detection_cache_unpack_speed(benchmark: BenchmarkFixture) -> None:
 
 
 def test_detection_cache_second_run_skips_detection(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path) -> None:
-    """A network runs on a real video; a second run reads all detections from the cache."""
     data = shared / "data" / "redkitchen"
     if not data.is_dir():
         pytest.skip(f"{data} does not exist")

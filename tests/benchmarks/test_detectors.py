@@ -1,7 +1,8 @@
-"""Time and memory of every available detector at 640x480: `python -m pytest tests/benchmarks -k detectors`.
+"""Time and memory of every available detector at 640x480.
 
-Each detector runs in its own process, so that its peak memory is measured separately. Networks without local weights
-get random weights: their times are representative, and they output MASKS objects per image.
+Run with `python -m pytest tests/benchmarks -k detectors`. Each detector runs in a separate process, so that the peak
+memory of each can be measured. Networks without local weights get random weights. Their times are representative, and
+they return MASKS objects per image.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ from tests.support import registered
 
 THREADS = 2
 FRAMES = 8
-ROUNDS = 3  # passes over the frames
-WARM_UP = 2  # images that are not timed
-LONGEST = 20.0  # s, maximum time per detector; slower detectors are stopped early
+ROUNDS = 3  # number of passes over the frames
+WARM_UP = 2  # number of images before the timing starts
+LONGEST = 20.0  # s, maximum time per detector; a slower detector is stopped
 MASKS = 20  # number of detections that random networks return per image
 
 
 def random_mask_rcnn(backbone: str, folder: Path) -> list[str]:
-    """Return the overrides for a network of the published architecture that assigns every object to the first class."""
+    """Return the overrides for the published architecture with weights that select the first class for all objects."""
     torch.manual_seed(0)
     network = MaskRCNN(Architecture(COCO, ResNetShape(backbone)))
     with torch.no_grad():
@@ -74,7 +75,7 @@ MASK2FORMER = partial(
 
 
 def rf_detr_seg(side: int, windows: int) -> Callable[[Path], list[str]]:
-    """Return a function that writes an RF-DETR-Seg network: Nano has 312 px and one window, Small 384 px and two."""
+    """Return a function that writes an RF-DETR-Seg network, either Nano (312 px) or Small (384 px, two windows)."""
     backbone = {
         "model_type": "rf_detr_dinov2", "hidden_size": 384, "num_attention_heads": 6, "image_size": side,
         "patch_size": 12, "num_windows": windows, "out_features": ["stage3", "stage6", "stage9", "stage12"],
@@ -95,18 +96,18 @@ RANDOM: dict[str, tuple[str, Callable[[Path], list[str]]]] = {
 
 @dataclass(frozen=True)
 class Measured:
-    """Measured values of a detector."""
+    """Results of one detector."""
 
     seconds: list[float]  # s, per image
     detections: float  # mean number per image
     mib: float  # increase of the peak memory of the process, MiB
-    fault: str = ""  # reason why the detector cannot run; "" = it ran
+    fault: str = ""  # reason why the detector cannot run; "" if it ran
 
 
 def measure(name: str, overrides: list[str], frames: list[Frame]) -> Measured:
-    """Build detector=`name`, run it on the frames, and return the measured values."""
+    """Run the detector `name` on the frames and return the results."""
     torch.set_num_threads(THREADS)
-    Path("/proc/self/clear_refs").write_text("5")  # reset the peak, which a new process inherits
+    Path("/proc/self/clear_refs").write_text("5")  # a new process inherits the peak of its parent
     before = peak_kib()
     try:
         detector = registered.built("detector", name, f"threads={THREADS}", *overrides)
@@ -133,7 +134,7 @@ def peak_kib() -> int:
 
 @pytest.fixture(scope="module")
 def frames() -> list[Frame]:
-    """Return frames of the synthetic room, which every detector accepts, including those that use the ground truth."""
+    """Return frames of the synthetic room. They have ground truth, which some detectors need."""
     return list(Synthetic(frames=240, stride=240 // FRAMES))
 
 

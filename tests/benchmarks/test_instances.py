@@ -1,6 +1,6 @@
-"""Time per frame for instances: ten masks at 640x480, and a 1 cm map that already contains their objects.
+"""Time per frame for instances, with ten masks at 640x480 and a 1 cm map that contains the objects.
 
-Run with `python -m pytest tests/benchmarks/test_instances.py`; test_refiners.py measures refinement.
+Run with `python -m pytest tests/benchmarks/test_instances.py`. Refinement is measured in test_refiners.py.
 """
 
 from __future__ import annotations

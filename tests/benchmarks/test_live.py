@@ -1,8 +1,8 @@
-"""Latency and dropped frames of a live run: `python -m pytest tests/benchmarks -k live`.
+"""Latency and dropped frames of a live run.
 
-Another process writes real frames into a folder at 15 Hz, and a run with the default stages at 1 cm maps them.
-INSTANCEMAP_LIVE_FRAMES sets the number of frames, for example 2000: the 300 frames of the video are played forward and
-backward.
+Run with `python -m pytest tests/benchmarks -k live`. Another process writes real frames into a folder at 15 Hz, and a
+run with the default stages maps them at 1 cm. INSTANCEMAP_LIVE_FRAMES sets the number of frames, for example 2000. The
+300 frames of the video are played forward and backward.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def resident(process: subprocess.Popen[str]) -> int:
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="requires /proc")
-def test_live_folder_latency_and_drops(
+def test_live_folder_reports_latency_and_dropped_frames(
     benchmark: BenchmarkFixture, shared: Path, tmp_path: Path, tables: list[Table]
 ) -> None:
     source, watched, place = shared / "data" / "redkitchen", tmp_path / "watched", tmp_path / "run"

@@ -1,6 +1,7 @@
-"""Mesh extraction of a real kitchen at 1 cm: full, after one more frame, and by Open3D from the same voxels.
+"""Mesh extraction of a real kitchen at 1 cm.
 
-Run with `python -m pytest tests/benchmarks/test_meshing.py -s`.
+The full extraction, the update after one more frame, and Open3D on the same voxels are measured. Run with `python -m
+pytest tests/benchmarks/test_meshing.py -s`.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def fuse(fuser: BayesianTsdf, frame: Frame) -> None:
 
 @pytest.fixture(scope="module")
 def kitchen() -> tuple[BayesianTsdf, Iterator[Frame]]:
-    """Return the map of all frames except the last UPDATES, and these frames."""
+    """Return the map of all frames except the last UPDATES frames, and an iterator over these frames."""
     if not KITCHEN.is_dir():
         pytest.skip(f"{KITCHEN} does not exist")
     frames = iter(RgbdFolder(root=KITCHEN, stop=FRAMES))
@@ -46,7 +47,6 @@ def kitchen() -> tuple[BayesianTsdf, Iterator[Frame]]:
 
 
 def test_slam_mesh_update_speed(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
-    """Measure the mesh update after one more frame."""
     fuser, frames = kitchen
     fuser.scene.mesh()
     benchmark.pedantic(fuser.scene.mesh, setup=lambda: fuse(fuser, next(frames)), rounds=UPDATES)
@@ -54,14 +54,13 @@ def test_slam_mesh_update_speed(benchmark, kitchen: tuple[BayesianTsdf, Iterator
 
 
 def test_slam_mesh_full_speed(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
-    """Measure the full mesh with colors and labels."""
     scene = kitchen[0].scene
     benchmark.pedantic(scene.mesh, setup=scene.volume.changed, rounds=20, warmup_rounds=1)
     note(benchmark, "full", len(scene.mesh().triangles))
 
 
 def test_slam_mesh_open3d_speed(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
-    """Measure Open3D's marching cubes on the same distances, with colors and without labels."""
+    """Open3D extracts the mesh from the same distances, with colors and without labels."""
     volume = open3d_volume(kitchen[0].scene)
     mesh = benchmark.pedantic(volume.extract_triangle_mesh, (0.5,), rounds=5, warmup_rounds=1)
     note(benchmark, "Open3D", len(mesh.triangle.indices))
@@ -79,7 +78,7 @@ def note(benchmark, name: str, triangles: int) -> None:
 
 
 def open3d_volume(scene: InstanceMap) -> o3d.t.geometry.VoxelBlockGrid:
-    """Return the map's voxels in Open3D's structure."""
+    """Copy the voxels of the map to a voxel block grid of Open3D."""
     grid, count = scene.volume.voxels.grid, scene.volume.voxels.block_count
     seen = grid.tsdf[:count] != UNSEEN
     values = {

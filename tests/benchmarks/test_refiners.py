@@ -1,6 +1,7 @@
-"""Speed of the refiners on ten masks at 640x480; the mixtures of gmm_em compared with scikit-learn and gmm_tree.
+"""Speed of the refiners on ten masks at 640x480.
 
-Run with `python -m pytest tests/benchmarks/test_refiners.py -s`.
+The mixtures of gmm_em are compared with scikit-learn and with gmm_tree. Run with `python -m pytest
+tests/benchmarks/test_refiners.py -s`.
 """
 
 from __future__ import annotations
@@ -36,7 +37,10 @@ CAMERA = Camera(640, 480, 540.0, 540.0, 319.5, 239.5)
 
 
 def ten_masks() -> tuple[PointClusters, Frame]:
-    """Return clusters and the noisy frame of ten ellipsoids of 30 to 100 px; masks extend 8 px onto the wall."""
+    """Return the clusters and the noisy frame of ten ellipsoids in front of a wall.
+
+    The masks bleed onto the wall by 8 px.
+    """
     rng = np.random.default_rng(0)
     v, u = np.mgrid[:480, :640]
     depth = 2.5 + 0.001 * u
@@ -88,11 +92,10 @@ def test_refine_ten_masks_speed(benchmark, refiner: ClusterRefiner):
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_gmm_em_agrees_with_scikit_learn(benchmark):
-    """With the same points, initial labels and iterations, the log-likelihoods agree; times are compared."""
     iterations, components = 8, 8
     clusters, frame = ten_masks()
     sample = surroundings(clusters, frame, Ring()).sampled(1000)
-    # initial labels without empty groups, which scikit-learn rejects
+    # scikit-learn rejects initial labels with empty groups
     labels = (np.arange(len(sample.points_camera)) * 7 // 3 % components).astype(np.int32)
 
     def ours() -> Mixtures:
@@ -133,7 +136,7 @@ def test_gmm_em_agrees_with_scikit_learn(benchmark):
 
 @pytest.mark.parametrize(("levels", "components"), [(2, 64), (3, 512)])
 def test_gmm_tree_fit_is_faster_than_flat_mixture(benchmark, levels: int, components: int):
-    """Both use the points of ten masks, the same number of Gaussians and iterations, and the same initialization."""
+    """Both fits have the same points, initialization, iterations and number of Gaussians."""
     clusters, frame = ten_masks()
     sample = surroundings(clusters, frame, Ring()).sampled(10_000)
     points, starts = sample.points_camera, sample.starts

@@ -1,4 +1,4 @@
-"""Tests of the camera path of the long benchmark, whose rooms must be identical."""
+"""Tests for the camera path of the benchmark with 2,000 frames."""
 
 import numpy as np
 
@@ -20,7 +20,6 @@ def test_room_row_frames_repeat_after_one_room() -> None:
 
 
 def test_room_row_nearby_frames_show_same_surface() -> None:
-    """Points of one frame lie on the surface in a later frame, except where they are occluded."""
     walk = RoomRow(100)
     one, other = walk[60], walk[64]
     v, u = (x.ravel() for x in np.mgrid[: CAMERA.height, : CAMERA.width])

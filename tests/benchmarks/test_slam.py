@@ -1,7 +1,8 @@
-"""Tracking and mapping compared with Open3D, alternating every few frames in one process.
+"""Tracking and mapping, compared with Open3D.
 
-`python -m pytest tests/benchmarks -k slam` prints the tables at the end; `--benchmark-json` stores the numbers. No time
-is asserted, because the load of the machine is unknown. Ratios are of medians.
+`python -m pytest tests/benchmarks -k slam` prints the tables at the end, and `--benchmark-json` stores the numbers.
+Both systems run in one process and alternate every few frames. The tests assert no times, because the load of the
+machine is unknown. Ratios are ratios of medians.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from tests.benchmarks.slam_loop import RENDERING, SlamLoop, seconds
 
 VOXEL_SIZES = (0.01, 0.02)  # m
 TURN = 10  # frames
-FIRST, LAST = 20, 80  # frames in [FIRST, LAST) are evaluated; earlier frames fill the caches
+FIRST, LAST = 20, 80  # frames in [FIRST, LAST) are evaluated; earlier frames warm up the caches
 TARGETS = {  # speedup over Open3D
     "redkitchen": {"whole loop": ">= 6", "integrate": ">= 3.5", "render full image": ">= 3"},
     "synthetic room": {"whole loop": ">= 5", "integrate": ">= 4", "render full image": ">= 3"},
@@ -39,7 +40,7 @@ TARGETS = {  # speedup over Open3D
 TARGETS_AT = 0.01  # m, voxel size of the targets
 FRAMES = 2000  # number of frames of the long path
 WARM = 10  # number of warm-up frames
-EARLY, LATE = (WARM, 700), (WARM + 1300, FRAMES)  # compared frames: a third each, a whole number of rooms apart
+EARLY, LATE = (WARM, 700), (WARM + 1300, FRAMES)  # the compared frames, which are a whole number of rooms apart
 SECOND_START = LATE[0] - EARLY[0]
 assert SECOND_START % FRAMES_PER_ROOM == 0, "expected a distance of a whole number of rooms"
 
@@ -51,7 +52,7 @@ def recordings(shared: Path) -> dict[str, Recording]:
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled() -> None:
-    """Compile every kernel, or load it from numba's cache, before the measurement."""
+    """Compile all kernels or load them from the numba cache before the measurement."""
     room = furnished_room(3)
     loop = SlamLoop(VoxelHashingIcp(), assemble(BayesianTsdf, voxel_size=0.02))
     for frame, detections in zip(room.frames, room.detections, strict=True):
@@ -62,7 +63,7 @@ def compiled() -> None:
 @pytest.mark.parametrize("voxel_size", VOXEL_SIZES, ids=lambda size: f"{100 * size:.0f}cm")
 @pytest.mark.parametrize("name", ["redkitchen", "synthetic room"], ids=lambda name: name.replace(" ", "_"))
 def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: str, voxel_size: float) -> None:
-    """pytest-benchmark times our loop with lifting; the setup of each round passes the frame to Open3D."""
+    """pytest-benchmark measures our loop. Open3D runs in the setup of each round."""
     recording = recordings[name]
     runs = AlternatingRuns(
         recording,
@@ -124,13 +125,13 @@ def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: st
 def test_slam_long_path_has_constant_speed(benchmark, tables) -> None:
     """Map 2,000 frames in eight identical rooms, and compare the times of early and late frames.
 
-    From frame 1300 on, five rooms from the start, a second loop maps the start of the path in alternation with the
-    first loop. It gets the same images at the same time and has a small map. pytest-benchmark times the first loop.
+    A second loop starts at frame 1300, five rooms after the start, and alternates with the first loop. Both loops get
+    the same images, but the second one has a small map. pytest-benchmark measures the first loop.
     """
     path, detector = RoomRow(FRAMES), GroundTruthDetector()
     long, short = (SlamLoop(VoxelHashingIcp(), BayesianTsdf()) for _ in range(2))
-    spent: dict[str, list[float]] = {"long": [], "short": []}  # s, of track and fuse in each frame
-    size = []  # bytes and voxels of the map of `long` after each frame, then those of its labels
+    spent: dict[str, list[float]] = {"long": [], "short": []}  # s, total of track and fuse in each frame
+    size = []  # after each frame: bytes and voxels of the map of `long`, bytes and voxels of its labels
     scene = long.fuser.scene
 
     def record_frame() -> None:
@@ -141,6 +142,7 @@ def test_slam_long_path_has_constant_speed(benchmark, tables) -> None:
             )
 
     def begin_frame() -> tuple[tuple[Frame, Detections], dict[str, Any]]:
+        """Load the next frame for our loop. At the beginning of a turn, run Open3D on the frames of the turn."""
         record_frame()
         k = len(long.poses)
         if k >= SECOND_START:
@@ -202,7 +204,7 @@ def test_slam_long_path_has_constant_speed(benchmark, tables) -> None:
 
 @pytest.fixture(scope="module")
 def videos(shared: Path) -> dict[str, list[Frame]]:
-    """Return two videos for accuracy: 300 real frames, and 200 frames without noise."""
+    """Return the videos for the accuracy benchmark: 300 real frames and 200 synthetic frames without noise."""
     return {
         "redkitchen": list(RgbdFolder(shared / "data" / "redkitchen", stop=300)),
         "room without noise": list(Synthetic(frames=240, stop=200, noise=0.0)),
@@ -235,7 +237,6 @@ ACCURACY = {("redkitchen", "voxel_hashing_icp"): "ATE <= 25", ("room without noi
 @pytest.mark.parametrize("tracker", TRACKERS)
 @pytest.mark.parametrize("video", ["redkitchen", "room without noise"])
 def test_slam_trajectory_error(benchmark, videos, trajectories, video: str, tracker: str) -> None:
-    """Measure tracking and mapping without labels."""
     frames = videos[video]
     slam = TRACKERS[tracker](frames[0])
     nothing = Detections.none(frames[0].camera.shape, ("thing",))
@@ -255,19 +256,19 @@ def test_slam_trajectory_error(benchmark, videos, trajectories, video: str, trac
 
 
 class AlternatingRuns:
-    """Runs of both systems on the same frames, alternating every TURN frames.
+    """Runs of both systems on the same frames, which alternate every TURN frames.
 
-    Other load on the machine affects both systems equally, and caches are mostly warm for each of them.
+    The load of the machine then affects both systems equally, and the caches are usually warm.
     """
 
     def __init__(self, recording: Recording, ours: SlamLoop, theirs: Open3DSlam) -> None:
         self.recording = recording
         self.ours = ours
         self.theirs = theirs
-        # times, s, of our loop and of Open3D in each frame, by row of the table
+        # for each row of the table, the times of our loop and of Open3D in each frame, s
         self._measured: dict[str, list[tuple[float, float]]] = defaultdict(list)
         self._lifting: list[float] = []
-        self._their_seconds: list[dict[str, float]] = []  # s, of the steps of each frame
+        self._their_seconds: list[dict[str, float]] = []  # times of the steps in each frame, s
         self._frame = -1
 
     def begin_frame(self) -> tuple[tuple[Frame, Detections], dict[str, Any]]:
@@ -286,7 +287,7 @@ class AlternatingRuns:
         self._their_seconds.append({step.__name__: seconds(step)[0] for step in steps})
 
     def finish_frame(self) -> None:
-        """Render the full image as for a viewer after our loop, and store the times of both systems."""
+        """Render the full image with our loop and store the times of both systems."""
         full, _ = seconds(self.ours.render_all, self.recording.frames[self._frame])
         o, t = self.ours.seconds, self._their_seconds[self._frame]
         for row, pair in {
@@ -300,7 +301,7 @@ class AlternatingRuns:
         self._lifting.append(o["lift"])
 
     def quantiles(self, q: float) -> dict[str, Float64]:
-        """Return the quantile `q` of the times (2,), s, of our loop and of Open3D, by row of the table."""
+        """Return the quantile `q` of the times of both systems, s, for each row of the table."""
         return {row: np.quantile(pairs[FIRST:], q, axis=0) for row, pairs in self._measured.items()}
 
     def lifting(self) -> float:

@@ -1,4 +1,4 @@
-"""Tests of the Python API, which maps frame by frame like the command."""
+"""Tests for the Python API."""
 
 from __future__ import annotations
 
@@ -103,9 +103,10 @@ def test_mapper_odometry_predicts_motion() -> None:
 
 @pytest.mark.parametrize("fuser", ["bayesian_tsdf", "open3d_vbg", "object_volumes", "class_only_fusion"])
 def test_mapper_sensor_up_direction_is_saved_in_map(fuser: str, tmp_path: Path) -> None:
-    """Only a slanted table is visible, so surfaces give a wrong up direction; the world is the first camera frame."""
+    """Only a slanted table is visible, from which the estimated up direction would be wrong."""
     tilt = np.radians(20)
-    up = np.array([np.sin(tilt), -np.cos(tilt) * np.sin(1.0), -np.cos(tilt) * np.cos(1.0)])  # in the first camera frame
+    # in the frame of the first camera
+    up = np.array([np.sin(tilt), -np.cos(tilt) * np.sin(1.0), -np.cos(tilt) * np.cos(1.0)])
     table = Scene(planes=[(np.array([0.0, -np.sin(1.0), -np.cos(1.0)]), -0.8)])
     stages = ("detector=none", "tracker=ground_truth", "refiner=identity", f"fuser={fuser}", "fuser.voxel_size=0.04")
     sensed, unsensed = Mapper(*stages), Mapper(*stages)
@@ -127,7 +128,7 @@ def test_mapper_sensor_up_direction_is_saved_in_map(fuser: str, tmp_path: Path) 
 
 
 def test_mapper_is_thread_safe(room: CornerRoom) -> None:
-    """Without the lock, the kernels would overwrite each other's buffers and crash the process."""
+    """Without the lock, kernels would write to the same buffers."""
     mapper, alone, faults = Mapper(*STAGES), Mapper(*STAGES), []
 
     def work(one: Callable[[], object]) -> None:
@@ -239,7 +240,7 @@ def test_load_map_damaged_file_raises_data_error(room: CornerRoom, tmp_path: Pat
         damaged[position] ^= 0xFF
         (tmp_path / "map.npz").write_bytes(damaged)
         try:
-            load_map(tmp_path / "map.npz")  # not every byte is significant
+            load_map(tmp_path / "map.npz")  # some bytes have no effect
         except DataError as error:
             assert "map.npz" in str(error)
 

@@ -1,4 +1,4 @@
-"""Tests of the data objects and of their validation."""
+"""Tests for the data classes and their validation."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_camera_and_frame_accept_numpy_scalars() -> None:
     assert frame(index=np.int64(3), timestamp=np.float32(1), camera=camera).index == 3
 
 
-def test_frame_up_must_be_unit_vector() -> None:
+def test_frame_up_other_than_unit_vector_raises() -> None:
     np.testing.assert_array_equal(frame(up=np.array([0.6, -0.8, 0.0])).up, [0.6, -0.8, 0.0])
     for wrong, message in (
         ([0.0, -9.81, 0.0], "expected a unit vector, got a vector of length 9.81"),
@@ -77,7 +77,7 @@ def test_camera_non_numeric_value_raises(name: str, value: object) -> None:
 
 
 def test_frame_copies_only_read_only_images() -> None:
-    """Numba would compile the kernels again for read-only arrays."""
+    """For read-only arrays, Numba would compile the kernels again."""
     depth = np.ones((3, 4), np.float32)
     assert frame(depth=depth).depth is depth
     depth.flags.writeable = False
@@ -199,7 +199,7 @@ def test_data_objects_invalid_values_raise_one_line_error(
 
 
 def test_instance_mesh_of_instance_has_only_its_vertices() -> None:
-    """The instance has all vertices of the quad 0 1 2 3 except vertex 1."""
+    """The mesh is a quad with the vertices 0 to 3. Vertex 1 does not belong to the instance."""
     whole = mesh(
         vertices=np.arange(12, dtype=np.float32).reshape(4, 3),
         triangles=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
@@ -217,7 +217,7 @@ def test_instance_mesh_of_instance_has_only_its_vertices() -> None:
 
 
 def test_frame_converts_image_views_to_contiguous_arrays() -> None:
-    """The kernels cannot read views such as bgr[..., ::-1]."""
+    """The kernels do not accept views such as bgr[..., ::-1]."""
     bgr = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
     depth = np.ones((4, 3), np.float32).T
     made = frame(color=bgr[..., ::-1], depth=depth)

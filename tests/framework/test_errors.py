@@ -1,4 +1,4 @@
-"""Tests of error messages, which are one printable line for any file content or name."""
+"""Tests for error messages. A message must be one printable line, whatever the file contains."""
 
 from __future__ import annotations
 

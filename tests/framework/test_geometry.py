@@ -1,4 +1,4 @@
-"""Tests of rigid motions and of the pinhole camera, compared with their definitions."""
+"""Tests for rigid motions and the pinhole camera, compared with their definitions."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_back_project_principal_point_lies_on_optical_axis() -> None:
 
 @pytest.mark.parametrize("factor", [0.5, 0.25, 2.0])
 def test_scaled_camera_keeps_rays(factor: float) -> None:
-    """At half the size, pixel k covers pixels 2k and 2k + 1, and its ray is the mean of theirs."""
+    """If the size is halved, pixel k corresponds to the pixels 2k and 2k + 1."""
     scaled = CAMERA.scaled(factor)
     point = np.array([[0.3, -0.2, 1.5]])
     full, resized = geometry.project(CAMERA, point) + 0.5, geometry.project(scaled, point) + 0.5

@@ -1,4 +1,4 @@
-"""Tests of `python -m framework` as a process: its streams and its exit status."""
+"""Tests for `python -m framework` as a process."""
 
 from __future__ import annotations
 
@@ -117,13 +117,13 @@ def test_leave_working_folder_in_deleted_folder_exits(tmp_path: Path, monkeypatc
 def test_module_search_path_excludes_working_directory(
     options: list[str], at: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With --config-dir, the working directory is at the end of the path, as Hydra appends it."""
+    """With --config-dir, Hydra appends the working directory at the end of the path."""
     monkeypatch.chdir(tmp_path)
     for first in ("", str(tmp_path)):
         monkeypatch.setattr(sys, "path", [first, "/elsewhere"])
         leave_working_folder(["detector=x", *options])
         assert sys.path == (["/elsewhere"] if at is None else ["/elsewhere", str(tmp_path)])
-    monkeypatch.setattr(sys, "path", ["/usr/bin", "/elsewhere"])  # as in the console script
+    monkeypatch.setattr(sys, "path", ["/usr/bin", "/elsewhere"])  # like in the console script
     leave_working_folder(options)
     assert sys.path == ["/usr/bin", "/elsewhere", *([] if at is None else [str(tmp_path)])]
     monkeypatch.chdir(CHECKOUT)
@@ -212,7 +212,7 @@ FAULTY = {
 }
 
 
-# Failed checks of doctor are not errors of the command.
+# failed checks of doctor are not errors of the command
 @pytest.mark.parametrize("command", sorted(COMMANDS.keys() - {"doctor"}))
 def test_command_debug_shows_traceback(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -220,7 +220,7 @@ def test_command_debug_shows_traceback(
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "metrics.json").write_text(json.dumps({"config_hash": config_hash({})}))
     (tmp_path / "old" / "config.yaml").write_text("{}")
-    if (CONF / f"{command.replace('-', '_')}.yaml").exists():  # Hydra changes its process
+    if (CONF / f"{command.replace('-', '_')}.yaml").exists():  # Hydra changes the process
         stderr = words(command, *FAULTY[command], "debug=true", directory=tmp_path).stderr
     else:
         monkeypatch.chdir(tmp_path)
@@ -294,7 +294,7 @@ def test_run_ctrl_c_writes_partial_outputs(tmp_path: Path) -> None:
     line = command(f"hydra.run.dir={tmp_path}", "dataset.frames=100000", "dataset.slow_s=0.02")
     with subprocess.Popen(line, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 60
-        while (tmp_path / "metrics.json").exists() and time.monotonic() < deadline:  # removed when mapping begins
+        while (tmp_path / "metrics.json").exists() and time.monotonic() < deadline:  # to be removed when mapping begins
             time.sleep(0.05)
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)

@@ -1,4 +1,4 @@
-"""Tests of the main loop: order, errors, early ends, and worker threads, which do not change the result."""
+"""Tests for the main loop. Worker threads must not change the results."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def test_pipeline_limits_log_of_skipped_frames(caplog: pytest.LogCaptureFixture)
 
 
 def test_pipeline_without_usable_frame_raises() -> None:
-    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
+    with pytest.raises(DataError, match="expected usable frames, got none among 1"):
         pipeline().run(CornerRoom(frames=1, unreadable=0))
     with pytest.raises(DataError, match="expected at least 1 frame, got 0"):
         pipeline().run(CornerRoom(start=6))
@@ -215,7 +215,7 @@ def test_pipeline_empty_map_raises_with_frame_summary() -> None:
     with pytest.raises(DataError) as caught:
         pipeline(tracker=GivenPose(lost_from=0, lost_to=3), fuser=fuser).run(CornerRoom(unreadable=5))
     assert str(caught.value) == (
-        "corner_room: expected mapped frames, got none of 6: 1 unusable; 3 lost (first reason: too few points "
+        "corner_room: expected mapped frames, got none among 6: 1 unusable; 3 lost (first reason: too few points "
         "associate); 2 without depth within 50 to 60 m"
     )
 
@@ -277,7 +277,7 @@ def test_run_to_any_end_returns_partial_result_after_error(room: CornerRoom) -> 
 
 @dataclass
 class FailsOnceOnKeyframes(GivenPose):
-    """Tracker whose keyframes raise an error on the first access, after the last frame."""
+    """Tracker whose keyframes raise an error when they are read for the first time, after the last frame."""
 
     asked: int = 0
 
@@ -322,7 +322,7 @@ class PressesCtrlC(GivenPose):
 
 
 def working_threads() -> int:
-    """Return the number of threads without tqdm's monitor, which the first progress bar of a process starts."""
+    """Return the number of threads. The monitor thread that tqdm starts once per process is not counted."""
     return sum(not isinstance(thread, TMonitor) for thread in threading.enumerate())
 
 
@@ -352,7 +352,7 @@ def test_pipeline_runs_outside_main_thread(room: CornerRoom) -> None:
 
 @dataclass
 class _InPairs(SphereDetector):
-    """Detector whose calls wait for each other in pairs; the number of calls must be even."""
+    """Detector that needs two concurrent calls. The total number of calls must be even."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -365,7 +365,7 @@ class _InPairs(SphereDetector):
 
 @dataclass
 class _OneReader(CornerRoom):
-    """Dataset that checks that its frames are read in order, one at a time."""
+    """Dataset that checks that frames are read one at a time and in order."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -382,13 +382,13 @@ class _OneReader(CornerRoom):
 
 
 def pretend_cores(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace the core count that Numba reports; its threads are unchanged."""
+    """Replace the core count that Numba reports, without changing its threads."""
     monkeypatch.setattr(numba, "get_num_threads", lambda: count)
     monkeypatch.setattr(numba, "set_num_threads", lambda number: None)
 
 
 @pytest.mark.parametrize("prefetch", [2, 3])
-def test_concurrent_detector_gets_two_frames_in_order(prefetch: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_concurrent_detector_receives_two_frames_in_order(prefetch: int, monkeypatch: pytest.MonkeyPatch) -> None:
     pretend_cores(2, monkeypatch)
     threads = working_threads()
     result = pipeline(prefetch, detector=_InPairs()).run(_OneReader())
@@ -430,7 +430,7 @@ def test_pipeline_prints_no_output_without_terminal(room: CornerRoom, capfd: pyt
 
 
 def test_pipeline_runs_without_stderr(room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", None)  # as under pythonw
+    monkeypatch.setattr(sys, "stderr", None)  # like under pythonw
     assert pipeline().run(room).frames == len(room)
 
 

@@ -1,4 +1,4 @@
-"""Tests of the registry, which builds a plugin from a config node or raises a one-line error."""
+"""Tests for the registry, which builds plugins from config nodes."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Abstract(Detector):
 
 @dataclass
 class Suppression:
-    """Part with parameters that several plugins share."""
+    """Part whose parameters are shared by several plugins."""
 
     nms: float = 0.5
     agnostic: bool = False
@@ -101,7 +101,7 @@ REGISTERED = ("Probe", "Undecorated", "Abstract", "Assembled", "Ambiguous", "Odd
 
 
 def register(monkeypatch: pytest.MonkeyPatch, folder: Path, stage: str, *targets: str) -> None:
-    """Register one option per target, as --config-dir does."""
+    """Register an option for each target, like the option --config-dir."""
     (folder / stage).mkdir(exist_ok=True)
     for target in targets:
         (folder / stage / f"{target.replace('.', '_').lower()}.yaml").write_text(f"_target_: {target}\n")
@@ -226,7 +226,7 @@ def test_find_class_import_failure_raises_one_line_error(tmp_path: Path, monkeyp
 
 @pytest.fixture
 def printing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write a package and a module with the class Named, both of which print when they are imported."""
+    """Write a package and a module that print when they are imported. Both have the class Named."""
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "printing").mkdir()
     (tmp_path / "printing" / "__init__.py").write_text("print('imported')\n")
@@ -251,7 +251,7 @@ def printing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_build_does_not_import_unregistered_target(
     target: str, output: str, hydra_runs: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Registered options are found in Hydra applications and, for stored configs, without Hydra."""
+    """Registered options are also found in Hydra applications, and in stored configs without Hydra."""
     monkeypatch.setattr(composition, "_added", [])
     with initialize_config_dir(str(CONF), version_base="1.3") if hydra_runs else nullcontext():
         assert output in fault(_target_=target)
@@ -284,7 +284,7 @@ def test_registry_has_interface_for_each_stage() -> None:
 
 
 def test_find_class_wrong_video_kind_raises() -> None:
-    """`check` and `detect` need random access to frames; a run also accepts live video."""
+    """Commands such as `check` require random access to the frames. A run also accepts live video."""
     live = "tests.support.scenes.corner_room.LiveRoom"
     assert find_class(RGBDVideo, live).__name__ == "LiveRoom"
     with pytest.raises(ConfigError, match=r"LiveRoom: expected a subclass of RGBDSequence "):

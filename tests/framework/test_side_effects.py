@@ -1,4 +1,4 @@
-"""Tests that the library does not change its host process."""
+"""Tests that using the library does not change the state of the host process."""
 
 from __future__ import annotations
 
@@ -136,9 +136,13 @@ numba.core.dispatcher.Dispatcher.compile = lambda *_: None
 
 
 def changes(code: str, path: Path, before: str = "", **variables: str) -> list[str]:
-    """Return the names of the process settings that `code` changes in a new process, which runs `before` first.
+    """Return the names of the process settings that `code` changes in a new process.
 
-    `variables` are environment variables of the process; `path` is a folder for a map.
+    Args:
+        code: Code to test.
+        path: Folder for a map.
+        before: Code that is executed first.
+        **variables: Environment variables of the process.
     """
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "NUMBA_THREADING"))

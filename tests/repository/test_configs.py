@@ -36,7 +36,7 @@ def test_option_composes_and_builds(stage: str, name: str, ready: Callable[..., 
     assert isinstance(ready(stage, name), GROUPS[stage])
 
 
-REQUIRED = {  # the first parameter that the user must set, by option
+REQUIRED = {  # the first required parameter, keyed by option
     key: asked[0]
     for key, option in registered.OPTION.items()
     if (asked := [parameter.name for parameter in option.parameters if parameter.default == "???"])
@@ -63,7 +63,7 @@ def test_option_yaml_lists_all_parameters_with_comments(stage: str, name: str) -
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:
-    """Return the default value; "???" is OmegaConf's marker of a missing value."""
+    """Return the default value, or "???" (OmegaConf's marker of a missing value)."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return "???" if field.default is dataclasses.MISSING else field.default
@@ -71,7 +71,7 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
 def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
-    """Variants may differ. Values that the user must set have no default in either the file or the class."""
+    """Variants may have other values. Required parameters have no default in the file or in the class."""
     path = CONF / stage / f"{name}.yaml"
     own = OmegaConf.load(path)
     is_variant = "_target_" not in own  # a variant of the option that it inherits
@@ -121,14 +121,14 @@ def test_main_config_lists_experiment_last_in_defaults() -> None:
     defaults = OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml").defaults)
     assert isinstance(defaults, list)
     assert defaults[0] == "_self_"
-    after_the_stages = ["dataset", "viewer", "launcher", "preset", "experiment"]  # which may override the stages
+    after_the_stages = ["dataset", "viewer", "launcher", "preset", "experiment"]  # that may override the stages
     stages = [stage for stage in STAGES if stage not in after_the_stages]
     assert [next(iter(entry)) for entry in defaults[1:]] == stages + after_the_stages
     assert defaults[-1] == {"experiment": None}
 
 
 def test_sweep_run_names_exclude_keys_without_effect() -> None:
-    """Otherwise skip_completed=true would not find a run with other settings of these keys."""
+    """Otherwise skip_completed=true would not find runs with other values of these keys."""
     main = OmegaConf.load(CONF / "config.yaml")
     left_out = set(OmegaConf.select(main, "hydra.job.config.override_dirname.exclude_keys"))
     shown = {

@@ -1,4 +1,7 @@
-"""Tests of the default detector of each dataset, and that the files of all defaults are part of the project."""
+"""Tests for the default detector of each dataset.
+
+The files of all defaults must be part of the project.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ TIMED = {"table1_runtime", "figure3_stage_times", "ablation_detection_interval"}
 
 
 def chosen(*overrides: str, main: str = "config") -> dict[str, str]:
-    """Return the dataset and the detector that Hydra chooses; the composed config must have this detector."""
+    """Return the dataset and the detector that Hydra chooses. The composed config must have the same detector."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config: DictConfig = compose(main, [*overrides], return_hydra_config=True)
     choices = {stage: str(config.hydra.runtime.choices[stage]) for stage in ("dataset", "detector")}
@@ -68,7 +71,7 @@ def test_experiment_detector_overrides_dataset_not_command_line(experiment: str)
 
 
 def test_default_detector_of_external_dataset_is_set(tmp_path: Path) -> None:
-    """A dataset that inherits from dataset=synthetic inherits its detector."""
+    """A dataset that inherits from dataset=synthetic also inherits the detector."""
     (tmp_path / "dataset").mkdir()
     (tmp_path / "dataset" / "theirs.yaml").write_text("_target_: theirs.Theirs\n")
     (tmp_path / "dataset" / "their_rooms.yaml").write_text("defaults: [synthetic, _self_]\nframes: 3\n")
@@ -87,7 +90,7 @@ def test_default_detector_without_dataset_is_maskrcnn2go() -> None:
 
 
 def test_default_detector_depends_on_dataset_of_sweep_job() -> None:
-    """The launcher composes each job from the config of the sweep and the overrides of the job."""
+    """A launcher composes each job from the config of the sweep and the overrides of the job."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
         sweep = loader.load_configuration("config", ["dataset=synthetic,rgbd_folder"], RunMode.MULTIRUN)
@@ -97,7 +100,7 @@ def test_default_detector_depends_on_dataset_of_sweep_job() -> None:
 
 
 def test_default_paths_are_inside_project() -> None:
-    """Each path in a YAML file exists below the project, or must be set by the user."""
+    """All paths in YAML files must exist in the project."""
     files = sorted(CONF.rglob("*.yaml"))
     assert len(files) > 60
     assert not [file for file in files if "../" in file.read_text()]

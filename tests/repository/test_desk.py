@@ -1,4 +1,4 @@
-"""Tests of the demo: its data, and its first frames mapped with the defaults."""
+"""Tests for the demo."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_desk_data_is_small_and_has_attribution() -> None:
 
 
 def test_desk_is_tracked_and_objects_are_detected() -> None:
-    """The included network detects objects in the first 24 frames."""
+    """Only the first 24 frames are mapped."""
     config = composed("dataset=desk")
     assert config.detector._target_ == "plugins.detectors.maskrcnn2go.MaskRCNN2Go"
     sequence = build(RGBDSequence, composed("dataset=desk", "dataset.stop=24").dataset)

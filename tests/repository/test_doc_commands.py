@@ -1,4 +1,4 @@
-"""Tests that every command and script of the README and of docs/ is tested."""
+"""Tests that every command and script in the README and in docs/ is tested."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EXECUTED = [
     "for frame in sequence",
     "for frame in frames:",
     "class ColorBlobs",
-    "load_runs(",
+    'load_runs("outputs/ablation_refiner',
     "normals_of(",
 ]  # executed in test_readme.py
 CONTRACT = block("python", "class TestMyRefiner")
@@ -37,7 +37,7 @@ RUN_ELSEWHERE = {"python -m framework doctor"}  # executed in test_doctor.py
 
 
 class ParsedError(Exception):
-    """Error raised instead of running a command."""
+    """Error that is raised instead of running a command."""
 
 
 @pytest.mark.parametrize("command", [line for line in PARSED if line not in {*COMMANDS, *RUNNABLE, *RUN_ELSEWHERE}])
@@ -55,7 +55,7 @@ def test_documented_command_line_is_parsed(command: str, monkeypatch: pytest.Mon
 
 
 def test_documented_commands_and_scripts_are_all_tested() -> None:
-    """All scripts and console lines are checked, except those of other programs such as viewers."""
+    """Commands of other programs such as viewers are excluded."""
     make = re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE)
     looked_at = {*COMMANDS, *RUNNABLE, *PARSED, *BENCHMARKS, *(f"make {target}" for target in make), OWN_PLUGIN}
     shown_in = (CHECKOUT / "docker" / "Dockerfile").read_text()
@@ -73,6 +73,7 @@ def test_documented_commands_and_scripts_are_all_tested() -> None:
         *OWN_DATA,
         *blocks("python", "README.md"),  # test_new_plugin.py
         *blocks("python", "docs/python.md"),
+        *blocks("python", "docs/tutorials/research_project.md"),  # test_research_workflow.py
         *(block("python", words) for words in EXECUTED),
     }
     assert not set(blocks("python")) - scripts

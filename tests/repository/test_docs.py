@@ -1,4 +1,7 @@
-"""Tests that the documentation builds without warnings, its links and names exist, and CITATION.cff is valid."""
+"""Tests for the documentation and CITATION.cff.
+
+The pages must build without warnings, and all links and names must exist.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,7 @@ LINK = re.compile(r"\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)")
 
 
 def anchors(page: str) -> set[str]:
-    """Return the anchors of the headings of a page, as code hosts and myst-parser generate them."""
+    """Return the anchors of the headings of a page, like those of code hosts and myst-parser."""
     titles = re.findall(r"^#+ (.*)", re.sub(r"^```.*?^```", "", page, flags=re.DOTALL | re.MULTILINE), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
@@ -74,7 +77,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_api_reference_has_all_public_names(built: Path) -> None:
     page = (built / "api.html").read_text()
     assert not [name for name in instancemap.__all__ if f'id="instancemap.{name}"' not in page]
-    assert "(H, W) m along z, 0 = no reading" in page  # the comment of a field
+    assert "(H, W) m along z, 0 = no reading" in page  # comment of a field
 
 
 def test_configuration_reference_has_all_parameters(built: Path) -> None:
@@ -91,7 +94,7 @@ def test_configuration_reference_has_all_parameters(built: Path) -> None:
 
 
 def test_page_plugins_and_parameters_exist(built: Path) -> None:
-    """`fuser=NAME` and `fuser.parameter` in prose and commands must be in the configuration reference."""
+    """Options `fuser=NAME` and parameters `fuser.parameter` must be in the configuration reference."""
     text = "\n".join(PAGES.values())
     for stage in GROUPS:
         reference = (built / "configuration" / f"{stage}.html").read_text()
@@ -120,7 +123,7 @@ def test_project_files_are_pages_with_valid_links(built: Path) -> None:
 
 
 def test_citation_file_has_required_keys() -> None:
-    """Citation File Format 1.2.0 requires keys of the file and of each reference."""
+    """The keys are required by Citation File Format 1.2.0."""
     citation = yaml.safe_load((CHECKOUT / "CITATION.cff").read_text())
     assert citation["cff-version"] == "1.2.0"
     assert str(citation["version"]) == __version__
@@ -135,7 +138,7 @@ def test_citation_file_has_required_keys() -> None:
 
 
 def test_dockerfile_matches_project_files() -> None:
-    """Only the Dockerfile is read: its copied files exist, and its packages are those of the Makefile."""
+    """The image is not built. The copied files must exist, and the packages must be those of the Makefile."""
     dockerfile = (CHECKOUT / "docker" / "Dockerfile").read_text().replace("\\\n", " ")
     steps = re.findall(r"^([A-Z]+) (.*)", dockerfile, re.MULTILINE)
     copied = {source for step, words in steps if step == "COPY" for source in words.split()[:-1]}
@@ -144,7 +147,7 @@ def test_dockerfile_matches_project_files() -> None:
     sent = set(re.findall(r"^!(.*)", (CHECKOUT / ".dockerignore").read_text(), re.MULTILINE))
     assert copied == sent
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
-    assert {project["readme"], project["license-files"][0]} <= copied  # pip reads them
+    assert {project["readme"], project["license-files"][0]} <= copied  # files that pip reads
     [(_, entrypoint)] = [step for step in steps if step[0] == "ENTRYPOINT"]
     assert set(json.loads(entrypoint)) <= set(project["scripts"])
     makefile = (CHECKOUT / "Makefile").read_text()
@@ -152,4 +155,5 @@ def test_dockerfile_matches_project_files() -> None:
     assert len(libraries) > 3
     assert libraries <= set(dockerfile.split())
     assert re.findall(r"torch==[\d.]+", makefile) == re.findall(r"torch==[\d.]+", dockerfile)
-    assert [step for step, _ in steps].index("USER") < [step for step, _ in steps].index("ENTRYPOINT")  # not as root
+    # does not run as root
+    assert [step for step, _ in steps].index("USER") < [step for step, _ in steps].index("ENTRYPOINT")

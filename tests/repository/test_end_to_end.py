@@ -1,4 +1,4 @@
-"""Tests of all real stages together on a small synthetic room."""
+"""Tests for all real stages together, in a small synthetic room."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def mapped(sequence: Synthetic, detector: SimulatedDetector | GroundTruthDetecto
 
 
 def test_prefetch_does_not_change_map(sequence: Synthetic) -> None:
-    """The worker thread competes with the mapping kernels for cores; the map is byte-identical."""
+    """The worker thread and the mapping kernels compete for the cores. The maps must be byte-identical."""
     maps = []
     for prefetch in (0, 2):
         scene = mapped(sequence, SimulatedDetector(seed=1), prefetch)
@@ -44,7 +44,7 @@ def test_prefetch_does_not_change_map(sequence: Synthetic) -> None:
 
 
 def test_ground_truth_masks_give_accurate_instances(sequence: Synthetic) -> None:
-    """Errors are caused only by tracking and mapping, not by detection."""
+    """With true masks, all errors are due to tracking and mapping."""
     scene = mapped(sequence, GroundTruthDetector(), prefetch=2)
     truth = sequence.scene_truth()
     assert truth is not None

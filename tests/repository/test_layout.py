@@ -1,4 +1,4 @@
-"""Tests of the layout rules: folders, names, and the direction of imports. CONTRIBUTING.md describes the layout."""
+"""Tests for the layout of folders, names and imports, which CONTRIBUTING.md describes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ LAYER = {part: k for k, layer in enumerate(LAYERS) for part in layer}
 ROOT = {"__init__", "__main__", "api", "data", "errors", "geometry", "interfaces", "pipeline", "registry"}
 """The modules at the root of framework/. Every other module is in the folder of its subject."""
 
-MAX_FILES = 20  # Python files in a folder
+MAX_FILES = 20  # maximum number of Python files in a folder
 
 OPTIONAL = {
     "onnxruntime",
@@ -116,7 +116,7 @@ def test_layers_cover_all_packages() -> None:
 
 
 def test_packages_have_no_import_cycle() -> None:
-    """Imports inside functions are included."""
+    """Imports inside of functions count as well."""
     imports = {part: set[str]() for part in LAYER}
     for path in MODULES:
         if (name := name_of(path)).startswith("framework."):
@@ -126,7 +126,7 @@ def test_packages_have_no_import_cycle() -> None:
 
 
 def test_modules_have_no_import_cycle() -> None:
-    """Imports inside functions are included, because they only hide a cycle."""
+    """Imports inside of functions count as well, because they only hide a cycle."""
     modules = {name_of(path): path for path in MODULES}
     imports = {name: set(imported_modules(path, modules)) - {name} for name, path in modules.items()}
     TopologicalSorter(imports).prepare()
@@ -166,7 +166,6 @@ def test_public_classes_are_defined_once() -> None:
 
 @pytest.mark.parametrize("package", ["framework", "plugins"])
 def test_test_folders_mirror_package(package: str) -> None:
-    """Each test folder corresponds to the package folder of the same name."""
     folders = {path.parent.relative_to(CHECKOUT / "tests") for path in (CHECKOUT / "tests" / package).rglob("*.py")}
     assert folders <= python_folders(package) | {Path(package)}
 
@@ -178,5 +177,5 @@ def test_optional_libraries_are_imported_lazily(path: Path) -> None:
 
 
 def test_test_folders_are_not_packages() -> None:
-    """As packages, tests/framework and tests/plugins could shadow the real ones."""
+    """As packages, tests/framework and tests/plugins could shadow the packages of the project."""
     assert [path.parent.name for path in (CHECKOUT / "tests").rglob("__init__.py")] == ["tests"]

@@ -1,4 +1,4 @@
-"""Tests that docs/development.md lists all uses of private parts of Hydra and numba, with the tested versions."""
+"""Tests for the list of private APIs of Hydra and numba in docs/development.md."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PRIVATE = re.compile(r"(hydra\._internal|hydra\.core\.singleton|hydra\.version|n
 
 
 def private_imports() -> dict[tuple[str, str], set[str]]:
-    """Return the files that import each private name, by its module and name."""
+    """Return the files that import each private name, keyed by module and name."""
     found: dict[tuple[str, str], set[str]] = {}
     for path in (path for package in ("framework", "plugins") for path in (CHECKOUT / package).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -1,4 +1,4 @@
-"""Tests that texts for readers contain no phrase of private_phrases.txt."""
+"""Tests that no text for readers contains a phrase of private_phrases.txt."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CONFIGS = ("conf", "examples")
 
 
 def files(roots: tuple[str, ...], *patterns: str) -> list[Path]:
-    """Return the files of these roots, which are folders or files."""
+    """Return the files of these folders or files."""
     found = []
     for root in (CHECKOUT / name for name in roots):
         found += [root] if root.is_file() else [path for pattern in patterns for path in root.rglob(pattern)]
@@ -32,7 +32,7 @@ def files(roots: tuple[str, ...], *patterns: str) -> list[Path]:
 
 
 def python_texts(source: str) -> Iterator[tuple[int, str]]:
-    """Yield the comments and the strings, docstrings included, of a module, with their lines."""
+    """Yield the comments and strings of a module, including docstrings, with their lines."""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
             yield token.start[0], token.string

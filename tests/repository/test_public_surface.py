@@ -1,4 +1,4 @@
-"""Tests that plugins of other packages import only `instancemap` and `instancemap.testing`."""
+"""Tests that other packages need only imports from `instancemap` and `instancemap.testing`."""
 
 from __future__ import annotations
 

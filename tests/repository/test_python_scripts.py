@@ -1,4 +1,4 @@
-"""Tests that the scripts of docs/python.md run unchanged, in one process."""
+"""Tests that the scripts of docs/python.md run unchanged in one process."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ for name, script in json.load(open("scripts.json")).items():
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder in which all scripts ran, with their output in printed.txt."""
+    """Return the folder in which all scripts have been run. The output is in printed.txt."""
     directory = tmp_path_factory.mktemp("scripts")
     (directory / "scripts.json").write_text(json.dumps(SCRIPTS))
     done = subprocess.run(

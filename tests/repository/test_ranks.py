@@ -1,4 +1,4 @@
-"""Tests of docs/results/ranks.py, compared with manual results and scipy's rank correlation."""
+"""Tests for docs/results/ranks.py, compared with manual results and SciPy."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ Ranking, ranks, spearman, write_ranks = script.Ranking, script.ranks, script.spe
 def places(tmp_path: Path) -> list[Path]:
     """Write the runs of four rows in three folders.
 
-    The rows rank a, b, c, d in the rooms; b, a, c = d in the flat; and d, c, b, a in the hall.
+    The order of the rows is a, b, c, d in the rooms. In the flat, it is b, a, and then c and d with equal ranks. In the
+    hall, it is d, c, b, a.
     """
     return [
         experiment(tmp_path / "rooms", {"a": (0.9, 0.7), "b": (0.7, 0.7), "c": (0.5, 0.3), "d": (0.1, 0.1)}),
@@ -64,12 +65,12 @@ def test_ranks_and_means_match_hand_computed_values(places: list[Path]) -> None:
 def test_ranks_rho_matches_hand_computed_values(places: list[Path]) -> None:
     """The ranks 1 2 3 4 and 2 1 3.5 3.5 have the correlation 3.5 / sqrt(5 * 4.5).
 
-    Minus their means, they are -1.5 -0.5 0.5 1.5 and -0.5 -1.5 1 1.
+    After subtraction of the means, they are -1.5 -0.5 0.5 1.5 and -0.5 -1.5 1 1.
     """
     lines = lines_of(write_ranks(places, [AP50], None))
     rhos = {line.split(" | ")[0]: line.split(" | ")[1:3] for line in lines if ", " in line and line.startswith("|")}
     expected = {"rooms, flat": 3.5 / math.sqrt(22.5), "rooms, hall": -1.0, "flat, hall": -3.5 / math.sqrt(22.5)}
-    # the ranks 1 2 3 4 and 3.5 2 3.5 1, minus their means: -1.5 -0.5 0.5 1.5 and 1 -0.5 1 -1.5
+    # the ranks 1 2 3 4 and 3.5 2 3.5 1 are -1.5 -0.5 0.5 1.5 and 1 -0.5 1 -1.5 without their means
     expected["rooms, mean of the others"] = -3 / math.sqrt(5 * 4.5)
     assert rhos == {f"| {pair}": ["4", f"{rho:+.2f}"] for pair, rho in expected.items()}
 
@@ -116,15 +117,15 @@ def test_ranks_row_interval_is_bootstrap_over_rows(tmp_path: Path) -> None:
 
 
 def test_ranks_run_interval_reflects_seed_noise(tmp_path: Path) -> None:
-    """The interval is wider than a point only if the order of rows differs between seeds."""
+    """If the order of the rows is the same for all seeds, the interval is a point."""
     steady = {"a": (0.9, 0.8, 0.9), "b": (0.5, 0.4, 0.5), "c": (0.1, 0.2, 0.1)}
     one, same = experiment(tmp_path / "one", steady), experiment(tmp_path / "same", steady)
     assert agreement([one, same]).over_runs == (1, 1)
     noisy = experiment(tmp_path / "noisy", {"a": (0.9, 0.4, 0.9), "b": (0.5, 0.8, 0.5), "c": (0.1, 0.2, 0.1)})
-    # means: a 0.73, b 0.6; b is first in samples with mostly the second seed; rho of 1 2 3 and 2 1 3 is 0.5
+    # the means of a and b are 0.73 and 0.6; b is first if the second seed dominates; then rho is 0.5
     found = agreement([one, noisy])
     assert (found.rho, *found.over_runs) == pytest.approx((1, 0.5, 1))
-    # b is first only if the last seed is drawn four times: 1 sample in 256, which is outside of the interval
+    # b is first only if the last seed is drawn four times, i.e. in 1 of 256 samples
     rare = experiment(tmp_path / "rare", {"a": (0.9, 0.9, 0.9, 0.8), "b": (0.5, 0.5, 0.5, 0.9), "c": (0.1,) * 4})
     assert agreement([one, rare]).over_runs == (1, 1)
 
@@ -136,7 +137,7 @@ def test_ranks_intervals_are_repeatable(places: list[Path]) -> None:
 
 
 def test_ranks_scenes_have_equal_weight_in_mean(tmp_path: Path) -> None:
-    """A scene with two runs counts once: the mean of 0.9, 0.9 and 0.3 is 0.6 instead of 0.7."""
+    """One of the two scenes has two runs. The mean over 0.9 and 0.3 is 0.6."""
     figures = {"a": (0.9, 0.3), "b": (0.5, 0.5), "c": (0.1, 0.1)}
     one = experiment(tmp_path / "one", figures, scenes=("x", "y"))
     other = experiment(tmp_path / "other", figures, scenes=("x", "y"))
@@ -148,7 +149,7 @@ def test_ranks_scenes_have_equal_weight_in_mean(tmp_path: Path) -> None:
 
 
 def test_ranks_compare_only_runs_common_to_all_rows(tmp_path: Path) -> None:
-    """A missing run of a difficult seed does not improve the rank of its row."""
+    """One row has no run for the most difficult seed, which must not improve its rank."""
     one = experiment(tmp_path / "one", {"a": (0.9, 0.3), "b": (0.8, 0.2), "c": (0.7, None), "d": (0.6, 0.1)})
     other = experiment(tmp_path / "other", {"a": (0.9,), "b": (0.8,), "c": (0.7,), "d": (0.6,)})
     lines = lines_of(write_ranks([one, other], [AP50], None))

@@ -1,4 +1,4 @@
-"""Tests that the commands and examples of the README and of docs/ work."""
+"""Tests that the commands and examples in the README and in docs/ work."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, K
 
 pytestmark = pytest.mark.integration
 
-COMMANDS = {  # main config, by command
+COMMANDS = {  # main config of each command
     line: "config" if "=" in words[3] or words[3] == "-m" else words[3].replace("-", "_")
     for line in LINES
     if (words := line.split())[:3] == ["python", "-m", "framework"]
@@ -65,7 +65,7 @@ def test_documented_data_frame_has_means_of_rows(
 ) -> None:
     stored_experiments.experiment(tmp_path / "outputs" / "ablation_refiner", {"chain": [0.5, 0.7], "identity": [0.25]})
     monkeypatch.chdir(tmp_path)
-    exec(block("python", "load_runs("), {})
+    exec(block("python", 'load_runs("outputs/ablation_refiner'), {})
     chain, identity = capsys.readouterr().out.splitlines()[-2:]
     assert chain.split()[:3] == ["chain", "0.60", "0.141421"]
     assert identity.split()[:2] == ["identity", "0.25"]
@@ -81,7 +81,7 @@ def test_contributing_paths_exist() -> None:
 
 @pytest.fixture
 def my_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Write the detector of the tutorial to the documented path."""
+    """Write the detector of the tutorial to the path in the documentation."""
     (tmp_path / "my_plugins").mkdir()
     (tmp_path / "my_plugins" / "color_blobs.py").write_text(block("python", "class ColorBlobs"))
     (tmp_path / "my_conf" / "detector").mkdir(parents=True)
@@ -98,8 +98,8 @@ def test_tutorial_detector_detects_red_square(my_plugins: Path, monkeypatch: pyt
     camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
     color = np.full((48, 64, 3), 200, np.uint8)
     color[10:30, 5:25] = (220, 20, 30)  # a red square
-    color[35:40, 40:45] = (220, 20, 30)  # red, but too small
-    color[10:30, 40:60] = (20, 220, 30)  # green
+    color[35:40, 40:45] = (220, 20, 30)  # a red square that is too small
+    color[10:30, 40:60] = (20, 220, 30)  # a green square
     found = detector.detect(Frame(0, 0.0, color, np.ones((48, 64), np.float32), camera))
     assert len(found) == 1
     np.testing.assert_array_equal(found.boxes, [[5, 10, 25, 30]])
@@ -111,7 +111,7 @@ def test_tutorial_detector_detects_red_square(my_plugins: Path, monkeypatch: pyt
 
 
 def test_tutorial_detector_runs_by_option_name(my_plugins: Path) -> None:
-    """The command is that of the tutorial; the other stages are fakes, for speed."""
+    """The command is the one in the tutorial. The other stages are fakes, which are faster."""
     chosen = [f"{stage}=fake" for stage in FAKES]
     (my_plugins / "my_conf").joinpath("dataset").mkdir()
     for stage, name in FAKES.items():
@@ -161,11 +161,12 @@ def test_documented_command_composes(command: str) -> None:
             )
 
 
-OWN_DATA = blocks("python", "docs/tutorials/own_data.md")  # writes a recording and reads the outputs of a run
+# example that writes a recording and reads the outputs of a run
+OWN_DATA = blocks("python", "docs/tutorials/own_data.md")
 SMALL = ["dataset.frames=4", "dataset.width=160", "dataset.height=120"]
 OWN = ["dataset=rgbd_folder", "dataset.root=DIR"]  # the imported recording
 DEFAULTS = "python -m framework"
-RUNNABLE = {  # arguments appended to each command, so that it takes seconds
+RUNNABLE = {  # arguments that reduce the run time of each command to seconds
     # 320x240 px, because tracking of the noisy room fails at 160x120 px
     DEFAULTS: [*SMALL, "dataset=synthetic", "dataset.width=320", "dataset.height=240", "hydra.run.dir=defaults"],
     "python -m framework import SOURCE DIR": [],
@@ -191,7 +192,7 @@ RUNNABLE = {  # arguments appended to each command, so that it takes seconds
         "hydra.run.dir=own"
     ],
     "python -m framework dataset=rgbd_folder dataset.root=DIR dataset.odometry=FILE": ["hydra.run.dir=with_odometry"],
-    "python -m framework tables outputs/table3_map": [],  # of the sweep above
+    "python -m framework tables outputs/table3_map": [],  # folder of the sweep above
     "python -m framework evaluate outputs/table3_map": [],
     "python -m framework export outputs/demo --to glb usd ply obj": [],
     "python -m framework export outputs/demo --to floorplan graph --robot-height 0.5": [],
@@ -222,7 +223,7 @@ for line in json.load(open("commands.json")):
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run all commands in one process, because loading libraries is slow, and return their folder."""
+    """Run all commands in one process, which loads the libraries only once, and return the folder."""
     folder = tmp_path_factory.mktemp("readme")
     write_stray_scanner(folder / "SOURCE", room_frames(6))
     recording, result = OWN_DATA
@@ -250,7 +251,7 @@ def test_documented_commands_write_expected_files(ran: Path) -> None:
 
 
 def test_default_pipeline_runs_end_to_end(ran: Path) -> None:
-    """The included network, tracking, all refiner links and fusion run on four small frames."""
+    """The included network, tracking, all refiners and fusion process four small frames."""
     metrics = json.loads((ran / "defaults" / "metrics.json").read_text())
     assert (metrics["frames"], metrics["frames_lost"], metrics["frames_skipped"]) == (4, 0, 0)
     assert metrics["pose_source"] == "tracked"

@@ -1,6 +1,6 @@
-"""Contract tests of `framework.interfaces` on every registered plugin. A new plugin needs no change here.
+"""Contract tests for every registered plugin.
 
-The contracts are in framework/testing, which other packages can import.
+New plugins are included automatically. The contract tests are in framework/testing, which other packages can import.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def video(request: pytest.FixtureRequest, ready: Ready, monkeypatch: pytest.Monk
 
 
 def come(video: LiveVideo) -> Iterator[Frame]:
-    """Yield the frames of a live video after checking that it yields None while it waits for a frame."""
+    """Yield the frames of a live video after checking that the video yields None while waiting."""
     with closing(video.frames()) as readers:
         yielded = time.monotonic()
         for reader in readers:

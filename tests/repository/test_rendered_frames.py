@@ -1,4 +1,4 @@
-"""Tests of the cache of rendered frames."""
+"""Tests for the cache of rendered frames."""
 
 from __future__ import annotations
 

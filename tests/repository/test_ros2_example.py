@@ -1,4 +1,4 @@
-"""Tests of the ROS 2 node of examples/ with fake ROS modules."""
+"""Tests for the ROS 2 node in examples/, with fake ROS modules."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DESK = TumRgbd(CHECKOUT / "data" / "desk", scene="rgbd_dataset_freiburg1_rpy")
 
 
 class Message(SimpleNamespace):
-    """A message whose fields are created on access."""
+    """Message whose fields are created on access."""
 
     DELETEALL, CUBE = 3, 1
 
@@ -31,7 +31,7 @@ class Message(SimpleNamespace):
 
 
 class Node:
-    """The part of rclpy's node that the example uses."""
+    """The methods of the node in rclpy that the example uses."""
 
     def __init__(self, name: str) -> None:
         self.published: list[Any] = []

@@ -1,4 +1,4 @@
-"""Tests of the comparison of run directories across renamed config keys."""
+"""Tests for the comparison of run directories after config keys have been renamed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of docs/results/steps.py, compared with manual results."""
+"""Tests for docs/results/steps.py, compared with manual results."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def lines_of(text: str) -> list[str]:
 
 
 def test_steps_differences_match_hand_computed_values(tmp_path: Path) -> None:
-    """Seeds of a real scene are averaged; seeds of the synthetic dataset are scenes."""
+    """The seeds of a real scene are averaged. In the synthetic dataset, each seed is a scene."""
     kitchen = {"paper": (0.1, 0.3), "step": (0.4, 0.4), "default": (0.5, 0.7), "without_step": (0.4, 0.6)}
     office = {"paper": (0.4,), "step": (0.4,), "default": (0.6,), "without_step": (0.6,)}
     rooms = {"paper": (0.5, 0.6), "step": (0.5, 0.7), "default": (0.8, 0.9), "without_step": (0.9, 0.9)}

@@ -1,7 +1,7 @@
-"""Cache of the light of synthetic rooms, in .pytest_cache.
+"""Cache for the light of synthetic rooms, in .pytest_cache.
 
-Import this module before a room is rendered. Baking the light takes 4 s per room. The file name is a hash of the room
-and of all modules that affect the light.
+Import this module before a room is rendered, because baking the light of a room takes 4 s. The file name is a hash of
+the room and of all modules that affect the light.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FOLDER = CHECKOUT / ".pytest_cache" / "lights"
 
 
 def bake(surfaces: Surfaces, caster: RayCaster, lamps: list[Lamp]) -> Float32:
-    """Return the irradiance (V, 3) from `lights.bake`, or from the cache if it is stored there."""
+    """Return the irradiance (V, 3) from the cache, or compute and store it with `lights.bake`."""
     content = sha256(_code())
     arrays = [surfaces.vertices, surfaces.normals, surfaces.triangles, surfaces.materials, surfaces.material_table]
     arrays += [surfaces.instance_ids, *(a for lamp in lamps for a in (lamp.points, lamp.normals, np.array(lamp.power)))]

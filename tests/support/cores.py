@@ -1,7 +1,7 @@
-"""Assignment of CPU cores to test processes: each process of pytest-xdist has its own cores.
+"""Assignment of CPU cores to the test processes of pytest-xdist.
 
-On shared cores, the parallel kernels of the processes wait for each other. For example, tracker tests that take 22 s on
-one core took 72 s in two processes on two shared cores.
+On shared cores, the parallel kernels of several processes wait for each other. Tracker tests that take 22 s on one core
+took 72 s in two processes on two shared cores. Each process therefore gets separate cores.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ ALL = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [
 
 
 def _share_among_processes() -> None:
-    """Set the cores before numba is loaded, because numba cannot add threads later.
+    """Set the cores of this process before numba is loaded, because numba cannot add threads later.
 
-    numba sets the number of OpenMP threads only in the thread that first uses it. Torch uses the same OpenMP. Without
-    these variables, torch would use another number in new threads, and networks would round differently.
+    numba sets the number of OpenMP threads only in the thread that first uses it, and torch uses the same OpenMP.
+    Without these variables, torch would use another number in new threads and round differently.
     """
     number = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
@@ -31,7 +31,7 @@ def _share_among_processes() -> None:
 
 @contextmanager
 def all_cores() -> Iterator[None]:
-    """Run the body, and the threads that it starts, on every core."""
+    """Use all cores in the body and in the threads that the body starts."""
     if not ALL:
         yield
         return
@@ -44,4 +44,4 @@ def all_cores() -> Iterator[None]:
 
 
 _share_among_processes()
-set_environment()  # as the command line does
+set_environment()  # like the command line

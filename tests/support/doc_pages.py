@@ -1,4 +1,4 @@
-"""Commands and code of README.md and of the pages of docs/, by language and without duplicates."""
+"""Commands and code in README.md and docs/, by language and without duplicates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PAGES = {
 
 
 def blocks(language: str, page: str | None = None) -> list[str]:
-    """Return the distinct code blocks of a language on one page, or on all pages, in order."""
+    """Return the distinct code blocks of a language on one page or, by default, on all pages."""
     texts = PAGES.values() if page is None else [PAGES[page]]
     return list(
         dict.fromkeys(code for text in texts for code in re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL))
@@ -29,7 +29,7 @@ def block(language: str, containing: str) -> str:
 
 LINES = list(
     dict.fromkeys(
-        re.sub(r"^instancemap ", "python -m framework ", line)  # the same command
+        re.sub(r"^instancemap ", "python -m framework ", line)  # continuation of the same command
         for code in blocks("console")
         for line in code.splitlines()
     )

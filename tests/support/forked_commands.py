@@ -1,4 +1,7 @@
-"""Commands in processes forked from one that has imported the libraries, which saves over 1 s per command."""
+"""Commands in forked processes.
+
+The parent process has imported the libraries, which saves more than 1 s per command.
+"""
 
 from __future__ import annotations
 
@@ -28,15 +31,15 @@ _context.set_forkserver_preload(LIBRARIES)
 
 
 def clean_environment() -> dict[str, str]:
-    """Return the environment of the tests without the variable that makes Hydra print tracebacks."""
+    """Return the environment without the variable that makes Hydra print tracebacks."""
     return {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
 
 
 class ForkedCommand:
-    """`python -m framework ARGUMENTS` in a separate process, with the interface of `subprocess.Popen`.
+    """`python -m framework ARGUMENTS` in a forked process, with the interface of `subprocess.Popen`.
 
     Args:
-        before: Function that the process calls before the command; a module-level function, because it is pickled.
+        before: Module-level function that the process calls before the command.
     """
 
     def __init__(
@@ -70,7 +73,7 @@ class ForkedCommand:
         self.send_signal(signal.SIGKILL)
 
     def communicate(self, timeout: float | None = None) -> tuple[str, str]:
-        """Return stdout and stderr when the process has ended; raise `subprocess.TimeoutExpired` after `timeout` s."""
+        """Return stdout and stderr of the finished process. Raise `subprocess.TimeoutExpired` after `timeout` s."""
         self._process.join(timeout)
         if self.poll() is None:
             raise subprocess.TimeoutExpired(self.args, timeout or 0)
@@ -81,7 +84,7 @@ class ForkedCommand:
 
 
 def completed(directory: Path, *arguments: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:
-    """Run `python -m framework ARGUMENTS` in a directory, as `subprocess.run` does."""
+    """Run `python -m framework ARGUMENTS` in a directory, like `subprocess.run`."""
     process = ForkedCommand(directory, *arguments)
     try:
         stdout, stderr = process.communicate(timeout)
@@ -104,7 +107,7 @@ def _run(
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(directory)
-    sys.path[:0] = [directory, str(CHECKOUT)]  # as with `python -m` and PYTHONPATH
+    sys.path[:0] = [directory, str(CHECKOUT)]  # like with `python -m` and PYTHONPATH
     sys.argv = [str(CHECKOUT / "framework" / "__main__.py"), *arguments[1:]]
     if before:
         before()

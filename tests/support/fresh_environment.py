@@ -1,4 +1,4 @@
-"""Virtual environments in which InstanceMap is installed from a wheel, outside of the checkout."""
+"""Virtual environments with InstanceMap, installed from a wheel outside of the checkout."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OFFLINE = ("--quiet", "--no-deps", "--no-index")
 def create_environment(folder: Path, packages: Iterable[Path] = ()) -> None:
     """Create the virtual environment `folder`/env with InstanceMap and the packages in other source folders.
 
-    The libraries are those of the current environment.
+    The dependencies are those of the current environment.
     """
     wheels = build_wheels(folder / "wheels", [CHECKOUT, *packages])
     venv.create(folder / "env", symlinks=True)
@@ -31,7 +31,7 @@ def create_environment(folder: Path, packages: Iterable[Path] = ()) -> None:
 
 
 def build_wheels(folder: Path, sources: Iterable[Path]) -> list[str]:
-    """Build the wheels of source folders in `folder`, and return the paths of all wheels there."""
+    """Build the wheels of source folders, and return the paths of all wheels in `folder`."""
     folder.mkdir(exist_ok=True)
     for source in sources:
         build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
@@ -40,7 +40,7 @@ def build_wheels(folder: Path, sources: Iterable[Path]) -> list[str]:
 
 
 def copy_kernels(site: Path) -> None:
-    """Copy the numba cache of the checkout to the installed files, with the modification times that numba checks."""
+    """Copy the numba cache of the checkout. The copied modification times are those that numba expects."""
     for path in (CHECKOUT / "framework").rglob("*.py"):
         shutil.copystat(path, site / path.relative_to(CHECKOUT))
     for path in (CHECKOUT / "framework").rglob("*.nb[ic]"):
@@ -51,7 +51,7 @@ def copy_kernels(site: Path) -> None:
 
 
 def run_in(folder: Path, *line: str) -> str:
-    """Run a program of `folder`/env in `folder`, and return its output."""
+    """Run a program of `folder`/env in `folder` and return its output."""
     alone = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "HYDRA_FULL_ERROR")}
     program = str(folder / "env" / "bin" / line[0])
     done = subprocess.run([program, *line[1:]], cwd=folder, env=alone, capture_output=True, text=True, timeout=300)

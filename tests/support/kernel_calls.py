@@ -1,10 +1,12 @@
-"""Kernels that the pipelines call, with their argument types: framework/compilation/kernels.txt.
+"""List of the kernels that the pipelines call, framework/compilation/kernels.txt.
+
+To write the list, which takes about a minute, run
 
     python -m tests.support.kernel_calls
 
-rewrites this list in about a minute. It runs every registered refiner, fuser and tracker on the demo's video, and one
-pipeline on a synthetic room. The list contains each kernel that Python calls, with each combination of argument types.
-A test compares the list with the same runs.
+All registered refiners, fusers and trackers are run on the demo, and one pipeline is run on a synthetic room. The list
+contains each kernel that Python calls, with each combination of argument types. A test compares the list with the same
+runs.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ class Compiled(event.Listener):
 
 
 class Remembered(Detector):
-    """Detector that stores the detections of another detector by frame."""
+    """Detector that stores the detections of another detector for each frame."""
 
     def __init__(self, detector: Detector) -> None:
         self.detector = detector
@@ -62,7 +64,7 @@ class Remembered(Detector):
 
 
 def calls() -> list[str]:
-    """Return a list to which each kernel is appended when it is first called with new argument types."""
+    """Return a list to which a kernel is appended whenever it is first called with new argument types."""
     noted: list[str] = []
     compile_for = Dispatcher._compile_for_args
 
@@ -80,14 +82,14 @@ def run_default(directory: Path, *overrides: str) -> None:
 
 
 def run_others() -> None:
-    """Run the pipeline with each registered refiner, fuser and tracker. Detectors have no kernels of their own."""
+    """Run the pipeline with each registered refiner, fuser and tracker. Detectors have no kernels."""
     config = composed(*FEW)
     Settings.of(config).apply()
     detector = Remembered(build(Detector, config.detector))
     video = build(RGBDSequence, config.dataset)
     for stage in ("refiner", "fuser", "tracker"):
         for option in sorted((CHECKOUT / "conf" / stage).glob("*.yaml")):
-            if option.stem == "trajectory_file":  # it needs a file and has no kernels
+            if option.stem == "trajectory_file":  # requires a file and has no kernels
                 continue
             own = composed(*FEW, f"{stage}={option.stem}")
             pipeline = Pipeline(
@@ -103,7 +105,7 @@ def run_others() -> None:
 
 
 def run_rendered(directory: Path) -> None:
-    """Run a synthetic room, including the renderer and the comparison of the map with the true surface."""
+    """Run a synthetic room, including rendering and the comparison of the map with the true surface."""
     config = composed(
         "dataset=synthetic", "detector=simulated", "dataset.frames=8", "dataset.width=160", "dataset.height=120"
     )
@@ -111,7 +113,7 @@ def run_rendered(directory: Path) -> None:
 
 
 def sections(whole: bool) -> dict[str, set[str]]:
-    """Return the lines of the list by section. Without `whole`, use a shorter default run with the same calls."""
+    """Return the lines of the list by section. Unless `whole`, use a shorter default run with the same calls."""
     noted = calls()
     with tempfile.TemporaryDirectory() as directory:
         run_default(Path(directory), *(() if whole else ("dataset.stride=2", "dataset.stop=24")))
@@ -123,14 +125,14 @@ def sections(whole: bool) -> dict[str, set[str]]:
 
 
 def record() -> None:
-    """Write the list. Other processes compile the kernels of the previous list that still exist."""
+    """Write the list. Meanwhile, other processes compile those kernels of the previous list that still exist."""
     found = sections(whole=True)
     text = "\n\n".join("\n".join([section, *sorted(lines)]) for section, lines in found.items())
     LIST.write_text(f"{text}\n", encoding="utf-8")
 
 
 def check() -> None:
-    """Print the called kernels that the list lacks, and the kernels that are compiled."""
+    """Print the called kernels that are missing in the list, and the kernels that are compiled."""
     compiled = Compiled()
     event.register("numba:compile", compiled)
     found = sections(whole=False)
@@ -147,7 +149,8 @@ def main() -> None:
         {"--check": check, "--record": record}[sys.argv[1]]()
         return
     LIST.write_text("", encoding="utf-8")
-    for _ in range(2):  # callees of a compiled kernel are not listed; the second run compiles no kernels
+    # kernels that are called by a compiled kernel are not listed; the second run compiles no kernels
+    for _ in range(2):
         subprocess.run([sys.executable, "-m", "tests.support.kernel_calls", "--record"], check=True)
 
 

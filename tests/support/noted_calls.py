@@ -1,4 +1,4 @@
-"""A viewer that writes its calls to a file."""
+"""Viewer that writes its calls to a file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from framework.data import Detections, Frame, Pose
 from framework.interfaces import SceneMap, Viewer
 
-CALLS = "calls.jsonl"  # file in the run directory: one list per call, the name of the method and arguments
+CALLS = "calls.jsonl"  # file in the run directory; one list per call, with the name of the method and the arguments
 
 
 @dataclass

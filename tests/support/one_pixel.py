@@ -1,4 +1,4 @@
-"""Point clusters that cover one pixel, and the voxel at the surface of this pixel."""
+"""Point clusters at a single pixel, and the voxel at the surface of this pixel."""
 
 import numpy as np
 
@@ -8,8 +8,8 @@ from framework.mapping.labels.label_evidence import Evidence, Measurement, named
 from framework.mapping.labels.label_evidence_kernels import Combine
 
 FLOOR = 0.05
-SCORE_SCALE = 1 << 16  # as precise as exact storage
-BARE, COVERED = np.int32(0), np.int32(1)  # indices of cluster lists: no clusters, all clusters of a measurement
+SCORE_SCALE = 1 << 16  # the precision of exact storage
+BARE, COVERED = np.int32(0), np.int32(1)  # indices of the cluster lists: no cluster, all clusters
 
 
 def blank() -> Evidence:
@@ -30,7 +30,7 @@ def measured(
     absence: float,
     last_id: int,
 ) -> Measurement:
-    """Return a measurement of clusters on the only pixel, each with an instance, a score and a class distribution."""
+    """Return a measurement of clusters at the only pixel. Each has an instance, a score and a class distribution."""
     clusters = np.flatnonzero(ids).astype(np.int32)
     matched = np.zeros(last_id + 1, np.bool_)
     matched[ids] = True
@@ -51,7 +51,7 @@ def measured(
 
 
 def voted(ids: list[int], weights: list[float], classes: list[int], combine: Combine, number: int = 6) -> Measurement:
-    """Return a measurement of clusters on the only pixel, each with an instance and a class, for non-Bayesian rules."""
+    """Return a measurement for rules that are not Bayesian. Each cluster has an instance, a weight and a class."""
     evidence = np.zeros((len(ids), number))
     evidence[np.arange(len(ids)), classes] = weights
     relative, named, bits = named_classes(evidence, logarithmic=False)

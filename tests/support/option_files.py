@@ -1,4 +1,4 @@
-"""Small files for options that require user files, so that the contract tests can run on them."""
+"""Small input files for options that require files of the user. The contract tests use these files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FRAMES = 3
 
 
 def modules(stage: str, name: str) -> dict[str, ModuleType]:
-    """Return the fake device libraries, by module name, that an option needs; empty for other options."""
+    """Return the fake device libraries that an option needs, keyed by module name."""
     plugged_in = {
         ("dataset", "orbbec"): {"pyorbbecsdk": orbbec_module(FakeCamera())},
         ("dataset", "realsense"): {"pyrealsense2": realsense_module(FakeCamera())},
@@ -32,13 +32,13 @@ def modules(stage: str, name: str) -> dict[str, ModuleType]:
 
 
 def overrides(stage: str, name: str, folder: Path) -> list[str]:
-    """Write the files that an option needs to `folder`; return its overrides, empty for other options."""
+    """Write the files that an option needs to `folder`, and return its overrides."""
     write = WRITERS.get((stage, name))
     return write(folder) if write else []
 
 
 def _images(color: str, depth: str, first: int = 0) -> None:
-    """Write the color and depth (mm) images of the corner room; names contain frame numbers from `first`."""
+    """Write the color and depth (mm) images of the corner room. The names contain frame numbers from `first` on."""
     for frame in CornerRoom(frames=FRAMES):
         for path, image in (
             (Path(color.format(first + frame.index)), frame.color[..., ::-1]),
@@ -122,7 +122,7 @@ def _mask_rcnn(folder: Path) -> list[str]:
 
 
 def _onnx_boxes(folder: Path) -> list[str]:
-    """Write a network with an input of 32x32 px and two boxes of 16 px, in YOLOX's grids of 4x4, 2x2 and 1x1 cells."""
+    """Write a network with an input of 32x32 px and two boxes of 16 px, in the layout of YOLOX."""
     pytest.importorskip("onnx")
     from tests.support.networks.tiny_networks import constant_network
 
@@ -134,7 +134,7 @@ def _onnx_boxes(folder: Path) -> list[str]:
 
 
 def _onnx_segmentation(folder: Path) -> list[str]:
-    """Write a network that returns two boxes, whose masks are the left and the lower half of the image."""
+    """Write a network with two boxes. The masks are the left half and the lower half of the image."""
     pytest.importorskip("onnx")
     from tests.support.networks.tiny_networks import constant_network
 

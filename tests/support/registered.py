@@ -1,4 +1,4 @@
-"""Options of all config groups, for tests that run on each of them."""
+"""Options of all config groups, for tests of all plugins."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def names(stage: str, kind: type = object) -> list[str]:
 
 
 def composed(stage: str, name: str, *overrides: str) -> DictConfig:
-    """Return the main config with this option and no other stage."""
+    """Return the main config with this option and without other stages."""
     return copy.deepcopy(_composed(stage, name, *overrides))
 
 
@@ -39,5 +39,5 @@ def _composed(stage: str, name: str, *overrides: str) -> DictConfig:
 
 
 def built(stage: str, name: str, *overrides: str) -> Any:
-    """Build the option as the command does."""
+    """Build the plugin of an option."""
     return build(GROUPS[stage], composed(stage, name, *overrides)[stage])

@@ -1,6 +1,6 @@
-"""Frames of synthetic sequences, rendered once and shared by all test processes.
+"""Frames of synthetic sequences, which are rendered once for all test processes.
 
-The cache is in the platform's cache folder. Its key is the hash of the code that renders, the library versions and the
+The cache is in the cache folder of the user. The key is a hash of the rendering code, the library versions and the
 parameters of the sequence.
 """
 
@@ -24,7 +24,7 @@ LIBRARIES = ("numpy", "numba", "open3d")
 
 
 def rendered_frames(sequence: Synthetic, indices: Sequence[int] | None = None) -> list[Frame]:
-    """Return the frames with these indices, by default all frames, from the cache if they are stored there."""
+    """Return the frames with these indices, by default all frames. Frames in the cache are not rendered again."""
     chosen = list(range(len(sequence)) if indices is None else indices)
     directory = Path(platformdirs.user_cache_dir("instancemap"), "test_frames")
     directory.mkdir(parents=True, exist_ok=True)

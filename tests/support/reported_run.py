@@ -1,4 +1,4 @@
-"""A small run with ground-truth instances, for tests of reports."""
+"""A small run with ground-truth instances, for the tests of reports."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CONFIG: dict[str, Any] = {
 
 
 def write_run(directory: Path, **dataset: Any) -> Path:
-    """Map the corner room with its spheres; return the run directory."""
+    """Map the corner room with its spheres and return the run directory."""
     config = CONFIG | {"dataset": CONFIG["dataset"] | dataset}
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(composition, "_added", [FAKES])

@@ -1,4 +1,4 @@
-"""Slow reference for the instance evaluation, written from the docstrings of framework.evaluation.instances."""
+"""Slow reference for the instance evaluation, based only on the docstrings of framework.evaluation.instances."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Pairs = list[tuple[int, int]]  # predicted and true id of each point, 0 = none
 
 @dataclass
 class Matched:
-    """The result of one pass over the predictions."""
+    """Result of one pass over the predictions."""
 
     hits: list[bool]
     ignored: int
@@ -25,7 +25,7 @@ class Matched:
 
     @property
     def ap(self) -> Fraction:
-        """Return the mean over the recalls k / truths of the best precision at that or a higher recall."""
+        """Return the average precision, i.e. the mean of the best precision at each recall k / truths or above."""
         total = Fraction(0)
         for k in range(1, self.truths + 1):
             precisions = [
@@ -45,7 +45,7 @@ class Matched:
 def slow_metrics(
     predictions: PredictedInstances, truth: SceneTruth, transfer: Transfer, max_distance: float, min_points: int
 ) -> dict[str, float]:
-    """Return the same keys and values as `evaluate(...).metrics()`."""
+    """Return the metrics with the same keys as `evaluate(...).metrics()`."""
     pairs = _pairs(predictions, truth, transfer, max_distance)
     sizes = {t: int((truth.instance_ids == t).sum()) for t in set(truth.instance_ids.tolist()) - {0}}
     classes = {t: truth.class_names.get(t) for t, size in sizes.items() if size >= min_points}
@@ -70,7 +70,7 @@ def slow_metrics(
         return mostly or any(overlap[p, t] >= threshold for t in ignored)
 
     def match(threshold: Fraction, of: str | None, by_class: bool) -> Matched:
-        """Match the predictions of the class `of` (None = all); with `by_class`, matches must have the same class."""
+        """Match the predictions of the class `of` (None = all). With `by_class`, only equal classes match."""
         chosen = [t for t, name in counted.items() if of in (None, name)]
         found = Matched([], 0, Fraction(0), len(chosen))
         free = set(counted)

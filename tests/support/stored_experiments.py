@@ -15,7 +15,7 @@ Figures = Mapping[str, Sequence[float | None]]  # values by row, one for each se
 
 
 def experiment(root: Path, figures: Figures, iou: float = 0.5, scenes: Sequence[str] = (), dataset: str = "d") -> Path:
-    """Write run directories of `dataset` below `root`. With `scenes`, the values are one per scene, with seed 0."""
+    """Write run directories of `dataset` below `root`. With `scenes`, each value is of one scene with seed 0."""
     root.mkdir(parents=True)
     rows = {row: [f"refiner={row}"] for row in figures}
     over = ["seed", "dataset.scene"] if scenes else ["seed"]

@@ -1,4 +1,4 @@
-"""The output of a process to a terminal."""
+"""Output of a process to a terminal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 @contextmanager
 def terminal_stderr(columns: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """Connect stderr to a terminal of `columns` characters. When the context ends, the list contains the text."""
+    """Connect stderr to a terminal of `columns` characters. Afterwards, the yielded list contains the text."""
     shown: list[str] = []
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
@@ -27,7 +27,7 @@ def terminal_stderr(columns: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[l
     try:
         while part := os.read(ours, 4096):
             parts.append(part)
-    except OSError:  # Linux reports the closed side of a pseudoterminal as an input/output error
+    except OSError:  # on Linux, the closed side of a pseudoterminal causes an input/output error
         pass
     os.close(ours)
     shown.append(b"".join(parts).decode())

@@ -1,4 +1,4 @@
-"""The same computation with one thread and with two."""
+"""The same computation with one thread and with two threads."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Made = TypeVar("Made")
 
 
 def by_one_thread_and_two(make: Callable[[], Made]) -> tuple[Made, Made]:
-    """Return the result of `make` with one numba thread and with two; skip on a single core."""
+    """Return the results of `make` with one and with two numba threads. Skip the test on a single core."""
     if numba.config.NUMBA_NUM_THREADS < 2:
         pytest.skip("this machine has one core")
     usual = numba.get_num_threads()

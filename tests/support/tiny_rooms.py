@@ -1,4 +1,4 @@
-"""Images that a tiny network can learn in seconds: red chairs and blue beds on gray."""
+"""Images that a tiny network can learn in seconds, with red chairs and blue beds on gray."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PICTURES = 6
 
 
 def write_room(folder: Path, number: int) -> None:
-    """Write a room as render_room() does, with images of 64x48 px."""
+    """Write a room like render_room(), with images of 64x48 px."""
     room = room_folder(folder, number)
     room.mkdir(parents=True)
     rng = np.random.default_rng(number)

@@ -1,4 +1,4 @@
-"""A run with fake stages that is logged to an experiment tracker, and its own outputs for comparison."""
+"""A run with fake stages that is logged to an experiment tracker."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ ROOM = [f"dataset.frames={FRAMES}", f"tracker.lost_from={LOST}", f"tracker.lost_
 
 @dataclass(frozen=True)
 class TrackedRun:
-    """The outputs of a run that an experiment tracker has received."""
+    """Outputs of a run that an experiment tracker has received."""
 
     directory: Path
 
     @property
     def tracking_ms(self) -> list[float]:
-        """The tracking time of each frame, ms, rounded to 1e-3."""
+        """The tracking time of each frame, ms, rounded to 0.001."""
         with (self.directory / "timings.csv").open() as file:
             return [float(row["milliseconds"]) for row in csv.DictReader(file) if row["stage"] == "tracking"]
 
@@ -37,7 +37,7 @@ class TrackedRun:
         return {f"run/{key}": value for key, value in json.loads(file.read_text()).items() if is_number(value)}
 
     def check(self, series: Mapping[str, list[tuple[int, float]]], numbers: Mapping[str, float], steps: int) -> None:
-        """Assert that these are the (frame, value) pairs of the first `steps` frames, and the metrics, by name."""
+        """Check the logged (frame, value) pairs of the first `steps` frames, and the logged metrics."""
         assert [step for step, _ in series["frame/lost"]] == list(range(steps))
         assert [value for _, value in series["frame/lost"]] == [float(step == LOST) for step in range(steps)]
         tracking = [value for _, value in series["frame/stage_ms.tracking"]]

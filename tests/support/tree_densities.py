@@ -1,4 +1,4 @@
-"""The density of a mixture tree in plain numpy, as a reference for its levels."""
+"""Density of a mixture tree in plain NumPy."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from framework.refinement.mixtures.mixture_tree import MixtureTree
 
 
 def gaussian_densities(points: np.ndarray, weights: np.ndarray, means: np.ndarray, Sigmas: np.ndarray) -> np.ndarray:
-    """Return the weighted densities pi_k N(x_i | mu_k, Sigma_k), (S, K)."""
+    """Return the density (S, K) of each weighted Gaussian at each point."""
     whitened = (points - means[:, None]) @ np.linalg.inv(np.linalg.cholesky(Sigmas)).transpose(0, 2, 1)  # (K, S, 3)
     scales = weights / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(Sigmas))
     return (np.exp(-0.5 * (whitened**2).sum(axis=-1)) * scales[:, None]).T
 
 
 def leaves(tree: MixtureTree, depth: int) -> list[tuple[int, np.ndarray]]:
-    """Return the leaves of the trees cut below `depth` levels: the index and the rows of the leaves of each level."""
+    """Return the leaves of the trees, which are cut below `depth` levels, as pairs of a level and its rows."""
     rows = []
     for k in range(min(depth, len(tree.levels))):
         last = k + 1 in (depth, len(tree.levels))
@@ -25,7 +25,7 @@ def leaves(tree: MixtureTree, depth: int) -> list[tuple[int, np.ndarray]]:
 
 
 def owners(tree: MixtureTree, k: int) -> np.ndarray:
-    """Return the index (M,) of the tree of each node of level `k`."""
+    """Return the tree (M,) to which each node of level `k` belongs."""
     found = tree.levels[0].parents
     for level in tree.levels[1 : k + 1]:
         found = found[level.parents]
@@ -33,10 +33,10 @@ def owners(tree: MixtureTree, k: int) -> np.ndarray:
 
 
 def log_likelihoods(tree: MixtureTree, points: np.ndarray, starts: np.ndarray, depth: int | None = None) -> np.ndarray:
-    """Return the mean log p(x) (N,), in nats, of each point set under the first `depth` levels; None = all.
+    """Return the mean log-likelihood (N,), nats, of each point set under the first `depth` levels.
 
-    p is the sum over all leaves and uniform components, whatever the branch of a point. The mean is 0 for a set without
-    points, and -inf for a set with a point where the tree has no density.
+    The density is the sum over all leaves and uniform components. The result is 0 for a set without points, and -inf if
+    the density is zero at a point.
     """
     depth = len(tree.levels) if depth is None else depth
     means = np.zeros(len(starts) - 1)

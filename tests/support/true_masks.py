@@ -1,4 +1,4 @@
-"""Ground-truth masks of an analytic scene, and their fusion as detections."""
+"""Ground-truth masks of an analytic scene, and fusion of these masks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def fuse_masks(
     embeddings: np.ndarray | None = None,
     space: str = "words@1",
 ) -> None:
-    """Fuse the frame at its ground-truth pose with these masks and their class distributions.
+    """Fuse the frame at its ground-truth pose with these masks and class distributions.
 
     `embeddings` (n, D) are optional.
     """

@@ -28,9 +28,13 @@ def main() -> None:
 
 
 def compile_named(kernels: list[Kernel], parts: list[str]) -> str:
-    """Compile the kernels that are not compiled yet and whose name contains one of the `parts`; return a summary.
+    """Compile all kernels whose name contains one of the parts, and return a summary.
 
-    Empty `parts` match all kernels. Raises ConfigError if no kernel matches, DataError if a kernel cannot be compiled.
+    Kernels that are already compiled are skipped. Without parts, all kernels are selected.
+
+    Raises:
+        ConfigError: No kernel is selected.
+        DataError: A kernel cannot be compiled.
     """
     if parts:
         kernels = [kernel for kernel in kernels if any(part in f"{kernel.module}.{kernel.name}" for part in parts)]

@@ -1,6 +1,6 @@
 """`instancemap convert-weights IN OUT`: convert torchvision or detectron2 weights for `detector=mask_rcnn`.
 
-The metadata of OUT describes the network, so `detector.weights=OUT` needs no other parameter. Code in IN is never
+OUT contains a description of the network, so `detector.weights=OUT` needs no other parameter. Code in IN is never
 executed.
 """
 
@@ -32,12 +32,12 @@ def main() -> None:
 
 
 def convert(source: Path, target: Path, kind: str | None, classes: str | None, norm_eps: float, half: bool) -> None:
-    """Convert the checkpoint `source` to the safetensors file `target`, and print a summary.
+    """Convert a checkpoint to a safetensors file, and print a summary.
 
     Args:
         source: A .pth or .pkl file, or the name of a published network.
-        target: The output file, .safetensors.
-        kind: The format of `source`: torchvision or detectron2; None = detected.
+        target: Output file with the suffix .safetensors.
+        kind: Format of the checkpoint, torchvision or detectron2; None = detected.
         classes: Comma-separated class names in network order; None = COCO classes.
         norm_eps: Epsilon of batch normalization, for torchvision only.
         half: Store the weights as float16.

@@ -116,7 +116,6 @@ def _as_text(sections: Mapping[str, list[Check]], errors: int) -> str:
 
 
 def _as_json(sections: Mapping[str, list[Check]]) -> str:
-    """Return JSON: a list of sections {title, checks}, each check with name, status, detail and fix."""
     listed = [
         {"title": title, "checks": [asdict(check) | {"status": check.status.name.lower()} for check in checks]}
         for title, checks in sections.items()

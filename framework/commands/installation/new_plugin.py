@@ -1,6 +1,6 @@
 """`instancemap new-plugin STAGE NAME`: create a package with a working plugin.
 
-framework/templates has one folder of templates for each stage, one for viewers and one for all stages.
+framework/templates contains a folder of templates for each stage, and one for all stages.
 """
 
 from __future__ import annotations
@@ -97,9 +97,16 @@ def main() -> None:
 
 
 def write_repository(stage: str, name: str, folder: Path) -> Path:
-    """Create the repository of a plugin in `folder` atomically, and return its path.
+    """Create the repository of a plugin atomically, and return its path.
 
-    Raises ConfigError for an invalid or existing name or a missing folder, and DataError if `folder` is not writable.
+    Args:
+        stage: Stage of the plugin.
+        name: Name of the plugin.
+        folder: Parent folder of the repository.
+
+    Raises:
+        ConfigError: The name is invalid or exists, or the folder is missing.
+        DataError: The folder is not writable.
     """
     check_name(stage, name)
     if not folder.is_dir():
@@ -125,7 +132,7 @@ def write_repository(stage: str, name: str, folder: Path) -> Path:
 
 
 def check_name(stage: str, name: str) -> None:
-    """Raise ConfigError unless the name is valid for a module and a new option of the stage."""
+    """Raise ConfigError unless a name is valid for a module and for a new option of a stage."""
     if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) > LONGEST_NAME:
         raise ConfigError(
             f"NAME: expected at most {LONGEST_NAME} characters a-z, 0-9 or single _, with a letter first, got "
@@ -176,13 +183,13 @@ def names_of(stage: str, name: str) -> dict[str, str]:
 
 
 def fields_of(data: type) -> str:
-    """Return the source lines of a dataclass: its name and its fields with their comments."""
+    """Return the source lines of a dataclass with its name and its fields."""
     body = inspect.getsource(data).partition("\n    def ")[0]
     return "\n".join([f"class {data.__name__}:", *re.findall(r"^    \w+: .*", body, re.MULTILINE)])
 
 
 def files_of(stage: str, name: str) -> dict[str, str]:
-    """Return the text of each file of the new repository, by path relative to the repository."""
+    """Return the text of each file of the new repository, by relative path."""
     names = names_of(stage, name)
     return {
         Template(place).substitute(names): Template(_template(stage, template)).substitute(names)

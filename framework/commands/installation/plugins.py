@@ -34,7 +34,7 @@ _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a plugin, with its comment in the YAML file of the option."""
+    """A parameter of a plugin, with its comment in the YAML file of the option."""
 
     name: str
     type: str
@@ -44,7 +44,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a stage: a YAML file that registers a class."""
+    """An option of a stage, i.e. a YAML file that registers a class."""
 
     stage: str
     name: str
@@ -56,7 +56,7 @@ class Option:
 
 
 def registered(*stages: str, only: str | None = None) -> list[Option]:
-    """Return the options of the config groups `stages`; with `only`, only the options of this name."""
+    """Return the options of config groups. With `only`, return only the options of this name."""
     with config_loader() as loader:
         files = CachingConfigRepository(loader.repository)  # shared, because the options have most configs in common
         return [
@@ -111,7 +111,7 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
 
 
 def _nested(made_of: Mapping[str, str], place: str, plugin_class: type) -> str:
-    """Return the comma-separated names of the options in the plugin field `place`, such as detector.detector."""
+    """Return the names of the options in a plugin field such as detector.detector, separated by commas."""
     if holds_one(plugin_class, place.rpartition(".")[2]):
         own = [path for path, package in made_of.items() if package == place]
         return own[-1].rpartition("/")[2] if own else ""  # after the inherited options
@@ -126,13 +126,13 @@ def _default(field: dataclasses.Field[Any]) -> object:
 
 
 def _text(source: str, name: str) -> str:
-    """Return the text of the YAML file `name` in a config source; "" for Hydra's own, uncommented configs."""
+    """Return the text of a YAML file in a config source, or "" for the configs of Hydra."""
     scheme, _, root = source.partition("://")
     return Path(root, name).read_text() if scheme == "file" else ""
 
 
 def describe(option: Option) -> str:
-    """Return an option as indented text: name, documentation, and one line for each parameter."""
+    """Return an option as indented text, with one line for each parameter."""
     origin = "" if option.provider == "main" else f"  [from {option.provider}]"
     lines = [
         f"  {option.name}{origin}",

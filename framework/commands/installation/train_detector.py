@@ -14,7 +14,7 @@ from framework.files.search_paths import CONF
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train_detector")
 def job(config: DictConfig) -> None:
-    """Train the detector with the settings of the config, in Hydra's output folder."""
+    """Train the detector with the settings of the config, in the output folder of Hydra."""
     from framework.training.train import train  # slow import: after Hydra has checked the keys
 
     train(config, Path(HydraConfig.get().runtime.output_dir))

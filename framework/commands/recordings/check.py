@@ -24,7 +24,7 @@ jobs = Jobs()
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="check")
 @jobs.reported
 def job(config: DictConfig) -> None:
-    """Check the dataset of the config, print the problems, and save the figure of depth, color and pose alignment."""
+    """Check the dataset of the config, print the problems, and save a figure."""
     out = checked_file("out", config.out, ".png") if config.out is not None else Path("outputs", "check.png").absolute()
 
     from framework.checking.recording_check import check

@@ -1,7 +1,7 @@
 """`instancemap convert-oni FILE.oni OUT`: convert a SceneNN recording to images for `dataset=scenenn`.
 
-OpenNI 2 decodes the recording. OUT is the scene folder DIR/NNN. The command writes image/, depth/ and timestamp.txt
-to OUT, with the file names of SceneNN's own converter.
+OpenNI 2 decodes the recording. The command writes image/, depth/ and timestamp.txt to the scene folder OUT (DIR/NNN).
+The file names are those of the converter of SceneNN.
 """
 
 from __future__ import annotations
@@ -39,10 +39,16 @@ def main() -> None:
 
 
 def convert(source: Path, target: Path) -> None:
-    """Convert the recording `source` to images in `target`, and print a summary.
+    """Convert a recording to images, and print a summary.
 
-    Frames that were written before an error are kept. Raises DataError if `source` is truncated or has no frames, or if
-    `target` already contains images.
+    Frames that were written before an error are kept.
+
+    Args:
+        source: Recording.
+        target: Scene folder.
+
+    Raises:
+        DataError: `source` is truncated or has no frames, or `target` already contains images.
     """
     contents = read_contents(source)
     image, depth, timestamp = target / "image", target / "depth", target / "timestamp.txt"
@@ -84,7 +90,7 @@ def convert(source: Path, target: Path) -> None:
 
 
 def _write_png(path: Path, image: Array) -> None:
-    """Write an image: depth (H, W) uint16, mm, or color (H, W, 3) uint8 BGR."""
+    """Write a depth image (H, W) in mm, or a BGR color image (H, W, 3)."""
     _, data = cv2.imencode(".png", image, PNG)
     with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())

@@ -38,8 +38,8 @@ def main() -> None:
     add("--depth", metavar="TOPIC", default="", help="depth images")
     add("--camera-info", metavar="TOPIC", default="", help="intrinsics of the color camera")
     poses = (
-        "camera poses: nav_msgs/Odometry or geometry_msgs/PoseStamped, in optical axes if the frame name contains "
-        '"optical" or is missing, otherwise in ROS axes (x forward)'
+        "camera poses: geometry_msgs/PoseStamped (optical axes), or nav_msgs/Odometry (optical axes if child_frame_id "
+        'contains "optical", otherwise ROS axes with x forward)'
     )
     add("--poses", metavar="TOPIC", default="", help=poses)
     odometry = (

@@ -51,14 +51,21 @@ def main() -> None:
 
 
 def visit_of(run: Path) -> Visit:
-    """Return the map and trajectory of a stored run. Raises DataError if a file is missing or invalid."""
+    """Return the map and trajectory of a stored run.
+
+    Raises:
+        DataError: A file is missing or invalid.
+    """
     from framework.api import scene_of  # slow import: after the arguments are checked
 
     return Visit(scene_of("diff", run), read_tum(run / TRAJECTORY)[1])
 
 
 def in_world(run: Path, world: Path) -> bool:
-    """Return True if the stored configs or metrics imply that `run` has the world frame of the run `world`."""
+    """Return True if two runs are known to have the same world frame.
+
+    This is the case if `run` was localized in `world` or resumed it, or if both used ground-truth poses.
+    """
     config = load_yaml(run / CONFIG) if path_exists(run / CONFIG) else None
     worlds = [config.get(key) for key in ("localize_in", "resume_from")] if isinstance(config, DictConfig) else []
     if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in worlds):
@@ -78,7 +85,7 @@ def line(change: Change) -> str:
 
 
 def entry(change: Change) -> dict[str, object]:
-    """Return the JSON entry of a change, with lengths in meters."""
+    """Return a change as a JSON object, with lengths in meters."""
     return {
         "kind": change.kind.value,
         "class": change.name,

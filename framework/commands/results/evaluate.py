@@ -68,9 +68,17 @@ def evaluate_runs(
     allow_changed: bool = False,
     ground_truth: str | None = None,
 ) -> int:
-    """Evaluate all runs in `roots` and their subfolders, print a line per run, and return the number of failures.
+    """Evaluate all runs in folders and their subfolders, and print one line per run.
 
-    `ground_truth` is the value of --ground-truth; None = ground truth used by the run.
+    Args:
+        roots: Run directories, or folders of run directories.
+        transfer: Direction of the label transfer for the printed metrics.
+        write: Write the metrics to metrics.json.
+        allow_changed: Evaluate even if the ground truth has changed since the run.
+        ground_truth: Value of --ground-truth; None = ground truth used by the run.
+
+    Returns:
+        The number of failures.
     """
     records, failures = _find(roots)
     for failure in failures:
@@ -99,7 +107,7 @@ def evaluate_runs(
 
 
 def summary(found: Reevaluation, transfer: Transfer) -> str:
-    """Return the changes as text: the main metrics with this label transfer, and the number of other changes."""
+    """Return the changes of the main metrics and the number of other changes as text."""
     changed, added = found.changed, found.added
     prefix = "instances." if transfer is Transfer.TO_TRUTH else f"instances.{transfer.value}."
     shown = [key for key in (*(prefix + name for name in MAIN_FIGURES), "annotation_release") if key in changed]
@@ -117,10 +125,7 @@ def _step(old: Any, new: Any) -> str:
 
 
 def _find(roots: Sequence[Path]) -> tuple[list[Record], list[DataError]]:
-    """Return the complete runs in `roots`, and an error for each incomplete run and each root without runs.
-
-    Each run is listed once.
-    """
+    """Return the complete runs in folders, and an error for each incomplete run and each folder without runs."""
     records: dict[Path, Record] = {}
     failures: dict[Path, DataError] = {}
     for root in roots:

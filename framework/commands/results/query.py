@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def heading(answer: QueryResult, wanted: str | None) -> str:
-    """Return a line with the ranking method and, if the run has no embeddings, the override that adds them."""
+    """Return a line with the ranking method. It suggests embeddings if the run has none."""
     if answer.by == "embeddings":
         return f"by embeddings of {answer.space}"
     unavailable = wanted is None and not answer.space
@@ -70,7 +70,7 @@ def table(found: Sequence[Match], measure: str) -> str:
 
 
 def entry(found: Match) -> dict[str, object]:
-    """Return the JSON entry of a matched object, with lengths in meters."""
+    """Return a matched object as a JSON object, with lengths in meters."""
     return {
         "id": found.instance.id,
         "class": found.name,

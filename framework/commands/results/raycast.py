@@ -1,4 +1,4 @@
-"""`instancemap raycast RUN`: draw a ray-cast view of a run's map from the pose of a frame, as in Figure 2."""
+"""`instancemap raycast RUN`: draw a ray-cast view of a map from the pose of a frame."""
 
 from __future__ import annotations
 
@@ -42,10 +42,16 @@ def main() -> None:
 
 
 def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> None:
-    """Write a figure of a run's map, ray-cast from `pose` or from the pose of the frame with number `frame`.
+    """Draw a ray-cast view of the map of a run.
 
-    `pose` is T_world_camera as translation tx, ty, tz, m, and unit quaternion qx, qy, qz, qw. If `pose` and `frame` are
-    None, the middle frame is used. Raises DataError if the frame was not mapped or the map is not in view.
+    Args:
+        run: Run directory.
+        frame: Number of the frame whose pose is used; None = middle frame.
+        pose: Camera pose as tx, ty, tz, m, and unit quaternion qx, qy, qz, qw; None = pose of the frame.
+        out: PNG file.
+
+    Raises:
+        DataError: The frame was not mapped, or the map is not in view.
     """
     from framework.api import scene_of  # slow import: after the arguments are checked
     from framework.figures.raycast_figure import write_raycast
@@ -78,9 +84,10 @@ def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> N
 
 
 def pose_of_frame(contents: RunContents, frame: int | None) -> int:
-    """Return the index of the pose of a frame in the trajectory; None = middle pose.
+    """Return the index of the pose of a frame in the trajectory. Without a frame, it is the middle pose.
 
-    Raises DataError if the frame was not mapped.
+    Raises:
+        DataError: The frame was not mapped.
     """
     numbers, lost = contents.frame_numbers, contents.lost_frames
     if not numbers:

@@ -34,10 +34,19 @@ def main() -> None:
 
 
 def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[Path]:
-    """Write the report of each run and, for several runs, their comparison. Return the paths, the comparison last.
+    """Write the report of each run and, for several runs, their comparison.
 
-    `out` is the path of the only report or of the comparison; None = default path. Raises DataError before any file is
-    written if a run cannot be read.
+    All runs are read before a file is written.
+
+    Args:
+        directories: Run directories.
+        out: Path of the only report or of the comparison; None = default path.
+
+    Returns:
+        The paths of the files, the comparison last.
+
+    Raises:
+        DataError: A run cannot be read.
     """
     from framework.reporting.comparison_page import Comparison
     from framework.reporting.run_contents import RunContents

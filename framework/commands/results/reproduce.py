@@ -1,4 +1,4 @@
-"""`instancemap reproduce RUN|FOLDER|BUNDLE`: run stored runs again and compare the results."""
+"""`instancemap reproduce RUN|FOLDER|TABLE|BUNDLE`: run stored runs again and compare the results."""
 
 from __future__ import annotations
 
@@ -18,18 +18,22 @@ from framework.errors import ConfigError, DataError
 from framework.runs.reproduction import Reproduction, causes
 from framework.runs.run_bundle import opened_bundle
 from framework.runs.stored_runs import METRICS, Record, find_records, no_run_error, read_record
+from framework.tables.comparison import ComparisonTable
+from framework.tables.table_check import TABLE_FORMATS, changed_tables
 
 
 def main() -> None:
     """Run the command `instancemap reproduce`."""
     parser = argparse.ArgumentParser(
         description="Run stored runs again and compare the results: byte-identical, or the first stage and frame that "
-        "differ. Changes of files, parameters, inputs, code and packages since the runs are listed first."
+        "differ. Changes to tables, files, parameters, inputs, code and packages since then are listed first."
     )
-    parser.add_argument("source", metavar="SOURCE", type=Path, help="run directory, folder of runs, or bundle (.zip)")
+    kinds = "run directory, folder of runs, its table (table.md, table.tex or table.csv), or bundle (.zip)"
+    parser.add_argument("source", metavar="SOURCE", type=Path, help=kinds)
     parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="overrides, e.g. dataset.root=DIR")
     parser.add_argument("--cell", metavar="ROW", help="reproduce only the runs of this row of the table; default: all")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="folder of the repeated runs; default: temporary")
+    repeated = "output folder of the repeated runs; default: a temporary folder"
+    parser.add_argument("--out", metavar="DIR", type=Path, help=repeated)
     check = "list the changes since the runs without running them again"
     parser.add_argument("--check-only", action="store_true", help=check)
     trust = "run the plugin code in a bundle; inspect its folder plugins/ first"
@@ -38,7 +42,9 @@ def main() -> None:
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors(), ExitStack() as stack:
         folder, out = parsed.source, parsed.out
-        if folder.suffix == ".zip":
+        if folder.suffix in TABLE_FORMATS:
+            folder = folder.parent
+        elif folder.suffix == ".zip":
             folder = stack.enter_context(opened_bundle(folder, parsed.trust_code))
         if out is None and not parsed.check_only:
             out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="instancemap_")))
@@ -48,24 +54,36 @@ def main() -> None:
 
 
 def reproduce_all(folder: Path, overrides: Sequence[str], row: str | None, out: Path | None) -> int:
-    """Print the changes and the comparison of each completed run, and return the number of different runs.
+    """Run completed runs again, and print the changes and the differences.
 
-    A run whose config.yaml or metrics.json was edited is different, and is not run again. `row`: only the runs of this
-    row of an experiment; None = all runs. `out`: the folder of the repeated runs; None = only list the changes.
+    A run with an edited config.yaml or metrics.json counts as different and is not run again.
+
+    Args:
+        folder: The folder of the runs and their tables.
+        overrides: Overrides of the stored configs.
+        row: Only the runs in this row of the table; None = all runs.
+        out: The folder of the repeated runs; None = only list the changes.
+
+    Returns:
+        The number of changed tables and different runs.
     """
     records, incomplete = find_records(folder)
     edited = [one for one in incomplete if (one.directory / METRICS).exists()]
     if not records and not edited:
         raise no_run_error(folder, incomplete)
     if records and row is not None:
-        records = _of_row(records, row)
+        records = _of_row(folder, row)
+    different = len(edited)
+    if not edited:
+        for change in changed_tables(folder):
+            print(f"changed: {change}")
+            different += 1
     for one in edited:
         print_error(DataError(one.reason))
         try:
             _print_changes(read_record(one.directory, check_config=False))
         except KNOWN_ERRORS as error:
             print_error(error, f"error: {one.directory.name}: ")
-    different = len(edited)
     for number, record in enumerate(records):
         repeated = None if out is None else out / f"{number:03d}_{record.directory.name}"[:200]
         try:
@@ -77,9 +95,9 @@ def reproduce_all(folder: Path, overrides: Sequence[str], row: str | None, out: 
 
 
 def _is_different(record: Record, overrides: Sequence[str], repeated: Path | None) -> bool:
-    """Return True if a run differs from its repetition in the folder `repeated`, and print both comparisons.
+    """Run a stored run again in the folder `repeated`, and return True if the results differ.
 
-    With `repeated` = None, the run is not repeated. It is then different if anything has changed since the run.
+    Without a folder, the run is not repeated. The result is then True if anything has changed since the run.
     """
     changed = _print_changes(record)
     if repeated is None:
@@ -91,23 +109,24 @@ def _is_different(record: Record, overrides: Sequence[str], repeated: Path | Non
 
 
 def _print_changes(record: Record) -> bool:
-    """Print what has changed since a run. Return True if there are changes."""
+    """Print the changes since a run, and return True if there are any."""
     changes = causes(record)
     for change in changes:
         print(f"{record.directory.name}: changed: {change}")
     return bool(changes)
 
 
-def _of_row(records: Sequence[Record], row: str) -> list[Record]:
-    """Return the runs of a row of an experiment. Raises ConfigError if no run has this row."""
-    rows = [str(record.config.get("row")) for record in records]
+def _of_row(folder: Path, row: str) -> list[Record]:
+    """Return the runs in a row of the table."""
+    comparison = ComparisonTable.below(folder)
+    rows = {comparison.called(one): list(one.records.values()) for one in comparison.rows}
     if row not in rows:
-        raise ConfigError(f"--cell: expected one of {', '.join(sorted(set(rows)))}, got {row!r}")
-    return [record for record, of_record in zip(records, rows, strict=True) if of_record == row]
+        raise ConfigError(f"--cell: expected one of the rows {'; '.join(rows)}, got {row!r}")
+    return rows[row]
 
 
 def _run_again(record: Record, overrides: Sequence[str], directory: Path) -> None:
-    """Run the stored config, with overrides, in a new run directory. Raises ConfigError for an unknown key."""
+    """Run the stored config, with overrides, in a new run directory."""
     from framework.commands.running.run import run
 
     config = OmegaConf.create(dict(record.config))
@@ -116,5 +135,6 @@ def _run_again(record: Record, overrides: Sequence[str], directory: Path) -> Non
         try:
             config.merge_with_dotlist([override])
         except OmegaConfBaseException as error:
-            raise ConfigError(f"{override}: expected KEY=VALUE with a key of the run's config, got another") from error
+            expected = "KEY=VALUE with a key and a type of the run's config"
+            raise ConfigError(f"{override}: expected {expected}, got another key or type") from error
     run(config, directory, record.choices)

@@ -9,7 +9,7 @@ from framework.tables.experiment_tables import write_tables
 def main() -> None:
     """Run the command `instancemap tables`."""
     print_for_directories(
-        "Write table.md, table.tex and table.csv of the runs in DIR and its subfolders, and print table.md.",
+        "Write table.md, table.tex and table.csv of the runs in DIR and its subfolders to DIR, and print table.md.",
         "folder of a sweep or of several runs",
         write_tables,
     )

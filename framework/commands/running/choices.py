@@ -1,7 +1,7 @@
-"""Choices on the command line: swept keys and rows of an experiment, checked before the first run.
+"""Swept keys and experiment rows on the command line, checked before the first run.
 
-Hydra's sweeper combines the values of independent keys, but a row of an experiment sets several keys together. An
-experiment therefore sweeps over the key `row`, and each job adds the overrides of its row in `rows`.
+The sweeper of Hydra combines the values of independent keys, but a row of an experiment sets several keys together. An
+experiment therefore sweeps over the key `row`. Each job adds the overrides of its row in `rows`.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ OmegaConf.register_new_resolver("all_of", lambda by_name: ",".join(map(str, by_n
 
 
 def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, Choices]:
-    """Return a job's config with the overrides of its row, and the chosen option of each config group.
+    """Return the config of a job with its row applied, and the chosen option of each config group.
 
-    Raises ConfigError for an unknown row, and for an invalid `table` or `figure`.
+    Raises:
+        ConfigError: The row is unknown, or `table` or `figure` is invalid.
     """
     choices: Choices = dict(hydra_config.runtime.choices)
     rows = checked_rows(config.get("rows"))
@@ -61,7 +62,8 @@ def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, C
 def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
     """Return an upper bound on the number of runs of a sweep.
 
-    Raises ConfigError for a key without values, and for a row that is not among the `rows` of the experiment.
+    Raises:
+        ConfigError: A key has no values, or a row does not exist.
     """
     runs: dict[str, int] = {}  # number of values by key; the last override of a key takes precedence
     for override in _parsed(overrides):
@@ -75,9 +77,13 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
 
 
 def check_table(config: DictConfig, overrides: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
-    """Raise ConfigError for an invalid `table` of a sweep, such as an unknown key.
+    """Check the `table` of a sweep.
 
-    A key may exist only with one of the swept options or rows. These are composed if the key is not found otherwise.
+    Some keys exist only with one of the swept options or rows. These configs are composed if a key is not found
+    otherwise.
+
+    Raises:
+        ConfigError: The table is invalid, for example because a key is unknown.
     """
     table = config.get("table")
     if table is None:
@@ -96,7 +102,7 @@ def check_table(config: DictConfig, overrides: Sequence[str], rows: Mapping[str,
 
 
 def _keys_of(config: DictConfig) -> set[str]:
-    """Return the keys of a config that describe a run."""
+    """Return the config keys that describe a run."""
     content = OmegaConf.to_container(config)
     assert isinstance(content, dict)
     plain = {str(key): value for key, value in content.items()}
@@ -124,7 +130,7 @@ def of_tables(overrides: Sequence[str]) -> list[str]:
 
 
 def check_row(chosen: Sequence[str], rows: Collection[str]) -> None:
-    """Raise ConfigError if a chosen row is not among the `rows` of the experiment."""
+    """Raise ConfigError if a row does not exist in the experiment."""
     for row in chosen:
         if row not in rows:
             close = get_close_matches(row, rows, n=1)
@@ -133,10 +139,10 @@ def check_row(chosen: Sequence[str], rows: Collection[str]) -> None:
 
 
 def error_of_first_run(words: Sequence[str]) -> HydraException | None:
-    """Return the error in the config of the first run of a sweep; None = no error.
+    """Return the error in the config of the first run of a sweep, if any.
 
-    If the experiment's config cannot be composed, Hydra treats the command line as a single run and reports its swept
-    values as errors. `words` is the command line.
+    If the config of the experiment cannot be composed, Hydra reports the swept values as errors instead. `words` is the
+    command line.
     """
     overrides = [word for word in words if word.startswith("~") or ("=" in word and not word.startswith("-"))]
     try:
@@ -148,11 +154,11 @@ def error_of_first_run(words: Sequence[str]) -> HydraException | None:
 
 
 def single_run(overrides: Sequence[str]) -> list[str]:
-    """Return the overrides of the first run of a sweep: the first value of each swept key."""
+    """Return the overrides of the first run of a sweep."""
     chosen = []
     for override in _parsed(overrides):
         values = _values(override)
-        swept = override.value_type in COUNTED and values
+        swept = override.value_type in COUNTED and values  # the first run has the first value of each key
         chosen.append(f"{override.get_key_element()}={values[0]}" if swept else str(override.input_line))
     return chosen
 
@@ -162,7 +168,7 @@ def _parsed(overrides: Sequence[str]) -> list[Override]:
 
 
 def _values(override: Override) -> list[str]:
-    """Return the values of an override in order; [] if they are known only to Hydra, as for a glob()."""
+    """Return the values of an override. The list is empty if only Hydra can determine them, as for a glob()."""
     try:
         return [*override.sweep_string_iterator()] if override.is_sweep_override() else [str(override.value())]
     except HydraException:

@@ -1,6 +1,6 @@
 """`instancemap detect detector=X dataset=D out=FILE`: write detections of a sequence to a COCO results file.
 
-If the sequence has ground truth, the command also reports the AP of masks and boxes, and the rates of detection errors.
+For a sequence with ground truth, the command also reports the AP of masks and boxes, and the rates of detection errors.
 With -m, each job has its own file, and a table compares the jobs.
 """
 
@@ -76,7 +76,7 @@ def job(config: DictConfig) -> None:
 
 
 def as_argument(key: str, path: Path) -> str:
-    """Return an override for the shell; a path with other characters, such as those of a job's folder, is quoted."""
+    """Return an override for the shell, quoted if necessary."""
     if re.fullmatch(r"[\w./-]+", str(path)):
         return f"{key}={path}"
     escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
@@ -84,7 +84,11 @@ def as_argument(key: str, path: Path) -> str:
 
 
 def file_of_job(out: object, folder: Path) -> Path:
-    """Return the output file of a job of a sweep: the name `out` in the job's folder. Raises ConfigError."""
+    """Return the output file of a job of a sweep.
+
+    Raises:
+        ConfigError: `out` is not a file name without a folder.
+    """
     name = checked_path("out", out).name
     if name != out:
         raise ConfigError(
@@ -98,7 +102,10 @@ def file_of_job(out: object, folder: Path) -> Path:
 def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> DetectionMetrics:
     """Write a COCO results file for `detector=precomputed`, and return its metrics.
 
-    Unusable frames are logged and skipped. Raises DataError if no frame is usable.
+    Unusable frames are logged and skipped.
+
+    Raises:
+        DataError: No frame is usable.
     """
     from framework.detection.domain import warn_outside_domain
     from framework.detection.stored.coco_results import results_file
@@ -129,7 +136,10 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
 def _written(
     results: ResultWriter, detector: Detector, sequence: RGBDSequence, errors: DetectionErrors
 ) -> Iterator[tuple[Bool, list[str | None], Detections]]:
-    """Write the detections frame by frame. With ground truth, count errors, and yield the input of `detection_ap`."""
+    """Write the detections of each frame, and yield the input of `detection_ap`.
+
+    For frames with ground truth, errors are also counted.
+    """
     with logging_redirect_tqdm(), tqdm(total=len(sequence), unit=" frames", disable=None, dynamic_ncols=True) as bar:
         for k in range(len(sequence)):
             bar.update()
@@ -152,12 +162,12 @@ def _written(
                 yield true_ids == ids[:, None, None], [names[i] for i in ids.tolist()], found
     if results.frames == 0:
         raise DataError(
-            f"{sequence.name}: expected usable frames, got none of {len(sequence)}; the log lists the reasons"
+            f"{sequence.name}: expected usable frames, got none among {len(sequence)}; the log lists the reasons"
         )
 
 
 def write_labels(path: Path, classes: tuple[str, ...]) -> Path:
-    """Write the class names to a text file next to a results file, one per line, and return its path."""
+    """Write the class names, one per line, to a text file next to a results file, and return its path."""
     from framework.files.atomic_write import atomic_write
 
     labels = path.with_suffix(".labels.txt")
@@ -167,7 +177,10 @@ def write_labels(path: Path, classes: tuple[str, ...]) -> Path:
 
 
 class TableCallback(Callback):
-    """Hydra callback that prints the table of the jobs at the end of a sweep, also after errors."""
+    """Hydra callback that prints the table of the jobs at the end of a sweep.
+
+    The table is also printed after errors.
+    """
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         ending.callback(print_table, Path(config.hydra.sweep.dir).absolute(), swept_keys(overrides_of(config.hydra)))

@@ -34,10 +34,7 @@ jobs = Jobs()
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 @jobs.reported
 def job(config: DictConfig) -> float | list[float] | None:
-    """Build the stages of the config, map the sequence and write the outputs to Hydra's directory.
-
-    Returns the objective for Hydra's sweeper.
-    """
+    """Execute a run with the config and output directory of Hydra, and return its objective."""
     hydra_config = HydraConfig.get()
     in_worker = is_of_sweep(hydra_config) and by_joblib(hydra_config) and parent_process() is not None
     with job_of_worker() if in_worker else nullcontext():
@@ -45,7 +42,7 @@ def job(config: DictConfig) -> float | list[float] | None:
 
 
 def run_job(config: DictConfig, hydra_config: HydraConf) -> float | list[float] | None:
-    """Execute a single run, or one job of a sweep. Returns its objective."""
+    """Execute a single run, or one job of a sweep, and return its objective."""
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
     objective_keys(config.objective)
@@ -59,17 +56,24 @@ def run_job(config: DictConfig, hydra_config: HydraConf) -> float | list[float] 
 
 
 def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) -> Interruption:
-    """Map the sequence or live video of the config, and write the outputs to `directory`.
+    """Map the sequence or live video of the config, and write the outputs.
 
-    `choices` contains the chosen option of each config group. A run ends in one of three ways:
+    A signal, an error of a stage or a disk error ends a run early. If at least one frame was mapped, the available
+    outputs are written and marked as partial. The first signal takes effect after the current frame or output, the
+    second signal immediately.
 
-    - completed: the outputs are complete. The returned Interruption contains a signal that arrived during writing, or
-      that ended a live video.
-    - partial: a signal, an error of a stage or a disk error ended the run after the first mapped frame. The available
-      outputs are written and marked as partial. Raises Interrupted, or PartialRunError with the error as its cause.
-    - nothing was mapped: raises the error that ended the run.
+    Args:
+        config: Config of the run.
+        directory: Output directory.
+        choices: Chosen option of each config group.
 
-    The first signal takes effect after the current frame or output, the second signal immediately.
+    Returns:
+        A record of the signal that arrived during writing or ended a live video, if any.
+
+    Raises:
+        Interrupted: A signal ended the run early.
+        PartialRunError: An error ended the run early. The error is its cause. If no frame was mapped, the error itself
+            is raised.
     """
     from framework.api import begin  # local: after Hydra has checked the names
     from framework.compilation.catalog import compile_for_run

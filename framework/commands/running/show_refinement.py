@@ -60,12 +60,17 @@ def job(config: DictConfig) -> None:
 
 
 def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tuple[int, Frame, Detections]:
-    """Return a position among the selected frames, its frame and the detections.
+    """Return a frame with its position in the selection and its detections.
 
-    If `position` is None, the candidate frame with the most detections is returned.
+    Args:
+        sequence: Sequence.
+        detector: Detector.
+        position: Position among the selected frames; None = candidate frame with the most detections.
 
-
-    Raises ConfigError for an invalid position, FrameError for an unusable frame, DataError if no candidate is usable.
+    Raises:
+        ConfigError: The position is invalid.
+        FrameError: The frame is unusable.
+        DataError: No candidate frame is usable.
     """
     from framework.detection.domain import warn_outside_domain
 
@@ -90,12 +95,13 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
         if best is None or len(found) > len(best[2]):
             best = k, frame, found
     if best is None:
-        raise DataError(f"{sequence.name}: expected a usable frame, got none of {len(tried)} candidates; set frame=K")
+        fix = "set frame to the number of a usable frame"
+        raise DataError(f"{sequence.name}: expected a usable frame, got none among {len(tried)} candidates; {fix}")
     return best
 
 
 def called(refiner: str, overrides: Iterable[str]) -> str:
-    """Return the overrides on the command line that select the refiner and set its parameters, as one string."""
+    """Return the overrides that select the refiner and set its parameters, as one string."""
     return " ".join(
         [f"refiner={refiner}", *(item for item in overrides if item.lstrip("+~").startswith(("refiner.", "refiner@")))]
     )

@@ -41,12 +41,15 @@ WORKER_START = f"{end_with_parent.__module__}.{end_with_parent.__name__}"
 
 
 def cores_of(threads: int) -> int:
-    """Return the number of cores for a job with `threads` threads; `threads` 0 = all cores."""
+    """Return the number of cores for a job with `threads` threads, where 0 means all cores."""
     return threads or available_cores()
 
 
 def jobs_at_once(threads: int) -> int:
-    """Return the number of jobs with `threads` threads each that run concurrently on this machine, at least 1."""
+    """Return the number of jobs that run concurrently on this machine, at least 1.
+
+    Each job has `threads` threads, where 0 means all cores.
+    """
     return max(1, available_cores() // cores_of(threads))
 
 
@@ -84,7 +87,11 @@ class DirectoryLockCallback(Callback):
 
 
 def directory_of(key: str, chosen: str) -> Path:
-    """Return the directory `chosen` for `key`. Raises ConfigError for an empty name (the working directory)."""
+    """Return the directory of a config key.
+
+    Raises:
+        ConfigError: The name is empty, which would be the working directory.
+    """
     if not chosen.strip():
         raise ConfigError(f"{key}: expected a folder, got an empty name; set {key}=. for the working directory")
     return Path(chosen)
@@ -92,7 +99,11 @@ def directory_of(key: str, chosen: str) -> Path:
 
 @contextmanager
 def run_in(directory: Path, wait: bool) -> Iterator[None]:
-    """Lock the directory of a run inside the context. Raises DataError if it is in use and `wait` is False."""
+    """Lock the directory of a run in the `with` body.
+
+    Raises:
+        DataError: The directory is in use and `wait` is False.
+    """
     with locked(directory, wait):
         if (directory / LOG).exists():
             check_regular(directory / LOG)  # Hydra would block on a pipe
@@ -100,10 +111,10 @@ def run_in(directory: Path, wait: bool) -> Iterator[None]:
 
 
 def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[None]:
-    """Return the context of a sweep. Raises InstanceMapError if the sweep has no runs.
+    """Return the context of a sweep.
 
-    joblib is limited to one worker per run. Otherwise, a signal from the terminal would end an idle worker, and joblib
-    would then end all workers.
+    Raises:
+        InstanceMapError: The sweep has no runs or its config is invalid.
     """
     own = config.hydra
     overrides, rows = overrides_of(own), checked_rows(config.get("rows"))
@@ -117,6 +128,7 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
     _name_by(own, swept_keys(overrides), of_tables(overrides))
     workers = 0
     if by_joblib(own):
+        # a signal from the terminal would end an idle worker, and joblib would then end all workers
         workers = min(joblib_workers(own.launcher.n_jobs), runs)
         with flag_override(own.launcher, ["readonly", "struct"], [False, False]):
             own.launcher.n_jobs = workers
@@ -126,21 +138,21 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
 
 
 def overrides_of(own: DictConfig) -> list[str]:
-    """Return the overrides of a sweep: first those of the experiment, then those of the command line."""
+    """Return the overrides of a sweep, those of the experiment first."""
     swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
     return [*swept, *own.overrides.task]
 
 
 def _name_by(own: DictConfig, swept: Collection[str], of_outputs: Collection[str]) -> None:
-    """Include swept keys in the names of job directories, even if they do not affect results, and omit `of_outputs`.
+    """Include all swept keys in the names of the job directories, and omit the keys `of_outputs`.
 
-    Otherwise, jobs that differ only in such keys would share a directory. The function extends Hydra's overrides,
-    because workers compose each job again from them.
+    Otherwise, jobs that differ only in keys without effect on results would share a directory.
     """
     left_out = [*own.job.config.override_dirname.exclude_keys]
     still = [*(key for key in left_out if key not in swept), *(key for key in of_outputs if key not in left_out)]
     if still != left_out:
         with flag_override(own, ["readonly", "struct"], [False, False]):
+            # workers compose each job again from these overrides
             own.overrides.hydra.append(f"hydra.job.config.override_dirname.exclude_keys=[{','.join(still)}]")
 
 
@@ -150,7 +162,7 @@ def by_joblib(own: DictConfig | HydraConf) -> bool:
 
 
 def joblib_workers(n_jobs: int | None) -> int:
-    """Return the number of worker processes that joblib starts for `n_jobs`; 1 = jobs run in this process."""
+    """Return the number of worker processes that joblib starts. With 1, jobs run in this process."""
     from joblib import effective_n_jobs  # type: ignore[import-untyped]
 
     return int(effective_n_jobs(n_jobs))
@@ -158,11 +170,18 @@ def joblib_workers(n_jobs: int | None) -> int:
 
 @contextmanager
 def sweep_in(directory: Path, with_table: bool, with_figure: bool, workers: bool = False) -> Iterator[None]:
-    """Lock the directory of a sweep inside the context. At the end, print the table of its runs, even after an error.
+    """Lock the directory of a sweep in the `with` body, and print the table of its runs at the end.
 
-    With `with_figure`, the figure is also drawn, except after Ctrl-C. With `workers`, signals are forwarded to the
-    workers, which store partial results before the sweep ends. Raises InstanceMapError if a launcher fails because a
-    worker was killed.
+    The table is also printed after an error.
+
+    Args:
+        directory: Directory of the sweep.
+        with_table: Write and print the table.
+        with_figure: Draw the figure, except after Ctrl-C.
+        workers: Forward signals to worker processes, which write partial outputs before the sweep ends.
+
+    Raises:
+        InstanceMapError: A launcher failed because a worker was killed.
     """
     # Python's resource tracker would warn when joblib stops its workers
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker")))
@@ -184,13 +203,12 @@ def sweep_in(directory: Path, with_table: bool, with_figure: bool, workers: bool
 
 
 def at_work_in(directory: Path) -> list[BaseProcess]:
-    """Return the child processes that are executing a run in `directory`."""
+    """Return the worker processes that are executing a run in a directory of a sweep."""
     busy = {holder(run) for run in directory.iterdir() if is_locked(run)}
     return [worker for worker in active_children() if holder_name(worker.pid) in busy]
 
 
 def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
-    """Write the tables and the figure of the runs in `directory`."""
     if with_table:
         from framework.tables.experiment_tables import write_tables
 
@@ -203,5 +221,5 @@ def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
 
 
 def _is_of_a_launcher(error: BaseException) -> bool:
-    """Return True for an error of a launcher: a RuntimeError, as raised by joblib and submitit, or an error of Ray."""
+    # joblib and submitit raise a RuntimeError
     return isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] == "ray"

@@ -1,4 +1,4 @@
-"""Readers of cameras and numbers in JSON files with format-specific keys."""
+"""Camera calibrations in JSON files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class StoredCamera(NamedTuple):
-    """Calibration of a recording: camera, depth scale, lens distortion and kind of the depth sensor."""
+    """Calibration of a recording."""
 
     camera: Camera
     depth_scale: float  # units per meter
@@ -34,7 +34,15 @@ class StoredCamera(NamedTuple):
 
 
 def read_json_object(path: Path, most: int = MAX_TEXT) -> dict[str, Any]:
-    """Return the JSON object in a file of at most `most` bytes. Raises a DataError that names the file."""
+    """Read the JSON object in a file.
+
+    Args:
+        path: The JSON file.
+        most: The maximum size of the file, bytes.
+
+    Raises:
+        DataError: The file is too large or contains no JSON object.
+    """
     found = read_json(path, most)
     if not isinstance(found, dict):
         raise DataError(f"{path}: expected a JSON object, got {type(found).__name__}")
@@ -42,7 +50,11 @@ def read_json_object(path: Path, most: int = MAX_TEXT) -> dict[str, Any]:
 
 
 def read_camera(path: Path) -> StoredCamera:
-    """Return the calibration in a camera.json. Raises a DataError that names the file and the key."""
+    """Read the calibration in a camera.json.
+
+    Raises:
+        DataError: The file is invalid, or a key is missing or has an invalid value.
+    """
     content = read_json_object(path)
     check_keys(path, content, (*CAMERA_KEYS, DISTORTION, SENSOR))
     camera = camera_of(path, content, CAMERA_KEYS)
@@ -50,10 +62,15 @@ def read_camera(path: Path) -> StoredCamera:
 
 
 def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tuple[Camera, float]:
-    """Return the camera and the depth scale (units per meter) from the values of `keys`.
+    """Return the camera and the depth scale (units per meter) in the content of a JSON file.
 
-    `keys` are the names of the CAMERA_KEYS in this file, in the same order. Raises a DataError that names the file and
-    the key.
+    Args:
+        path: The file, for error messages.
+        content: The JSON object in the file.
+        keys: The keys of this file format, in the order of CAMERA_KEYS.
+
+    Raises:
+        DataError: A key is missing or has an invalid value.
     """
     *camera, depth_scale = numbers_of(path, content, *keys)
     if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
@@ -65,9 +82,9 @@ def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tu
 
 
 def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Camera:
-    """Return the pinhole camera with this image size and these intrinsics, px.
+    """Return a pinhole camera.
 
-    Raises a DataError that names `where` if they are invalid.
+    The image size and the intrinsics are in px. DataError names `where` if they are invalid.
     """
     if width != int(width) or height != int(height):
         raise DataError(f"{where}: width, height: expected whole numbers of px, got {width:g}x{height:g}")
@@ -76,7 +93,11 @@ def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float
 
 
 def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Log unknown keys. Raises DataError for a probable misspelling of a known key."""
+    """Log a warning for unknown keys.
+
+    Raises:
+        DataError: An unknown key is similar to a known key and is probably misspelled.
+    """
     unread = [key for key in content if key not in known]
     for key in unread:
         close = get_close_matches(key.lower(), known, n=1, cutoff=0.8)
@@ -87,9 +108,10 @@ def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> 
 
 
 def number_list(where: Path | str, values: Any, count: int) -> list[float]:
-    """Return the numbers of a JSON list.
+    """Return a JSON list of numbers as floats.
 
-    Raises a DataError that names `where` if `values` is not a list of `count` finite numbers.
+    Raises:
+        DataError: `values` is not a list of `count` finite numbers.
     """
     if not isinstance(values, list) or len(values) != count or not all(map(_is_number, values)):
         raise DataError(f"{where}: expected a list of {count} numbers, got {values!r:.60}")
@@ -97,7 +119,11 @@ def number_list(where: Path | str, values: Any, count: int) -> list[float]:
 
 
 def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> list[float]:
-    """Return the finite numbers under `keys` in `content`. Raises a DataError that names `where` and the key."""
+    """Return the values of several keys as floats.
+
+    Raises:
+        DataError: A key is missing, or its value is not a finite number.
+    """
     for key in keys:
         if key not in content:
             raise DataError(f"{where}: expected a key {key!r}, got none")
@@ -107,9 +133,12 @@ def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> lis
 
 
 def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
-    """Return the lens distortion in the content of a camera.json; None = pinhole camera.
+    """Return the lens distortion in the content of a camera.json.
 
-    Raises DataError if it is not a list of five finite numbers.
+    The result is None for a pinhole camera, i.e. without the key.
+
+    Raises:
+        DataError: The value is not a list of five finite numbers.
     """
     if DISTORTION not in content:
         return None
@@ -117,9 +146,12 @@ def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
 
 
 def sensor_of(path: Path, content: Mapping[str, Any]) -> SensorKind:
-    """Return the kind of the depth sensor in the content of a camera.json; KINECT_V1 if missing.
+    """Return the kind of the depth sensor in the content of a camera.json.
 
-    Raises DataError if it is not the name of a SensorKind.
+    The default is KINECT_V1.
+
+    Raises:
+        DataError: The value is not the name of a SensorKind.
     """
     name = content.get(SENSOR, SensorKind.KINECT_V1.name)
     if not isinstance(name, str) or name not in SensorKind.__members__:

@@ -1,4 +1,7 @@
-"""Registration of color to a depth camera with the same pose but different image size and intrinsics."""
+"""Registration of color images to depth images.
+
+The two cameras have the same pose, but can differ in image size and intrinsics.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,11 @@ LONGEST_SIDE = 2**15 - 2  # px, limit of OpenCV's warp
 
 @dataclass(frozen=True)
 class ColorRegistration:
-    """Warp of color images to the depth camera. Raises DataError if the intermediate image is too large."""
+    """Resampling of color images to the pixels of the depth camera.
+
+    Raises:
+        DataError: The resolutions of the cameras differ too much.
+    """
 
     color: Camera
     depth: Camera
@@ -33,16 +40,17 @@ class ColorRegistration:
 
     @property
     def _fine(self) -> int:
-        """Color pixels per depth pixel along an axis, rounded, at least 1."""
+        """Oversampling factor: the number of color pixels per depth pixel along an axis."""
         return max(1, round(min(self.color.fx / self.depth.fx, LONGEST_SIDE)))
 
     def apply(self, image: UInt8) -> UInt8:
-        """Return the color image (H, W, 3) of the depth camera, resampled from an image of the color camera.
+        """Resample an image of the color camera to the pixels of the depth camera.
 
-        Each pixel is the mean color of its area. The image is resampled bilinearly at `fine` times the resolution of
-        the depth camera, then averaged over fine x fine pixels. Outside the color image, the nearest color is repeated.
+        The result has the shape (H, W, 3). Each pixel is the mean color of its area. Pixels outside the color image
+        have the color of the nearest image border.
         """
         fine = self._fine
+        # bilinear resampling at `fine` times the resolution of the depth camera, then the mean of fine x fine pixels;
         # pixel i of the fine image has its center at (i + 1/2) / fine - 1/2 in the depth image
         u, u_0 = _line(self.color.fx, self.color.cx, self.depth.fx, self.depth.cx, fine)
         v, v_0 = _line(self.color.fy, self.color.cy, self.depth.fy, self.depth.cy, fine)
@@ -58,7 +66,7 @@ class ColorRegistration:
 
 
 def registered_images(images: StoredImages, registration: ColorRegistration) -> StoredImages:
-    """Return the images of a frame. Color is registered to the depth camera when it is read."""
+    """Return the images of a frame, with color registered to depth on reading."""
     return replace(images, color=partial(_registered_color, images, registration))
 
 
@@ -72,6 +80,6 @@ def _registered_color(images: StoredImages, registration: ColorRegistration) -> 
 
 
 def _line(f_color: float, c_color: float, f_depth: float, c_depth: float, fine: int) -> tuple[float, float]:
-    """Return (a, b): the pixel coordinate i in the fine image corresponds to a i + b in the color image."""
+    """Return (a, b) for the mapping of a coordinate i of the oversampled image to a * i + b in the color image."""
     slope = f_color / f_depth
     return slope / fine, slope * (0.5 / fine - 0.5 - c_depth) + c_color

@@ -1,4 +1,4 @@
-"""Conversion of raw sensor images: depth unit, depth range and lens undistortion."""
+"""Conversion of raw sensor images to metric depth and undistorted images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NO_READING = 65535  # uint16, written by some sensors instead of 0
 
 
 def check_max_depth(max_depth: float) -> None:
-    """Raise ConfigError for a maximum depth (m) that is negative or not finite."""
+    """Raise ConfigError if the maximum depth is negative or not finite."""
     require(
         math.isfinite(max_depth) and max_depth >= 0,
         "dataset.max_depth",
@@ -28,7 +28,11 @@ def check_max_depth(max_depth: float) -> None:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera and the properties of its images. Raises DataError for an invalid lens distortion."""
+    """A camera with its depth scale and lens distortion.
+
+    Raises:
+        DataError: The lens distortion does not fit the camera.
+    """
 
     camera: Camera
     source: Path | str  # file or parameter with the camera, for messages
@@ -41,12 +45,20 @@ class Calibration:
         object.__setattr__(self, "lens", Undistortion(self.camera, self.distortion) if self.distortion else None)
 
     def color(self, raw: UInt8, name: Path | str) -> UInt8:
-        """Return the undistorted color (H, W, 3), RGB. Raises a FrameError that names an image of the wrong size."""
+        """Return the undistorted color image (H, W, 3), RGB.
+
+        Raises:
+            FrameError: The image has the wrong size.
+        """
         self.check_size(name, raw.shape)
         return self.lens.smooth(raw) if self.lens else raw
 
     def depth(self, raw: UInt16, name: Path | str) -> Float32:
-        """Return the depth (H, W) in m, 0 = no reading. Raises a FrameError that names an image of the wrong size."""
+        """Return the undistorted depth (H, W), m, 0 = no reading.
+
+        Raises:
+            FrameError: The image has the wrong size.
+        """
         self.check_size(name, raw.shape)
         depth = raw.astype(np.float32)
         depth /= np.float32(self.depth_scale)
@@ -56,12 +68,16 @@ class Calibration:
         return self.lens.exact(depth) if self.lens else depth
 
     def labels(self, raw: UInt16, name: Path | str) -> UInt16:
-        """Return the undistorted instance ids (H, W). Raises a FrameError that names an image of the wrong size."""
+        """Return the undistorted instance ids (H, W).
+
+        Raises:
+            FrameError: The image has the wrong size.
+        """
         self.check_size(name, raw.shape)
         return self.lens.exact(raw) if self.lens else raw
 
     def check_size(self, name: Path | str, shape: tuple[int, ...]) -> None:
-        """Raise FrameError that names the image if its size differs from the size of the camera's images."""
+        """Raise FrameError if an image does not have the size of the camera."""
         if shape[:2] != self.camera.shape:
             expected = f"expected {self.camera.width}x{self.camera.height} px as in {self.source}"
             raise FrameError(f"{name}: {expected}, got {shape[1]}x{shape[0]} px")

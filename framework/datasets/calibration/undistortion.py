@@ -1,7 +1,7 @@
-"""Lens undistortion.
+"""Lens undistortion with the Brown-Conrady model.
 
-The lens model is Brown-Conrady, as in OpenCV. A point (x, y, 1) m in the camera frame projects to the pixel
-(fx x' + cx, fy y' + cy) of the recorded image. With r^2 = x^2 + y^2:
+The convention is that of OpenCV. A point (x, y, 1) in the camera frame projects to the pixel (fx x' + cx, fy y' + cy)
+of the recorded image. With r^2 = x^2 + y^2:
 
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -25,7 +25,10 @@ FARTHEST_SHIFT = 0.5  # maximum shift of a pixel, as a fraction of the image wid
 
 @dataclass(frozen=True)
 class Distortion:
-    """Distortion coefficients of a lens; all 0 = pinhole camera."""
+    """Distortion coefficients of a lens.
+
+    All coefficients are 0 for a pinhole camera.
+    """
 
     k1: float = 0.0
     k2: float = 0.0
@@ -38,7 +41,12 @@ class Distortion:
             raise DataError(f"distortion (k1, k2, p1, p2, k3): expected finite coefficients, got {astuple(self)}")
 
     def distorted(self, camera: Camera, pixels: Float64) -> Float64:
-        """Map `pixels` (N, 2), px, of the pinhole camera to positions (N, 2), px, in the recorded image."""
+        """Return the positions (N, 2), px, of pixels of the pinhole camera in the recorded image.
+
+        Args:
+            camera: The pinhole camera.
+            pixels: The pixels (N, 2), px.
+        """
         x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -50,8 +58,10 @@ class Distortion:
 class Undistortion:
     """Conversion of recorded images to a pinhole camera with the same intrinsics.
 
-    Depth is still measured along the optical axis. Pixels outside the recorded image become 0. Raises DataError for
-    coefficients that do not fit the camera.
+    Pixels outside the recorded image become 0.
+
+    Raises:
+        DataError: The coefficients do not fit the camera.
     """
 
     def __init__(self, camera: Camera, distortion: Distortion) -> None:
@@ -68,9 +78,9 @@ class Undistortion:
         self._u, self._v = source.T.reshape(2, *camera.shape).astype(np.float32)
 
     def smooth(self, image: UInt8) -> UInt8:
-        """Return the undistorted colors (H, W, 3), with bilinear interpolation."""
+        """Undistort a color image (H, W, 3) with bilinear interpolation."""
         return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR), np.uint8)
 
     def exact(self, image: NDArray[Value]) -> NDArray[Value]:
-        """Return the undistorted depth or labels (H, W), float32 or uint16, with nearest-neighbor sampling."""
+        """Undistort a depth or label image (H, W) with nearest-neighbor sampling."""
         return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_NEAREST), image.dtype)

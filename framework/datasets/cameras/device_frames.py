@@ -1,4 +1,4 @@
-"""Depth cameras, read with the libraries of their vendors."""
+"""Live depth cameras, read with the vendors' libraries."""
 
 from __future__ import annotations
 
@@ -29,14 +29,17 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class DepthCamera(LiveVideo):
-    """A depth camera with factory calibration. The vendor's library registers depth to color."""
+    """A depth camera with factory calibration.
+
+    The vendor's library registers depth to color.
+    """
 
     brand: ClassVar[str]
     default_sensor: ClassVar[SensorKind]  # kind of the depth sensor in devices with unknown names
     serial: str = ""  # serial number of the device; "" = the first device found
     width: int = 640  # width of the color image and of the registered depth image, px, in [64, 4096]
     height: int = 480  # height of the color image and of the registered depth image, px, in [64, 4096]
-    # frame rate, Hz, in [1, 300]; width, height and fps must be a mode of the device
+    # frame rate, Hz, in [1, 300]; width, height and fps must match a mode of the device
     fps: int = 30
     max_depth: float = 10.0  # maximum depth, m, >= 0; farther readings are dropped; 0 = unlimited
     # delay of color relative to depth at equal timestamps, s, in [-0.2, 0.2]; positive = color captured later; AUTO =
@@ -60,39 +63,50 @@ class DepthCamera(LiveVideo):
     def start(self) -> None:
         """Start streaming.
 
-        Raises ConfigError if the library is not installed, and one of `self.errors` if the device cannot stream.
+        Raises:
+            ConfigError: The library is not installed.
+            Exception: The device cannot stream. The type is one of `self.errors`.
         """
 
     @abstractmethod
     def stop(self) -> None:
-        """Stop streaming after a successful start."""
+        """Stop streaming."""
 
     @abstractmethod
     def wait(self) -> Any:
-        """Return the color and depth images in the library's type, not yet registered; None = none within WAIT_MS."""
+        """Return the next pair of images, or None if none arrives within WAIT_MS.
+
+        The images are not registered yet and have the type of the vendor's library.
+        """
 
     @abstractmethod
     def calibrate(self, images: Any) -> Calibration | None:
-        """Return the calibration of the color camera, or None if these images do not contain it."""
+        """Return the calibration of the color camera, or None if the images do not contain the calibration."""
 
     @abstractmethod
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
-        """Return copies of color (H, W, 3), RGB, and registered depth (H, W) in device units; None = missing."""
+        """Return copies of the color image (H, W, 3), RGB, and of the registered depth (H, W).
+
+        Depth is in device units. A missing image is None.
+        """
 
     @abstractmethod
     def device_name(self) -> str:
         """Return the model name of the streaming device, such as "Intel RealSense D435"."""
 
     def depth_after_color(self, images: Any) -> float | None:
-        """Return the time from the color image to the depth image in s, on the device's clock; None = unknown."""
+        """Return the delay of the depth image after the color image in s, or None if unknown."""
         return None
 
     def distortion(self, coefficients: Sequence[float], model: object, brown_conrady: object) -> Distortion | None:
-        """Return the lens distortion; None = pinhole camera.
+        """Return the lens distortion, or None for a pinhole camera.
 
-        `coefficients` are k1, k2, p1, p2, k3 and possibly others. `model` is the lens model of the device, and
-        `brown_conrady` is the library's name for the supported model. Other models, and nonzero coefficients after k3,
-        are logged, and the distortion is ignored.
+        An unsupported lens model is logged and ignored.
+
+        Args:
+            coefficients: The coefficients k1, k2, p1, p2, k3, and possibly others that must be 0.
+            model: The lens model of the device.
+            brown_conrady: The supported lens model, as defined by the vendor's library.
         """
         if not any(coefficients):
             return None
@@ -135,7 +149,11 @@ class DepthCamera(LiveVideo):
             self.stop()
 
     def _frame(self, images: Any, number: int, timestamp: float, calibration: Calibration, sensor: SensorKind) -> Frame:
-        """Return the registered frame. Raises FrameError if an image is missing or registration fails."""
+        """Return the registered frame.
+
+        Raises:
+            FrameError: An image is missing, or registration fails.
+        """
         try:
             color, depth = self.read(images)
         except self.errors as error:
@@ -156,7 +174,11 @@ class DepthCamera(LiveVideo):
 
 
 def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images | None]:
-    """Yield the results of `wait`, None = no images. Raises DataError after LONGEST_SILENCE seconds without images."""
+    """Yield the images returned by `wait`, including None.
+
+    Raises:
+        DataError: No images arrive for LONGEST_SILENCE seconds.
+    """
     last_time = time.monotonic()
     while True:
         images = wait()

@@ -1,13 +1,15 @@
-"""Live frames written into a folder by another program during mapping, with the layout of dataset=rgbd_folder.
+"""Live frames from a folder that another program writes during mapping.
+
+The layout is that of `dataset=rgbd_folder`:
 
     camera.json         as in an RGB-D folder; may appear after the start
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
     end                 an empty file, written after the last frame
 
-A frame is complete when both of its files exist; their order does not matter. Write each file under a name that begins
-with a dot, then rename it. Numbers must increase. A frame is skipped if it is still incomplete when a later frame is
-complete or the sequence ends. You can remove the files of earlier frames during the run.
+A frame is complete when both of its files exist, in any order. To write a file, use a temporary name that begins with a
+dot, then rename the file. Frame numbers must increase. A frame is skipped if it is still incomplete when a later frame
+is complete or the sequence ends. Files of earlier frames can be deleted during the run.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class FolderWatch(LiveVideo):
-    """Frames written into a folder by another program during mapping."""
+    """Frames from a folder that another program writes during mapping."""
 
     root: Path  # existing folder of frames from another program, relative to the working or project directory
     idle_timeout: float = 0.0  # maximum time without a new frame before the run ends, s, in [0, 86400]; 0 = unlimited
@@ -81,7 +83,7 @@ class FolderWatch(LiveVideo):
             time.sleep(min(max(self.poll_interval, MIN_REST * (time.monotonic() - began)), 0.1))
 
     def _calibration(self) -> Generator[None, None, tuple[Calibration, SensorKind]]:
-        """Wait for a complete camera.json and return the calibration and the kind of the depth sensor."""
+        """Wait for camera.json and return the calibration and the kind of the depth sensor."""
         path, deadline = self.folder / "camera.json", time.monotonic() + self.camera_timeout
         while True:
             try:
@@ -101,7 +103,6 @@ class FolderWatch(LiveVideo):
 def _read(
     number: int, images: StoredImages | str, timestamp: float, calibration: Calibration, sensor: SensorKind
 ) -> Frame:
-    """Read a frame. Raises FrameError if it is unusable."""
     if isinstance(images, str):
         raise FrameError(images)
     color = calibration.color(images.color(), images.color_name)
@@ -110,7 +111,7 @@ def _read(
 
 
 class Arrivals:
-    """New frames in a folder, from the images that arrived since the last poll."""
+    """Detector of new frames in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._color, self._depth = NewImages(folder / "color", COLOR), NewImages(folder / "depth", DEPTH)
@@ -118,10 +119,12 @@ class Arrivals:
         self._halves: set[int] = set()  # numbers of skipped frames with only one image so far
 
     def look(self, to_the_end: bool) -> Iterator[tuple[int, StoredImages | str]]:
-        """Yield the new frames in ascending order up to the newest complete frame.
+        """Yield the new frames in ascending order.
 
-        If `to_the_end` is True, later incomplete frames are also yielded. Each item is the frame number, and either
-        the images or the reason for skipping the frame.
+        Each item consists of the frame number and either the images or the reason for skipping the frame.
+
+        Args:
+            to_the_end: True = include all frames; False = include frames up to the newest complete frame.
         """
         self._color.look()
         self._depth.look()
@@ -148,7 +151,7 @@ class Arrivals:
 
 
 class NewImages:
-    """Images of a folder that are not yet assigned to frames."""
+    """Images in a folder that are not yet assigned to frames."""
 
     def __init__(self, folder: Path, suffixes: Sequence[str]) -> None:
         self.folder, self.suffixes = folder, suffixes
@@ -157,7 +160,11 @@ class NewImages:
         self._first: Path | None = None
 
     def look(self) -> None:
-        """Add the new images. Raises DataError if their names differ in more than one number (ambiguous order)."""
+        """Add the images that appeared since the last call.
+
+        Raises:
+            DataError: The names differ in more than one number, so that their order is ambiguous.
+        """
         try:
             with os.scandir(self.folder) as entries:
                 names = {entry.name for entry in entries}

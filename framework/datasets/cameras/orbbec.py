@@ -77,7 +77,7 @@ class Orbbec(DepthCamera):
 
 
 def _pixels(image: Any, dtype: np.dtype[Any], channels: tuple[int, ...]) -> Any:
-    """Return a copy (H, W) or (H, W, 3) of the pixels, or None if `image` is None."""
+    """Return a copy of the pixels, or None without an image."""
     if image is None:
         return None
     raw = np.frombuffer(image.get_data(), dtype)

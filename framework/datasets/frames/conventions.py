@@ -1,6 +1,7 @@
-"""Conventions of stored poses and depth that override the defaults of the format: axes, units, delays.
+"""Conventions of stored poses and depth images, such as axes, units and delays.
 
-`instancemap check` detects the conventions of a recording.
+They can be set if a recording differs from the default of its format. `instancemap check` detects the conventions of a
+recording.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class CameraAxes(Enum):
 
     @property
     def R_axes_camera(self) -> Float64:
-        """Rotation (3, 3) from OpenCV's axes to these axes."""
+        """Rotation matrix (3, 3) from OpenCV's axes to these axes."""
         return _AXES[self.name]
 
 
@@ -50,7 +51,7 @@ _AXES = {
 
 
 class QuaternionOrder(Enum):
-    """Order of the components of a quaternion. The default of the formats is x y z w."""
+    """Order of the components of a quaternion."""
 
     XYZW = "x y z w"
     WXYZ = "w x y z"
@@ -58,7 +59,10 @@ class QuaternionOrder(Enum):
 
 @dataclass(frozen=True)
 class PoseReading:
-    """Convention of stored poses. The default is T_world_camera in OpenCV's axes and meters."""
+    """Convention of stored poses.
+
+    The default is T_world_camera with OpenCV's axes, in meters.
+    """
 
     pose_kind: PoseKind = PoseKind.T_WORLD_CAMERA  # direction of the stored transforms
     camera_axes: CameraAxes = CameraAxes.OPENCV  # camera axes of the stored poses
@@ -76,7 +80,7 @@ class PoseReading:
         )
 
     def pose(self, stored: Float64) -> Float64:
-        """Convert a stored rigid transform (4, 4) to T_world_camera (4, 4) in m and OpenCV's axes."""
+        """Convert a stored rigid transform (4, 4) to T_world_camera (4, 4) with OpenCV's axes, in meters."""
         if self == PoseReading():
             return stored
         T = stored.copy()
@@ -90,9 +94,10 @@ class PoseReading:
 
 
 def color_delay_of(parameter: str) -> float | None:
-    """Return the delay in s set by `dataset.color_delay`; None = AUTO.
+    """Parse `dataset.color_delay` and return the delay in s, or None for AUTO.
 
-    Raises ConfigError for a delay above LONGEST_COLOR_DELAY or any other text.
+    Raises:
+        ConfigError: The text is not a number, or the delay is above LONGEST_COLOR_DELAY.
     """
     if parameter == AUTO:
         return None

@@ -1,4 +1,4 @@
-"""Folders of images with frame numbers at the end of their names."""
+"""Image folders in which each file name ends in the frame number."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from framework.errors import DataError, FrameError
 
 
 def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    """Return the paths of the images in a folder, by the number at the end of the name, in ascending order.
+    """Return the paths of the images in a folder by frame number, in ascending order.
 
-    Raises DataError for a folder without images, a name without a number, or two names with the same number. Names
-    that differ in other digits, such as the decimals of a timestamp, also raise DataError.
+    Each name must end in a unique number. Names must not differ in other digits, such as the decimals of a timestamp.
+
+    Raises:
+        DataError: The folder contains no images, or a name is invalid.
     """
     if not folder.is_dir():
         raise DataError(f"{folder}: expected a folder, got none")
@@ -39,7 +41,10 @@ def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
 
 
 def paired_images(colors: dict[int, Path], depths: dict[int, Path]) -> dict[int, StoredImages]:
-    """Return the color and depth image of each frame by frame number. Reading a missing image raises FrameError."""
+    """Return the color and depth images by frame number.
+
+    If a file is missing, reading the image raises FrameError.
+    """
     numbers = sorted(colors.keys() | depths.keys())
     return {
         k: StoredImages.of_files(*(files.get(k) or _missing(files, k) for files in (colors, depths))) for k in numbers
@@ -47,14 +52,18 @@ def paired_images(colors: dict[int, Path], depths: dict[int, Path]) -> dict[int,
 
 
 def _missing(files: dict[int, Path], number: int) -> Path:
-    """Return the path that a missing image would have, named like the other `files`."""
+    """Return the expected path of a missing image, with a name like those of the other files."""
     first = next(iter(files.values()))
     before = _before_number(first)
     return first.with_stem(before + str(number).zfill(len(first.stem) - len(before)))
 
 
 def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[int, int]:
-    """Return the width and height in px of the first readable image. Raises DataError if no image is readable."""
+    """Return the width and height in px of the first readable image.
+
+    Raises:
+        DataError: No image is readable.
+    """
     errors = []
     for path in paths:
         try:
@@ -68,13 +77,13 @@ def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[in
 
 
 def number_of(path: Path) -> int | None:
-    """Return the number at the end of an image's name, or None if the name does not end in a number."""
+    """Return the number at the end of a file name, or None without a number."""
     digits = path.stem[len(_before_number(path)) :]
     return int(digits) if digits else None
 
 
 def check_one_number(files: Sequence[Path]) -> None:
-    """Raise DataError if image names differ in digits other than their last number."""
+    """Raise DataError if the names of images differ in digits before the frame number."""
     for path in files:
         before, of_first = _before_number(path), _before_number(files[0])
         if before != of_first and re.search("[0-9]", before + of_first):

@@ -1,4 +1,4 @@
-"""Base class of recording readers. A subclass lists the stored frames; `Recording` selects and reads them."""
+"""Base class of dataset readers."""
 
 from __future__ import annotations
 
@@ -56,7 +56,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class StoredImages:
-    """The two images of a frame, registered to each other and read on demand. Reading may raise FrameError."""
+    """The color and depth images of a frame, read on demand.
+
+    The images are registered to each other. Reading them can raise FrameError.
+    """
 
     color_name: Path | str  # file, and position in the file, for messages
     depth_name: Path | str
@@ -71,7 +74,7 @@ class StoredImages:
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """One frame of a recording, with images read on demand."""
+    """One frame of a recording, with images that are read on demand."""
 
     images: StoredImages
     timestamp: float  # s
@@ -88,7 +91,10 @@ class RecordedFrame:
 
     @classmethod
     def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
-        """Return a frame with the pose returned by `pose`, or with the error message if `pose` raises DataError."""
+        """Return a frame with the pose that `pose` returns.
+
+        If `pose` raises DataError, the frame is unusable and contains the error message.
+        """
         try:
             return cls(images, timestamp, pose())
         except DataError as error:
@@ -97,7 +103,7 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class Contents:
-    """Contents of a recording before the frame selection."""
+    """All frames of a recording and their calibration."""
 
     camera: Camera
     camera_source: Path | str  # file or parameter with the camera, for messages
@@ -109,13 +115,13 @@ class Contents:
 
 @dataclass
 class Recording(RGBDSequence):
-    """An RGB-D video on disk. A subclass lists the stored frames (`open`) and provides the recording's ground truth.
+    """An RGB-D video on disk.
 
-    `ground_truth` replaces the recording's own ground truth with a complete mesh, independent of the frame selection.
-    The ground-truth instances in a frame are rendered from this mesh.
+    A subclass implements `open`, which lists all frames. This class selects frames and reads their images. If
+    `ground_truth` is set, its mesh replaces the ground truth of the recording.
 
-    Errors of the whole recording raise DataError when the recording is opened. Errors of one frame raise FrameError
-    when the frame is read. The pipeline counts and skips such frames.
+    Opening an invalid recording raises DataError. Reading an invalid frame raises FrameError, and the pipeline skips
+    the frame.
     """
 
     root: Path  # folder of the recording or of the scenes, relative to the working or project directory
@@ -172,26 +178,31 @@ class Recording(RGBDSequence):
 
     @abstractmethod
     def open(self) -> Contents:
-        """Return the contents of `self.folder`. Raises a DataError that names the file if the format is invalid."""
+        """Return the contents of `self.folder`.
+
+        Raises:
+            DataError: A file is missing or invalid.
+        """
 
     def truth_in(self, index: int) -> FrameTruth | None:
-        """Return the recording's own ground-truth instances in stored frame `index`; None = unknown."""
+        """Return the recording's own ground-truth instances in a frame, or None if unknown.
+
+        Args:
+            index: The index of the frame in the recording.
+        """
         return None
 
     def constant_color_delay(self) -> float | None:
         return color_delay_of(self.color_delay)
 
     def own_scene_truth(self) -> SceneTruth | None:
-        """Return the recording's own ground-truth instances in the world frame of its poses.
-
-        None = no annotation.
-        """
+        """Return the recording's own ground-truth instances, or None without an annotation."""
         return None
 
     def scene_truth(self) -> SceneTruth | None:
-        """Return the ground-truth instances with a trajectory in their world frame.
+        """Return the ground-truth instances and a trajectory in the same world frame.
 
-        None = no annotation or no poses.
+        The result is None without an annotation or without poses.
         """
         named = self.named_truth
         truth = self.own_scene_truth() if named is None else named.mesh.scene_truth()
@@ -233,9 +244,13 @@ class Recording(RGBDSequence):
         )
 
     def metric_depth(self, index: int) -> Float32:
-        """Return the depth (H, W) of stored frame `index` in m, 0 = no reading.
+        """Return the depth (H, W), m, of a frame, 0 = no reading.
 
-        Raises FrameError if the image cannot be read or has the wrong size.
+        Args:
+            index: The index of the frame in the recording.
+
+        Raises:
+            FrameError: The image cannot be read or has the wrong size.
         """
         images = self.contents.frames[index].images
         return self.calibration.depth(images.depth(), images.depth_name)
@@ -255,7 +270,7 @@ class Recording(RGBDSequence):
         return ReferenceTrajectory(times, np.array([one.T_world_camera for one in posed]).reshape(-1, 4, 4), given=True)
 
     def _check_truth_poses(self, named: NamedTruth) -> None:
-        """Raise ConfigError if no selected frame has a pose in the world frame of the named ground truth."""
+        """Raise ConfigError if no selected frame has a pose in the world frame of `ground_truth`."""
         frames = [self.contents.frames[index] for index in self.chosen]
         if any(named.pose(one.timestamp, one.T_world_camera) is not None for one in frames):
             return
@@ -279,10 +294,7 @@ class Recording(RGBDSequence):
             log.warning("%s: %d of %d frames have no odometry", self.name, missing, len(times))
 
     def _check_first_image(self) -> None:
-        """Raise FrameError if the images of the first selected frame have the wrong size.
-
-        Otherwise, every frame would be skipped.
-        """
+        """Raise FrameError if the images of the first selected frame have the wrong size."""
         images = self.contents.frames[self.chosen[0]].images
         for name, read in ((images.color_name, images.color), (images.depth_name, images.depth)):
             try:
@@ -293,7 +305,10 @@ class Recording(RGBDSequence):
 
 
 def delay_poses(frames: Sequence[RecordedFrame], delay: int) -> Sequence[RecordedFrame]:
-    """Return the frames, each with the pose from `delay` frames later, or with an error if there is no such frame."""
+    """Return the frames with the poses of the frames `delay` frames later.
+
+    A frame has an error if there is no such pose.
+    """
     moved = []
     for frame, other in _with_later(frames, delay):
         error = frame.error or (other.error if other else f"expected a pose at an offset of {delay} frames, got none")
@@ -302,7 +317,7 @@ def delay_poses(frames: Sequence[RecordedFrame], delay: int) -> Sequence[Recorde
 
 
 def delay_depth(frames: Sequence[RecordedFrame], delay: int) -> Sequence[RecordedFrame]:
-    """Return the frames, each with the depth image from `delay` frames later.
+    """Return the frames with the depth images of the frames `delay` frames later.
 
     A frame has an error if there is no such depth image.
     """
@@ -318,12 +333,11 @@ def delay_depth(frames: Sequence[RecordedFrame], delay: int) -> Sequence[Recorde
 
 
 def _without_image_times(frame: RecordedFrame) -> RecordedFrame:
-    """Return the frame without separate timestamps of color and depth."""
     return replace(frame, color_timestamp=None, depth_timestamp=None)
 
 
 def _with_plausible_image_times(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
-    """Return the frames, without separate timestamps of color and depth if any of these are implausible."""
+    """Remove the separate timestamps of color and depth if any of them are implausible."""
     offsets = [
         frame.color_timestamp - frame.depth_timestamp
         for frame in frames
@@ -338,15 +352,15 @@ def _with_plausible_image_times(name: str, frames: Sequence[RecordedFrame]) -> S
 
 
 def _with_later(frames: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[RecordedFrame, RecordedFrame | None]]:
-    """Yield each frame and the frame `delay` frames later; None = no such frame."""
+    """Yield each frame together with the frame `delay` frames later, or None without such a frame."""
     for k, frame in enumerate(frames):
         yield frame, frames[k + delay] if 0 <= k + delay < len(frames) else None
 
 
 def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
-    """Return the frame with its pose converted to the default convention.
+    """Convert the pose of a frame to the default convention.
 
-    If the pose is more than FARTHEST m from the origin, the frame has an error instead.
+    A frame has an error instead if the pose is more than FARTHEST m from the origin.
     """
     if recorded.T_world_camera is None:
         return recorded
@@ -360,7 +374,7 @@ def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
 
 
 def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
-    """Return the frames, with timestamps at FRAME_RATE if the timestamps of usable frames do not increase."""
+    """Replace the timestamps by a constant frame rate if they do not increase."""
     times = [recorded.timestamp for recorded in frames if not recorded.error]
     if all(a < b for a, b in pairwise(times)):
         return frames
@@ -389,15 +403,12 @@ def choose_frames(
     The same `seed` always selects the same frames. At least one frame is selected.
 
     Args:
-        count: Number of frames in the recording.
-        start: Index of the first frame.
-        stop: Index after the last frame; TO_THE_END = to the end.
-        stride: Step between frames; 1 = every frame.
-        frame_fraction: Fraction of these frames that is selected at random, in (0, 1]; 1 = all frames.
-        seed: Seed of the random selection.
-
-    Returns:
-        Frame indices from 0.
+        count: The number of frames in the recording.
+        start: The index of the first frame.
+        stop: The index after the last frame; TO_THE_END = to the end.
+        stride: The step between frames; 1 = every frame.
+        frame_fraction: The fraction of these frames that is selected at random, in (0, 1]; 1 = all frames.
+        seed: The seed of the random selection.
 
     Raises:
         ConfigError: A parameter is invalid, or `start` is beyond the last frame.

@@ -1,4 +1,4 @@
-"""Meshes with an instance label for each vertex, as published by datasets of scanned rooms."""
+"""Ground-truth meshes with an instance id for each vertex."""
 
 from __future__ import annotations
 
@@ -17,22 +17,26 @@ from framework.rendering.rasterizer import Rasterizer
 
 @dataclass(frozen=True)
 class LabeledMesh:
-    """The ground-truth surface of a scene with its instances."""
+    """A ground-truth mesh with an instance id for each vertex."""
 
     vertices: Float32  # (V, 3) m, world frame
     triangles: Int32  # (F, 3) vertex indices
     instance_ids: Int32  # (V,), 0 = no instance
-    class_names: Mapping[int, str | None]  # as in FrameTruth
-    classes: tuple[str, ...] | None = None  # as in SceneTruth
+    class_names: Mapping[int, str | None]  # by instance id; None = unknown class, not evaluated
+    classes: tuple[str, ...] | None = None  # all annotated classes; None = unknown
 
     def scene_truth(self) -> SceneTruth:
-        """Return all vertices as points, independent of the frame selection."""
+        """Return the vertices as ground-truth points."""
         return SceneTruth(self.vertices, self.instance_ids, dict(self.class_names), self.classes)
 
     def seen_by(self, camera: Camera, T_world_camera: Float64) -> FrameTruth:
-        """Return the ground truth of a view at the pose T_world_camera (4, 4), rendered on demand.
+        """Return the ground truth of a view, rendered on demand.
 
-        Each pixel has the instance of the vertex nearest to its surface point.
+        Each pixel has the instance id of the nearest vertex of its triangle.
+
+        Args:
+            camera: The camera of the view.
+            T_world_camera: The pose (4, 4) of the view.
         """
         return DeferredTruth(
             render=lambda: self._rasterizer.draw(camera, T_world_camera).nearest(self.triangles, self.instance_ids),
@@ -47,7 +51,7 @@ class LabeledMesh:
 
     @cached_property
     def _fingerprint(self) -> str:
-        """SHA-256 (hex) of the mesh and the rendering code."""
+        """SHA-256 hash of the mesh and the rendering code."""
         digest = hashlib.sha256()
         for array in (self.vertices, self.triangles, self.instance_ids):
             add_array(digest, array)
@@ -57,7 +61,10 @@ class LabeledMesh:
 
 
 def unseen(camera: Camera, why: str) -> FrameTruth:
-    """Return the ground truth of a frame that cannot be rendered: access raises NoPoseError with the reason `why`."""
+    """Return the ground truth of a frame that cannot be rendered.
+
+    Accessing the instance ids raises NoPoseError with the message `why`.
+    """
 
     def render() -> Int32:
         raise NoPoseError(why)

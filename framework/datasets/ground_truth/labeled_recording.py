@@ -18,9 +18,9 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class LabeledRecording(Recording):
-    """A recording with an optional labeled mesh.
+    """A recording with an optional labeled mesh as ground truth.
 
-    The subclass loads the mesh in `open`. The ground truth is the whole mesh, independent of the frame selection.
+    The subclass loads the mesh in `open`.
     """
 
     frame_ground_truth: bool = False  # ground truth per frame for simulated detectors, rendered from the mesh
@@ -30,9 +30,14 @@ class LabeledRecording(Recording):
         super().__post_init__()
 
     def load_mesh(self, files: Sequence[Path], read: Callable[..., LabeledMesh]) -> None:
-        """Load the mesh with `read(*files)` if all `files` exist and `ground_truth` is not set.
+        """Load the mesh if all of its files exist and `ground_truth` is not set.
 
-        Raises DataError if a file is missing and `frame_ground_truth` is set.
+        Args:
+            files: The files of the mesh and its annotation.
+            read: A function that returns the mesh. Its arguments are the files.
+
+        Raises:
+            DataError: A file is missing, and `frame_ground_truth` is set.
         """
         if self.named_truth is not None:
             return

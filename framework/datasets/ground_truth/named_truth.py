@@ -1,12 +1,11 @@
-"""Ground truth set by `dataset.ground_truth`: a labeled mesh or the map of a run.
+"""The ground truth set by `dataset.ground_truth`: a labeled mesh or the map of a run.
 
     DIR/mesh.ply            a PLY file of any name: vertex x y z [m], integer property `instance`, 0 = none; faces
-    DIR/instances.json      next to it or in the parent folder: {"<id>": {"name", "class"}}; class = a COCO name, or
-                            null = unknown
-
+    DIR/instances.json      next to the mesh or in the parent folder: {"<id>": {"name", "class"}}; class = a COCO name,
+                            or null = unknown
     RUN/                    a run directory: mesh.ply, instances.json (a list) and trajectory.txt
 
-A labeled mesh is in the world frame of the recording's given poses. The map of a run is in the world frame of its
+A labeled mesh is in the world frame of the recording's poses. The map of a run is in the world frame of the estimated
 trajectory.
 """
 
@@ -40,16 +39,18 @@ MAX_DIGITS = 10  # maximum number of digits of an id, including leading zeros
 
 @dataclass(frozen=True)
 class NamedTruth:
-    """A labeled mesh and, for the map of a run, the trajectory of the run."""
+    """A ground-truth mesh, with the trajectory of the run if the mesh is the map of a run."""
 
     mesh: LabeledMesh
     name: str  # for tables: the file and its folder
     trajectory: ReferenceTrajectory | None  # None = the mesh is in the world frame of the given poses
 
     def pose(self, timestamp: float, given: Float64 | None) -> Float64 | None:
-        """Return T_world_camera (4, 4) of a frame in the world frame of the mesh, or None if it is unknown.
+        """Return the pose T_world_camera (4, 4) of a frame in the world frame of the mesh, or None if unknown.
 
-        `timestamp` is the time of the frame in s, and `given` is its given pose (4, 4).
+        Args:
+            timestamp: The timestamp of the frame, s.
+            given: The pose (4, 4) of the frame in the recording.
         """
         if self.trajectory is None:
             return given
@@ -58,9 +59,11 @@ class NamedTruth:
 
 
 def read_named_truth(path: Path) -> NamedTruth:
-    """Return the ground truth in a run directory or a labeled mesh.
+    """Read the ground truth in a run directory or a labeled mesh.
 
-    Raises ConfigError if the path does not exist. Raises a DataError that names the file if it is invalid.
+    Raises:
+        ConfigError: The path does not exist.
+        DataError: A file is missing or invalid.
     """
     files = truth_files(path)
     mesh, names = files[0], files[1]
@@ -81,9 +84,11 @@ def read_named_truth(path: Path) -> NamedTruth:
 
 
 def truth_files(path: Path) -> list[Path]:
-    """Return the files at a path: the mesh, its instances.json and, for a run, its trajectory.
+    """Return the ground-truth files: the mesh, its instances.json and, for a run, the trajectory.
 
-    Raises ConfigError or DataError that names a missing file.
+    Raises:
+        ConfigError: The path does not exist.
+        DataError: A file is missing.
     """
     found = next((place for place in candidates(path) if place.exists()), None)
     if found is None:
@@ -100,9 +105,12 @@ def truth_files(path: Path) -> list[Path]:
 
 
 def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
-    """Return the class of each instance id in the JSON file of a labeled mesh; None = unknown.
+    """Read the class of each instance id in the instances.json of a labeled mesh.
 
-    Raises a DataError that names the file if it is invalid or contains an id above `largest_id`.
+    An unknown class is None.
+
+    Raises:
+        DataError: The file is invalid or contains an id above `largest_id`.
     """
     content = read_json(path)
     if not isinstance(content, dict):
@@ -130,14 +138,14 @@ def _class_of(where: str, entry: Any) -> str | None:
 
 
 def _labels_of(path: Path, ply: PlyMesh) -> Int32:
-    """Return the instance ids (V,) of the vertices of a mesh with triangles."""
+    """Return the instance ids (V,) of the vertices."""
     labels = ply.properties.get(LABELS)
     if labels is None or labels.dtype.kind not in "iu":
         found = found_property(ply, labels)
         raise DataError(f"{path}: expected an integer vertex property {LABELS!r}, got {found}; label the mesh")
     if not len(ply.triangles):
         raise DataError(f"{path}: expected faces to render masks from, got none; set {KEY} to a mesh with faces")
-    if labels.min() < 0 or labels.max() > LARGEST_ID:
+    if int(labels.min()) < 0 or int(labels.max()) > LARGEST_ID:
         raise DataError(f"{path}: {LABELS}: expected values in [0, {LARGEST_ID}], got {labels.min()} to {labels.max()}")
     return labels.astype(np.int32)
 
@@ -149,7 +157,10 @@ def _labeled(path: Path, ply: PlyMesh, ids: Int32, class_names: Mapping[int, str
 
 
 def _classes_of_run(path: Path, entries: Sequence[Any]) -> dict[int, str | None]:
-    """Return the class of each instance of a run; None = the map has no classes."""
+    """Return the class of each instance in the instances.json of a run.
+
+    The classes are None if the map has no classes.
+    """
     class_names: dict[int, str | None] = {}
     for number, entry in enumerate(entries, start=1):
         key, name = (entry.get("id"), entry.get("class", ...)) if isinstance(entry, dict) else (None, None)

@@ -1,4 +1,4 @@
-"""Fusion of depth, instance images and ground-truth poses into a ground-truth surface."""
+"""Fusion of labeled depth images into a ground-truth point cloud."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ INITIAL_CAPACITY = 1 << 16  # number of slots, a power of two; doubled before mo
 
 @dataclass(frozen=True)
 class LabeledDepth:
-    """Ground truth of one view."""
+    """A depth image with ground-truth instances and pose."""
 
     depth: Float32  # (H, W) m along z, 0 = no reading
     instance_ids: Int32  # (H, W), 0 = no instance
@@ -26,18 +26,26 @@ class LabeledDepth:
 
 
 def check_truth_voxel(size: float) -> None:
-    """Raise ConfigError if `size`, the spacing of ground-truth points in m, is not in [0.001, 1]."""
+    """Raise ConfigError if the spacing of ground-truth points is not in [0.001, 1] m."""
     require(1e-3 <= size <= 1, "dataset.ground_truth_spacing", size, "a value in [0.001, 1] m")
 
 
 def fuse_scene_truth(
     views: Iterable[LabeledDepth], class_names: Mapping[int, str | None], ground_truth_spacing: float = 0.02
 ) -> SceneTruth:
-    """Return one labeled point for each occupied voxel with a side length of `ground_truth_spacing` m.
+    """Fuse labeled depth images into a point cloud with one labeled point per voxel.
 
-    Every pixel with depth votes for its instance id in its voxel. A voxel gets the id with the most votes; ties go to
-    the smaller id. Its point is the mean of the points that voted for this id. Points are in the order of first
-    observation. Memory depends on the size of the surface, not on the number of views.
+    Each pixel votes for its instance id in its voxel. The id with the most votes is selected, and the smaller id in a
+    tie. The point of a voxel is the mean of the points with the selected id. The points are in the order of first
+    observation.
+
+    Args:
+        views: The labeled depth images.
+        class_names: The class of each instance id.
+        ground_truth_spacing: The side length of the voxels, m.
+
+    Raises:
+        DataError: A point is too far from the world origin.
     """
     slots, taken = Slots.empty(INITIAL_CAPACITY), 0
     for view in views:
@@ -66,7 +74,7 @@ def fuse_scene_truth(
 
 
 def _elect(slots: Slots) -> tuple[Float32, Int32]:
-    """Return the mean point (V, 3), m, and the majority id (V,) of each voxel, in the order of first observation."""
+    """Return the point (V, 3), m, and the instance id (V,) of each voxel."""
     keys, ids, votes, sums, first = slots
     taken = np.flatnonzero(votes)
     best_first = taken[np.lexsort((ids[taken], -votes[taken], keys[taken]))]

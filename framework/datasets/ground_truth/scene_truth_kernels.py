@@ -14,7 +14,10 @@ KEY_OFFSET = 1 << (KEY_BITS - 1)  # added to voxel coordinates, which makes them
 
 
 class Slots(NamedTuple):
-    """A hash table with linear probing and S slots. S is a power of two. A slot without votes is empty."""
+    """A hash table with linear probing and S slots, with one slot for each pair of voxel and instance id.
+
+    S is a power of two. A slot without votes is empty.
+    """
 
     keys: Int64  # (S,) packed voxel coordinates
     ids: Int32  # (S,) instance id
@@ -30,7 +33,7 @@ class Slots(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _slot(slots: Slots, key: np.int64, instance: np.int32) -> np.int64:
-    """Return the index of the slot of (key, instance), or of the empty slot for its insertion."""
+    """Return the index of the slot of a voxel and an instance, or of the empty slot to use."""
     keys, ids, votes, _, _ = slots
     mask = len(keys) - 1
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(instance) * np.uint64(0xC2B2AE3D27D4EB4F)
@@ -46,10 +49,19 @@ def _slot(slots: Slots, key: np.int64, instance: np.int32) -> np.int64:
 def vote(
     depth: Float32, instance_ids: Int32, intrinsics: Float64, T: Float64, scale: float, slots: Slots, taken: int
 ) -> int:
-    """Add the pixels with depth and return the number of occupied slots; -1 = a point is too far from the origin.
+    """Add the pixels of a depth image to the hash table.
 
-    `depth`: (H, W) m, 0 = no reading. `instance_ids`: (H, W). `intrinsics`: (fx, fy, cx, cy) px. `T`: T_world_camera
-    (4, 4). `scale`: voxels per m. `taken`: number of slots occupied before.
+    Args:
+        depth: The depth (H, W), m, 0 = no reading.
+        instance_ids: The instance ids (H, W).
+        intrinsics: The camera intrinsics (fx, fy, cx, cy), px.
+        T: The pose T_world_camera (4, 4).
+        scale: The number of voxels per meter.
+        slots: The hash table.
+        taken: The number of occupied slots before the call.
+
+    Returns:
+        The number of occupied slots, or -1 if a point is too far from the origin.
     """
     keys, ids, votes, sums, first = slots
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -85,7 +97,7 @@ def vote(
 
 @njit(cache=True, nogil=True)
 def move_slots(slots: Slots, to: Slots) -> None:
-    """Copy all entries of `slots` into the larger table `to`."""
+    """Copy all entries of a hash table into a larger table."""
     for s in range(len(slots.keys)):
         if slots.votes[s] > 0:
             slot = _slot(to, slots.keys[s], slots.ids[s])

@@ -1,4 +1,6 @@
-"""ScanNet (Dai et al., CVPR 2017): rooms scanned with an iPad and an attached depth sensor, with labeled meshes.
+"""ScanNet dataset (Dai et al., CVPR 2017).
+
+Rooms were scanned with an iPad and an attached depth sensor:
 
     scene0000_00/scene0000_00.sens      the video in one file (`sens_file.py`), or the export of ScanNet's SensReader:
     scene0000_00/color/0.jpg            8-bit color, numbered from 0
@@ -56,8 +58,8 @@ log = logging.getLogger(__name__)
 class ScanNet(LabeledRecording):
     """A scan of ScanNet v2, read from its `.sens` file if it exists, otherwise from exported images.
 
-    Extrinsics between the color and depth cameras are not applied. The published extrinsics are identities, because
-    color is already registered to depth. Other extrinsics are logged with the resulting shift in px.
+    Color is assumed to be registered to depth, as in the published scans. Extrinsics between the two cameras are not
+    applied. A warning is logged if they are not negligible.
     """
 
     def open(self) -> Contents:
@@ -144,9 +146,9 @@ def _camera(path: Path, width: int, height: int) -> Camera:
 
 
 def _color_camera(path: Path, width: int, height: int) -> Camera:
-    """Return the camera of exported color images with the size `width` x `height`, px.
+    """Return the camera of exported color images with the given size, px.
 
-    SensReader may resize the images without scaling the intrinsics. The intrinsics are then scaled here.
+    The intrinsics are scaled if SensReader has resized only the images.
     """
     matrix = read_matrix(path)
     if _fits(matrix.camera(width, height)) or not _fits(camera := matrix.camera(*COLOR_SIZE)):
@@ -157,13 +159,13 @@ def _color_camera(path: Path, width: int, height: int) -> Camera:
 
 
 def _fits(camera: Camera) -> bool:
-    """Return True if the principal point is within 1/8 of the image size of the image center."""
+    """Return True if the principal point is near the image center."""
     u, v = camera.cx / camera.width, camera.cy / camera.height
     return max(abs(u - 0.5), abs(v - 0.5)) <= 1 / 8
 
 
 def _warn_of_parallax(source: Path, color: PrintedMatrix, depth: PrintedMatrix, camera: Camera) -> None:
-    """Log a warning if the extrinsics shift color by more than LARGEST_SHIFT in the depth camera `camera`."""
+    """Log a warning if the extrinsics shift color by more than LARGEST_SHIFT."""
     try:
         T_color_depth = inverse(color.pose()) @ depth.pose()
     except DataError:

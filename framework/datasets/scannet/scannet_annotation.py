@@ -1,4 +1,4 @@
-"""Reader of ScanNet annotations: mesh segments, objects as sets of segments, and classes of object names."""
+"""Reader of ScanNet annotations."""
 
 from __future__ import annotations
 
@@ -44,16 +44,22 @@ class SegGroup:
 
 
 def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[str, str]) -> LabeledMesh:
-    """Return the mesh with object k as instance k + 1. If objects overlap, the later object has precedence.
+    """Read the mesh and its annotated objects.
 
-    Objects of a COCO class have the name of this class. Objects of other known classes (wall, cabinet, ...) become
-    instance 0: detections of a COCO class there are false positives. Objects of unknown classes have the class None.
-    All unlabeled vertices form another instance of class None. Detections there are not evaluated, as in ScanNet's own
-    benchmark.
+    The instance id of an object is its object id + 1. If objects overlap, the later object takes precedence. Objects of
+    a COCO class have the name of this class. Objects of other known classes, such as wall or cabinet, become instance
+    0, so that detections there are false positives. Objects of unknown classes have the class None. Unlabeled vertices
+    form one more instance of class None, so that detections there are not evaluated, as in the ScanNet benchmark.
 
-    `nyu40` is the result of `read_label_table`; empty = no table. Names match even if they differ in spaces and
-    punctuation, such as trashcan and trash can. Raises a DataError that names the file for invalid or inconsistent
-    files, or for names that are not in the table.
+    Args:
+        mesh: The mesh, a PLY file.
+        segs: The JSON file with the segment of each vertex.
+        aggregation: The JSON file with the segments of each object.
+        nyu40: The NYU40 class of each name from `read_label_table`; empty = no table. Spaces and punctuation in names
+            are ignored.
+
+    Raises:
+        DataError: A file is invalid, the files are inconsistent, or a name is not in the table.
     """
     ply = read_ply(mesh)
     segments = _whole_numbers(f"{segs}: segIndices", _read_list(segs, "segIndices"))
@@ -99,7 +105,11 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
 
 
 def read_aggregation(path: Path) -> tuple[SegGroup, ...]:
-    """Return the objects of a scene in file order. Raises a DataError that names the file and the object."""
+    """Read the annotated objects of a scene.
+
+    Raises:
+        DataError: The file is invalid, or an object has two labels.
+    """
     groups = _read_list(path, "segGroups")
     found = tuple(_group(f"{path}: segGroups[{k}]", group) for k, group in enumerate(groups))
     labels: dict[int, str] = {}
@@ -112,9 +122,12 @@ def read_aggregation(path: Path) -> tuple[SegGroup, ...]:
 
 
 def read_label_table(path: Path) -> Mapping[str, str]:
-    """Return the NYU40 class of each name in a label table of either release; "" = no class.
+    """Read the NYU40 class of each object name in a label table.
 
-    Names and classes are in lower case. Raises a DataError that names the file and the line.
+    Names and classes are in lower case. An empty string means no class.
+
+    Raises:
+        DataError: A column is missing, or a line is too short.
     """
     header, *rows = read_text(path, LARGEST_FILE).rstrip("\r\n").split("\n")
     columns = header.rstrip("\r").split("\t")
@@ -133,13 +146,13 @@ def read_label_table(path: Path) -> Mapping[str, str]:
 
 
 def _spellings(nyu40: Mapping[str, str]) -> dict[str, str]:
-    """Return the known name for each spelling: the name itself, and the name reduced to letters and digits."""
+    """Return the known names by spelling: as written, and reduced to letters and digits."""
     names = {**nyu40, **MEANINGS, **dict.fromkeys(UNNAMED)}
     return {_letters(name): name for name in names} | {name: name for name in names}
 
 
 def _spelled(label: str, spellings: Mapping[str, str]) -> str:
-    """Return the known name of an annotated label, or the label itself if it is unknown."""
+    """Return the known name of a label, or the label itself if it is unknown."""
     own = label.strip().lower()
     return spellings.get(own) or spellings.get(_letters(own), own)
 

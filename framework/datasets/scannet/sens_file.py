@@ -1,4 +1,4 @@
-"""ScanNet's `.sens` files, version 4: a header, and frames with pose, timestamps and compressed images.
+"""Reader of ScanNet's `.sens` files, version 4.
 
     uint32 version, uint64 n, n bytes: sensor name
     float32[64]     four 4x4 matrices: color intrinsics, color extrinsics, depth intrinsics, depth extrinsics
@@ -46,7 +46,7 @@ OVERHEAD = 2**16  # bytes; a compressed image has at most twice the raw size plu
 
 @dataclass(frozen=True)
 class SensHeader:
-    """Header of a .sens file: properties of all frames."""
+    """Header of a .sens file."""
 
     color_camera: Camera
     depth_camera: Camera
@@ -60,7 +60,7 @@ class SensHeader:
 
 @dataclass(frozen=True)
 class SensFrame:
-    """One frame, with images read on demand."""
+    """A frame of a .sens file, with images that are read on demand."""
 
     path: Path
     header: SensHeader
@@ -74,7 +74,7 @@ class SensFrame:
 
     @property
     def images(self) -> StoredImages:
-        """The two images, each in the camera of its sensor."""
+        """The color and depth images, not registered to each other."""
         return StoredImages(self._color_name, self._depth_name, self.color, self.depth)
 
     @property
@@ -86,7 +86,11 @@ class SensFrame:
         return f"{self.path}, depth of frame {self.number} at byte {self.byte + self.color_bytes}"
 
     def color(self) -> UInt8:
-        """Return the color (H, W, 3), RGB, of the color camera. Raises FrameError if it cannot be read."""
+        """Return the image (H, W, 3), RGB, of the color camera.
+
+        Raises:
+            FrameError: The image cannot be read.
+        """
         data = self._read(self._color_name, self.byte, self.color_bytes)
         if self.header.color_compression != RAW:
             return decode_color(self._color_name, data)
@@ -95,9 +99,10 @@ class SensFrame:
         return np.frombuffer(data, np.uint8).reshape(shape)
 
     def depth(self) -> UInt16:
-        """Return the depth (H, W) of the depth camera in units of 1 / depth_scale m, 0 = no reading.
+        """Return the depth (H, W) of the depth camera in device units, 0 = no reading.
 
-        Raises FrameError if it cannot be read.
+        Raises:
+            FrameError: The image cannot be read.
         """
         data = self._read(self._depth_name, self.byte + self.color_bytes, self.depth_bytes)
         shape = self.header.depth_camera.shape
@@ -128,7 +133,11 @@ class SensFile:
 
 
 def open_sens(path: Path) -> SensFile:
-    """Read the header and the frame positions. Raises a DataError that names the byte of an invalid header."""
+    """Read the header and the file positions of the frames.
+
+    Raises:
+        DataError: The file is unreadable, the header is invalid, or there is no complete frame.
+    """
     check_regular(path)
     try:
         with path.open("rb", buffering=0) as file:
@@ -192,7 +201,7 @@ def _matrix(where: str, data: bytes) -> PrintedMatrix:
 
 
 def _find_frames(path: Path, file: BinaryIO, length: int, header: SensHeader) -> tuple[list[SensFrame], str]:
-    """Return the complete frames, and the reason for missing frames; "" = all frames are complete."""
+    """Return the complete frames and the reason for missing frames ("" = none are missing)."""
     most_color = 2 * 3 * prod(header.color_camera.shape) + OVERHEAD
     most_depth = 2 * 2 * prod(header.depth_camera.shape) + OVERHEAD
     frames: list[SensFrame] = []
@@ -217,7 +226,7 @@ def _find_frames(path: Path, file: BinaryIO, length: int, header: SensHeader) ->
 
 
 def _inflate(name: str, data: bytes, length: int) -> bytes:
-    """Decompress `data` to `length` bytes. Raises FrameError for another length or damaged data."""
+    """Decompress zlib data of known length."""
     stream = zlib.decompressobj()
     try:
         unpacked = stream.decompress(data, length + 1)

@@ -1,1 +1,1 @@
-"""SceneNN file formats: one module per format, with lenient readers and strict writers."""
+"""SceneNN file formats."""

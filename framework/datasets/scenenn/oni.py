@@ -1,7 +1,4 @@
-"""Frames of an OpenNI recording (.oni): color and depth images, paired as in SceneNN's playback.
-
-OpenNI 2's C library decodes the images. A damaged file can crash the library.
-"""
+"""Frames of an OpenNI recording (.oni), decoded by the OpenNI 2 C library."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ from framework.data import UInt8, UInt16
 from framework.datasets.scenenn.oni_records import Images, OniContents, Stream, playable
 from framework.errors import ConfigError, DataError, InstanceMapError, errors_of
 
-LARGEST_TIME_DIFFERENCE = 33_000  # us, maximum between the two images of a frame, as in SceneNN's playback
+LARGEST_TIME_DIFFERENCE = 33_000  # us, maximum between the images of a frame, as in SceneNN's own playback
 WAITING = 30  # maximum number of unpaired images of a stream (1 s at 30 Hz); older ones are dropped
 LIBRARIES = ("libOpenNI2.so.0", "libOpenNI2.so", "libOpenNI2.dylib", "OpenNI2.dll")
 LONGEST_PATH = 255  # bytes, limit of OpenNI 2
@@ -77,9 +74,13 @@ class OniFrame:
 def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
     """Yield the frames of a recording.
 
-    If the recording is truncated, a repaired copy in the folder `scratch` is read. Raises ConfigError if OpenNI 2 is
-    not installed. Raises DataError if OpenNI 2 cannot play the whole recording, or if color and depth have different
-    sizes.
+    Args:
+        contents: The records of the recording.
+        scratch: A folder for a repaired copy of a truncated recording.
+
+    Raises:
+        ConfigError: OpenNI 2 is not installed.
+        DataError: OpenNI 2 cannot play the recording, or color and depth have different sizes.
     """
     with (
         errors_of(contents.path),
@@ -90,11 +91,13 @@ def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
 
 
 def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
-    """Pair color and depth images, given in file order, and yield each pair as a frame.
+    """Pair color and depth images that are in file order, and yield each pair as a frame.
 
-    If the next color and depth images are more than LARGEST_TIME_DIFFERENCE apart, the earlier image is dropped. The
-    published trajectories use the frame numbers of SceneNN's playback, which drops the same images. Raises DataError
-    if color and depth have different sizes.
+    If the next color and depth images are more than LARGEST_TIME_DIFFERENCE apart, the earlier image is dropped.
+    SceneNN's own playback drops the same images. The frame numbers therefore match the published trajectories.
+
+    Raises:
+        DataError: Color and depth have different sizes.
     """
     waiting = {stream: deque[OniImage](maxlen=WAITING) for stream in Stream}
     colors, depths = waiting[Stream.COLOR], waiting[Stream.DEPTH]
@@ -114,9 +117,12 @@ def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
 
 
 def play_in_subprocess(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """Yield the images of `play`, which runs in a separate process.
+    """Decode a file with `play` in a separate process and yield the images.
 
-    OpenNI 2 crashes on some damaged recordings. Raises DataError in this case.
+    A separate process is used because OpenNI 2 crashes on some damaged recordings.
+
+    Raises:
+        DataError: OpenNI 2 crashes or cannot play the file.
     """
     spawn = multiprocessing.get_context("spawn")  # the library's threads and locks do not survive a fork
     receiver, sender = spawn.Pipe(duplex=False)
@@ -141,7 +147,7 @@ def play_in_subprocess(path: Path, streams: Mapping[Stream, Images]) -> Generato
 
 
 def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -> None:
-    """Send each image, and finally None or an error, to the parent process."""
+    """Send each image to the parent process, then None or an error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the parent ends the child
     try:
         with closing(play(path, streams)) as images:
@@ -155,9 +161,13 @@ def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -
 
 
 def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """Decode a file with OpenNI 2 and yield its complete images until the last image of each stream is read.
+    """Decode a file with OpenNI 2 and yield its images.
 
-    Raises ConfigError if OpenNI 2 is not installed, and DataError if it cannot play the file.
+    Incomplete images are skipped.
+
+    Raises:
+        ConfigError: OpenNI 2 is not installed.
+        DataError: OpenNI 2 cannot play the file.
     """
     openni = _library()
     file = os.fsencode(path)
@@ -186,7 +196,13 @@ def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
 
 
 def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """Yield the complete images in playback order. `handles` are the stream handles in the order of Stream."""
+    """Yield the complete images in playback order.
+
+    Args:
+        openni: The OpenNI 2 library.
+        handles: The stream handles in the order of Stream.
+        streams: The image counts of the streams.
+    """
     waited = (ctypes.c_void_p * len(handles))(*handles)
     last = dict.fromkeys(Stream, 0)
     while any(last[stream] < streams[stream].last for stream in Stream):
@@ -211,10 +227,7 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
 
 
 def _pixels(stream: Stream, frame: _Frame) -> npt.NDArray[Any] | None:
-    """Return a copy of the pixels, as in OniImage, or None for an incomplete image.
-
-    Raises DataError for an unsupported pixel format.
-    """
+    """Return a copy of the pixels, or None for an incomplete image."""
     pixel_format, shape = frame.mode.pixel_format, (frame.height, frame.width)
     if frame.data_size < frame.stride * frame.height:
         return None

@@ -1,6 +1,6 @@
-"""Records of an OpenNI recording (.oni): streams, image counts and the position of a truncation.
+"""Records of an OpenNI recording (.oni).
 
-OpenNI 2 decodes the images but can crash on a damaged file. The records are therefore checked first.
+OpenNI 2 can crash on a damaged file. The records are therefore checked before the images are decoded.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LARGEST_FIELDS = 2**20  # bytes per record; OpenNI reads the fields into a buffe
 
 
 class OniRecord(IntEnum):
-    """Record types of the format."""
+    """Record types of the file format."""
 
     NODE_ADDED_1_0_0_4 = 0x02
     NEW_DATA = 0x0A
@@ -40,7 +40,7 @@ class OniRecord(IntEnum):
 
 
 class Stream(IntEnum):
-    """Stream types, with the format's node type as value."""
+    """Stream types, with the node types of the file format as values."""
 
     DEPTH = 2
     COLOR = 3
@@ -48,7 +48,7 @@ class Stream(IntEnum):
 
 @dataclass
 class Images:
-    """The node and image count of one stream. Only complete images are counted."""
+    """The complete images of a stream."""
 
     node: int  # node id of this stream's records
     count: int = 0
@@ -57,7 +57,7 @@ class Images:
 
 @dataclass(frozen=True)
 class OniContents:
-    """Contents of a recording, collected from its records."""
+    """Contents of a recording."""
 
     path: Path
     streams: Mapping[Stream, Images]  # for depth and color
@@ -69,9 +69,10 @@ class OniContents:
 
 
 def read_contents(path: Path) -> OniContents:
-    """Return the streams and image counts of a recording, without decoding the images.
+    """Read the streams and image counts of a recording without decoding the images.
 
-    Raises DataError if the file is not a recording, or if it has no depth images or no color images.
+    Raises:
+        DataError: The file is not an OpenNI recording, or it has no depth images or no color images.
     """
     check_regular(path)
     try:
@@ -83,10 +84,10 @@ def read_contents(path: Path) -> OniContents:
 
 @contextmanager
 def playable(contents: OniContents, scratch: Path) -> Iterator[Path]:
-    """Yield a file for OpenNI 2: the recording, or a repaired copy in `scratch` if it is truncated.
+    """Yield the path of a recording that OpenNI can play.
 
-    A recording ends with seek tables, to which earlier records point. OpenNI rejects a truncated recording, because
-    these tables are missing. In the copy, the pointers are 0 (no table), and an end record is added.
+    OpenNI rejects a truncated recording, because the seek tables at the end are missing. In this case, the result is a
+    repaired copy in `scratch`. The copy has no seek tables and ends with an end record.
     """
     if not contents.cut_off:
         yield contents.path
@@ -146,11 +147,8 @@ def _read_contents(path: Path, file: BinaryIO) -> OniContents:
 
 
 def _layouts(wide: bool) -> tuple[struct.Struct, struct.Struct]:
-    """Return the struct layouts of a file position and a record header.
-
-    A record header contains the magic number, the record type, the node id, the sizes of the fields and the payload in
-    bytes, and a file position.
-    """
+    """Return the struct layouts of a file position and a record header."""
+    # record header: magic number, record type, node id, sizes of the fields and the payload in bytes, file position
     position = "Q" if wide else "I"
     return struct.Struct(f"<{position}"), struct.Struct(f"<4s4I{position}")
 
@@ -189,10 +187,7 @@ def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
 
 
 def _added_stream(path: Path, record: _Record) -> Stream | None:
-    """Return the stream of an added node, or None for a device, infrared or audio node.
-
-    Raises DataError for an incomplete record.
-    """
+    """Return the stream type of an added node, or None for a node other than color or depth."""
     try:
         (name_size,) = struct.unpack_from("<I", record.fields)
         (node_type,) = struct.unpack_from("<I", record.fields, 4 + name_size)

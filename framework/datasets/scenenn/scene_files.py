@@ -1,4 +1,4 @@
-"""SceneNN's text files: poses, timestamps and intrinsics.
+"""SceneNN's text files with poses, timestamps and intrinsics.
 
 trajectory.log      per frame: a header of three integers, and the four rows of T_world_camera in meters
 timestamp.txt       per frame: number (from 1), and timestamps of color and depth in microseconds
@@ -35,7 +35,7 @@ LARGEST_INTRINSICS = 2**20  # bytes; an intrinsics file has a few hundred
 
 @dataclass(frozen=True)
 class TrajectoryLog:
-    """Poses of a trajectory.log. Frames that are missing from the file are in neither mapping."""
+    """The poses in a trajectory.log."""
 
     poses: Mapping[int, Float64]  # by frame, from 0: T_world_camera (4, 4), exactly rigid
     unusable: Mapping[int, str]  # by frame, from 0: reason (lost tracking, not finite, truncated, or repeated)
@@ -51,10 +51,12 @@ class _Line(NamedTuple):
 
 
 def read_trajectory_log(path: Path) -> TrajectoryLog:
-    """Return the poses of a trajectory.log.
+    """Read the poses in a trajectory.log.
 
-    A frame with two different poses is unusable, and so is a truncated last frame. Raises a DataError that names the
-    file and the line for other invalid lines.
+    A frame with two different poses is unusable. A truncated last frame is unusable too.
+
+    Raises:
+        DataError: Another line is invalid.
     """
     content = read_bytes(path, MAX_TEXT).removeprefix(BOM_UTF8)
     numbered = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))
@@ -92,10 +94,10 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
 
 
 def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
-    """Write the pose T_world_camera (4, 4) of each frame atomically.
+    """Write the pose T_world_camera (4, 4) of each frame to a trajectory.log.
 
-    `read_trajectory_log` returns the nearest exactly rigid transforms. Raises DataError for a negative frame number, a
-    pose that is not rigid, or a failed write.
+    Raises:
+        DataError: A frame number is negative, a pose is not rigid, or the file cannot be written.
     """
     lines = []
     for frame, T_world_camera in sorted(poses.items()):
@@ -110,10 +112,7 @@ def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
 
 
 def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
-    """Return the matrix (4, 4) in four lines, or None if the file ends before the last row.
-
-    Values may be NaN or infinite. Raises DataError for a line that does not contain four numbers.
-    """
+    """Return the matrix (4, 4) in four lines, or None if the file is truncated."""
     matrix = np.empty((4, 4))
     for k, line in enumerate(rows):
         try:
@@ -131,14 +130,15 @@ def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
 
 
 def _is_frame(word: str) -> bool:
-    """Return True if `word` is a valid number in a frame header."""
+    """Return True if a word is a valid number for a frame header."""
     return word.isascii() and word.isdigit() and len(word) < 11 and int(word) <= LARGEST_FRAME + 1
 
 
 def read_timestamps(path: Path) -> Mapping[int, tuple[float, float]]:
-    """Return the timestamps of color and depth (s) by image number.
+    """Read the timestamps of color and depth, s, by image number.
 
-    Raises a DataError that names the file and the line for an invalid line or a repeated image number.
+    Raises:
+        DataError: A line is invalid, or an image number is repeated.
     """
     times: dict[int, tuple[float, float]] = {}
     for n, line in enumerate(read_lines(path), start=1):
@@ -159,9 +159,12 @@ def read_timestamps(path: Path) -> Mapping[int, tuple[float, float]]:
 
 
 def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mapping[int, float] | None = None) -> None:
-    """Write the timestamps of color and depth (s) of each image number atomically.
+    """Write the timestamps of color and depth of each image.
 
-    `times` contains the timestamps of depth. They are also written for color if `color_times` is None.
+    Args:
+        path: The file.
+        times: The timestamps of depth by image number, s.
+        color_times: The timestamps of color by image number, s; None = same as depth.
     """
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for image, time in times.items():
@@ -170,11 +173,13 @@ def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mappin
 
 
 def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx, cy in px, from lines `key value`, `key = value` or `key: value`.
+    """Read fx, fy, cx, cy in px, from lines `key value`, `key = value` or `key: value`.
 
-    Keys may be in upper case. Comments (# or ;), section headers and other keys are ignored. Without cx or cy, half of
-    depth_width or depth_height is used, as in ethz-asl/scenenn_to_rosbag. Raises a DataError that names the file and
-    the line for a missing or repeated key or a value that is not finite. Focal lengths and sizes must be positive.
+    Comments (# or ;), section headers and other keys are ignored. If cx or cy is missing, half of depth_width or
+    depth_height is used, as in ethz-asl/scenenn_to_rosbag.
+
+    Raises:
+        DataError: A key is missing or repeated, or its value is not a valid number.
     """
     values: dict[str, float] = {}
     lines = read_bytes(path, LARGEST_INTRINSICS).removeprefix(BOM_UTF8).decode("latin-1").splitlines()
@@ -203,7 +208,7 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
 
 
 def write_intrinsics(path: Path, camera: Camera) -> None:
-    """Write the camera's intrinsics atomically, in full precision."""
+    """Write the intrinsics of a camera in full precision."""
     sizes = {"depth_width": camera.width, "depth_height": camera.height}
     values = sizes | {key: getattr(camera, key) for key in INTRINSICS}
     with atomic_write(path) as temporary:

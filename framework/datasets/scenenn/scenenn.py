@@ -1,4 +1,6 @@
-"""SceneNN (Hua et al., 3DV 2016): rooms scanned with an Asus Xtion or a Kinect v2, with labeled meshes.
+"""SceneNN dataset (Hua et al., 3DV 2016).
+
+Rooms were scanned with an Asus Xtion or a Kinect v2:
 
     NNN/image/image00001.png    8-bit color, numbered from 1
     NNN/depth/depth00001.png    uint16, mm, registered to color
@@ -44,7 +46,7 @@ log = logging.getLogger(__name__)
 
 
 class SceneNNIntrinsics(Enum):
-    """Intrinsics files of SceneNN. The value of a member is the kind of the depth sensor."""
+    """Intrinsics files of SceneNN, with the kind of the depth sensor as value."""
 
     ASUS = SensorKind.KINECT_V1
     KINECT2 = SensorKind.TIME_OF_FLIGHT
@@ -54,8 +56,7 @@ class SceneNNIntrinsics(Enum):
 class SceneNN(LabeledRecording):
     """A SceneNN sequence, or a synthetic scene from `instancemap synthesize` in the same format.
 
-    A frame is unusable if an image is missing. It is also unusable if the sequence has a trajectory without a valid
-    pose for the frame.
+    A frame is unusable if an image is missing, or if the sequence has a trajectory without a valid pose for the frame.
     """
 
     scene: str = "011"  # number of the scene
@@ -86,8 +87,11 @@ def _recorded(
 ) -> RecordedFrame:
     """Return a frame with its pose and timestamps.
 
-    `pose_id` is the id of its pose in trajectory.log. `times` contains the timestamps of color and depth (s); None =
-    unknown.
+    Args:
+        images: The images of the frame.
+        pose_id: The id of the pose in trajectory.log.
+        poses: The poses; None = no trajectory.
+        times: The timestamps of color and depth, s; None = unknown.
     """
     color, depth = times or (None, None)
     timestamp = pose_id / FRAME_RATE if depth is None else depth
@@ -99,9 +103,9 @@ def _recorded(
 
 
 def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, tuple[float, float]]:
-    """Return the timestamps of color and depth (s) by image number; empty if the timestamps of any image are missing.
+    """Return the timestamps of color and depth, s, by image number.
 
-    This prevents a mix of recorded timestamps and timestamps derived from the frame rate.
+    The result is empty if the timestamps of any image are missing.
     """
     if not path_exists(path):
         return {}
@@ -113,21 +117,24 @@ def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, tuple[flo
         "%s: expected timestamps of all images, got none for %d of %d images, first %d; using a frame rate of %g Hz"
     )
     log.warning(message, path, len(without), len(images), without[0], FRAME_RATE)
-    return {}
+    return {}  # recorded timestamps are not mixed with those of a constant frame rate
 
 
 def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
-    """Return the mesh with its labels as instances, with COCO names for the nine evaluated classes.
+    """Read the mesh with its labels as instances.
 
-    Labels without a name or an annotation have the class None: detections there are not evaluated. Labels of other
-    classes (wall, cabinet, ...) and label 0 become instance 0: detections of the nine classes there are false
-    positives. Raises a DataError that names the file if a file cannot be read or the mesh has no labels.
+    Instances of the nine evaluated classes have COCO names. Labels without a name or an annotation have the class None,
+    so that detections there are not evaluated. Label 0 and labels of other classes, such as wall, become instance 0, so
+    that detections there are false positives.
+
+    Raises:
+        DataError: A file cannot be read, or the mesh has no labels.
     """
     ply = read_ply(mesh)
     labels = ply.properties.get("label")
     if labels is None or labels.dtype.kind not in "iu":
         raise DataError(f"{mesh}: expected an integer vertex property 'label', got {found_property(ply, labels)}")
-    if len(labels) and (labels.min() < 0 or labels.max() > LARGEST_ID):
+    if len(labels) and (int(labels.min()) < 0 or int(labels.max()) > LARGEST_ID):
         raise DataError(f"{mesh}: label: expected values in [0, {LARGEST_ID}], got {labels.min()} to {labels.max()}")
     names = {one.id: one for one in read_annotation(annotation)}
     present, inverse = np.unique(labels.astype(np.int32), return_inverse=True)
@@ -146,7 +153,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
 
 
 def _nyu_class(label: Annotated | None) -> str:
-    """Return the NYU class of a label; "" = unknown."""
+    """Return the NYU class of a label, or "" if unknown."""
     if label is None or not label.text.strip():
         return ""
     name = label.nyu_class.strip().lower()

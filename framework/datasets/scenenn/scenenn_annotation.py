@@ -1,4 +1,4 @@
-"""Reader and writer of SceneNN annotations (NNN.xml), which describe the object of each mesh label."""
+"""Reader and writer of SceneNN annotations (NNN.xml)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 
 @dataclass(frozen=True)
 class Annotated:
-    """The annotation of a mesh label. Missing or invalid values are "", NO_COLOR or None."""
+    """The annotation of a mesh label.
+
+    Missing or invalid values are "", NO_COLOR or None.
+    """
 
     id: int  # the value of the mesh's vertex property `label`, 0 to LARGEST_ID
     text: str  # name given by the annotators
@@ -40,11 +43,12 @@ class Annotated:
 
 
 def read_annotation(path: Path) -> tuple[Annotated, ...]:
-    """Return the labels of an annotation in file order.
+    """Read the labels of an annotation.
 
-    Unknown elements and attributes are ignored. Raises a DataError that names the line if the file is not XML or
-    declares a document type, which could define entities and default attributes. It also raises DataError for a file
-    without labels, a label without an integer id, or different labels with the same id.
+    Unknown elements and attributes are ignored.
+
+    Raises:
+        DataError: The file is not valid XML, declares a document type, or contains no labels or invalid ids.
     """
     content = read_bytes(path, LARGEST_FILE)
     labels = _Labels(path)
@@ -77,10 +81,10 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
 
 
 def write_annotation(path: Path, objects: Sequence[Annotated]) -> None:
-    """Write an annotation atomically.
+    """Write an annotation.
 
-    `read_annotation` returns the same values, with a rotation error of about 1e-15. Raises DataError for values that
-    XML or the reader cannot represent, or for a failed write.
+    Raises:
+        DataError: A value cannot be represented in the file, or the file cannot be written.
     """
     if not objects:
         raise DataError(f"{path}: expected at least one label, got none")
@@ -161,7 +165,7 @@ def _color(text: str) -> tuple[int, int, int]:
 
 
 def _aabb(text: str) -> Float64 | None:
-    """Parse a box `minx miny minz maxx maxy maxz`, m, or return None for an invalid box."""
+    """Parse an axis-aligned box `minx miny minz maxx maxy maxz`, m, or return None if invalid."""
     numbers = _numbers(text, 6)
     if numbers is None or (numbers[:3] > numbers[3:]).any():
         return None
@@ -169,7 +173,7 @@ def _aabb(text: str) -> Float64 | None:
 
 
 def _obb(text: str) -> Box | None:
-    """Parse a box of center (m), extent (m) and quaternion xyzw, or return None for an invalid box.
+    """Parse an oriented box with center (m), extent (m) and quaternion xyzw, or return None if invalid.
 
     The order of the numbers is documented in github.com/hkust-vgd/scenenn, issue 11.
     """
@@ -182,7 +186,7 @@ def _obb(text: str) -> Box | None:
 
 
 def _numbers(text: str, count: int) -> Float64 | None:
-    """Parse `count` finite numbers, or return None for any other text."""
+    """Parse `count` finite numbers, or return None if invalid."""
     try:
         numbers = np.array([float(word) for word in text.split(maxsplit=count)])
     except ValueError:

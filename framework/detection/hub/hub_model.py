@@ -1,4 +1,7 @@
-"""Models from huggingface.co, which are downloaded once into the cache of huggingface_hub and verified."""
+"""Models from huggingface.co.
+
+Models are downloaded once into the cache of huggingface_hub. Their hashes are verified.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +30,17 @@ log = logging.getLogger(__name__)
 
 
 def find_model(model: str, revision: str, more: Sequence[str] = ()) -> Path:
-    """Return the folder of a model: a local folder, or the cached download of a model id.
+    """Return the folder of a model, and download the model if necessary.
 
-    A missing model is downloaded. A cached model is used without a network request. Requires huggingface_hub, a
-    dependency of transformers. `more`: required files in addition to config, preprocessing and weights, such as the
-    tokenizer files. Raises DataError if the model does not exist, cannot be downloaded, or has a wrong hash.
+    Cached models are used without a network request.
+
+    Args:
+        model: A local folder, or a model id on huggingface.co.
+        revision: The branch, tag or commit of the model.
+        more: Required files in addition to config, preprocessing and weights, such as the tokenizer files.
+
+    Raises:
+        DataError: The model does not exist, cannot be downloaded, or has a wrong hash.
     """
     folder = expanded(Path(model))
     if folder.is_dir():
@@ -50,12 +59,12 @@ def find_model(model: str, revision: str, more: Sequence[str] = ()) -> Path:
 
 
 def commit_of(folder: Path) -> str:
-    """Return the commit hash of a downloaded model's folder; "" for a local folder."""
+    """Return the commit hash of a downloaded model, or "" for a local folder."""
     return folder.name if folder.parent.name == "snapshots" else ""
 
 
 def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
-    """Return the cached folder of a model id, None if a required file is missing."""
+    """Return the cached folder of a model id, or None if a required file is missing."""
     from huggingface_hub import try_to_load_from_cache
     from huggingface_hub.errors import HFValidationError
 
@@ -76,7 +85,7 @@ def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
 
 
 def _listed(index: Path) -> list[str]:
-    """Return the names of the weight files listed in the index file `index`."""
+    """Return the names of the weight files in an index file."""
     try:
         return [*read_json(index)["weight_map"].values()]
     except (DataError, KeyError, TypeError, AttributeError) as error:
@@ -87,7 +96,7 @@ def _listed(index: Path) -> list[str]:
 
 
 def _weights(names: Collection[str]) -> list[str]:
-    """Return the names of the weight files among `names` that transformers would load; empty if there are none."""
+    """Return the names of the weight files that transformers would load."""
     if WHOLE in names:
         return [WHOLE]
     if INDEX in names:
@@ -96,13 +105,13 @@ def _weights(names: Collection[str]) -> list[str]:
 
 
 def _published(more: Sequence[str], names: Collection[str]) -> Sequence[str]:
-    """Return `more`, with the tokenizer files replaced by their older names if the model has only the older ones."""
+    """Return the names of additional files, with older tokenizer files if the model has only those."""
     older = more == TOKENIZER and TOKENIZER[0] not in names and {*OLDER_TOKENIZER} <= {*names}
     return OLDER_TOKENIZER if older else more
 
 
 def _download(model: str, revision: str, more: Sequence[str]) -> None:
-    """Download the required files with huggingface_hub, which writes files atomically and shows progress."""
+    """Download the required files of a model into the cache."""
     if variable := forbidden_by():
         raise DataError(
             f"detector.model: expected a local folder while {variable} disables downloads, got {model}; unset "
@@ -137,16 +146,14 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
 
 
 def forbidden_by() -> str:
-    """Return the name of the environment variable that disables downloads; "" = downloads are enabled."""
+    """Return the name of the environment variable that disables downloads, or "" if downloads are enabled."""
     forbidding = [name for name in HUB_OFFLINE if os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE")]
     return (forbidding + [OFFLINE] * bool(os.environ.get(OFFLINE)) + [""])[0]
 
 
 def _check(path: Path, published: Any) -> None:
-    """Check that a large file (Git LFS) has the published SHA-256, because huggingface_hub checks only the size.
-
-    Otherwise, delete the file and raise DataError.
-    """
+    """Delete a downloaded file and raise DataError if it does not have the published SHA-256."""
+    # huggingface_hub checks only the size of large files (Git LFS)
     if published.lfs is None or (found := path_hash(path)) == published.lfs.sha256:
         return
     path.resolve().unlink()  # the content, if the cache uses symbolic links
@@ -158,14 +165,26 @@ def _check(path: Path, published: Any) -> None:
 
 
 def imported_transformers() -> Any:
-    """Import transformers. Raises ConfigError with the required extra if transformers is not installed."""
+    """Import transformers.
+
+    Raises:
+        ConfigError: transformers is not installed.
+    """
     return import_optional("transformers", "loads models of huggingface.co", "transformers")
 
 
 def read_part(parameter: str, folder: Path, what: str, auto_class: Any, **options: Any) -> Any:
-    """Load a part of a model from a folder with a class of transformers.
+    """Load a part of a model, such as the tokenizer, with a class of transformers.
 
-    `parameter` (a config key) and `what` (a noun for the part) appear in errors. Raises DataError if loading fails.
+    Args:
+        parameter: The config key, for messages.
+        folder: The folder of the model.
+        what: A noun for the part, for messages.
+        auto_class: The class of transformers.
+        **options: Further arguments of `from_pretrained`.
+
+    Raises:
+        DataError: The part cannot be loaded.
     """
     try:
         return auto_class.from_pretrained(str(folder), local_files_only=True, **options)

@@ -1,4 +1,4 @@
-"""CLIP, SigLIP and SigLIP 2 from Hugging Face transformers: image and text embeddings in one space."""
+"""Models that embed images and texts in a common space: CLIP, SigLIP and SigLIP 2."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ GRAY = 128  # gray value of suppressed surroundings
 
 
 class ImageTextFamily(NamedTuple):
-    """The conventions of a family of models."""
+    """Conventions of a family of image-text models."""
 
     prompt: str  # template around a class name, as in the published evaluation
     padding: str  # padding of texts, as in training
@@ -57,8 +57,8 @@ class ImageTextModel:
     """A model with an image encoder and a text encoder (Radford et al. 2021, "CLIP").
 
     Attributes:
-        space: Name and version of the model. Only embeddings of the same space are comparable.
-        side: Width and height of the input images, in px.
+        space: The name and version of the model. Only embeddings with the same value can be compared.
+        side: The width and height of the input images, px.
     """
 
     def __init__(self, model: str, revision: str, device: str, half_precision: bool) -> None:
@@ -90,7 +90,11 @@ class ImageTextModel:
 
     @torch.inference_mode()
     def embed_crops(self, crops: UInt8) -> Float32:
-        """Return the embeddings (N, D), unit vectors, of crops (N, side, side, 4), RGB and mask; masks are ignored."""
+        """Return the normalized embeddings (N, D) of image crops.
+
+        Args:
+            crops: The crops (N, side, side, 4), RGB and mask. The masks are ignored.
+        """
         images = torch.from_numpy(crops[..., :3]).to(self._device).permute(0, 3, 1, 2).float() * self._factor
         mean, std = (torch.tensor(values, device=self._device)[:, None, None] for values in (self._mean, self._std))
         pixels = ((images - mean) / std).to(self._network.dtype)
@@ -98,7 +102,7 @@ class ImageTextModel:
 
     @torch.inference_mode()
     def embed_text(self, text: str) -> Float32:
-        """Return the embedding (D,), a unit vector, of a phrase such as "a red chair"."""
+        """Return the normalized embedding (D,) of a phrase, such as "a red chair"."""
         prompt = self._family.prompt.format(text.lower() if self._family.lower else text)
         length = min(MAX_TOKENS, int(self._network.config.text_config.max_position_embeddings))
         tokens = self._tokenizer(
@@ -110,7 +114,7 @@ class ImageTextModel:
         return np.asarray(self._unit(self._network.get_text_features(**given))[0])
 
     def _unit(self, features: Any) -> Float32:
-        """Return features (N, D) normalized to unit length. Raises DataError for zero or non-finite features."""
+        """Normalize feature vectors (N, D) to unit length."""
         tensor: Tensor = features if isinstance(features, Tensor) else features.pooler_output
         vectors = tensor.float().cpu().numpy()
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -123,7 +127,7 @@ class ImageTextModel:
 
 
 def _normalization(path: Path, family: ImageTextFamily) -> tuple[tuple[float, ...], tuple[float, ...], float]:
-    """Read the mean, standard deviation and rescale factor from preprocessor_config.json."""
+    """Read the mean, the standard deviation and the rescale factor from preprocessor_config.json."""
     content = read_json(path)
     if not isinstance(content, Mapping):
         raise DataError(f"detector.model: {path}: expected a JSON object, got {content!r:.100}")
@@ -139,10 +143,7 @@ def _normalization(path: Path, family: ImageTextFamily) -> tuple[tuple[float, ..
 
 
 def _space(folder: Path, model: str) -> str:
-    """Return the name of the embedding space.
-
-    It is the model id with its commit, or the name of a local folder with a hash of its config and weights.
-    """
+    """Return a name that identifies the model and its version."""
     if commit := commit_of(folder):
         return f"{model}@{commit}"
     weights = sorted(folder.glob("*.safetensors")) + sorted(folder.glob("pytorch_model*.bin"))
@@ -151,11 +152,16 @@ def _space(folder: Path, model: str) -> str:
 
 
 def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundings: float = 1.0) -> UInt8:
-    """Return crops (N, side, side, 4) of the image around each of the masks (N, H, W): RGB and mask (0 or 255).
+    """Return square crops (N, side, side, 4) of an image around masks, with RGB and mask (0 or 255).
 
-    A crop is a square around the center of the mask's box. Its side is `context` times the longer side of the box. Its
-    part outside of the image is black. If `surroundings` < 1, all pixels outside the mask keep only this fraction of
-    their difference from gray, including the black part. The crop of an empty mask is black.
+    The crop of an empty mask is black. The part of a crop outside of the image is black.
+
+    Args:
+        color: The image (H, W, 3), RGB.
+        masks: The masks (N, H, W).
+        side: The side of the resized crops, px.
+        context: The side of a crop before resizing, as a multiple of the longer side of the mask's bounding box.
+        surroundings: The contrast of pixels outside the mask. With 1 they are unchanged, with 0 they are gray.
     """
     crops = np.zeros((len(masks), side, side, 4), np.uint8)
     for k, box in enumerate(tight_boxes(masks)):
@@ -166,7 +172,7 @@ def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundi
 
 
 def _square_crop(image: UInt8, box: Float32, side: int, context: float, surroundings: float) -> UInt8:
-    """Return the crop (side, side, 4) of an image (H, W, 4), RGB and mask, around `box`, the mask's tight box."""
+    """Return the crop (side, side, 4) of an image (H, W, 4) around a box."""
     height, width = image.shape[:2]
     x1, y1, x2, y2 = (int(value) for value in box)
     wide = max(1, round(context * (max(x2 - x1, y2 - y1) + 1)))  # px
@@ -182,6 +188,9 @@ def _square_crop(image: UInt8, box: Float32, side: int, context: float, surround
 
 
 def network_pixels(image: UInt8, mean: Sequence[float], std: Sequence[float], device: torch.device) -> Tensor:
-    """Return the normalized input (1, 3, H, W) of an RGB image (H, W, 3); `mean`, `std`: RGB, of values 0..1."""
+    """Normalize an RGB image (H, W, 3) and convert it to a network input (1, 3, H, W).
+
+    The mean and the standard deviation refer to values in [0, 1].
+    """
     pixels = torch.from_numpy(np.ascontiguousarray(image)).to(device).permute(2, 0, 1)[None].float() / 255
     return (pixels - torch.tensor(mean, device=device)[:, None, None]) / torch.tensor(std, device=device)[:, None, None]

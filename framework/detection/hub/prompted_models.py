@@ -1,4 +1,7 @@
-"""Prompted models from Hugging Face transformers: OWLv2 (boxes for texts) and the SAM family (masks for boxes)."""
+"""Prompted models from Hugging Face transformers.
+
+OWLv2 detects boxes for texts. The models of the SAM family segment the objects in boxes.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ SAM_FAMILY = {
 
 
 class TextPromptedBoxes:
-    """OWLv2 (Minderer et al. 2023) with fixed texts, loaded by its huggingface.co id or from a folder."""
+    """Box detector OWLv2 (Minderer et al. 2023) for a fixed list of texts."""
 
     def __init__(
         self, model: str, revision: str, texts: Sequence[str], device: torch.device, half_precision: bool
@@ -54,9 +57,14 @@ class TextPromptedBoxes:
 
     @torch.inference_mode()
     def __call__(self, color: UInt8) -> tuple[Float32, Float32]:
-        """Return P candidate boxes (P, 4) and the probability (P, T) of each of the T texts for each box.
+        """Detect boxes in an image.
 
-        Boxes are x1 y1 x2 y2, px of the image `color` (H, W, 3), with pixel centers at integers.
+        Args:
+            color: The image (H, W, 3), RGB.
+
+        Returns:
+            The candidate boxes (P, 4) x1 y1 x2 y2, px, and the probability (P, T) of each text. Pixel centers are at
+            integers.
         """
         long = max(color.shape[:2])
         square = np.full((long, long, 3), PADDING, np.uint8)
@@ -74,7 +82,7 @@ class TextPromptedBoxes:
 
 
 class BoxPromptedMasks:
-    """SAM (Kirillov et al. 2023), SAM 2 or EdgeTAM, loaded by its huggingface.co id or from a folder."""
+    """Segmentation model SAM (Kirillov et al. 2023), SAM 2 or EdgeTAM with boxes as prompts."""
 
     def __init__(self, model: str, revision: str, device: torch.device, half_precision: bool) -> None:
         transformers = imported_transformers()
@@ -92,7 +100,12 @@ class BoxPromptedMasks:
 
     @torch.inference_mode()
     def __call__(self, color: UInt8, boxes: Float32) -> Bool:
-        """Return the masks (N, H, W) of the objects in boxes (N, 4) x1 y1 x2 y2 px, pixel centers at integers."""
+        """Segment the objects in boxes and return their masks (N, H, W).
+
+        Args:
+            color: The image (H, W, 3), RGB.
+            boxes: The boxes (N, 4) x1 y1 x2 y2, px, with pixel centers at integers.
+        """
         height, width = color.shape[:2]
         if not len(boxes):
             return np.zeros((0, height, width), np.bool_)

@@ -1,1 +1,1 @@
-"""Mask R-CNN: the network, and readers of published weights."""
+"""Mask R-CNN network and readers of published weights."""

@@ -1,4 +1,4 @@
-"""Reader of Mask R-CNN files from this project, torchvision (github.com/pytorch/vision) and detectron2."""
+"""Reader of Mask R-CNN weights from torchvision, detectron2 and this project."""
 
 from __future__ import annotations
 
@@ -38,11 +38,18 @@ class CheckpointKind(Enum):
 def read_network(
     path: Path, kind: CheckpointKind | None = None, classes: tuple[str, ...] | None = None, norm_eps: float = 0.0
 ) -> MaskRCNN:
-    """Return the network in `path`, in float32 and inference mode.
+    """Load a network in float32 and inference mode.
 
-    A .safetensors file is in this project's format and contains its description. For .pkl and .pth files, `kind` is
-    detected from the names of the weights if it is None. See `from_torchvision` and `from_detectron2` for the other
-    arguments. Code in the file is never run. Raises DataError if the file does not contain a Mask R-CNN.
+    Code in the file is never run.
+
+    Args:
+        path: A .safetensors file of this project, or a .pkl or .pth file of detectron2 or torchvision.
+        kind: The library that wrote a .pkl or .pth file; None = detected from the names of the weights.
+        classes: The class names; None = COCO.
+        norm_eps: The epsilon of the batch normalization, see `from_torchvision`.
+
+    Raises:
+        DataError: The file does not contain a Mask R-CNN with a feature pyramid.
     """
     if path.suffix == ".safetensors":
         return load_network(path)
@@ -58,12 +65,12 @@ def read_network(
 
 
 def domain_of_network(path: Path) -> str:
-    """Return the image domain of the network in `path` from its model card; "" = any."""
+    """Return the image domain in the model card of a network, or "" if any images are suitable."""
     return str(describe_network(path).card.get("domain", "")) if path.suffix == ".safetensors" else ""
 
 
 def _read_torch(path: Path) -> dict[str, Tensor]:
-    """Return the state_dict in a file written by torch.save."""
+    """Read the state_dict from a file that was written by torch.save."""
     check_regular(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -83,12 +90,17 @@ def _read_torch(path: Path) -> dict[str, Tensor]:
 def from_torchvision(
     state: Mapping[str, Tensor], where: str, classes: tuple[str, ...] | None = None, norm_eps: float = 0.0
 ) -> MaskRCNN:
-    """Return the network from a state_dict with torchvision's conventions.
+    """Build the network from a state_dict of torchvision.
 
-    `classes`: the labels after the background; None = COCO's 91 labels. The rows of unused COCO ids, which were trained
-    only as negatives, are removed. `norm_eps`: 0 for torchvision's published checkpoint, 1e-5 for networks trained with
-    the default. `where`: the source of the state_dict, for errors. Raises DataError if it is not from a Mask R-CNN with
-    a feature pyramid.
+    Args:
+        state: The state_dict.
+        where: The source of the state_dict, for messages.
+        classes: The class names without the background; None = COCO.
+        norm_eps: The epsilon of the batch normalization. It is 0 for the published checkpoint, and 1e-5 for networks
+            trained with default parameters.
+
+    Raises:
+        DataError: The state_dict is not from a Mask R-CNN with a feature pyramid.
     """
     tensors = {_newer_name(name): tensor for name, tensor in state.items()}
     labels = len(required(tensors, "roi_heads.box_predictor.cls_score.bias", where))
@@ -117,7 +129,7 @@ def _newer_name(name: str) -> str:
 
 
 def _without_gaps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors without the predictors' rows of unused COCO ids: the background and 80 classes remain."""
+    """Remove the rows of unused COCO ids from the predictors."""
     rows = torch.tensor(COCO_ROWS)
     sliced = dict(tensors)
     for kind in ("weight", "bias"):
@@ -130,7 +142,7 @@ def _without_gaps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _backbone(tensors: Mapping[str, Tensor], norm_eps: float, where: str) -> ResNetShape:
-    """Return the shape of the residual network, identified by the number of blocks in each level."""
+    """Identify the residual network by the number of blocks in each level."""
     depths = tuple(
         len({match[1] for name in tensors if (match := re.match(rf"backbone\.body\.layer{level}\.(\d+)\.", name))})
         for level in (1, 2, 3, 4)

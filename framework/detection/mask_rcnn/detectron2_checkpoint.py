@@ -1,6 +1,6 @@
-"""Conversion of detectron2's Mask R-CNN with ResNet-FPN (github.com/facebookresearch/detectron2) to a MaskRCNN.
+"""Converter for Mask R-CNN with ResNet-FPN from detectron2 (github.com/facebookresearch/detectron2).
 
-Its conventions differ from those of torchvision:
+The conventions differ from those of torchvision:
 
 - Images are BGR with a standard deviation of 1.
 - The first convolution of a bottleneck has the stride, as in MSRA's networks.
@@ -56,10 +56,15 @@ NOT_WEIGHTS = r"(pixel_mean|pixel_std|.*\.cell_anchors\.\d+|.*\.num_batches_trac
 
 
 def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str, ...] | None = None) -> MaskRCNN:
-    """Return the network from a detectron2 state_dict.
+    """Build the network from a state_dict of detectron2.
 
-    `where`: the source of the state_dict, for errors. `classes`: None = COCO's 80 classes. Raises DataError if the
-    state_dict is not from a Mask R-CNN with ResNet-FPN.
+    Args:
+        state: The state_dict.
+        where: The source of the state_dict, for messages.
+        classes: The class names; None = COCO.
+
+    Raises:
+        DataError: The state_dict is not from a Mask R-CNN with ResNet-FPN.
     """
     _check_input(state, where)
     tensors = {_renamed(name, where): tensor for name, tensor in state.items() if not re.fullmatch(NOT_WEIGHTS, name)}
@@ -88,9 +93,10 @@ def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str,
 
 
 def read_pickle(path: Path) -> dict[str, Tensor]:
-    """Read the state_dict from a `model_final_*.pkl` of detectron2 without running code from the file.
+    """Read the state_dict from a .pkl file of detectron2 without running code from the file.
 
-    Raises DataError if the file is damaged or contains objects other than arrays.
+    Raises:
+        DataError: The file is damaged or contains objects other than arrays.
     """
     check_regular(path)
     try:
@@ -109,7 +115,7 @@ def read_pickle(path: Path) -> dict[str, Tensor]:
 
 
 class ArraysOnly(pickle.Unpickler):
-    """Unpickler of numpy arrays that rejects all other objects in a pickle."""
+    """Unpickler that accepts only numpy arrays."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (allowed := ALLOWED.get((module.replace("numpy._core", "numpy.core"), name))) is None:
@@ -118,7 +124,7 @@ class ArraysOnly(pickle.Unpickler):
 
 
 def _encoded(text: str, encoding: str) -> bytes:
-    """Return the bytes that older pickle protocols of Python 3 store as `text`."""
+    """Return the bytes that pickle protocols before 3 store as `text`."""
     if encoding != "latin1":
         raise pickle.UnpicklingError(f"the encoding {encoding}")
     return text.encode("latin1")
@@ -147,23 +153,18 @@ def _renamed(name: str, where: str) -> str:
 
 
 def _check_input(state: Mapping[str, Tensor], where: str) -> None:
-    """Raise DataError if a checkpoint contains another normalization than PIXEL_MEAN and PIXEL_STD.
-
-    Only older checkpoints contain the normalization. Other values indicate another backbone.
-    """
+    """Raise DataError if the checkpoint contains an unsupported image normalization."""
+    # only older checkpoints contain the normalization; other values indicate another backbone
     for name, expected in (("pixel_mean", PIXEL_MEAN[::-1]), ("pixel_std", PIXEL_STD)):
         if name in state and not torch.allclose(state[name].float().flatten(), torch.tensor(expected), atol=1e-2):
             found = [round(value, 3) for value in state[name].flatten().tolist()]
-            raise DataError(f"{where}: {name}: expected {expected}, as in networks initialized from MSRA, got {found}")
+            origin = "as in networks initialized with MSRA weights"
+            raise DataError(f"{where}: {name}: expected {expected}, {origin}, got {found}")
 
 
 def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:
-    """Return the anchor sides, px of the network's input, one per pyramid level.
-
-    Only older checkpoints contain anchors. Otherwise, return the default sides of detectron2. Raises DataError for
-    aspect ratios other than those of `Architecture`.
-    """
-    sides = list(Architecture.anchor_sides)
+    """Return the anchor size of each pyramid level, px."""
+    sides = list(Architecture.anchor_sides)  # default of detectron2; only older checkpoints contain anchors
     for level in range(len(sides)):
         if (anchors := state.get(f"proposal_generator.anchor_generator.cell_anchors.{level}")) is None:
             continue
@@ -177,7 +178,7 @@ def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:
 
 
 def _put_background_first(tensors: dict[str, Tensor], where: str) -> None:
-    """Move the scores of the background from the end to the front; add zeros as its deltas and masks."""
+    """Move the scores of the background to the front, and add zeros as its deltas and masks."""
     for kind in ("weight", "bias"):
         name = f"roi_heads.box_predictor.cls_score.{kind}"
         tensors[name] = required(tensors, name, where).roll(1, dims=0)
@@ -188,7 +189,7 @@ def _put_background_first(tensors: dict[str, Tensor], where: str) -> None:
 
 
 def _depth(tensors: Mapping[str, Tensor], where: str) -> str:
-    """Return the name of the residual network, identified by the number of blocks in its third level."""
+    """Identify the residual network by the number of blocks in its third level."""
     blocks = len({name.split(".")[3] for name in tensors if name.startswith("backbone.body.layer3.")})
     for name in WITH_BOTTLENECKS:
         if DEPTHS[name][2] == blocks:

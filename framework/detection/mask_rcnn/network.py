@@ -1,10 +1,9 @@
-"""Mask R-CNN on a feature pyramid (He et al. 2017; Lin et al. 2017), in plain torch, with torchvision's names.
+"""Mask R-CNN with a feature pyramid (He et al. 2017, Lin et al. 2017), in plain torch.
 
     image ─► ResNet ─► feature pyramid ─► region proposals ─► boxes and class distributions ─► masks
 
-An Architecture describes the network and is stored with the weights. `propose` and `select` take the parameters of a
-run, such as thresholds. Boxes are x1 y1 x2 y2 px of the network's input, with extent 0
-(framework.detection.masks.boxes) unless stated otherwise. Class 0 is the background.
+The parameters have the names of torchvision. Unless stated otherwise, boxes are x1 y1 x2 y2 in px of the network's
+input, and x2 is the right border. Class 0 is the background.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ PROPOSAL_NMS = 0.7  # IoU threshold of non-maximum suppression among the proposa
 
 @dataclass(frozen=True)
 class Architecture:
-    """Parameters of a network that its weights do not contain."""
+    """Hyperparameters of a network, stored together with its weights."""
 
     classes: tuple[str, ...]  # without the background, in the order of the network's columns
     backbone: ResNetShape = field(default_factory=ResNetShape)
@@ -56,7 +55,7 @@ class Architecture:
 
 
 class MaskRCNN(nn.Module):
-    """Mask R-CNN, with its steps `normalize`, `extract`, `score_anchors`, `classify` and `segment`."""
+    """Mask R-CNN network."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
@@ -78,7 +77,7 @@ class MaskRCNN(nn.Module):
         return self.roi_heads.box_predictor.cls_score.weight.dtype
 
     def normalize(self, images: Tensor) -> Tensor:
-        """Normalize RGB images (N, 3, H, W), 0..255, and pad them at the right and bottom to multiples of 32 px."""
+        """Normalize RGB images (N, 3, H, W) with values 0 to 255, and pad them to multiples of 32 px."""
         mean, std = (
             torch.tensor(values, device=images.device)[:, None, None]
             for values in (self.architecture.pixel_mean, self.architecture.pixel_std)
@@ -90,16 +89,13 @@ class MaskRCNN(nn.Module):
     def extract(self, images: Tensor) -> list[Tensor]:
         """Return the feature pyramid of normalized images (N, 3, H, W).
 
-        The levels P2 to P6 are (N, F, H / stride, W / stride), with F = `fpn_channels` and STRIDES.
+        Each of the levels P2 to P6 has the shape (N, fpn_channels, H / stride, W / stride). The strides are STRIDES.
         """
         levels: list[Tensor] = self.backbone(images)
         return levels
 
     def score_anchors(self, pyramid: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the objectness logits (N, A) and deltas (N, A, 4) of the A anchors of all levels.
-
-        Their order is that of `anchors`.
-        """
+        """Return the objectness logits (N, A) and box deltas (N, A, 4) of the anchors of all levels."""
         objectness, deltas = zip(*(self.rpn["head"](level) for level in pyramid), strict=True)
         n = len(pyramid[0])
         return (
@@ -108,10 +104,7 @@ class MaskRCNN(nn.Module):
         )
 
     def anchors(self, pyramid: Sequence[Tensor]) -> list[Float32]:
-        """Return the anchors of each level as an array (A, 4), px, where A depends on the level.
-
-        Repeated calls with equal shapes return the same arrays.
-        """
+        """Return the anchor boxes (A, 4), px, of each level."""
         shapes = [(level.shape[2], level.shape[3]) for level in pyramid]
         known, grids = self._grids
         if shapes != known:
@@ -125,25 +118,28 @@ class MaskRCNN(nn.Module):
         return grids
 
     def classify(self, pyramid: Sequence[Tensor], boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the class logits (P, 1 + C) and box deltas (P, 1 + C, 4) of boxes (P, 4), px, in one image.
+        """Classify boxes in one image and refine their coordinates.
 
-        The first of the 1 + C labels is the background.
+        Args:
+            pyramid: The feature pyramid of the image.
+            boxes: The boxes (P, 4), px.
+
+        Returns:
+            The class logits (P, 1 + C) and box deltas (P, 1 + C, 4). The background is first.
         """
         x = self.roi_heads.box_head(self.pool(pyramid, boxes, BOX_BINS))
         logits, deltas = self.roi_heads.box_predictor(x)
         return logits, deltas.view(*logits.shape, 4)  # -1 would be ambiguous without boxes
 
     def segment(self, pyramid: Sequence[Tensor], boxes: Tensor) -> Tensor:
-        """Return the mask logits (P, 1 + C, 28, 28) of each label over boxes (P, 4), px, in one image."""
+        """Return the mask logits (P, 1 + C, 28, 28) of each class in boxes (P, 4), px."""
         logits: Tensor = self.roi_heads.mask_predictor(self.roi_heads.mask_head(self.pool(pyramid, boxes, MASK_BINS)))
         return logits
 
     def pool(self, pyramid: Sequence[Tensor], boxes: Tensor, bins: int) -> Tensor:
-        """Return the features (P, F, bins, bins) of boxes (P, 4), px, with F = `fpn_channels`.
-
-        The size of a box determines its level (Lin et al. 2017, eq. 1).
-        """
+        """Return the features (P, fpn_channels, bins, bins) pooled from boxes (P, 4), px."""
         sides = (boxes[:, 2:] - boxes[:, :2]).clamp(min=0).prod(dim=1).sqrt()
+        # the size of a box determines its level (Lin et al. 2017, eq. 1)
         level = torch.floor(CANONICAL_LEVEL + torch.log2(sides / CANONICAL_SIDE) + 1e-6)
         level = level.clamp(0, POOLED_LEVELS - 1)
         pooled = pyramid[0].new_zeros((len(boxes), pyramid[0].shape[1], bins, bins))
@@ -157,7 +153,7 @@ class MaskRCNN(nn.Module):
 
 
 class FeaturePyramid(nn.Module):
-    """P2 to P6 from C2 to C5 (Lin et al., "Feature Pyramid Networks", 2017)."""
+    """Feature pyramid with the levels P2 to P6 (Lin et al., "Feature Pyramid Networks", 2017)."""
 
     def __init__(self, channels: Sequence[int], out: int) -> None:
         super().__init__()
@@ -175,7 +171,7 @@ class FeaturePyramid(nn.Module):
 
 
 class ProposalHead(nn.Module):
-    """Objectness and deltas of the anchors of every cell (Ren et al., "Faster R-CNN", 2015)."""
+    """Head that predicts the objectness and box deltas of anchors (Ren et al., "Faster R-CNN", 2015)."""
 
     def __init__(self, channels: int, anchors: int) -> None:
         super().__init__()
@@ -189,7 +185,7 @@ class ProposalHead(nn.Module):
 
 
 class RoiHeads(nn.Module):
-    """The box head and the mask head, which process pooled regions."""
+    """The box head and the mask head."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
@@ -219,7 +215,7 @@ class RoiHeads(nn.Module):
 
 
 class BoxPredictor(nn.Module):
-    """Predictor of the logit and the box deltas of each label."""
+    """Linear layers that predict the logit and the box deltas of each class."""
 
     def __init__(self, features: int, labels: int) -> None:
         super().__init__()
@@ -235,7 +231,7 @@ def _convolution(channels: int, out: int) -> nn.Sequential:
 
 
 def _anchors(side: float, architecture: Architecture) -> Float32:
-    """Return the anchors (R, 4), px, of one cell with R aspect ratios; their centers are at (0, 0)."""
+    """Return the anchor boxes (R, 4), px, of a cell with its center at (0, 0)."""
     ratios = np.array(architecture.anchor_ratios)
     widths, heights = side / np.sqrt(ratios), side * np.sqrt(ratios)
     anchors = np.stack([-widths, -heights, widths, heights], axis=1).astype(np.float64) / 2
@@ -251,11 +247,16 @@ def propose(
     after_nms: int,
     extent: float = 0.0,
 ) -> Float32:
-    """Return the box proposals (P, 4), px, for one image of `shape` (height, width) px, best first.
+    """Select the box proposals (P, 4), px, of one image, best first.
 
-    `anchors`: one array (A_k, 4) for each level k. `objectness` (A,) and `deltas` (A, 4): of the anchors of all levels
-    in order. At most the best `before_nms` anchors of each level are decoded. At most `after_nms` boxes of all levels
-    remain. `extent`: the box convention, see `framework.detection.masks.boxes`.
+    Args:
+        anchors: The anchors (A_k, 4) of each level k, px.
+        objectness: The objectness (A,) of the anchors of all levels.
+        deltas: The box deltas (A, 4) of the anchors of all levels.
+        shape: The image size (height, width), px.
+        before_nms: The maximum number of anchors per level before non-maximum suppression.
+        after_nms: The maximum number of proposals.
+        extent: The box convention, see `framework.detection.masks.boxes`.
     """
     boxes, scores, levels = [], [], []
     start = 0
@@ -274,7 +275,10 @@ def propose(
 
 
 def best_first(scores: Float32, count: int) -> Int64:
-    """Return the indices of the `count` highest scores, best first, without a full sort; ties keep their order."""
+    """Return the indices of the `count` highest scores, best first.
+
+    Equal scores keep their order.
+    """
     if count >= len(scores):
         return np.asarray(np.argsort(-scores, kind="stable"), np.int64)
     lowest = np.partition(scores, len(scores) - count)[len(scores) - count]
@@ -292,11 +296,22 @@ def select(
     limit: int,
     extent: float = 0.0,
 ) -> tuple[Float32, Int32, Int32]:
-    """Return the boxes (N, 4), indices of their proposals (N,) and labels (N,) after suppression, best first.
+    """Select the detected boxes of one image by probability and non-maximum suppression.
 
-    `proposals`: (P, 4) px. `probabilities`: (P, 1 + C). `deltas`: (P, 1 + C, 4). `shape`: (height, width) px. Label 0
-    is the background. Each other label of a proposal with a probability above `score_threshold` is a candidate with its
-    own deltas. `nms`: IoU threshold of the suppression within a label. `limit`: maximum number of boxes, N.
+    Each class of a proposal with a sufficient probability is a separate candidate.
+
+    Args:
+        proposals: The proposals (P, 4), px.
+        probabilities: The class probabilities (P, 1 + C). The background is first.
+        deltas: The box deltas (P, 1 + C, 4) of each class.
+        shape: The image size (height, width), px.
+        score_threshold: The minimum probability of a class.
+        nms: The IoU above which the worse of two boxes of a class is removed.
+        limit: The maximum number of boxes.
+        extent: The box convention, see `framework.detection.masks.boxes`.
+
+    Returns:
+        The boxes (N, 4), px, the index of the proposal of each box (N,), and its label (N,), best first.
     """
     proposal, label = np.nonzero(probabilities[:, 1:] > score_threshold)
     label += 1
@@ -310,9 +325,9 @@ def select(
 
 
 def fuse_batch_norms(network: nn.Module) -> None:
-    """Fold each nn.BatchNorm2d into the preceding convolution, in place.
+    """Fold each batch normalization into the preceding convolution, in place.
 
-    The network must be in inference mode, because the normalization depends on the batch in training.
+    The network must be in inference mode.
     """
     for module in network.modules():
         for (name, layer), (next_name, next_layer) in pairwise(list(module.named_children())):

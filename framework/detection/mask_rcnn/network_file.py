@@ -1,8 +1,10 @@
-"""Networks as safetensors files with metadata.
+"""Network files in safetensors format.
 
-architecture     the Architecture as JSON
-card             the model card as JSON: data, steps, AP, limits, ...; `domain`: the image domain of the training
-tensors_sha256   hash of all names, types, shapes and values, to detect damage
+The metadata contain:
+
+    architecture     the Architecture as JSON
+    card             the model card as JSON: data, steps, AP, limits, ...; `domain`: the image domain of the training
+    tensors_sha256   hash of all names, types, shapes and values, to detect damage
 """
 
 from __future__ import annotations
@@ -32,22 +34,26 @@ COUNTERS = ".num_batches_tracked"  # suffix of the counters of batch normalizati
 
 @dataclass(frozen=True)
 class NetworkDescription:
-    """The metadata of a network file."""
+    """Metadata of a network file."""
 
     architecture: Architecture
     card: Mapping[str, Fact]
 
 
 def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: bool = False) -> None:
-    """Write the network to `path` atomically.
+    """Write a network to a file.
 
-    `half`: True = weights with two or more dimensions are stored as float16. Biases and statistics remain float32,
-    because they are few and variances may exceed the range of float16.
+    Args:
+        network: The network.
+        path: The output file.
+        card: The model card.
+        half: True = store weight matrices and kernels in half precision.
 
-    Raises DataError if a weight is not finite or the file cannot be written.
+    Raises:
+        DataError: A weight is not finite, or the file cannot be written.
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in _stored(network).items()}
-    if half:
+    if half:  # biases and statistics remain float32, because variances may exceed the range of float16
         tensors = {name: tensor.half() if tensor.ndim >= 2 else tensor for name, tensor in tensors.items()}
     _check_finite(tensors, str(path))
     metadata = {
@@ -63,7 +69,11 @@ def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: 
 
 
 def load_network(path: Path) -> MaskRCNN:
-    """Read the network in `path`, in float32 and inference mode. Raises DataError if it is not a valid network file."""
+    """Load a network in float32 and inference mode.
+
+    Raises:
+        DataError: The file is not a valid network file.
+    """
     with _opened(path) as file:
         description = _description(file.metadata(), path)
         names = file.keys()
@@ -77,16 +87,21 @@ def load_network(path: Path) -> MaskRCNN:
 
 
 def describe_network(path: Path) -> NetworkDescription:
-    """Read the metadata of `path` without the weights."""
+    """Read the metadata of a network file without loading the weights."""
     with _opened(path) as file:
         return _description(file.metadata(), path)
 
 
 def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str) -> MaskRCNN:
-    """Build a network with these weights, in float32 and inference mode.
+    """Build a network with the given weights, in float32 and inference mode.
 
-    Counters are ignored. `where`: the source of the tensors, for errors. Raises DataError if the tensors do not match
-    the architecture.
+    Args:
+        architecture: The architecture.
+        tensors: The weights by name.
+        where: The source of the weights, for messages.
+
+    Raises:
+        DataError: The weights do not match the architecture.
     """
     try:
         with torch.device("meta"):  # saves memory and random initialization of weights that are replaced below
@@ -107,7 +122,11 @@ def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str
 
 
 def required(tensors: Mapping[str, Tensor], name: str, where: str) -> Tensor:
-    """Return the tensor `name` of the source `where`. Raises DataError if the tensor is missing."""
+    """Return the tensor with a given name.
+
+    Raises:
+        DataError: There is no such tensor. The message contains the source `where`.
+    """
     if name not in tensors:
         raise DataError(f"{where}: expected the weights {name} of a Mask R-CNN with a feature pyramid, got none")
     return tensors[name]
@@ -125,7 +144,7 @@ def _check_names(expected: typing.AbstractSet[str], found: typing.AbstractSet[st
 
 
 def _first_of(names: typing.AbstractSet[str]) -> str:
-    """Format the first name and the number of other names for messages."""
+    """Format one of the names and the number of the others, for messages."""
     return f"{min(names)} and {len(names) - 1} more" if len(names) > 1 else min(names)
 
 
@@ -136,7 +155,7 @@ def _check_finite(tensors: Mapping[str, Tensor], where: str) -> None:
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:
-    """Compute the SHA-256 (hex) of names, types, shapes and values."""
+    """Return the SHA-256 hash of the names, types, shapes and values."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name]
@@ -168,7 +187,7 @@ def _description(metadata: Mapping[str, str] | None, path: Path) -> NetworkDescr
 
 
 def _parsed(kind: Any, value: Any, name: str) -> Any:
-    """Convert a JSON value to the annotated type `kind`. Raises ValueError for other types."""
+    """Convert a JSON value to an annotated type."""
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
             raise ValueError(f"{name}: expected a JSON object, got {value!r}")

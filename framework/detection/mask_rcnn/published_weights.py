@@ -1,4 +1,4 @@
-"""Network files: local files, and published files that are downloaded once and verified."""
+"""Local network files, and published network files that are downloaded once."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PublishedNetwork:
-    """A published file. Its name contains the first digits of its hash."""
+    """A published network file.
+
+    The file name contains the first digits of the hash.
+    """
 
     url: str
     algorithm: str  # name in hashlib
@@ -39,11 +42,11 @@ class PublishedNetwork:
 
     @property
     def file(self) -> Path:
-        """The path in the user's cache."""
+        """The path of the file in the user's cache."""
         return networks_folder() / self.url.rpartition("/")[2]
 
     def digest_of(self, path: Path) -> str:
-        """Compute the hash of a file, truncated to the number of published digits."""
+        """Return the hash of a file, with as many digits as published."""
         with path.open("rb") as file:
             return hashlib.file_digest(file, self.algorithm).hexdigest()[: len(self.digest)]
 
@@ -65,15 +68,19 @@ PUBLISHED = {
 
 
 def networks_folder() -> Path:
-    """Return the folder of downloaded networks in the user's cache."""
+    """Return the cache folder of downloaded networks."""
     return platformdirs.user_cache_path("instancemap", appauthor=False) / "networks"
 
 
 def find_network(weights: Path) -> Path:
-    """Return the file of `weights`, a path or a name in PUBLISHED.
+    """Return the path of a network file, and download a published file if necessary.
 
-    A missing published file is downloaded. A relative path is searched in the working directory, then in the project
-    folder. Raises DataError if the file does not exist, cannot be downloaded, or has a wrong hash.
+    Args:
+        weights: A path, or a name in PUBLISHED. Relative paths are searched in the working directory, then in the
+            project folder.
+
+    Raises:
+        DataError: The file does not exist, cannot be downloaded, or has a wrong hash.
     """
     if published := PUBLISHED.get(str(weights)):
         if not published.file.exists():
@@ -88,7 +95,7 @@ def find_network(weights: Path) -> Path:
 
 
 def check(published: PublishedNetwork) -> None:
-    """Raise DataError unless the cached file has the published hash."""
+    """Raise DataError if a downloaded file does not have the published hash."""
     try:
         found = published.digest_of(published.file)
     except OSError as error:
@@ -101,7 +108,7 @@ def check(published: PublishedNetwork) -> None:
 
 
 def download(published: PublishedNetwork) -> None:
-    """Download the file into the cache with a progress bar, and write it atomically."""
+    """Download a published file into the cache."""
     by_hand = f"download {published.url} and put it at {published.file}"
     if os.environ.get(OFFLINE):
         raise DataError(f"{published.file}: expected a file while {OFFLINE} disables downloads, got none; {by_hand}")
@@ -120,7 +127,7 @@ def download(published: PublishedNetwork) -> None:
 
 
 def _received(published: PublishedNetwork, by_hand: str) -> Iterator[bytes]:
-    """Yield the blocks of the file from the server. Raises DataError with the fix `by_hand` for connection errors."""
+    """Yield the blocks of a file that is downloaded, and show the progress."""
     url, name = published.url, published.file.name
     try:
         with (

@@ -1,4 +1,4 @@
-"""Residual networks (He et al., "Deep Residual Learning", 2016) as feature extractors, with torchvision's names."""
+"""Residual networks (He et al., "Deep Residual Learning", 2016) as feature extractors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EXPANSION = 4  # number of output channels per inner channel of a bottleneck
 
 @dataclass(frozen=True)
 class ResNetShape:
-    """The parameters of a residual network."""
+    """Hyperparameters of a residual network."""
 
     name: str = "resnet50"  # a key of DEPTHS
     width: int = 64  # number of channels of the stem; 64 in He et al. 2016
@@ -30,13 +30,13 @@ class ResNetShape:
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """The number of channels of each of the four levels."""
+        """The number of output channels of each of the four levels."""
         factor = EXPANSION if self.name in WITH_BOTTLENECKS else 1
         return tuple(self.width * 2**level * factor for level in range(4))
 
 
 class ResNet(nn.Module):
-    """The levels C2 to C5 of a residual network, with strides of 4, 8, 16 and 32."""
+    """Residual network that returns the levels C2 to C5, with strides of 4, 8, 16 and 32 px."""
 
     def __init__(self, shape: ResNetShape) -> None:
         super().__init__()
@@ -62,10 +62,7 @@ def _layer(channels: int, out: int, stride: int, blocks: int, shape: ResNetShape
 
 
 class Block(nn.Module):
-    """A residual block: two 3x3 convolutions, or a bottleneck of 1x1, 3x3 and 1x1 convolutions.
-
-    The inner convolutions of a bottleneck have a quarter of the output channels.
-    """
+    """A residual block with two 3x3 convolutions, or a bottleneck with 1x1, 3x3 and 1x1 convolutions."""
 
     def __init__(self, channels: int, out: int, stride: int, shape: ResNetShape) -> None:
         super().__init__()

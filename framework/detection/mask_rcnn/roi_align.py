@@ -1,6 +1,6 @@
-"""RoIAlign (He et al., "Mask R-CNN", 2017) as two matrix products or as weighted sums of cells, whichever is cheaper.
+"""RoIAlign (He et al., "Mask R-CNN", 2017) in plain torch.
 
-torchvision's implementation is not used, because its extension loads only with a matching build of torch.
+torchvision's implementation is not used, because its extension requires a matching build of torch.
 """
 
 from __future__ import annotations
@@ -23,16 +23,19 @@ def roi_align(
     sampling_ratio: int = 0,
     half_pixel: bool = False,
 ) -> Tensor:
-    """Return the pooled features (N, C, bins, bins) of N boxes, in channels-last memory format.
+    """Return the features (N, C, bins, bins) pooled from N boxes.
 
-    A bin is the mean of bilinear samples on a regular grid. `features`: (1, C, H, W). `boxes`: (N, 4) x1 y1 x2 y2 px of
-    the network's input. `spatial_scale`: cells per pixel. `sampling_ratio`: number of samples per side of a bin, 0 =
-    one per covered cell. `half_pixel`: True = "aligned"; False = the older convention. In the older convention, the
-    center of cell i is at input coordinate i / spatial_scale, and a box is at least one cell wide.
+    Each bin is the mean of bilinear samples on a regular grid. The result is differentiable and has channels-last
+    memory format.
 
-    Bilinear weights factorize into x and y, and so does their mean over a grid. A pooled box is A_y F A_x^T with a
-    (bins, H) and a (bins, W) matrix, which costs O(bins H W) per box. Each row of the matrices is zero outside of a
-    window of a few cells. A weighted sum over the windows costs O(bins^2 window^2). Both are differentiable.
+    Args:
+        features: The feature map (1, C, H, W).
+        boxes: The boxes (N, 4) x1 y1 x2 y2, px of the network's input.
+        bins: The number of bins per side of a box.
+        spatial_scale: The number of feature cells per pixel of the input.
+        sampling_ratio: The number of samples per side of a bin; 0 = one per covered cell.
+        half_pixel: True = "aligned" as in detectron2; False = the older convention. In the older convention, the center
+            of cell i is at the input coordinate i / spatial_scale, and boxes are at least one cell wide.
     """
     channels, height, width = features.shape[1:]
     boxes_cells = boxes.float() * spatial_scale - (0.5 if half_pixel else 0.0)
@@ -40,6 +43,8 @@ def roi_align(
     x = Samples.along(boxes_cells[:, 0], boxes_cells[:, 2], bins, width, sampling_ratio, shortest)
     y = Samples.along(boxes_cells[:, 1], boxes_cells[:, 3], bins, height, sampling_ratio, shortest)
     cells = features[0].permute(1, 2, 0).reshape(height * width, channels)
+    # Bilinear pooling is separable: A_y F A_x^T, which costs O(bins H W) per box as matrix products. Each row of the
+    # matrices is zero outside a window of a few cells. A weighted sum over the windows costs O(bins^2 window^2).
     sums = float((x.windows * y.windows).sum()) * bins * PRODUCT_SPEED
     products = len(boxes) * float(height * width + bins * width)
     return _sums(cells, x, y) if sums <= products else _products(cells, x, y)
@@ -47,7 +52,7 @@ def roi_align(
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples of N boxes along one axis of a feature map."""
+    """Sampling positions in N boxes along one axis of a feature map."""
 
     start: Tensor  # (N,) in cells
     size: Tensor  # (N,) in cells
@@ -58,10 +63,15 @@ class Samples:
 
     @classmethod
     def along(cls, start: Tensor, end: Tensor, bins: int, cells: int, ratio: int, shortest: float) -> Samples:
-        """Create the samples between `start` and `end` (N,), in cells.
+        """Create the samples of boxes along one axis.
 
-        `ratio`: number of samples per bin, 0 = one per covered cell. Boxes shorter than `shortest`, in cells, are
-        extended to it.
+        Args:
+            start: The first border (N,) of the boxes, cells.
+            end: The second border (N,) of the boxes, cells.
+            bins: The number of bins per box.
+            cells: The number of cells of the feature map.
+            ratio: The number of samples per bin; 0 = one per covered cell.
+            shortest: The minimum length of a box, cells. Shorter boxes are extended.
         """
         size = (end - start).clamp(min=shortest)
         counts = torch.full_like(size, ratio) if ratio else (size / bins).ceil().clamp(min=1.0)
@@ -70,12 +80,12 @@ class Samples:
         return cls(start, size, counts, windows, bins, cells)
 
     def of(self, chosen: Tensor) -> Samples:
-        """Return the samples of the boxes at the indices `chosen`."""
+        """Return the samples of some of the boxes."""
         start, size, counts, windows = (array[chosen] for array in (self.start, self.size, self.counts, self.windows))
         return Samples(start, size, counts, windows, self.bins, self.cells)
 
     def weights(self) -> tuple[Tensor, Tensor]:
-        """Return the first cell (N, bins) int64 and the weights (N, bins, window) of each bin's window."""
+        """Return the nonzero weights (N, bins, window) of feature cells in each bin, and the first cell (N, bins)."""
         most, window = (int(array.max()) if len(array) else 1 for array in (self.counts, self.windows))
         k = torch.arange(most, device=self.start.device)
         counts = self.counts[:, None, None]
@@ -89,27 +99,23 @@ class Samples:
         return first.long(), weights.sum(dim=2) / counts
 
     def matrices(self) -> Tensor:
-        """Return the weights as matrices (N, bins, cells)."""
+        """Return the weights of all cells as matrices (N, bins, cells)."""
         first, weights = self.weights()
         cells = first[..., None] + torch.arange(weights.shape[2], device=first.device)
         return weights.new_zeros((*first.shape, self.cells)).scatter_(2, cells, weights)
 
 
 def _products(cells: Tensor, x: Samples, y: Samples) -> Tensor:
-    """Return the pooled features (N, C, bins, bins) as A_y F A_x^T of each box."""
+    """Return the pooled features (N, C, bins, bins), computed as matrix products."""
     rows = y.matrices().to(cells.dtype).reshape(-1, y.cells) @ cells.reshape(y.cells, -1)
     pooled = x.matrices().to(cells.dtype)[:, None] @ rows.view(-1, y.bins, x.cells, cells.shape[1])
     return pooled.permute(0, 3, 1, 2)
 
 
 def _sums(cells: Tensor, x: Samples, y: Samples) -> Tensor:
-    """Return the pooled features (N, C, bins, bins) as weighted sums over windows of cells.
-
-    The boxes are processed in chunks with windows of similar size, because the largest window of a chunk determines its
-    cost.
-    """
+    """Return the pooled features (N, C, bins, bins), computed as weighted sums over windows of cells."""
     sizes = x.windows * y.windows
-    largest = int(sizes.max()) if len(sizes) else 1
+    largest = int(sizes.max()) if len(sizes) else 1  # the largest window determines the cost of a chunk
     at_once = max(1, CHUNK // (x.bins * y.bins * largest))
     if len(sizes) <= at_once:
         return _sum_chunk(cells, x, y).permute(0, 3, 1, 2)
@@ -120,7 +126,7 @@ def _sums(cells: Tensor, x: Samples, y: Samples) -> Tensor:
 
 
 def _sum_chunk(cells: Tensor, x: Samples, y: Samples) -> Tensor:
-    """Return the pooled features (N, bins, bins, C) as sums over bags of weighted cells."""
+    """Return the pooled features (N, bins, bins, C) of boxes that are processed together."""
     first_x, weights_x = x.weights()
     first_y, weights_y = y.weights()
     column = first_x[..., None] + torch.arange(weights_x.shape[2], device=cells.device)

@@ -1,4 +1,4 @@
-"""Binary masks: creation from box grids or prototypes, bounding boxes, overlaps and duplicates."""
+"""Binary masks: conversion from network outputs, bounding boxes, overlaps and duplicates."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ from framework.detection.masks.letterbox import Letterbox
 
 
 def paste_masks(grids: Float32, borders: Float32, shape: tuple[int, int], threshold: float = 0.5) -> Bool:
-    """Return the masks (N, H, W) of grids of probabilities, resampled to their boxes in an image of `shape`.
+    """Resample mask probabilities of boxes to the image and return the masks (N, H, W).
 
-    Pixels above `threshold` after bilinear interpolation are inside a mask. `grids`: (N, G, G) probabilities over each
-    box. `borders`: (N, 4) boxes x1 y1 x2 y2 px, pixel centers at integers. The grids are padded with one cell of zeros,
-    as in Detectron, so that a mask ends at the border of its box even if all cells are filled.
+    The grids are padded with zeros, as in Detectron, so that each mask ends at the border of its box.
+
+    Args:
+        grids: The mask probabilities (N, G, G) on a grid over each box.
+        borders: The boxes (N, 4) x1 y1 x2 y2, px, with pixel centers at integers.
+        shape: The image size (height, width), px.
+        threshold: The minimum probability of a pixel in the mask.
     """
     padded = np.pad(grids.astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
     masks = np.zeros((len(grids), *shape), np.bool_)
@@ -32,12 +36,15 @@ def masks_from_prototypes(
     shape: tuple[int, int],
     threshold: float = 0.5,
 ) -> Bool:
-    """Return the masks (N, H, W): thresholded weighted sums of prototypes (Bolya et al., "YOLACT").
+    """Compute masks (N, H, W) as weighted sums of prototypes (Bolya et al., "YOLACT", 2019).
 
-    `coefficients`: (N, M). `prototypes`: (M, h, w), whose cells cover the complete input of the network. `borders`: (N,
-    4) boxes x1 y1 x2 y2 px of the image, the limits of the masks. `letterbox`: the placement of the image in the input.
-    `shape`: (height, width) px of the image. The sums are logits, interpolated bilinearly between cell centers.
-    `threshold`: minimum mask probability of a pixel in the mask.
+    Args:
+        coefficients: The weights (N, M) of the prototypes.
+        prototypes: The prototypes (M, h, w), which cover the complete input of the network.
+        borders: The boxes (N, 4) x1 y1 x2 y2 in the image, px. Masks are limited to their boxes.
+        letterbox: The placement of the image in the input of the network.
+        shape: The image size (height, width), px.
+        threshold: The minimum probability of a pixel in the mask.
     """
     count, rows, columns = prototypes.shape
     logits = (coefficients @ prototypes.reshape(count, -1)).reshape(len(coefficients), rows, columns)
@@ -57,20 +64,30 @@ def masks_from_prototypes(
 
 
 def tight_boxes(masks: Bool) -> Float32:
-    """Return the boxes (N, 4) x1 y1 x2 y2 px of masks (N, H, W): first and last pixels inside; 0 for an empty mask."""
+    """Return the bounding boxes (N, 4) x1 y1 x2 y2, px, of masks (N, H, W).
+
+    The borders are the first and last pixels in the mask. The box of an empty mask is 0.
+    """
     return np.asarray(mask_bounds(masks.view(np.uint8)), np.float32)
 
 
 def mask_overlaps(masks: Bool, boxes: Float32) -> Float64:
-    """Return the intersections (N, N), in pixels, of masks (N, H, W); boxes (N, 4) must be their `tight_boxes`."""
+    """Return the number of common pixels (N, N) for each pair of masks.
+
+    Args:
+        masks: The masks (N, H, W).
+        boxes: The bounding boxes (N, 4) from `tight_boxes`.
+    """
     return np.asarray(shared_pixels(masks.view(np.uint8), boxes.astype(np.int64)), np.float64)
 
 
 def suppress_duplicates(masks: Bool, boxes: Float32, iou: float) -> Int32:
-    """Return the indices of the remaining masks after suppression of duplicates, best first.
+    """Return the indices of masks that are neither empty nor duplicates of a better mask.
 
-    A mask is removed if it is empty or its IoU with a better remaining mask exceeds `iou`. `masks`: (N, H, W), best
-    first. `boxes` (N, 4) must be their `tight_boxes`.
+    Args:
+        masks: The masks (N, H, W), best first.
+        boxes: The bounding boxes (N, 4) from `tight_boxes`.
+        iou: The IoU above which the worse of two masks is a duplicate.
     """
     overlaps = mask_overlaps(masks, boxes)
     areas = overlaps.diagonal()
@@ -84,7 +101,15 @@ def suppress_duplicates(masks: Bool, boxes: Float32, iou: float) -> Int32:
 def without_duplicates(
     masks: Bool, scores: Float32, class_probabilities: Float32, classes: tuple[str, ...], iou: float
 ) -> Detections:
-    """Return the detections of masks (N, H, W) after `suppress_duplicates`, with tight boxes."""
+    """Return detections with bounding boxes, without empty masks and duplicates.
+
+    Args:
+        masks: The masks (N, H, W), best first.
+        scores: The scores (N,).
+        class_probabilities: The class distributions (N, C).
+        classes: The class names.
+        iou: The IoU above which the worse of two masks is a duplicate.
+    """
     boxes = tight_boxes(masks)
     kept = suppress_duplicates(masks, boxes, iou)
     return Detections(masks[kept], boxes[kept], scores[kept], class_probabilities[kept], classes)

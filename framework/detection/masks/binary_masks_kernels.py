@@ -1,4 +1,4 @@
-"""Kernels of binary_masks.py, and contacts between instances."""
+"""Kernels of binary_masks.py, and detection of touching instances."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ CONTACT_DEPTH = 0.1  # largest difference in depth between neighboring pixels of
 
 @njit(cache=True, nogil=True)
 def mask_bounds(masks):
-    """Return the bounds (N, 4) x1 y1 x2 y2 px of masks (N, H, W), 0 for an empty mask.
+    """Return the bounding boxes (N, 4) x1 y1 x2 y2, px, of masks (N, H, W).
 
-    A vectorized test skips empty rows, because most rows are empty. The other rows are scanned from both ends.
+    The box of an empty mask is 0.
     """
     n, height, width = masks.shape
     bounds = np.zeros((n, 4), np.int64)
     for i in range(n):
         x1, y1, x2, y2 = width, height, -1, -1
         for v in range(height):
-            filled = np.uint8(0)
+            filled = np.uint8(0)  # a vectorized test skips empty rows, because most rows are empty
             for u in range(width):
                 filled = np.uint8(filled | masks[i, v, u])  # numba would widen to 64 bits
             if not filled:
@@ -39,9 +39,9 @@ def mask_bounds(masks):
 
 @njit(cache=True, nogil=True)
 def shared_pixels(masks, bounds):
-    """Return the number of common pixels (N, N) of each pair of masks (N, H, W).
+    """Return the number of common pixels (N, N) for each pair of masks (N, H, W).
 
-    `bounds`: their bounds (N, 4) x1 y1 x2 y2 px, first and last pixels inside.
+    `bounds` are the bounding boxes (N, 4) from `mask_bounds`.
     """
     n = len(masks)
     shared = np.zeros((n, n), np.int64)
@@ -60,10 +60,16 @@ def shared_pixels(masks, bounds):
 
 @njit(cache=True, nogil=True)
 def _grid_cells(start, end, cells, pixels):
-    """Return the first pixel, and for each pixel the lower cell index and the interpolation weight of the next cell.
+    """Return the pixels of a box along one axis and the grid cells between which they are interpolated.
 
-    The pixels are those along one axis of a box from `start` to `end`, px, and up to half a cell outside of it, in an
-    image of `pixels` pixels. `cells`: number of grid cells along the axis without the padding. Index 0 is the padding.
+    Args:
+        start: The first border of the box, px.
+        end: The second border of the box, px.
+        cells: The number of grid cells without the padding. Index 0 is the padding.
+        pixels: The size of the image, px.
+
+    Returns:
+        The first pixel, and for each pixel the index of the lower cell and the weight of the next cell.
     """
     cell = (end - start) / cells  # px
     first = max(0, int(np.ceil(start - 0.5 * cell)))
@@ -81,10 +87,13 @@ def _grid_cells(start, end, cells, pixels):
 
 @njit(cache=True, nogil=True)
 def paste(padded, borders, threshold, masks):
-    """Write to `masks` (N, H, W) the zero-padded probability grids `padded` (N, G + 2, G + 2), resampled to boxes.
+    """Resample grids of probabilities to the boxes of an image.
 
-    `borders`: the boxes (N, 4) x1 y1 x2 y2, px. A pixel is set if its probability exceeds `threshold`. Each row of
-    pixels is interpolated first along y, then along x.
+    Args:
+        padded: The probabilities (N, G + 2, G + 2), padded with zeros.
+        borders: The boxes (N, 4) x1 y1 x2 y2, px.
+        threshold: The minimum probability of a pixel in the mask.
+        masks: The output masks (N, H, W), initially False.
     """
     n, height, width = masks.shape
     cells = padded.shape[1] - 2
@@ -105,10 +114,18 @@ def paste(padded, borders, threshold, masks):
 
 @njit(cache=True, nogil=True)
 def _prototype_cells(start, end, pixels, scale, shift, cells):
-    """Return the first pixel, and for each pixel the lower cell index and the interpolation weight of the next cell.
+    """Return the pixels of a box along one axis and the cells between which they are interpolated.
 
-    The pixels are those along one axis of a box from `start` to `end`, px, in an image of `pixels` pixels. The position
-    of pixel u among the `cells` cells is u * scale + shift; 0 is the center of the first cell.
+    Args:
+        start: The first border of the box, px.
+        end: The second border of the box, px.
+        pixels: The size of the image, px.
+        scale: The number of cells per pixel.
+        shift: The cell coordinate of pixel 0.
+        cells: The number of cells.
+
+    Returns:
+        The first pixel, and for each pixel the index of the lower cell and the weight of the next cell.
     """
     first, stop = max(0, int(np.ceil(start))), min(pixels, int(np.ceil(end)))
     n = max(0, stop - first)
@@ -123,10 +140,14 @@ def _prototype_cells(start, end, pixels, scale, shift, cells):
 
 @njit(cache=True, nogil=True)
 def sample_prototypes(logits, borders, affine, least, masks):
-    """Write to `masks` (N, H, W) the pixels inside the boxes `borders` with interpolated logits above `least`.
+    """Write the masks of boxes from interpolated logits.
 
-    `logits`: (N, h, w). `borders`: (N, 4) x1 y1 x2 y2, px. `affine`: (2, 2) scale and shift from pixels to cells, along
-    x and y. Each row of pixels is interpolated first along y, then along x.
+    Args:
+        logits: The logits (N, h, w).
+        borders: The boxes (N, 4) x1 y1 x2 y2, px.
+        affine: The scale and shift (2, 2) from pixels to cells, along x and y.
+        least: The minimum logit of a pixel in the mask.
+        masks: The output masks (N, H, W), initially False.
     """
     n, height, width = masks.shape
     rows, columns = logits.shape[1:]
@@ -144,10 +165,14 @@ def sample_prototypes(logits, borders, affine, least, masks):
 
 @njit(cache=True, nogil=True)
 def contacts(ids, depth):
-    """Return the M pairs (M, 2) of ids of touching instances, smaller id first; pairs may repeat.
+    """Return the pairs (M, 2) of ids of touching instances, possibly with repetitions.
 
-    `ids`: (H, W), not positive = no instance. `depth`: (H, W), m. Two instances touch at neighboring pixels whose
-    depths differ by less than CONTACT_DEPTH.
+    Instances touch if they have neighboring pixels whose depths differ by less than CONTACT_DEPTH. The smaller id of a
+    pair is first.
+
+    Args:
+        ids: The instance ids (H, W), 0 or negative = no instance.
+        depth: The depth (H, W), m.
     """
     height, width = ids.shape
     pairs = np.empty((2 * height * width, 2), np.int32)

@@ -1,7 +1,7 @@
-"""Boxes x1 y1 x2 y2 in px: anchors, deltas, non-maximum suppression.
+"""Bounding boxes x1 y1 x2 y2 in px: anchors, deltas and non-maximum suppression.
 
-A network requires the box convention of its training. `extent` selects the convention. 1 = the older convention: x2 is
-the last pixel inside, and a box is x2 - x1 + 1 px wide. 0 = the newer convention: x2 is the right border.
+There are two conventions, and a network requires the convention of its training. With `extent` = 1 (older), x2 is the
+last pixel inside, and the width is x2 - x1 + 1 px. With `extent` = 0 (newer), x2 is the right border.
 """
 
 from __future__ import annotations
@@ -16,9 +16,13 @@ LARGEST_LOG_SCALE = float(np.log(1000.0 / 16.0))
 
 
 def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float | tuple[float, float]) -> Float32:
-    """Return the anchors (rows * columns * A, 4) of all cells from the anchors (A, 4) of cell (0, 0).
+    """Return the anchors (rows * columns * A, 4), px, of all cells of a feature map.
 
-    The anchor index varies fastest. `stride`: px per cell, for both axes or as (y, x).
+    Args:
+        anchors: The anchors (A, 4) of the first cell, px.
+        rows: The number of rows of the feature map.
+        columns: The number of columns of the feature map.
+        stride: The size of a cell, px, for both axes or as (y, x).
     """
     stride_y, stride_x = stride if isinstance(stride, tuple) else (stride, stride)
     x, y = np.meshgrid(np.arange(columns) * stride_x, np.arange(rows) * stride_y)
@@ -27,10 +31,15 @@ def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float | tuple
 
 
 def decode(boxes: Float32, deltas: Float32, extent: float = 1.0) -> Float32:
-    """Return boxes (N, 4), px, moved and scaled by deltas (N, 4) dx dy dw dh.
+    """Apply predicted deltas to boxes and return the refined boxes (N, 4), px.
 
-    dx and dy are in units of the box's width and height; dw and dh are the logarithms of scale factors.
     Source: Girshick et al., "Rich feature hierarchies ...", 2014, appendix C, with Detectron's pixel conventions.
+
+    Args:
+        boxes: The boxes (N, 4), px.
+        deltas: The deltas (N, 4) dx dy dw dh. The shifts dx and dy are in units of the box size, and dw and dh are
+            logarithms of scale factors.
+        extent: The box convention.
     """
     sizes = boxes[:, 2:] - boxes[:, :2] + np.float32(extent)
     centers = boxes[:, :2] + sizes * np.float32(0.5)
@@ -41,7 +50,7 @@ def decode(boxes: Float32, deltas: Float32, extent: float = 1.0) -> Float32:
 
 
 def clip(boxes: Float32, shape: tuple[int, int], extent: float = 1.0) -> Float32:
-    """Clip boxes (N, 4), px, to an image of `shape` (height, width) px."""
+    """Clip boxes (N, 4), px, to an image of size `shape` (height, width), px."""
     height, width = shape
     largest = np.array([width, height, width, height], np.float32) - np.float32(extent)
     return np.clip(boxes, np.float32(0), largest)
@@ -50,9 +59,16 @@ def clip(boxes: Float32, shape: tuple[int, int], extent: float = 1.0) -> Float32
 def to_original_image(
     boxes: Float32, resized: tuple[int, int], original: tuple[int, int], extent: float = 1.0
 ) -> Float32:
-    """Convert boxes in the resized image to borders (N, 4) in the original image; shapes are (height, width).
+    """Convert boxes from the resized image to the original image.
 
-    Pixel centers are at integers: the borders of pixel (u, v) are u - 0.5 and u + 0.5.
+    Args:
+        boxes: The boxes (N, 4) in the resized image, px.
+        resized: The size (height, width) of the resized image, px.
+        original: The size (height, width) of the original image, px.
+        extent: The box convention.
+
+    Returns:
+        The boxes (N, 4), px, with pixel centers at integers. The borders of pixel u are u - 0.5 and u + 0.5.
     """
     scale = np.array(original[::-1], np.float32) / np.array(resized[::-1], np.float32)
     borders = boxes + np.array([0, 0, extent, extent], np.float32)
@@ -67,12 +83,21 @@ def suppress_boxes(
     limit: int | None = None,
     extent: float = 1.0,
 ) -> Int32:
-    """Return the indices of boxes after greedy non-maximum suppression, best first; ties keep the input order.
+    """Apply greedy non-maximum suppression to boxes.
 
-    A box of `boxes` (N, 4) is removed if its IoU with a better remaining box of its class exceeds `iou`. `classes`:
-    (N,), None = one class. `limit`: maximum number of remaining boxes. OpenCV's implementation is not used, because it
-    offsets boxes by class, which rounds the IoU. torchvision's extension loads only with a matching build of torch.
+    Args:
+        boxes: The boxes (N, 4), px.
+        scores: The scores (N,). Equal scores keep their order.
+        iou: The IoU above which the worse of two boxes of a class is removed.
+        classes: The class indices (N,); None = one class.
+        limit: The maximum number of boxes.
+        extent: The box convention.
+
+    Returns:
+        The indices of the remaining boxes, best first.
     """
+    # OpenCV's implementation offsets boxes by class, which rounds the IoU; torchvision's extension requires a matching
+    # build of torch
     order = np.argsort(-scores, kind="stable").astype(np.int32)
     if classes is None:
         classes = np.zeros(len(scores), np.int32)

@@ -8,10 +8,18 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def suppress_sorted(boxes, classes, order, iou, extent, limit):
-    """Return the entries of `order` (N,) for at most `limit` boxes that remain after non-maximum suppression.
+    """Apply greedy non-maximum suppression to boxes that are sorted by score.
 
-    `boxes`: (N, 4) x1 y1 x2 y2 px, best first. `classes`: (N,). A box is removed if its IoU with an earlier remaining
-    box of its class exceeds `iou`. `extent`: the box convention, see boxes.py.
+    Args:
+        boxes: The boxes (N, 4) x1 y1 x2 y2, px, best first.
+        classes: The class indices (N,).
+        order: The values (N,) to return for the boxes.
+        iou: The IoU above which the worse of two boxes of a class is removed.
+        extent: The box convention, see boxes.py.
+        limit: The maximum number of boxes.
+
+    Returns:
+        The values of `order` for the remaining boxes.
     """
     survivors = np.empty(min(limit, len(boxes)), np.int32)
     n = 0

@@ -1,4 +1,4 @@
-"""Placement of an image of any shape in the fixed input of a network."""
+"""Resizing and padding of images to the fixed input size of a network."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from framework.data import Float32, UInt8
 
 
 class Placement(Enum):
-    """Position of the resized image in the input; the rest of the input is padding."""
+    """Position of the resized image in the input."""
 
     top_left = "top_left"
     center = "center"
@@ -22,9 +22,9 @@ class Placement(Enum):
 
 @dataclass(frozen=True)
 class Letterbox:
-    """Scale and offset from an image to a network's input for each axis.
+    """Scale and offset between an image and the input of a network.
 
-    In the input, 0 is the left border of the first pixel. In images, pixel centers are at integers. Therefore,
+    In the input, the left border of the first pixel is at 0. In the image, pixel centers are at integers. Therefore,
     x_input = scale_x (u + 0.5) + left.
     """
 
@@ -37,7 +37,10 @@ class Letterbox:
 
     @classmethod
     def fit(cls, image_shape: tuple[int, int], input_shape: tuple[int, int], placement: Placement) -> Letterbox:
-        """Return the letterbox that fits an image into the input at maximum size; shapes are (height, width)."""
+        """Return the letterbox that fits an image into the input at maximum size.
+
+        Sizes are (height, width) in px.
+        """
         height, width = image_shape
         resized = input_shape
         if placement is not Placement.stretch:
@@ -49,7 +52,7 @@ class Letterbox:
         return cls(input_shape, resized, top, left, resized[1] / width, resized[0] / height)
 
     def fill(self, color: UInt8, padding: int) -> UInt8:
-        """Return the input (H, W, 3) for the image `color` (h, w, 3), padded with the gray value `padding`."""
+        """Resize an image (h, w, 3) and pad it with a gray value to the input size."""
         height, width = self.resized
         canvas = np.full((*self.input_shape, 3), padding, np.uint8)
         canvas[self.top : self.top + height, self.left : self.left + width] = cv2.resize(
@@ -65,9 +68,14 @@ class Letterbox:
 
 
 def network_input(canvas: UInt8, dtype: str, bgr: bool, black: float, white: float) -> np.ndarray[Any, Any]:
-    """Convert an RGB image (H, W, 3) to a network's dtype, with 0 mapped to `black` and 255 to `white`.
+    """Convert an RGB image to the data type, channel order and value range of a network.
 
-    For the dtype uint8, the values 0..255 are unchanged. `bgr`: True = the channels are reversed to BGR.
+    Args:
+        canvas: The image (H, W, 3), RGB.
+        dtype: The data type. The values are unchanged for uint8.
+        bgr: True = reverse the channels to BGR.
+        black: The value for 0.
+        white: The value for 255.
     """
     image = canvas[..., ::-1] if bgr else canvas
     if dtype == "uint8":

@@ -1,16 +1,15 @@
-"""Masks from boxes and depth: the connected foreground of each box.
+"""Segmentation of the foreground in bounding boxes from depth.
 
 For each box:
 
-1. The depth readings form a histogram over log depth, because sensor noise and the depth step per pixel of a slanted
-   surface grow with depth. The weight of a reading decreases from 1 at the center of the box to 0 at its border.
-2. A mode is a run of bins between two valleys. Valleys are bins below `VALLEY` of the run's peak. The foreground is the
-   nearest mode with at least `significance` of the weight. Thin objects in front have less weight, and the wall behind
-   is farther.
-3. Two neighboring foreground pixels (4-connectivity) are connected if their depth step is small enough. The limit is
-   the step of a surface with the slant `max_slant`, z tan(max_slant) / f per pixel, plus the sensor's noise. The
-   connected component with the largest weight is the object.
-4. Holes of the object are closed if they have no readings or are small.
+1. Compute a histogram of log depth. The weight of a reading decreases from 1 at the center of the box to 0 at its
+   border. Log depth is used because noise and depth steps grow with depth.
+2. Select the nearest mode of the histogram with at least `significance` of the total weight as foreground. Thin objects
+   in front have less weight, and the background is farther. Neighboring modes are separated by valleys, i.e. bins
+   below VALLEY of the peak.
+3. Connect neighboring foreground pixels with similar depths. The limit of the depth step is z tan(max_slant) / f, the
+   step of a slanted surface, plus the sensor noise. The component with the largest weight is the object.
+4. Close holes that have no readings or are small.
 """
 
 from __future__ import annotations
@@ -31,18 +30,19 @@ def masks_in_boxes(
     borders: Float32, depth: Float32, camera: Camera, significance: float, max_slant: float, min_readings: float,
     sensor: SensorKind = SensorKind.KINECT_V1,
 ) -> tuple[Bool, Bool]:  # fmt: skip
-    """Return the masks (N, H, W) of the objects in boxes, and an array (N,), True for boxes with enough depth readings.
-
-    The masks of other boxes are empty.
+    """Segment the objects in boxes by depth.
 
     Args:
-        borders: (N, 4) x1 y1 x2 y2 px, pixel centers at integers.
-        depth: (H, W) m, 0 = no reading.
+        borders: The boxes (N, 4) x1 y1 x2 y2, px, with pixel centers at integers.
+        depth: The depth (H, W), m, 0 = no reading.
         camera: The camera of the depth image.
-        significance: Minimum fraction of the weighted readings in the foreground.
-        max_slant: Maximum angle between the image plane and a surface, degrees.
-        min_readings: Minimum fraction of a box's pixels that have a depth reading.
+        significance: The minimum fraction of the weighted readings in the foreground.
+        max_slant: The maximum angle between the image plane and a surface, degrees.
+        min_readings: The minimum fraction of pixels with a depth reading in a box.
         sensor: The kind of the depth sensor.
+
+    Returns:
+        The masks (N, H, W), and an array (N,) that is True for boxes with enough depth readings. Other masks are empty.
     """
     height, width = depth.shape
     masks = np.zeros((len(borders), height, width), np.bool_)
@@ -57,9 +57,9 @@ def masks_in_boxes(
 
 
 def _close_holes(mask: Bool, has_reading: Bool) -> None:
-    """Close the holes of `mask` (h, w) in place, except holes at its border and large holes with depth readings.
+    """Close holes in a mask (h, w), in place.
 
-    `has_reading`: (h, w), True where a pixel has a depth reading.
+    Holes at the border of the box and large holes with depth readings stay open.
     """
     count, component = cv2.connectedComponents((~mask).view(np.uint8), connectivity=4)
     sizes = np.bincount(component.ravel(), minlength=count)

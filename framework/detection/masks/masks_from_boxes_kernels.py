@@ -15,11 +15,20 @@ SIGMAS = 3.0  # depth step that noise may cause, in standard deviations
 
 @njit(cache=True, nogil=True)
 def fill_masks(borders, windows, depth, significance, step, noise, min_readings, masks):
-    """Write the masks of the objects in the boxes to `masks` (N, H, W), before holes are closed.
+    """Write the masks of the objects in boxes, with holes.
 
-    `borders`: the boxes (N, 4) x1 y1 x2 y2, px. `windows`: the pixels u1 <= u < u2, v1 <= v < v2 of the boxes, as (N,
-    4) u1 v1 u2 v2. `step`: maximum depth step between neighboring pixels per meter of depth. `noise`: the noise model
-    of the sensor. See `masks_in_boxes` for the other arguments. Returns an array (N,), True where a mask was found.
+    Args:
+        borders: The boxes (N, 4) x1 y1 x2 y2, px.
+        windows: The pixel ranges (N, 4) u1 v1 u2 v2 of the boxes, without u2 and v2.
+        depth: The depth (H, W), m, 0 = no reading.
+        significance: The minimum fraction of the weighted readings in the foreground.
+        step: The maximum depth step between neighboring pixels, m per meter of depth.
+        noise: The noise model of the sensor.
+        min_readings: The minimum fraction of pixels with a depth reading in a box.
+        masks: The output masks (N, H, W), initially False.
+
+    Returns:
+        An array (N,) that is True for boxes with a mask.
     """
     found = np.zeros(len(masks), np.bool_)
     for i in range(len(masks)):
@@ -40,20 +49,20 @@ def fill_masks(borders, windows, depth, significance, step, noise, min_readings,
 
 @njit(cache=True, nogil=True)
 def _tent(start, end, first, stop):
-    """Return the weights of pixels `first` to `stop` - 1 along one axis of a box from `start` to `end`, px.
+    """Return the weights of pixels along one axis of a box.
 
-    They decrease linearly from 1 at its center to 0 at its borders; 1e-6 is added to all weights.
+    The weights decrease linearly from 1 at the center of the box to 0 at its borders.
     """
     center, half = 0.5 * (start + end), 0.5 * (end - start)
+    # 1e-6 prevents weights of 0
     return np.maximum(0.0, 1.0 - np.abs(np.arange(first, stop) - center) / half) + 1e-6
 
 
 @njit(cache=True, nogil=True)
 def _foreground(window, weight_x, weight_y, significance):
-    """Return the depth interval (near, far), m, of the nearest mode with at least `significance` of the weight.
+    """Return the depth range (near, far), m, of the foreground.
 
-    Without such a mode, return the interval of the mode with the largest weight. `window`: depth (h, w), m. The weight
-    of pixel (u, v) is weight_x[u] * weight_y[v].
+    It is the nearest mode with sufficient weight. Without such a mode, it is the mode with the largest weight.
     """
     bins = int(np.log(FARTHEST / NEAREST) / BIN) + 1
     histogram = np.zeros(bins + 2)
@@ -95,10 +104,7 @@ def _foreground(window, weight_x, weight_y, significance):
 
 @njit(cache=True, nogil=True)
 def _grow(window, weight_x, weight_y, near, far, step, noise, mask):
-    """Write to `mask` (h, w) the connected component of the largest weight with depths from `near` to `far`, m.
-
-    See `fill_masks` and `_foreground` for the other arguments.
-    """
+    """Write the mask of the connected foreground component with the largest weight."""
     height, width = window.shape
     label = np.zeros((height, width), np.int32)
     stack = np.empty((height * width, 2), np.int32)
@@ -134,5 +140,5 @@ def _grow(window, weight_x, weight_y, near, far, step, noise, mask):
 
 @njit(cache=True, nogil=True)
 def _largest_step(z, step, noise):
-    """Return the largest difference in depth, m, between neighboring pixels of one surface at depth `z`, m."""
+    """Return the maximum depth step, m, between neighboring pixels of a surface at depth `z`, m."""
     return step * z + SIGMAS * axial_sigma(z, noise)

@@ -1,8 +1,7 @@
-"""Masks as run lengths in COCO's format: the lengths of alternating runs of 0 and 1, column by column.
+"""Run-length encoded masks in COCO's format.
 
-A file contains run lengths as a list of numbers or as a packed string (pycocotools' `rleToString`). A packed string
-consists of groups of five bits, lowest first. From the third number on, it stores the difference from the number two
-positions earlier. pycocotools packs and decodes. This module validates strings, because pycocotools 2.0.11 leaves the
+Run lengths are the lengths of alternating runs of 0 and 1, column by column. They are stored as a list of numbers or as
+a packed string. pycocotools packs and decodes them. Strings are validated here, because pycocotools 2.0.11 leaves the
 pixels after a short string uninitialized.
 """
 
@@ -23,15 +22,15 @@ MAX_CHARACTERS = 7  # maximum number of characters per number; its range exceeds
 
 
 def encode(masks: Bool) -> list[bytes]:
-    """Encode masks (N, H, W) as packed run lengths, one string for each mask."""
+    """Encode masks (N, H, W) as packed run lengths."""
     columns_first = np.asfortranarray(masks.transpose(1, 2, 0).view(np.uint8))
     return [run["counts"] for run in coco.encode(columns_first)] if len(masks) else []
 
 
 def decode(counts: Sequence[bytes], shape: tuple[int, int]) -> Bool:
-    """Decode packed run lengths to masks (N, H, W) of `shape` (height, width).
+    """Decode packed run lengths to masks (N, H, W).
 
-    Call `check` first for untrusted `counts`.
+    Validate untrusted run lengths with `check` first.
     """
     masks = np.zeros((len(counts), *shape), np.uint8)
     size = list(shape)
@@ -42,7 +41,11 @@ def decode(counts: Sequence[bytes], shape: tuple[int, int]) -> Bool:
 
 
 def pack(lengths: Sequence[int], shape: tuple[int, int]) -> bytes:
-    """Pack run lengths. Raises DataError unless they fill an image of `shape` (height, width)."""
+    """Pack run lengths for an image of size `shape` (height, width).
+
+    Raises:
+        DataError: The run lengths do not fill the image.
+    """
     if not all(isinstance(length, int) and not isinstance(length, bool) for length in lengths):
         raise DataError(f"run lengths: expected integers, got {lengths!r:.200}")
     _check_filled(np.array(lengths, np.float64), shape)
@@ -51,12 +54,16 @@ def pack(lengths: Sequence[int], shape: tuple[int, int]) -> bytes:
 
 
 def check(counts: bytes, shape: tuple[int, int]) -> None:
-    """Raise DataError unless packed run lengths fill an image of `shape` (height, width) exactly."""
+    """Raise DataError unless packed run lengths fill an image of size `shape` (height, width)."""
     _check_filled(unpack(counts), shape)
 
 
 def unpack(counts: bytes) -> Int64:
-    """Unpack a packed string to run lengths (R,). Raises DataError for invalid strings."""
+    """Unpack a string to run lengths (R,).
+
+    Raises:
+        DataError: The string is invalid.
+    """
     codes = np.frombuffer(counts, np.uint8).astype(np.int64) - FIRST_CHARACTER
     if not len(codes) or codes.min() < 0 or codes.max() >= 2 * MORE or codes[-1] & MORE:
         raise DataError(f"run lengths: expected a packed string in COCO's format, got {counts!r:.100}")

@@ -1,1 +1,1 @@
-"""Runtimes of networks: ONNX and Caffe2."""
+"""Runtimes of ONNX and Caffe2 networks."""

@@ -1,8 +1,9 @@
-"""Caffe2 networks with 8-bit integers, computed in integers on a CPU or in float on any device.
+"""Runtime of Caffe2 networks with 8-bit quantization.
 
-An integer q of a blob represents scale * (q - zero point) (Jacob et al., "Quantization and Training of Neural Networks
-for Efficient Integer-Arithmetic-Only Inference", 2018). torch provides the integer convolutions of oneDNN. They require
-an x86 processor with VNNI. On other processors, sums of 8-bit products overflow 16 bits.
+The network is computed in integers on a CPU, or in float on any device. An integer q represents the value scale * (q -
+zero_point). See Jacob et al., "Quantization and Training of Neural Networks for Efficient Integer-Arithmetic-Only
+Inference", 2018. Integer convolutions use oneDNN and require an x86 processor with VNNI. On other processors, sums of
+8-bit products overflow 16 bits.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Network:
-    """A network that computes the blobs `outputs` from the blobs `inputs`, all in float32."""
+    """A network with float32 inputs and outputs."""
 
     steps: tuple[Step, ...]
     inputs: tuple[str, ...]
@@ -57,13 +58,13 @@ class Network:
 
 
 class Quantization(NamedTuple):
-    """Quantization of a blob: a uint8 value q represents scale * (q - zero_point)."""
+    """Quantization parameters of a blob."""
 
     scale: float
     zero_point: int
 
     def quantize(self, x: Tensor) -> Tensor:
-        """Quantize x (N, C, H, W) on the CPU to uint8, rounded to nearest."""
+        """Quantize a tensor (N, C, H, W) on the CPU to uint8."""
         channels_last = x.permute(0, 2, 3, 1).contiguous()
         rounded = torch.empty_like(channels_last, dtype=torch.uint8)
         flat = channels_last.numpy().reshape(-1), rounded.numpy().reshape(-1)
@@ -75,10 +76,11 @@ class Quantization(NamedTuple):
 
 
 def dequantized_weights(values: Array, scale_zero: tuple[float, int] | None) -> Tensor:
-    """Return the weights scale * (q - zero point) of the integers `values` as float32.
+    """Return the weights as float32, with the axis order of torch.
 
-    Kernels (out, h, w, in) and (in, h, w, out) are permuted to the axis order of torch. `scale_zero`: (scale, zero
-    point); None = `values` are not quantized.
+    Args:
+        values: The stored weights. Kernels are (out, h, w, in) or (in, h, w, out).
+        scale_zero: The scale and zero point; None = the weights are not quantized.
     """
     if scale_zero is None:
         return torch.from_numpy(values)
@@ -89,7 +91,7 @@ def dequantized_weights(values: Array, scale_zero: tuple[float, int] | None) -> 
 
 @cache
 def has_int8_kernels() -> bool:
-    """Return True if torch computes integer convolutions correctly on this processor, even for the largest values."""
+    """Return True if torch computes integer convolutions correctly on this processor."""
     has_mkldnn = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
     if not has_mkldnn or torch.backends.quantized.engine != "x86":
         return False
@@ -108,16 +110,21 @@ def network_between(
     outputs: tuple[str, ...],
     spacings: Mapping[str, float] | None = None,
 ) -> Network:
-    """Build the network between the blobs `inputs` and `outputs` of a graph.
+    """Build the part of a network that computes some blobs from others.
 
-    `tensors`: the weights by name. `spacings`: quantization steps of the kernels by name, for integer convolutions;
-    None = all operators compute in float. A float network has quantized weights, but no rounding between operators. An
-    integer network does not round the following values, at little cost:
+    In an integer network, linear channels between blocks and outputs, means, fully connected layers and transposed
+    convolutions are not rounded. Rounding errors in the linear channels would accumulate (Sandler et al.,
+    "MobileNetV2", 2018).
 
-    - the linear channels between blocks (Sandler et al., "MobileNetV2", 2018), because rounding errors would accumulate
-    - outputs, means, fully connected layers and transposed convolutions
+    Args:
+        graph: The operators of the complete network.
+        tensors: The weights by name.
+        inputs: The names of the input blobs.
+        outputs: The names of the output blobs.
+        spacings: The quantization step of each kernel by name, for integer convolutions; None = compute in float.
 
-    Raises DataError for an unknown operator.
+    Raises:
+        DataError: An operator is not supported.
     """
     operators = _between(graph, tensors, inputs, outputs)
     if spacings is None:
@@ -130,7 +137,7 @@ def network_between(
 def _between(
     graph: list[Operator], tensors: Tensors, inputs: tuple[str, ...], outputs: tuple[str, ...]
 ) -> list[Operator]:
-    """Return the operators of the graph that are required to compute `outputs` from `inputs`, in order."""
+    """Return the operators that are required to compute `outputs` from `inputs`."""
     needed, found = set(outputs), []
     for operator in reversed(graph):
         name = operator["outputs"][0]
@@ -145,7 +152,7 @@ def _blobs(operator: Operator, tensors: Tensors) -> tuple[str, ...]:
 
 
 def _weights(operator: Operator, tensors: Tensors) -> tuple[Tensor, ...]:
-    """Return the kernel and bias of an operator; empty for an operator without weights."""
+    """Return the kernel and bias of an operator, if any."""
     return tuple(tensors[name] for name in operator["inputs"] if name in tensors)
 
 
@@ -188,7 +195,8 @@ def _int8_steps(
         on_integers = kind in CONVOLUTIONS and name not in outputs
         for blob in blobs:
             if on_integers and blob not in quantizations:
-                raise DataError(f"graph.json: {blob}: expected a scale for the integers of a convolution, got none")
+                expected = "quantization parameters for the input of an 8-bit convolution"
+                raise DataError(f"graph.json: {blob}: expected {expected}, got none")
             if blob not in converted and (blob in in_integers) != on_integers:
                 converted[blob] = f"{blob}, converted"
                 convert = quantizations[blob].quantize if on_integers else quantizations[blob].dequantize
@@ -218,11 +226,16 @@ def _int8_convolution(
     result: Quantization | None,
     relu: bool,
 ) -> Run:
-    """Return a oneDNN convolution with a kernel (out, in, h, w) from uint8 to uint8, or to float32.
+    """Return a oneDNN convolution from uint8 to uint8 or float32.
 
-    `source`: the quantization of the input. `result`: the quantization of the output; None = float32. The quantization
-    step of the kernel is `spacing` in channels whose integers fit into int8. Other channels are rounded to a coarser
-    step. In Mask R-CNN 2Go, 30,194 of 30,381 channels fit.
+    Args:
+        kernel: The kernel (out, in, h, w).
+        bias: The bias (out,).
+        spacing: The quantization step of the kernel. It is increased for channels that would exceed int8.
+        window: The strides, pads, dilations and groups.
+        source: The quantization of the input.
+        result: The quantization of the output; None = float32.
+        relu: True = apply a ReLU to the output.
     """
     scales = torch.clamp(kernel.abs().amax(dim=(1, 2, 3)) / MAX_WEIGHT, min=spacing)
     integers = torch.round(kernel / scales[:, None, None, None]).to(torch.int8)

@@ -1,4 +1,4 @@
-"""Device, precision and threads of a torch network."""
+"""Device, precision and number of threads of torch networks."""
 
 from __future__ import annotations
 
@@ -16,9 +16,12 @@ _before: list[int] = []  # previous number of torch threads, once for each threa
 
 
 def torch_device(device: str, name: str = "detector.device") -> torch.device:
-    """Return the torch device for `device` auto, cpu or cuda; auto = cuda if available.
+    """Return the torch device for `auto`, `cpu` or `cuda`.
 
-    Raises ConfigError with the key `name` for other values, and for cuda without a GPU.
+    `auto` selects cuda if available.
+
+    Raises:
+        ConfigError: The device is unknown or not available. The message contains the config key `name`.
     """
     require(device in ("auto", "cpu", "cuda"), name, device, "auto, cpu or cuda")
     available = torch.cuda.is_available()
@@ -27,19 +30,22 @@ def torch_device(device: str, name: str = "detector.device") -> torch.device:
 
 
 def ready(network: Any, device: torch.device, half_precision: bool) -> Any:
-    """Move the network to the device and set it to inference mode; half precision is used only on CUDA."""
+    """Move a network to a device and set it to inference mode.
+
+    Half precision is only used on CUDA.
+    """
     dtype = torch.float16 if half_precision and device.type == "cuda" else torch.float32
     return network.to(device, dtype).eval()
 
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Limit torch to the calling thread, because short operations end before other threads wake up.
+    """Limit torch to one thread within a context.
 
-    Several threads may use this context at once. Torch stores the number of threads per thread. At its first query, a
-    thread gets the latest number set by any thread. So each thread queries the number before setting it, and restores
-    it on exit.
+    Short operations end before other threads wake up. Several threads can use this context at the same time.
     """
+    # torch stores the number of threads per thread; a thread's first query returns the latest number set by any thread,
+    # so each thread queries the number before setting it
     with _changing:
         count = torch.get_num_threads()
         _before.append(_before[0] if _before else count)

@@ -1,4 +1,4 @@
-"""ONNX networks in onnxruntime, with fixed or dynamic image shapes."""
+"""Runtime of ONNX networks."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ CUDA = "CUDAExecutionProvider"
 
 
 class OnnxNetwork:
-    """An ONNX network that computes named arrays from one image, on the CPU or with CUDA.
+    """An ONNX network with one image as input.
 
-    The network uses as many threads as OpenCV (`threads` in the config). The default of onnxruntime would be all cores.
-    Idle threads sleep, because mapping runs at the same time.
+    The number of threads is that of OpenCV (`threads` in the config). Idle threads sleep, because mapping runs at the
+    same time.
 
     Attributes:
-        shape: (height, width) px of the input.
-        dtype: NumPy type of the input: float32, float16 or uint8.
+        shape: The size of the input (height, width), px.
+        dtype: The NumPy type of the input: float32, float16 or uint8.
         channels_last: True = the input is (1, H, W, 3), False = (1, 3, H, W).
     """
 
     def __init__(self, path: Path, sha256: str, device: str, input_size: int) -> None:
-        """Load the network from `path`; see `find_file` for relative paths.
+        """Load a network.
 
         Args:
-            path: The ONNX file.
+            path: The ONNX file, see `find_file`.
             sha256: The expected hash; "" = any.
             device: auto, cpu or cuda.
-            input_size: Side of the square input of a network with dynamic size, px; 0 = the network's own size.
+            input_size: The side of the square input of a network with dynamic size, px; 0 = from the metadata.
 
         Raises:
             DataError: The file is missing or damaged, has another hash, or cannot be run.
@@ -66,9 +66,10 @@ class OnnxNetwork:
         self.shape = _input_shape(self.path, image, self.channels_last, input_size, self.metadata)
 
     def __call__(self, image: Array) -> Outputs:
-        """Return the float32 outputs by name for an image (H, W, 3) with the network's `shape` and dtype.
+        """Run the network on an image (H, W, 3) and return the float32 outputs by name.
 
-        Raises DataError if the network fails or its outputs are not finite.
+        Raises:
+            DataError: The network fails, or its outputs are not finite.
         """
         blob = image[None] if self.channels_last else image.transpose(2, 0, 1)[None]
         names = [output.name for output in self._session.get_outputs()]
@@ -86,7 +87,7 @@ class OnnxNetwork:
 
 
 class ImageNetworkParameters(Protocol):
-    """Common parameters of detectors with an ONNX network; see the fields of the detectors for their meaning."""
+    """Common parameters of detectors with an ONNX network."""
 
     weights: Path
     sha256: str
@@ -100,10 +101,15 @@ class ImageNetworkParameters(Protocol):
 
 
 class ImageNetwork:
-    """An ONNX network with preprocessing that fits images of any shape into its input."""
+    """An ONNX network with preprocessing for images of any size."""
 
     def __init__(self, detector: ImageNetworkParameters) -> None:
-        """Load the network. Raises ConfigError for parameters out of bounds, and the errors of `OnnxNetwork`."""
+        """Load the network.
+
+        Raises:
+            ConfigError: A parameter is out of bounds, or onnxruntime or the device is missing.
+            DataError: The file is missing or damaged, has another hash, or cannot be run.
+        """
         path, device, black, white = detector.weights, detector.device, detector.black_level, detector.white_level
         require(len(detector.sha256) in (0, 64), "detector.sha256", detector.sha256, "64 hexadecimal digits, or empty")
         allowed = f"0 (size of the network) or a value in [1, {LONGEST_SIDE}] px"
@@ -126,14 +132,14 @@ class ImageNetwork:
         self._detector = detector
 
     def __call__(self, color: UInt8) -> tuple[Outputs, Letterbox]:
-        """Return the outputs by name for an RGB image (h, w, 3), uint8, and the placement of the image in the input."""
+        """Run the network on an RGB image (h, w, 3) and return the outputs by name and the letterbox."""
         detector = self._detector
         letterbox = Letterbox.fit(color.shape[:2], self.shape, detector.placement)
         canvas, levels = letterbox.fill(color, detector.padding), (detector.black_level, detector.white_level)
         return self._network(network_input(canvas, self._network.dtype, detector.bgr, *levels)), letterbox
 
     def outputs_for_black(self) -> Outputs:
-        """Return the outputs for a black image, for example to validate their shapes when a detector is built."""
+        """Return the outputs for a black image, for example to check their shapes."""
         outputs, _ = self(np.zeros((*self.shape, 3), np.uint8))
         return outputs
 
@@ -158,12 +164,14 @@ def _loaded(path: Path, device: str) -> InferenceSession:
             f"{path}: expected an ONNX file for onnxruntime, got an error ({in_one_line(error)})"
         ) from error
     if device == "cuda" and CUDA not in session.get_providers():
-        raise ConfigError("detector.device: expected cpu or auto because CUDA did not start, got cuda")
+        raise ConfigError(
+            "detector.device: expected a GPU that onnxruntime can initialize, got none; set detector.device=cpu or auto"
+        )
     return session
 
 
 def _image_input(path: Path, inputs: Sequence[NodeArg]) -> tuple[NodeArg, Shape]:
-    """Return the single image input and its shape. Raises DataError for other inputs."""
+    """Return the single image input of a network and its shape."""
     found = ", ".join(map(_described, inputs))
     wanted = "expected one image (1, 3, H, W) or (1, H, W, 3)"
     if len(inputs) != 1:
@@ -177,10 +185,7 @@ def _image_input(path: Path, inputs: Sequence[NodeArg]) -> tuple[NodeArg, Shape]
 def _input_shape(
     path: Path, image: NodeArg, channels_last: bool, input_size: int, metadata: ExportMetadata
 ) -> tuple[int, int]:
-    """Return the (height, width) px of the input.
-
-    Dynamic dimensions are set to `input_size`, px, or if it is 0, to the size in the file's metadata.
-    """
+    """Return the size of the input (height, width), px."""
     shape, described = _shape(image), _described(image)
     height, width = shape[1:3] if channels_last else shape[2:]
     if height and width:
@@ -207,9 +212,12 @@ def _shape(tensor: NodeArg) -> Shape:
 
 
 def find_file(path: Path) -> Path:
-    """Return the path of an existing file. Raises DataError if the file is missing.
+    """Return the path of an existing file.
 
     A relative path is searched in the working directory, then in the project folder.
+
+    Raises:
+        DataError: The file is missing.
     """
     for candidate in candidates(path):
         if candidate.is_file():
@@ -221,7 +229,11 @@ def find_file(path: Path) -> Path:
 
 
 def checked_hash(path: Path, sha256: str) -> str:
-    """Compute the SHA-256 (hex) of a file. Raises DataError if it differs from `sha256`; "" = any."""
+    """Return the SHA-256 hash of a file.
+
+    Raises:
+        DataError: The file is unreadable, or the hash differs from a nonempty `sha256`.
+    """
     try:
         found = path_hash(path)
     except OSError as error:
@@ -235,7 +247,10 @@ def checked_hash(path: Path, sha256: str) -> str:
 
 @dataclass(frozen=True)
 class ExportMetadata:
-    """Metadata from the exporter; empty if missing or in an unknown format."""
+    """Metadata that the exporter stored in an ONNX file.
+
+    Missing values are empty or 0.
+    """
 
     names: tuple[str, ...] = ()  # class names, in the order of the scores
     image_size: tuple[int, int] = (0, 0)  # (height, width) px of the exported input; 0 = unknown
@@ -243,12 +258,12 @@ class ExportMetadata:
 
     @classmethod
     def parse(cls, texts: Mapping[str, str]) -> ExportMetadata:
-        """Return the metadata from key-value pairs whose values are Python or JSON literals."""
+        """Parse the metadata from key-value pairs with Python or JSON literals."""
         return cls(_names(texts.get("names", "")), _size(texts.get("imgsz", "")), texts.get("author", ""))
 
 
 def _names(text: str) -> tuple[str, ...]:
-    """Return the class names in a text {0: "person", ...}; keys are integers or strings of digits."""
+    """Parse class names in a text such as {0: "person", ...}."""
     names = _literal(text)
     if not isinstance(names, dict):
         return ()
@@ -257,7 +272,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Return the (height, width) px in a text [height, width], or in one number for both."""
+    """Parse the image size [height, width], px, or a single number for both."""
     sides = _literal(text)
     height, width = sides if isinstance(sides, list) and len(sides) == 2 else (sides, sides)
     if isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0:

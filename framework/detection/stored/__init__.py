@@ -1,1 +1,1 @@
-"""Readers and writers of stored detections."""
+"""Stored detections."""

@@ -1,4 +1,7 @@
-"""Cache of detections on disk. Ablations over refiners and fusers run the network only once."""
+"""Cache of detections on disk.
+
+With a cache, the network runs only once when other parameters of the pipeline are varied.
+"""
 
 from __future__ import annotations
 
@@ -44,30 +47,35 @@ class CacheMode(Enum):
 
 @runtime_checkable
 class ReadsFields(Protocol):
-    """Interface of detectors that declare the fields of Frame they read, so that more frames share an entry."""
+    """Interface of detectors that read only some fields of a frame.
+
+    Frames that are equal in these fields share a cache entry.
+    """
 
     reads: tuple[str, ...]  # names of fields of Frame
 
 
 @runtime_checkable
 class Fingerprinted(Protocol):
-    """Interface of detectors whose parameters do not identify their weights, such as the name of a model on a hub."""
+    """Interface of detectors whose parameters do not identify their weights, for example a model name on a hub."""
 
     def fingerprint(self) -> str:
-        """Return a hash of all inputs of the detections except the frame. It must include `fingerprint(self)`."""
+        """Return a hash of everything that determines the detections, except the frame.
+
+        The hash must include `fingerprint(self)`.
+        """
 
 
 @dataclass
 class CachedDetector(Detector):
-    """Cache of byte-identical detections for frames already processed by `detector`.
+    """A detector that stores its detections on disk and reuses them for equal frames.
 
-    The key of an entry consists of the fingerprint and classes of the detector and its input fields of the frame. A
-    different parameter, weight or image is a cache miss. The same image in another video is a hit. Several processes
-    may share a folder, because writes are atomic and equal keys have equal entries. A damaged entry is logged and
-    computed again. Entries are never removed automatically, and you can delete them at any time. Frames are processed
-    one at a time even if `detector` is concurrent, because concurrent equal frames would each count as a miss.
+    The key of an entry is a hash of the detector and of the frame's data. Equal images in different videos share an
+    entry. Several processes may share a folder. A damaged entry is logged and computed again. You can delete entries at
+    any time.
     """
 
+    # not concurrent, because concurrent equal frames would each count as a miss
     detector: Detector
     directory: Path
     mode: CacheMode = CacheMode.READ_WRITE
@@ -134,17 +142,18 @@ class CachedDetector(Detector):
 
 
 def _checksum(path: Path, content: bytes) -> bytes:
-    """Return the SHA-256 of an entry's name and content. The name detects an entry moved to another key."""
+    """Return the SHA-256 of the name and content of an entry."""
+    # the name detects an entry that was moved to another key
     return hashlib.sha256(f"{path.parent.name}/{path.name}\n".encode() + content).digest()
 
 
 def fields_read(detector: Detector) -> tuple[str, ...]:
-    """Return the names of the Frame fields that the detector reads: `reads`, or all fields if it does not define it."""
+    """Return the names of the frame fields that a detector reads."""
     return detector.reads if isinstance(detector, ReadsFields) else FRAME_FIELDS
 
 
 def identity_of(detector: Detector) -> str:
-    """Return the fingerprint defined by the detector, or if it defines none, the hash from `fingerprint(detector)`."""
+    """Return the fingerprint of a detector."""
     if not isinstance(detector, Fingerprinted):
         return fingerprint(detector)
     try:
@@ -157,7 +166,7 @@ def identity_of(detector: Detector) -> str:
 
 
 def with_cache(detector: Detector, config: DictConfig) -> Detector:
-    """Return the detector, wrapped in the cache configured by `detection_cache` and `detection_cache_dir`."""
+    """Wrap a detector in a cache if `detection_cache` is enabled."""
     mode = config.detection_cache
     named = "off" if mode is False else mode  # YAML parses an unquoted off as false
     modes = {mode.value: mode for mode in CacheMode}
@@ -175,19 +184,18 @@ def with_cache(detector: Detector, config: DictConfig) -> Detector:
 
 
 def cache_metrics(detector: Detector) -> Mapping[str, int]:
-    """Return the hits and misses for metrics.json, empty without a cache; frames with errors do not count."""
+    """Return the numbers of cache hits and misses, or an empty mapping without a cache."""
     if not isinstance(detector, CachedDetector):
         return {}
     return {"detection_cache.hits": detector.hits, "detection_cache.misses": detector.misses}
 
 
 def frame_hash(frame: Frame, reads: tuple[str, ...]) -> str:
-    """Compute the SHA-256 (hex) of the fields `reads` of a frame.
+    """Return the SHA-256 of some fields of a frame.
 
-    SHA-256 is faster than BLAKE2 on processors with SHA instructions. Ground truth that is not rendered yet is
-    identified by its origin, so that a hit avoids rendering.
+    Ground truth that is rendered on demand is identified by its origin, so that it is not rendered.
     """
-    digest = hashlib.sha256()
+    digest = hashlib.sha256()  # faster than BLAKE2 on processors with SHA instructions
     for name in sorted(reads):
         value = getattr(frame, name)
         digest.update(f"{name}=".encode())
@@ -206,15 +214,13 @@ def frame_hash(frame: Frame, reads: tuple[str, ...]) -> str:
 
 
 def pack(detections: Detections) -> bytes:
-    """Pack detections into an entry: safetensors of the arrays, with run lengths of each mask inside its tight box.
-
-    Runs are along rows. COCO's format has runs along columns, which would require a transposition.
-    """
+    """Serialize detections to the content of an entry."""
     from safetensors.numpy import save
 
     boxes = tight_boxes(detections.masks).astype(np.int32)
     runs = []
     for mask, (x1, y1, x2, y2) in zip(detections.masks, boxes.tolist(), strict=True):
+        # runs along rows; COCO's runs along columns would require a transposition
         rows = np.ascontiguousarray(mask[y1 : y2 + 1, x1 : x2 + 1])
         runs.append(coco.encode(rows.view(np.uint8).T)["counts"])
     arrays = {name: np.ascontiguousarray(getattr(detections, name)) for name in KEPT}
@@ -234,7 +240,7 @@ def pack(detections: Detections) -> bytes:
 
 
 def unpack(content: bytes, classes: tuple[str, ...]) -> Detections:
-    """Unpack the detections from the content of an entry, whose checksum must be valid."""
+    """Deserialize detections from the content of an entry."""
     from safetensors.numpy import load
 
     stored = load(content)

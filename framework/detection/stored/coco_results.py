@@ -1,7 +1,7 @@
-"""COCO results files: a JSON list with an entry for each detection of each image (cocodataset.org/#format-results).
+"""COCO results files: a JSON list with an entry for each detection (cocodataset.org/#format-results).
 
-In addition to COCO's keys, an entry may have `category_name` and the complete distribution `class_probabilities`.
-pycocotools is not used for reading, because it requires the annotations of the images and does not validate entries.
+In addition to COCO's keys, an entry may contain `category_name` and the distribution `class_probabilities`. pycocotools
+is not used for reading, because it requires an annotation file and does not validate entries.
 """
 
 from __future__ import annotations
@@ -35,14 +35,18 @@ MAX_DIGITS = 18  # maximum length of a frame number
 
 
 class CategoryIds(Enum):
-    """Numbering of `category_id`."""
+    """Numbering of the classes in `category_id`."""
 
     COCO_91 = "ids of COCO's annotation files: 1 to 90, with gaps"
     FROM_ONE = "indices of the labels, from 1"
     FROM_ZERO = "indices of the labels, from 0"
 
     def of(self, labels: Sequence[str]) -> list[int]:
-        """Return the id of each label. Raises ConfigError if the labels do not match this numbering."""
+        """Return the id of each label.
+
+        Raises:
+            ConfigError: The labels do not match this numbering.
+        """
         if self is not CategoryIds.COCO_91:
             return list(range(len(labels))) if self is CategoryIds.FROM_ZERO else list(range(1, len(labels) + 1))
         if tuple(labels) != COCO:
@@ -53,12 +57,18 @@ class CategoryIds(Enum):
 
 
 def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[StoredDetection]:
-    """Read the detections from a results file, in the order of the file.
+    """Read the detections in a results file.
 
-    `segmentation`: run lengths (packed or a list) or polygons. `image_id`: `Frame.index`, as a number or as the file
-    name of the image ("color/000012.png"). `labels`: the names in the file's label space. `ids`: the numbering of
-    `category_id`, which is used only without `category_name`. Raises DataError with the file and the entry for an
-    invalid entry.
+    `segmentation` contains run lengths or polygons. `image_id` is a frame index, or a file name such as
+    "color/000012.png".
+
+    Args:
+        path: The results file.
+        labels: The class names of the file's label space.
+        ids: The numbering of `category_id`, for entries without `category_name`.
+
+    Raises:
+        DataError: An entry is invalid.
     """
     entries = read_json(path)
     if not isinstance(entries, list):
@@ -164,7 +174,7 @@ def _read_polygons(found: Sequence[Any]) -> Polygons:
 
 
 class ResultWriter:
-    """Writer of a results file, frame by frame."""
+    """Writer of a results file."""
 
     def __init__(self, file: TextIO, classes: tuple[str, ...]) -> None:
         self._file = file
@@ -174,7 +184,7 @@ class ResultWriter:
         self.frames = 0
 
     def write(self, frame: int, detections: Detections) -> None:
-        """Write the detections of the frame with index `frame`."""
+        """Write the detections of a frame."""
         height, width = detections.masks.shape[1:]
         best = detections.class_probabilities.argmax(axis=1).tolist()
         boxes = detections.boxes.astype(np.float64)  # float64 makes x + width exactly x2
@@ -197,7 +207,10 @@ class ResultWriter:
 
 @contextmanager
 def results_file(path: Path, classes: tuple[str, ...]) -> Iterator[ResultWriter]:
-    """Open a results file for a detector with these classes; the file appears atomically at the end of the block."""
+    """Open a results file for writing.
+
+    The file is created atomically at the end of the block.
+    """
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write("[\n")
         yield ResultWriter(file, classes)
@@ -205,5 +218,5 @@ def results_file(path: Path, classes: tuple[str, ...]) -> Iterator[ResultWriter]
 
 
 def _shortest(values: Float32) -> list[float]:
-    """Return float32 values rounded to the fewest decimal digits that identify them, which halves the file size."""
-    return [float(text) for text in values.astype(str)]
+    """Convert float32 values to floats with as few decimal digits as possible."""
+    return [float(text) for text in values.astype(str)]  # halves the file size

@@ -1,4 +1,4 @@
-"""Fingerprint of a detector: a hash of all inputs of its detections except the frame."""
+"""Fingerprint of a detector: a hash of everything that determines its detections, except the frame."""
 
 from __future__ import annotations
 
@@ -22,15 +22,14 @@ NOT_GIVEN = Path()  # value of an empty path in a config
 
 
 def fingerprint(detector: object) -> str:
-    """Compute the SHA-256 (hex) of the class, code and parameters of a dataclass instance.
+    """Return the SHA-256 of the code and parameters of a detector.
 
-    The code comprises the modules of the class and its base classes, framework.detection, and the versions of numerical
-    libraries. A path, or a str that names an existing file or folder, is identified by its content. A folder includes
-    all files below it. Relative paths are searched in the working directory, then in the project folder. `device: auto`
-    is identified by the selected device. The number of threads is not included.
+    The code includes the modules of the class and its base classes, framework.detection, and the versions of numerical
+    libraries. Paths are replaced by the contents of their files. The number of threads is not included.
 
-    Raises ConfigError for a missing path and for code without a source file, such as a class in a notebook. Such a
-    class must define a method `fingerprint`.
+    Raises:
+        ConfigError: A path does not exist, or the class has no source file, for example in a notebook. Such a class
+            must define a method `fingerprint`.
     """
     kind = type(detector)
     digest = hashlib.sha256()
@@ -62,7 +61,8 @@ def _code(kind: type) -> Iterator[str]:
 def _parameters(detector: object) -> Iterator[str]:
     if not dataclasses.is_dataclass(detector):
         raise ConfigError(
-            f"{type(detector).__qualname__}: expected a dataclass, got a class without fields; implement fingerprint()"
+            f"{type(detector).__qualname__}: expected a dataclass, got another class; make it a dataclass "
+            "or implement fingerprint()"
         )
     for field in dataclasses.fields(detector):
         value = getattr(detector, field.name)
@@ -81,7 +81,7 @@ def _parameters(detector: object) -> Iterator[str]:
 
 
 def _is_path(value: str) -> bool:
-    """Return True if a str parameter is an existing path, not a name such as `auto`."""
+    """Return True if a text is an existing path."""
     try:
         return value not in ("", ".") and any(candidate.exists() for candidate in candidates(Path(value)))
     except (OSError, ValueError):  # too long for a file name
@@ -89,7 +89,7 @@ def _is_path(value: str) -> bool:
 
 
 def content_hash(path: Path) -> str:
-    """Compute the `path_hash` of the file or folder at a path; "" for an empty path."""
+    """Return the hash of a file or folder, or "" for an empty path."""
     if path == NOT_GIVEN:
         return ""
     found = next((candidate for candidate in candidates(path) if candidate.exists()), None)

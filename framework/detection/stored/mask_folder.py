@@ -1,4 +1,7 @@
-"""Mask folders. Each frame has an image NNNNNN.png of instance ids and a file NNNNNN.json of classes and scores."""
+"""Folders with instance masks.
+
+Each frame has an image NNNNNN.png of instance ids and a file NNNNNN.json of classes and scores.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ LARGEST_ID = np.iinfo(np.uint16).max
 
 @dataclass(frozen=True)
 class InstanceOfImage(Segmentation):
-    """The pixels with one id in an image of instance ids."""
+    """The pixels with one instance id in an image."""
 
     path: Path
     id: int
@@ -44,11 +47,17 @@ class InstanceOfImage(Segmentation):
 
 
 def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetection]:
-    """Read the detections from a mask folder.
+    """Read the detections in a mask folder.
 
-    NNNNNN is `Frame.index`. The PNG has one channel of 16 bits. The JSON is a list of objects with the keys "id",
-    "class", "score" and optionally "class_probabilities". `labels`: the names in the folder's label space. Unlisted ids
-    are not detections. Masks cannot overlap. Raises DataError with the file and the entry for an invalid entry.
+    NNNNNN is the frame index. The PNG has one channel of 16 bits. The JSON is a list of objects with the keys "id",
+    "class", "score" and optionally "class_probabilities". Ids that are not listed are ignored.
+
+    Args:
+        folder: The mask folder.
+        labels: The class names of the folder's label space.
+
+    Raises:
+        DataError: A file or an entry is invalid.
     """
     index = {name: k for k, name in enumerate(labels)}
     found: list[StoredDetection] = []

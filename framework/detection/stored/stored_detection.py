@@ -1,4 +1,4 @@
-"""Stored detections from other programs, validated on reading."""
+"""Detections that were stored by other programs."""
 
 from __future__ import annotations
 
@@ -19,16 +19,20 @@ MAX_PROBABILITY = 1e6  # maximum of a single value, checked before the sum to pr
 
 
 class Segmentation(ABC):
-    """The region of an object in its image."""
+    """The region of an object in an image."""
 
     @abstractmethod
     def mask(self, shape: tuple[int, int]) -> Bool:
-        """Return the mask (H, W) for an image of `shape` (height, width). Raises DataError for another size."""
+        """Return the mask (H, W) for an image of size `shape` (height, width).
+
+        Raises:
+            DataError: The segmentation is from an image of another size.
+        """
 
 
 @dataclass(frozen=True)
 class RunLengths(Segmentation):
-    """Packed run lengths in COCO's format, already checked."""
+    """Packed run lengths in COCO's format, already validated."""
 
     counts: bytes
     shape: tuple[int, int]  # height, width
@@ -44,7 +48,10 @@ class RunLengths(Segmentation):
 
 @dataclass(frozen=True)
 class Polygons(Segmentation):
-    """Outlines of an object's parts, each x1 y1 x2 y2 ... px; as in COCO, the corner of the image is (0, 0)."""
+    """Outlines x1 y1 x2 y2 ... of the parts of an object, px.
+
+    The image corner is at (0, 0), as in COCO.
+    """
 
     outlines: tuple[tuple[float, ...], ...]
 
@@ -63,7 +70,7 @@ class Polygons(Segmentation):
 
 @dataclass(frozen=True)
 class StoredDetection:
-    """A detection from a file: one object in one image."""
+    """One detection in a file."""
 
     where: str  # file and entry, for errors
     frame: int  # Frame.index
@@ -76,14 +83,22 @@ class StoredDetection:
 
 
 def read_score(found: Any) -> float:
-    """Return a score in [0, 1]. Raises DataError for other values."""
+    """Return a score.
+
+    Raises:
+        DataError: The value is not a number in [0, 1].
+    """
     if isinstance(found, bool) or not isinstance(found, int | float) or not 0 <= found <= 1:
         raise DataError(f"score: expected a number in [0, 1], got {found!r}")
     return float(found)
 
 
 def read_label(found: Any, index: Mapping[str, int]) -> str:
-    """Return the name if it is in the label space `index`. Raises DataError for other values."""
+    """Return a class name.
+
+    Raises:
+        DataError: The value is not a name in `index`.
+    """
     if not isinstance(found, str) or found not in index:
         raise DataError(
             f"label: expected one of the {len(index)} names in detector.label_space, got {found!r}; set "
@@ -93,11 +108,17 @@ def read_label(found: Any, index: Mapping[str, int]) -> str:
 
 
 def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
-    """Return the distribution (C,) over the label space from a JSON list or object; None = not given.
+    """Return the class distribution (C,) from a JSON list or object, or None if not given.
 
-    `index`: the index of each name in the label space. An object has class names as keys; missing names have the
-    probability 0. A sum that differs from 1 by at most ROUNDED_SUM, due to rounded digits, is normalized. Raises
-    DataError for other values.
+    A JSON object has class names as keys, and missing names have the probability 0. The sum is normalized if it differs
+    from 1 only by rounding.
+
+    Args:
+        found: The JSON value.
+        index: The index of each class name.
+
+    Raises:
+        DataError: The value is not a distribution over these classes.
     """
     if found is None:
         return None

@@ -1,8 +1,7 @@
-"""Up directions from the accelerometer in a ROS bag (sensor_msgs/Imu) with known extrinsics to the camera.
+"""Up directions from the accelerometer in a ROS bag.
 
-At rest, an accelerometer measures an upward vector of 9.8 m/s^2 (REP 145) in the frame of its message. The header of a
-sensor_msgs/Image names the optical frame of the camera. /tf_static contains the rotation between the two frames.
-RealSense's recorder stores this rotation with each stream.
+At rest, an accelerometer measures an upward vector of 9.8 m/s^2 (REP 145). Its rotation to the camera is taken from
+/tf_static, or from the stream of a RealSense recording.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Accelerometer:
-    """Accelerometer measurements, rotated to the axes of the color camera."""
+    """Accelerometer measurements in the axes of the color camera."""
 
     times: Float64  # (N,) s, ascending
     measured: Float64  # (N, 3) m/s^2
 
     def up(self, timestamp: float) -> Float64 | None:
-        """Return the unit up vector (3,) in the camera frame at a time in s; None = no measurement within NEAR s."""
+        """Return the unit up vector (3,) in the camera frame at a time in s, or None without measurements."""
         first, end = np.searchsorted(self.times, (timestamp - NEAR, timestamp + NEAR))
         if first == end:
             return None
@@ -45,10 +44,12 @@ class Accelerometer:
 
 
 def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> Accelerometer | None:
-    """Return the first usable accelerometer of a bag in the order of topic names; None = no usable accelerometer.
+    """Return the first usable accelerometer in a bag, or None if there is none.
 
-    `color` is the topic of the color images, and `timestamps` are their times in s. A warning is logged if all
-    accelerometers are unusable.
+    Args:
+        bag: The bag.
+        color: The topic of the color images.
+        timestamps: The timestamps of the color images, s.
     """
     reasons = []
     for topic in bag.topics(IMU):
@@ -67,7 +68,7 @@ def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> 
 
 
 def _accelerometer(bag: RosBag, topic: str, color: str) -> Accelerometer | str:
-    """Return the accelerometer of a topic, or the reason why it is unusable."""
+    """Return the accelerometer of a topic, or the reason why it cannot be used."""
     times, measured, frame_id = _read(bag, topic)
     if not len(times):
         return f"{topic}: expected readable messages, got none"
@@ -86,7 +87,7 @@ def _accelerometer(bag: RosBag, topic: str, color: str) -> Accelerometer | str:
 
 
 def _rotation(bag: RosBag, topic: str, frame_id: str, color: str) -> Float64 | None:
-    """Return R_camera_imu (3, 3), or None if it is not in the bag."""
+    """Return the rotation (3, 3) from the accelerometer to the camera, or None if it is not in the bag."""
     if topic.startswith(REALSENSE):
         T_imu_reference = stream_motion(bag, topic.removesuffix("/imu/data"))
         T_color_reference = stream_motion(bag, color.removesuffix("/image/data"))
@@ -99,10 +100,7 @@ def _rotation(bag: RosBag, topic: str, frame_id: str, color: str) -> Float64 | N
 
 
 def _read(bag: RosBag, topic: str) -> tuple[Float64, Float64, str]:
-    """Return the header times (N,) in s, the measurements (N, 3) in m/s^2 and their frame id.
-
-    Damaged messages are skipped.
-    """
+    """Read the timestamps (N,), s, the accelerations (N, 3), m/s^2, and the frame id of a topic."""
     times, measured, frame_id, damaged = [], [], "", 0
     try:
         for message in bag.messages([topic]):

@@ -1,17 +1,17 @@
-"""ROS 1 and ROS 2 bags, including .bag files of RealSense's recorder (ROS 1 bags with other topics).
+"""Import of ROS 1 and ROS 2 bags, including .bag files of RealSense's recorder.
 
     sensor_msgs/Image, CompressedImage      color (8 bits) and depth (16UC1 and similar: mm; 32FC1: m)
     sensor_msgs/CameraInfo                  intrinsics of color, and of depth if it is not registered
-    nav_msgs/Odometry, geometry_msgs/PoseStamped    camera poses, optional; in optical axes if the frame name contains
-                                            "optical" or is missing, otherwise in ROS axes (x forward)
+    geometry_msgs/PoseStamped               camera poses in optical axes, optional
+    nav_msgs/Odometry                       camera poses, optional; in optical axes if child_frame_id contains
+                                            "optical", otherwise in ROS axes (x forward)
     sensor_msgs/Imu, tf2_msgs/TFMessage     up direction, optional, from the accelerometer and /tf_static
     /device_0/sensor_1/Color_0/image/data   RealSense's color; Depth_0 contains depth. .../tf/0 is T_stream_depth, with
                                             the rotation as in the recorder's player. .../option/Depth Units is the
                                             depth unit in m. Depth is registered to color on import
 
-The kind of the depth sensor is derived from the topic names of the drivers for RealSense, Azure Kinect and Orbbec.
-
-Color and depth images are associated by time, as in TUM RGB-D. Poses are interpolated at the time of the color image.
+Color and depth images are associated by time. Poses are interpolated at the time of the color image. The kind of the
+depth sensor is derived from the topic names.
 """
 
 from __future__ import annotations
@@ -52,12 +52,21 @@ log = logging.getLogger(__name__)
 
 
 def recognized(path: Path) -> bool:
-    """Return True if this reader supports the path."""
+    """Return True if the path is a ROS bag."""
     return path.suffix.lower() in (".bag", ".mcap", ".db3") if path.is_file() else (path / "metadata.yaml").is_file()
 
 
 def open_source(path: Path, given: Topics) -> Source:
-    """Open a bag. Raises DataError if the bag cannot be read, and ConfigError for invalid topics."""
+    """Open a bag.
+
+    Args:
+        path: The bag.
+        given: The topics set by the user.
+
+    Raises:
+        DataError: The bag cannot be read, or data are missing.
+        ConfigError: A topic does not exist or has the wrong type, or several topics are possible.
+    """
     bag = RosBag(path)
     topics = found_topics(bag, given)
     info = bag.first(topics.camera_info)
@@ -83,7 +92,10 @@ def open_source(path: Path, given: Topics) -> Source:
 
 @dataclass(frozen=True)
 class Pair:
-    """A color and a depth image taken at about the same time, as indices of the messages in their topics."""
+    """A color image and a depth image taken at about the same time.
+
+    The images are identified by the indices of their messages in the topics.
+    """
 
     color: int
     depth: int
@@ -93,7 +105,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Device:
-    """Properties shared by all frames of a bag."""
+    """Calibration, topics and trajectory of a bag."""
 
     bag: RosBag
     topics: Topics
@@ -105,7 +117,11 @@ class Device:
     pose_reading: PoseReading
 
     def frame(self, pair: Pair, color: Message, depth: Message) -> DeviceFrame:
-        """Return the frame of two messages. Raises DataError if they are unusable."""
+        """Decode two messages and return the frame.
+
+        Raises:
+            DataError: An image or the pose is invalid.
+        """
         where = f"{self.bag.path}, {pair.timestamp:.6f} s"
         stored = self.trajectory.at(pair.timestamp) if self.trajectory else None
         metric = depth_of(f"{where}: {depth.topic}", self.bag.decoded(depth), self.depth_unit)
@@ -128,9 +144,9 @@ class Device:
 
 
 def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
-    """Return the pairs matched by header timestamps, or by recording times if the clocks of the headers differ.
+    """Associate color and depth images by time.
 
-    The clocks count as different if header timestamps give less than half as many pairs.
+    Header timestamps are used, unless they give less than half as many pairs as the recording times.
     """
     sensed: dict[str, list[float]] = {topics.color: [], topics.depth: []}
     stored: dict[str, list[float]] = {topics.color: [], topics.depth: []}
@@ -153,18 +169,16 @@ def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
 
 
 def _associated(color_times: Sequence[float], depth_times: Sequence[float]) -> list[Pair]:
-    """Return the pairs of color and depth images matched by time (s).
-
-    Only the first image of each time is used, because some recorders write zero for all times.
-    """
-    # the indices of first occurrences are sorted to restore the recording order
+    """Associate color and depth images by their times, s."""
+    # Only the first image of each time is used, because some recorders write zero for all times. The indices are sorted
+    # to restore the recording order.
     colors, depths = (sorted(np.unique(times, return_index=True)[1].tolist()) for times in (color_times, depth_times))
     pairs = associate([color_times[i] for i in colors], [depth_times[j] for j in depths], MAX_PAIR_INTERVAL)
     return [Pair(colors[i], depths[j], color_times[colors[i]], depth_times[depths[j]]) for i, j in pairs]
 
 
 def _frames(device: Device, pairs: Sequence[Pair]) -> Iterator[StoredFrame]:
-    """Yield the frames. A frame is yielded as soon as both of its images are read."""
+    """Yield the frames of a bag."""
     topics = device.topics
     partner = {topics.color: {pair.color: pair for pair in pairs}, topics.depth: {pair.depth: pair for pair in pairs}}
     counts = {topics.color: 0, topics.depth: 0}
@@ -199,7 +213,7 @@ def _raise(error: DataError) -> DeviceFrame:
 
 
 def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading]:
-    """Return the poses of a topic (None = no topic) and their convention. Raises DataError if it has no messages."""
+    """Return the poses of a topic, if any, and their convention."""
     if not topic:
         return None, PoseReading()
     lines, frame_id = _pose_lines(bag, topic)
@@ -249,10 +263,7 @@ def _pose_lines(bag: RosBag, topic: str) -> tuple[list[TumLine], str | None]:
 
 
 def _registration(bag: RosBag, topics: Topics, color: Camera) -> DepthRegistration | None:
-    """Return the registration of depth to color; None = depth is registered already, or its camera is unknown.
-
-    Raises DataError if the bag has no extrinsics for the registration.
-    """
+    """Return the registration of depth to color, or None if depth is registered or its camera is unknown."""
     own = camera_info_of(bag, topics.depth)
     if topics.depth_is_registered or not own or own == topics.camera_info:
         return None
@@ -281,7 +292,7 @@ def _is_same(depth: Camera, color: Camera) -> bool:
 
 
 def _depth_unit(bag: RosBag, topics: Topics) -> float:
-    """Return the unit of integer depth images in m."""
+    """Return the unit of integer depth images, m."""
     if topics.depth.startswith(REALSENSE):
         sensor = topics.depth.partition(DEPTH_STREAM)[0]
         for name in ("Depth Units", "Depth_Units"):
@@ -292,7 +303,7 @@ def _depth_unit(bag: RosBag, topics: Topics) -> float:
 
 
 def _numbers(info: Any, name: str) -> list[float]:
-    """Return the values of a CameraInfo field. Field names are in upper case in ROS 1."""
+    """Return the values of a CameraInfo field, which has an upper-case name in ROS 1."""
     return [float(value) for value in getattr(info, name.upper() if hasattr(info, name.upper()) else name)]
 
 
@@ -302,7 +313,7 @@ def _camera(where: str, info: Any) -> Camera:
 
 
 def _distortion(topics: Topics, info: Any) -> Distortion | None:
-    """Return the lens distortion of color; None = no distortion, rectified images or an unsupported lens model."""
+    """Return the lens distortion of color, or None for a pinhole camera or an unsupported model."""
     values = _numbers(info, "d")
     if "rect" in topics.color.rpartition("/")[2] or not any(values):
         return None

@@ -1,7 +1,7 @@
-"""Messages of ROS bags, and the images in these messages.
+"""Reader of ROS bags and decoder of image messages.
 
 Only standard message types are supported. Message definitions in a bag are ignored, because rosbags would generate code
-from these definitions.
+from them.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: unused integer, quan
 
 @dataclass(frozen=True)
 class Message:
-    """A message before decoding."""
+    """An undecoded message."""
 
     topic: str
     kind: str  # message type
@@ -54,7 +54,12 @@ class RosBag:
     """A ROS 1 bag, or a ROS 2 bag as a folder, .mcap file or .db3 file."""
 
     def __init__(self, path: Path) -> None:
-        """Open a bag. Raises a DataError that names the bag if it cannot be read."""
+        """Open a bag.
+
+        Raises:
+            DataError: The bag cannot be read.
+            ConfigError: The package rosbags is not installed.
+        """
         self.path = path
         import_optional("rosbags", "reads ROS bags", "ros")
         from rosbags import rosbag1, rosbag2, typesys
@@ -72,11 +77,15 @@ class RosBag:
             raise DataError(f"{path}: expected a ROS bag, got an error ({in_one_line(error)[:SHOWN]})") from error
 
     def topics(self, *kinds: str) -> list[str]:
-        """Return the topics with messages of these types."""
+        """Return the topics with given message types."""
         return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
 
     def messages(self, topics: Sequence[str]) -> Iterator[Message]:
-        """Yield the messages of `topics` in the order of recording. Raises DataError for a damaged bag."""
+        """Yield the messages of some topics in the order of recording.
+
+        Raises:
+            DataError: The bag is damaged.
+        """
         chosen = [found for found in self._reader.connections if found.topic in topics]
         if not chosen:
             return
@@ -88,12 +97,20 @@ class RosBag:
             raise DataError(f"{self.path}: expected readable messages, got an error ({reason})") from error
 
     def first(self, topic: str) -> Any:
-        """Return the decoded first message of a topic; None = no messages. Raises DataError for a damaged bag."""
+        """Return the decoded first message of a topic, or None without messages.
+
+        Raises:
+            DataError: The bag is damaged.
+        """
         message = next(self.messages([topic]), None)
         return None if message is None else self.decoded(message)
 
     def decoded(self, message: Message) -> Any:
-        """Return the content of a message. Raises a FrameError that names the topic if the message is damaged."""
+        """Decode a message.
+
+        Raises:
+            FrameError: The message is damaged.
+        """
         decode = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
         try:
             return decode(message.raw, message.kind)
@@ -104,9 +121,12 @@ class RosBag:
             ) from error
 
     def sensed_at(self, message: Message) -> float:
-        """Return the measurement time in s from the header of a message.
+        """Return the timestamp in the header of a message, s.
 
-        The header must be the first field. Raises FrameError if the message is too short for a header.
+        The header must be the first field.
+
+        Raises:
+            FrameError: The message is too short for a header.
         """
         try:
             if self._is_ros1:
@@ -120,7 +140,11 @@ class RosBag:
 
 
 def color_of(where: str, message: Any) -> UInt8:
-    """Return the color (H, W, 3), RGB, of an Image or a CompressedImage. Raises a FrameError that names `where`."""
+    """Decode a color image (H, W, 3), RGB.
+
+    Raises:
+        FrameError: The image is invalid. The message contains `where`.
+    """
     if hasattr(message, "format"):
         return decode_color(where, message.data.tobytes())
     if message.encoding not in COLOR_CHANNELS:
@@ -131,9 +155,15 @@ def color_of(where: str, message: Any) -> UInt8:
 
 
 def depth_of(where: str, message: Any, unit: float) -> Float32:
-    """Return the depth (H, W) in m, 0 = no reading, of an Image or a CompressedImage.
+    """Decode a depth image (H, W), m, 0 = no reading.
 
-    `unit` is the unit of integer depth in m. Raises a FrameError that names `where`.
+    Args:
+        where: The location in the bag, for messages.
+        message: The decoded Image or CompressedImage message.
+        unit: The unit of integer depth, m.
+
+    Raises:
+        FrameError: The image is invalid.
     """
     if hasattr(message, "format"):
         return _compressed_depth(where, message, unit)
@@ -151,11 +181,7 @@ def _whole(stored: Array, unit: float) -> Float32:
 
 
 def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
-    """Return the depth (H, W) in m of a PNG image, 0 = no reading. `unit` is the unit of integer depth in m.
-
-    In the compressedDepth format, a 12-byte header precedes the image. For float depth, the header contains the
-    quantization of inverse depth: depth = A / (value - B).
-    """
+    """Decode a compressed depth image (H, W), m, 0 = no reading."""
     encoding, _, codec = message.format.partition(";")
     data = message.data.tobytes()
     if COMPRESSED_DEPTH not in codec:
@@ -164,6 +190,7 @@ def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
         raise FrameError(f"{where}: expected PNG or uncompressed depth, got RVL; record depth as PNG or uncompressed")
     if len(data) < DEPTH_HEADER.size:
         raise FrameError(f"{where}: expected a header of {DEPTH_HEADER.size} bytes and an image, got {len(data)} bytes")
+    # for float depth, the header contains the quantization of inverse depth: depth = A / (value - B)
     _, quantization_a, quantization_b = DEPTH_HEADER.unpack_from(data)
     stored = decode_uint16(where, data[DEPTH_HEADER.size :])
     if encoding.strip() not in METERS:

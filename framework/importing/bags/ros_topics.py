@@ -1,4 +1,4 @@
-"""Topics of color, depth, cameras and poses in a ROS bag, set by the user or selected by type and name."""
+"""Selection of the topics of a ROS bag by type and name."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ KINDS = {"color": IMAGES, "depth": IMAGES, "camera_info": (CAMERA_INFO,), "poses
 
 @dataclass(frozen=True)
 class Topics:
-    """Topic names; "" = selected by type and name."""
+    """Topics of color, depth, camera and poses.
+
+    An empty topic is selected by type and name.
+    """
 
     color: str = ""
     depth: str = ""
@@ -43,14 +46,16 @@ class Topics:
 
     @property
     def depth_is_registered(self) -> bool:
-        """True if the name of the depth topic indicates registered depth."""
+        """True if the name of the depth topic indicates that depth is registered to color."""
         return bool(REGISTERED.search(self.depth))
 
 
 def found_topics(bag: RosBag, given: Topics) -> Topics:
-    """Return the given topics. Topics that are not given are selected by type and name.
+    """Select the topics that are not set by the user.
 
-    Raises DataError or ConfigError that names the option if no single topic matches.
+    Raises:
+        ConfigError: A topic does not exist or has the wrong type, or no single topic matches.
+        DataError: The bag has no matching camera info.
     """
     images = [topic for topic in bag.topics(*IMAGES) if not NEITHER.search(topic)]
     depth = given.depth or _one(bag, "depth", [topic for topic in images if DEPTH.search(topic)], REGISTERED)
@@ -75,7 +80,7 @@ def found_topics(bag: RosBag, given: Topics) -> Topics:
 
 
 def camera_info_of(bag: RosBag, image: str) -> str:
-    """Return the only CameraInfo topic, or the one nearest to `image` in the tree of topic names; "" = none."""
+    """Return the CameraInfo topic of an image topic, or "" if there is none."""
     infos = bag.topics(CAMERA_INFO)
     folders = {topic: f"/{topic.strip('/').rpartition('/')[0]}" for topic in (image, *infos)}
     shared = {topic: len(PurePosixPath(commonpath([folders[topic], folders[image]])).parts) for topic in infos}
@@ -86,10 +91,7 @@ def camera_info_of(bag: RosBag, image: str) -> str:
 
 
 def _one(bag: RosBag, name: str, candidates: Sequence[str], preferred: re.Pattern[str]) -> str:
-    """Return the single matching topic. Topics with a preferred name, and uncompressed topics, have precedence.
-
-    Raises ConfigError if no topic or several topics match.
-    """
+    """Return the only topic among the candidates, after filtering by preferred names and uncompressed images."""
     fitting = [topic for topic in candidates if preferred.search(topic)] or list(candidates)
     left = [topic for topic in fitting if bag.kinds[topic] == IMAGE] or fitting
     if len(left) == 1:
@@ -99,6 +101,6 @@ def _one(bag: RosBag, name: str, candidates: Sequence[str], preferred: re.Patter
 
 
 def _choice(bag: RosBag, name: str) -> str:
-    """Return the end of an error message that lists the possible topics of an option; "" = none."""
+    """Return the end of an error message, with the possible topics of an option."""
     existing = bag.topics(*KINDS[name])
     return f"; set {OPTIONS[name]} to one of these topics: {', '.join(existing)}" if existing else ""

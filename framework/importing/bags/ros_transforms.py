@@ -18,9 +18,12 @@ SMALLEST_QUATERNION = 0.5  # minimum norm of a valid quaternion
 
 
 def stream_motion(bag: RosBag, stream: str) -> Float64 | None:
-    """Return T_stream_reference (4, 4) of a RealSense stream, such as /device_0/sensor_1/Color_0.
+    """Return the transform (4, 4) from the reference frame to a RealSense stream, or None if unknown.
 
-    The reference frame is the same for all streams. None = not in the bag. Raises DataError for an invalid rotation.
+    A stream is for example /device_0/sensor_1/Color_0. All streams have the same reference frame.
+
+    Raises:
+        DataError: The rotation is invalid.
     """
     stored = bag.first(f"{stream}/tf/0") if stream.startswith(REALSENSE) else None
     if stored is None:
@@ -38,7 +41,13 @@ def stream_motion(bag: RosBag, stream: str) -> Float64 | None:
 
 
 def static_motion(bag: RosBag, to: str, of: str) -> Float64 | None:
-    """Return T_to_of (4, 4) between two frames in /tf_static, possibly through other frames; None = not in the bag."""
+    """Return the transform T_to_of (4, 4) between two frames from /tf_static, or None if unknown.
+
+    Args:
+        bag: The bag.
+        to: The name of the target frame.
+        of: The name of the source frame.
+    """
     neighbors: dict[str, dict[str, Float64]] = defaultdict(dict)
     for message in bag.messages([topic for topic in bag.topics(TRANSFORMS) if topic.endswith("tf_static")]):
         for stored in bag.decoded(message).transforms:
@@ -70,7 +79,7 @@ def _motion(stored: Any) -> Float64 | None:
 
 
 def _rotation(quaternion: Any) -> Float64 | None:
-    """Return the rotation (3, 3) of a quaternion message, or None if it is invalid."""
+    """Return the rotation matrix (3, 3) of a quaternion message, or None if it is invalid."""
     quat_xyzw = [getattr(quaternion, name) for name in "xyzw"]
     if not np.isfinite(quat_xyzw).all() or np.linalg.norm(quat_xyzw) < SMALLEST_QUATERNION:
         return None

@@ -1,7 +1,7 @@
-"""Rotation of images, cameras, poses and lenses by quarter turns. Phones store images in sensor orientation.
+"""Rotation of images, cameras and poses by quarter turns.
 
-A clockwise quarter turn moves the pixel (u, v) of an image of height H to (H - 1 - v, u). A point
-(x, y, z) in the camera frame becomes (-y, x, z).
+Phones store images in sensor orientation. A clockwise quarter turn moves the pixel (u, v) of an image of height H to (H
+- 1 - v, u). A point (x, y, z) in the camera frame becomes (-y, x, z).
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ class Turn:
 
     @property
     def R_turned_camera(self) -> Float64:
-        """Rotation (3, 3) from the camera before the turn to the camera after the turn."""
+        """Rotation matrix (3, 3) from the original camera to the rotated camera."""
         quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         return np.linalg.matrix_power(quarter, self.quarters)
 
     def image(self, image: NDArray[Value]) -> NDArray[Value]:
-        """Return the rotated image (H, W) or (H, W, 3)."""
+        """Rotate an image (H, W) or (H, W, 3)."""
         return np.ascontiguousarray(np.rot90(image, -self.quarters))
 
     def camera(self, camera: Camera) -> Camera:
@@ -45,7 +45,7 @@ class Turn:
         return camera
 
     def pose(self, T_world_camera: Float64) -> Float64:
-        """Return T_world_turned (4, 4) of the rotated camera."""
+        """Return the pose (4, 4) of the rotated camera."""
         T = T_world_camera.copy()
         T[:3, :3] = T[:3, :3] @ self.R_turned_camera.T
         return T
@@ -57,9 +57,10 @@ class Turn:
 
 
 def upright(ups_camera: Sequence[Float64 | None]) -> Turn | None:
-    """Return the rotation that makes the images upright, or None if it is unknown.
+    """Return the rotation that makes the images upright, or None if unknown.
 
-    `ups_camera` contains the up direction (3,) of each frame in its camera frame, None = unknown.
+    Args:
+        ups_camera: The up direction (3,) of each frame in the camera frame; None = unknown.
     """
     known = [up for up in ups_camera if up is not None]
     if not known:

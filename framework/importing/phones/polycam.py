@@ -1,4 +1,4 @@
-"""Polycam's raw data (developer mode, https://github.com/PolyCam/polyform).
+"""Import of raw data from Polycam (developer mode, https://github.com/PolyCam/polyform).
 
     keyframes/images/1442008525605.jpg          8-bit color in sensor orientation; named by timestamp (microseconds)
     keyframes/cameras/1442008525605.json        fx, fy, cx, cy, width, height and t_00 ... t_23: ARKit's T_world_camera
@@ -8,8 +8,8 @@
     keyframes/confidence/1442008525605.png      uint8: 0 low, 255 high, other values medium (127 as documented, 54 in
                                                 exports)
 
-Corrected files are preferred. Up is taken from the recorded poses, because the y axis of optimized poses is
-undocumented.
+Corrected files are preferred. The up direction is taken from the recorded poses, because the y axis of optimized poses
+is undocumented.
 """
 
 from __future__ import annotations
@@ -34,17 +34,21 @@ ROWS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 
 
 def keyframes(path: Path) -> Path:
-    """Return the subfolder keyframes/ of `path`, or `path` itself if there is no such subfolder."""
+    """Return the folder with the keyframes."""
     return path / "keyframes" if (path / "keyframes").is_dir() else path
 
 
 def recognized(path: Path) -> bool:
-    """Return True if this reader supports the path."""
+    """Return True if the path is a recording of Polycam."""
     return (keyframes(path) / "cameras").is_dir() and (keyframes(path) / "images").is_dir()
 
 
 def open_source(path: Path) -> Source:
-    """Open a recording. Raises DataError if it is unusable."""
+    """Open a recording.
+
+    Raises:
+        DataError: Depth images or camera files are missing.
+    """
     folder = keyframes(path)
     stems = [entry.stem for entry in (folder / "cameras").glob("*.json")]
     stems = sorted((stem for stem in stems if re.fullmatch("[0-9]{1,18}", stem)), key=int)
@@ -82,7 +86,7 @@ def _read(folder: Path, stem: str) -> DeviceFrame:
 
 
 def _pose(path: Path, content: dict[str, Any]) -> Float64:
-    """Return T_world_camera (4, 4) in the content of a camera file. Raises a DataError that names the file."""
+    """Return the pose T_world_camera (4, 4) in a camera file."""
     rows = np.reshape(numbers_of(path, content, *ROWS), (3, 4))
     return arkit_pose(path, np.vstack([rows, [[0, 0, 0, 1]]]))
 

@@ -1,4 +1,4 @@
-"""Record3D (https://record3d.app): "EXR + RGB" exports and .r3d files.
+"""Import of Record3D recordings (https://record3d.app): "EXR + RGB" exports and .r3d files.
 
     metadata.json           w, h: size of color, px; dw, dh: size of depth, px; K: intrinsics of color, 3 x 3,
                             column-major; fps; poses: [qx, qy, qz, qw, x, y, z] per frame; in newer versions
@@ -9,7 +9,7 @@ An .r3d file is a zip archive of metadata (the same JSON), rgbd/0.jpg, rgbd/0.de
 Confidence (uint8, 0 to 2) requires a LiDAR. Depth and confidence are compressed with LZFSE.
 
 Images are upright in both formats. Poses are T_world_camera of the upright camera in ARKit's axes. In older versions,
-the first pose is the identity and the up direction is unknown. Newer versions store `arframe.camera.transform`
+the first pose is the identity, and the up direction is unknown. Newer versions store `arframe.camera.transform`
 (marek-simonik/record3d, issues 27 and 64). The up direction is therefore known if the first pose is rotated.
 """
 
@@ -68,21 +68,21 @@ def open_file(path: Path) -> Source:
 
 @dataclass(frozen=True)
 class ExrFolder:
-    """Images of an export by frame number. Reading may raise DataError."""
+    """Images of an exported folder by frame number."""
 
     folder: Path
 
     def color(self, number: int) -> UInt8:
-        """Return the color (H, W, 3), RGB."""
+        """Read the color image (H, W, 3), RGB."""
         return read_color(self.folder / f"rgb/{number}.jpg")
 
     def depth(self, number: int, shape: tuple[int, int]) -> Float32:
-        """Return the depth (h, w) in m, 0 = no reading."""
+        """Read the depth image (h, w), m, 0 = no reading."""
         path = self.folder / f"depth/{number}.exr"
         return readings(_read_exr(path, read_bytes(path, LARGEST_FILE), shape))
 
     def confidence(self, number: int, shape: tuple[int, int]) -> UInt8 | None:
-        """Return the confidence (h, w) of depth, from 0 to 2; None = unknown."""
+        """Read the confidence (h, w) of depth, from 0 to 2, or return None if unknown."""
         return None
 
     def name(self, number: int) -> str:
@@ -91,10 +91,14 @@ class ExrFolder:
 
 
 class R3dFile:
-    """Images of an .r3d file, with the methods of `ExrFolder`."""
+    """Images of an .r3d file by frame number."""
 
     def __init__(self, path: Path) -> None:
-        """Open an .r3d file. Raises a DataError that names the file if it is not a zip archive."""
+        """Open an .r3d file.
+
+        Raises:
+            DataError: The file is not a zip archive.
+        """
         self.path = path
         try:
             self._zip = zipfile.ZipFile(path)
@@ -117,7 +121,11 @@ class R3dFile:
         return f"{self.path}: rgbd/{number}.depth"
 
     def read(self, name: str, most: int) -> bytes:
-        """Return the content of an archive member. Raises DataError if it is unreadable or larger than `most` bytes."""
+        """Read an archive member.
+
+        Raises:
+            DataError: The member is unreadable or larger than `most` bytes.
+        """
         try:
             info = self._zip.getinfo(name)
             if info.file_size > most:
@@ -192,7 +200,7 @@ def _pose(where: str, values: Any) -> Float64:
 
 
 def _is_turned(pose: Any) -> bool:
-    """Return True if a stored pose is valid and rotated."""
+    """Return True if a stored pose is valid and its rotation is not the identity."""
     try:
         quat_xyzw = number_list("pose", pose, 7)[:4]
     except DataError:
@@ -201,7 +209,7 @@ def _is_turned(pose: Any) -> bool:
 
 
 def _intrinsics(where: Path | str, content: Mapping[str, Any], count: int) -> list[tuple[float, ...]]:
-    """Return the intrinsics fx, fy, cx, cy of each frame's color image."""
+    """Return fx, fy, cx, cy, px, of each color image."""
     own = content.get("perFrameIntrinsicCoeffs")
     if isinstance(own, list) and len(own) == count:
         return [tuple(number_list(f"{where}: perFrameIntrinsicCoeffs", values, 4)) for values in own]
@@ -210,7 +218,7 @@ def _intrinsics(where: Path | str, content: Mapping[str, Any], count: int) -> li
 
 
 def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[float]:
-    """Return the timestamp (s) of each frame, derived from the frame rate in older recordings."""
+    """Return the timestamp of each frame, s."""
     if "frameTimestamps" in content:
         return number_list(f"{where}: frameTimestamps", content.get("frameTimestamps"), count)
     [rate] = numbers_of(where, content, "fps")
@@ -220,17 +228,17 @@ def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[fl
 
 
 def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
-    """Return the shape (h, w) of depth, px. In older versions without this size, depth has the size of color."""
-    if "dw" not in content:
+    """Return the size (h, w) of the depth images, px."""
+    if "dw" not in content:  # older versions; depth has the size of color
         return camera.shape
     width, height = numbers_of(where, content, "dw", "dh")
     return pinhole(where, width, height, camera.fx, camera.fy, 0, 0).shape
 
 
 def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDArray[np.floating]:
-    """Return the stored depth (h, w), m. The header is checked first, because it determines the required memory."""
+    """Read a depth image (h, w), m, from an EXR file."""
     OpenEXR = _load_openexr()
-    try:
+    try:  # the header is checked first, because it determines the required memory
         header = OpenEXR.File(io.BytesIO(data), header_only=True).header()
         low, high = header["dataWindow"]
         found = tuple(int(n) for n in (high - low + 1)[::-1])

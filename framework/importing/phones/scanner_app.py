@@ -1,10 +1,12 @@
-"""3D Scanner App by Laan Labs (https://3dscannerapp.com): the export "All Data" of a low-resolution scan.
+"""Import of scans from 3D Scanner App by Laan Labs (https://3dscannerapp.com), exported as "All Data".
 
 frame_00000.json        intrinsics of color, 3 x 3, row-major; cameraPoseARFrame, ARKit's T_world_camera, 4 x 4,
                         row-major; time, s
 frame_00000.jpg         8-bit color in sensor orientation, only for some frames
 depth_00000.png         uint16 mm, 256x192
 conf_00000.png          uint8 0 to 2, from ARKit, optional
+
+Only low-resolution scans contain depth.
 """
 
 from __future__ import annotations
@@ -26,12 +28,16 @@ _FRAME = re.compile(r"frame_([0-9]{5,9})\.json")
 
 
 def recognized(path: Path) -> bool:
-    """Return True if this reader supports the path."""
+    """Return True if the path is a scan of 3D Scanner App."""
     return path.is_dir() and any(_FRAME.fullmatch(entry.name) for entry in path.iterdir())
 
 
 def open_source(path: Path) -> Source:
-    """Open a recording. Raises DataError if it is unusable."""
+    """Open a recording.
+
+    Raises:
+        DataError: There are no frames with color and depth.
+    """
     digits = sorted(match[1] for entry in path.iterdir() if (match := _FRAME.fullmatch(entry.name)))
     complete = [n for n in digits if (path / f"frame_{n}.jpg").exists() and (path / f"depth_{n}.png").exists()]
     if not complete:

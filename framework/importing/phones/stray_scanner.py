@@ -1,4 +1,4 @@
-"""Stray Scanner (https://github.com/strayrobots/scanner, docs/format.md): iPhones and iPads with LiDAR.
+"""Import of recordings from Stray Scanner (https://github.com/strayrobots/scanner, docs/format.md).
 
     rgb.mp4                 HEVC, 1920x1440, in sensor orientation; appears rotated if the phone was held upright
     depth/000000.png        uint16 mm, 256x192, one image per video frame
@@ -6,8 +6,9 @@
     camera_matrix.csv       3 x 3 intrinsics of the video
     odometry.csv            timestamp, frame, x, y, z, qx, qy, qz, qw; in newer versions also fx, fy, cx, cy
 
-The app rotates ARKit's camera about its x axis before writing (q_WA * q_AC in OdometryEncoder). Poses are therefore
-T_world_camera in OpenCV's axes. The accelerometer data of a real recording confirm this.
+The app records on iPhones and iPads with LiDAR. It rotates ARKit's camera about its x axis before writing (q_WA * q_AC
+in OdometryEncoder). Poses are therefore T_world_camera in OpenCV's axes. The accelerometer data of a real recording
+confirm this.
 """
 
 from __future__ import annotations
@@ -48,12 +49,16 @@ class OdometryRow:
 
 
 def recognized(path: Path) -> bool:
-    """Return True if this reader supports the path."""
+    """Return True if the path is a recording of Stray Scanner."""
     return (path / "odometry.csv").is_file() and (path / "camera_matrix.csv").is_file()
 
 
 def open_source(path: Path) -> Source:
-    """Open a recording. Raises DataError if it is unusable."""
+    """Open a recording.
+
+    Raises:
+        DataError: A file is missing or invalid.
+    """
     video = Video(path / "rgb.mp4")
     rows = _read_odometry(path / "odometry.csv", _read_camera(path / "camera_matrix.csv", video))
     confident = (path / "confidence").is_dir()
@@ -78,7 +83,10 @@ def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: b
 
 
 def _read_odometry(path: Path, camera: Camera) -> list[OdometryRow | DataError]:
-    """Return the row of each frame, or its error. `camera` is used for rows without intrinsics."""
+    """Return the odometry of each frame, or the error of an invalid line.
+
+    `camera` is used for lines without intrinsics.
+    """
     lines = read_lines(path)
     header = [word.strip() for word in lines[0].split(",")] if lines else []
     if tuple(header[: len(POSE)]) != POSE:
@@ -116,10 +124,14 @@ def _read_camera(path: Path, video: Video) -> Camera:
 
 
 class Video:
-    """Reader of video frames in sensor orientation, as for depth. The rotation in the metadata is ignored."""
+    """Reader of video frames in sensor orientation."""
 
     def __init__(self, path: Path) -> None:
-        """Open a video. Raises a DataError that names the file if it cannot be decoded."""
+        """Open a video.
+
+        Raises:
+            DataError: The file cannot be decoded.
+        """
         check_regular(path)
         with path.open("rb") as file:
             if not (start := file.read(KIND_AT + len(KIND))).endswith(KIND):
@@ -131,7 +143,7 @@ class Video:
             self._capture = cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG)
         finally:
             cv2.utils.logging.setLogLevel(before)
-        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # ignores the rotation in the metadata
         self.width = int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH))  # px
         self.height = int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT))  # px
         if not self._capture.isOpened() or not 0 < self.width * self.height <= MAX_PIXELS:
@@ -141,9 +153,15 @@ class Video:
         self._next = 0
 
     def frame(self, number: int) -> UInt8:
-        """Return the color (H, W, 3), RGB, of frame `number` (0 = first).
+        """Return a frame (H, W, 3), RGB.
 
-        Raises FrameError if frames are not read in ascending order or the frame cannot be decoded.
+        Frames must be read in ascending order.
+
+        Args:
+            number: The index of the frame, from 0.
+
+        Raises:
+            FrameError: The frame cannot be decoded, or it is before the last frame that was read.
         """
         if number < self._next - 1:
             raise FrameError(f"{self.path}: expected increasing frames, got {number} after {self._next - 1}")

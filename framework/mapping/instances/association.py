@@ -1,11 +1,11 @@
-"""Data association of a frame's clusters with the instances of the map.
+"""Data association between the clusters of a frame and the instances of the map.
 
-The pixels of a cluster vote for the instances of the map at these pixels. The instances come from the voxels at the
-measured surface or from the ray-cast view. The ray-cast view is our interpretation of section 3.3 of the paper.
+Each pixel of a cluster votes for the instance of the map at this pixel. The instances are looked up in the voxels at
+the measured surface or in a ray-cast view. The ray-cast view is our interpretation of section 3.3 of the paper.
 
-A cluster and an instance may match if their overlap is large enough. By default, the overlap is relative to the smaller
-of the two, so that a part of an object matches the whole. Matching is one to one, best IoU first, so that a table does
-not match the book on it. An unmatched cluster creates a new instance.
+A cluster and an instance can match if their overlap is large enough. By default, the overlap is relative to the smaller
+of the two, so that a part of an object matches the whole. Matching is one to one, in order of decreasing IoU. An
+unmatched cluster creates a new instance.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ VOTES_ACROSS = 320  # approximate number of voting pixels per image row; more ta
 
 
 class InstanceSource(Enum):
-    """The source of the instances that the pixels of a frame vote for."""
+    """Source of the instances that are compared with the clusters."""
 
     SURFACE_LOOKUP = "voxels at the measured surface"
     RAYCAST = "object indices of the map, ray-cast from the pose of the frame"
 
 
 class OverlapRule(Enum):
-    """The denominator of an overlap."""
+    """Denominator of the overlap of a cluster and an instance."""
 
     SMALLER = "size of the smaller of cluster and instance, so that a part of an object matches the whole"
     IOU = "number of pixels in the union of cluster and instance"
@@ -49,7 +49,7 @@ class OverlapRule(Enum):
 
 @dataclass(frozen=True)
 class Overlaps:
-    """Overlap of N clusters with the M instances visible in the frame."""
+    """Overlap of the N clusters of a frame with the M visible instances."""
 
     instance_ids: Int32  # (M,) ascending
     visible: Int32  # (M,) number of pixels of each visible instance
@@ -59,30 +59,32 @@ class Overlaps:
     stride: int  # distance between the samples in `seen`, px
 
     def by(self, rule: OverlapRule, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return the overlaps (N, M), in [0, 1], with the denominator `rule`, which is at least `min_pixels`."""
+        """Return the overlaps (N, M), in [0, 1], with the given denominator, which is at least `min_pixels`."""
         if rule is OverlapRule.CLUSTER:
             return np.asarray(self.votes / np.maximum(self.sizes[:, None], min_pixels))
         return self.over_smaller(min_pixels) if rule is OverlapRule.SMALLER else self.over_union(min_pixels)
 
     def over_union(self, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return the IoUs (N, M), in [0, 1], of clusters and instances, with a union of at least `min_pixels`."""
+        """Return the IoUs (N, M), with a union of at least `min_pixels`."""
         union = self.sizes[:, None] + self.visible[None, :] - self.votes
         return np.asarray(self.votes / np.maximum(union, min_pixels))
 
     def over_smaller(self, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return the shared pixels (N, M) divided by the smaller of cluster and visible instance, in [0, 1].
+        """Return the overlaps (N, M), relative to the smaller of cluster and visible instance.
 
-        The divisor is at least `min_pixels`. Otherwise, an instance with a few stray voxels under a cluster would
-        overlap it completely, and match it instead of the correct instance.
+        The denominator is at least `min_pixels`. Otherwise, an instance with a few stray voxels inside a cluster could
+        match it instead of the correct instance.
         """
         return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), min_pixels)
 
 
 def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> Overlaps:
-    """Return the overlaps of the clusters in `points` with the visible instances.
+    """Return the overlaps of clusters with the visible instances.
 
-    `instance_ids` (h, w), 0 = none, samples every stride-th pixel of every stride-th row. Each sample counts as
-    stride^2 pixels.
+    Args:
+        points: The lists of clusters at the pixels.
+        instance_ids: The instance (h, w) at every stride-th pixel of every stride-th row, 0 = none.
+        stride: The distance between the samples, px. Each sample counts as stride^2 pixels.
     """
     is_seen = np.zeros(instance_ids.max() + 1, np.bool_)
     find_seen(instance_ids, is_seen)
@@ -103,15 +105,19 @@ def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> 
 
 
 def class_agreement(clusters: Float32, instances: Float32) -> npt.NDArray[np.float64]:
-    """Return the Bhattacharyya coefficients (N, M), in [0, 1], of class distributions (N, C) and (M, C); 1 = equal."""
+    """Return the Bhattacharyya coefficients (N, M) between class distributions (N, C) and (M, C), 1 = equal."""
     return np.asarray(np.sqrt(clusters.astype(np.float64)) @ np.sqrt(instances.astype(np.float64)).T)
 
 
 def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int32:
     """Return the matched column (N,) of each row, -1 = unmatched.
 
-    The matching of the `allowed` pairs (N, M) is greedy, in order of decreasing `preference` (N, M). Ties go to the
-    smaller column, then to the smaller row.
+    Pairs are matched greedily in order of decreasing preference. Ties go to the smaller column, then to the smaller
+    row.
+
+    Args:
+        allowed: A Boolean array (N, M), True for pairs that can match.
+        preference: The preference (N, M) of each pair.
     """
     match = np.full(len(allowed), -1, np.int32)
     rows, columns = np.nonzero(allowed)
@@ -130,14 +136,14 @@ def vote_stride(camera: Camera) -> int:
 
 
 class LabeledMap(Protocol):
-    """A map with an instance table and with instance labels in its voxels."""
+    """A map with an instance table and instance labels in its voxels."""
 
     table: InstanceTable
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """Return the most likely instance (ceil(H / stride), ceil(W / stride)) at the measured surface, 0 = none.
+        """Return the most likely instance at the measured surface at every stride-th pixel of a frame, 0 = none.
 
-        The samples are every stride-th depth reading of every stride-th row of `frame.depth`. Unlike ray casting, the
+        The result (ceil(H / stride), ceil(W / stride)) is looked up at the depth readings. Unlike ray casting, the
         look-up never returns an instance that is hidden behind a new object.
         """
 
@@ -145,12 +151,12 @@ class LabeledMap(Protocol):
         """Return the ray-cast view of the map."""
 
     def merge(self, kept: int, dropped: int) -> None:
-        """Merge instance `dropped` into `kept`, in the table and in every voxel."""
+        """Merge instance `dropped` into instance `kept`."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Instances assigned to a frame's N clusters."""
+    """The instances matched with the N clusters of a frame."""
 
     frame_index: int
     clusters: PointClusters
@@ -159,10 +165,15 @@ class Matches:
 
 
 def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min_pixels: int) -> None:
-    """Update the table with the `class_evidence` (N, C) of the clusters.
+    """Add the matched clusters of a frame to the instance table.
 
-    An instance is in view if it is visible in at least `min_pixels` pixels, or if it was detected. Frames on which the
-    detector did not run are ignored.
+    Frames on which the detector did not run are ignored.
+
+    Args:
+        table: The instance table.
+        matches: The matches of the frame.
+        class_evidence: The class evidence (N, C) of the clusters.
+        min_pixels: The minimum number of visible pixels of an instance in view. Detected instances are always in view.
     """
     if not matches.clusters.detected:
         return
@@ -181,7 +192,7 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min
 def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding]:
     """Return the embedding of each cluster by index, weighted by its score.
 
-    Clusters without an embedding or with score 0 are omitted.
+    Clusters without an embedding or with a score of 0 are omitted.
     """
     if clusters.embeddings is None:
         return {}
@@ -191,7 +202,7 @@ def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding
 
 @dataclass
 class Association:
-    """Association of clusters with instances, and merging of instances detected as one object."""
+    """Association of clusters with instances, and merging of instances that are parts of one object."""
 
     # source of the instances that clusters are compared with
     association: InstanceSource = InstanceSource.SURFACE_LOOKUP
@@ -227,13 +238,13 @@ class Association:
         self._merge_votes: Counter[tuple[int, int]] = Counter()  # votes by pair of instances; see merge_frames
 
     def match(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> tuple[PixelLists, Matches]:
-        """Return the clusters at each pixel, and their matches with existing and new instances of the map."""
+        """Return the clusters at each pixel, and their matches with existing and new instances."""
         points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = self.look_up(scene, frame, pose, points)
         return points, self.associate(scene.table, overlaps, clusters, frame.index)
 
     def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, points: PixelLists) -> Overlaps:
-        """Return the overlaps of the clusters with the instances of the map at their pixels."""
+        """Return the overlaps of the clusters with the instances of the map."""
         stride = vote_stride(frame.camera)
         if self.association is InstanceSource.RAYCAST:
             view = scene.render(frame.camera, pose.T_world_camera)
@@ -241,9 +252,9 @@ class Association:
         return count_overlaps(points, scene.instances_seen(frame, pose.T_world_camera, stride), stride)
 
     def associate(self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, frame_index: int) -> Matches:
-        """Match the clusters to instances, and return the matches.
+        """Match clusters with instances, and create instances for unmatched clusters.
 
-        An unmatched cluster creates an instance if it meets `create_score` and `create_points`.
+        A cluster creates an instance only if it meets `create_score` and `create_points`.
         """
         frame_index = table.number_of(frame_index)
         allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
@@ -260,20 +271,20 @@ class Association:
         return Matches(frame_index, clusters, overlaps, instance_ids)
 
     def _agree(self, table: InstanceTable, clusters: PointClusters, instance_ids: Int32) -> Bool:
-        """Return a Boolean array (N, M), True where the classes of cluster n and instance m allow a match."""
+        """Return a Boolean array (N, M), True where the class distributions allow a match."""
         if self.min_class_agreement == 0 or not len(instance_ids):
             return np.ones((len(clusters), len(instance_ids)), np.bool_)
         known = np.stack([table.class_probabilities(table.records[int(k)]) for k in instance_ids])
         return class_agreement(clusters.class_probabilities, known) >= self.min_class_agreement
 
     def observe(self, table: InstanceTable, matches: Matches, class_evidence: Float64) -> None:
-        """Update the instance table with the matches of this frame."""
+        """Add the matched clusters of a frame to the instance table."""
         observe(table, matches, class_evidence, self.create_points)
 
     def merge(self, scene: LabeledMap, matches: Matches) -> None:
-        """Merge two instances that often share a cluster and are rarely detected separately (as in Voxblox++).
+        """Merge two instances that often share a cluster and are rarely detected separately.
 
-        At most one pair is merged per frame.
+        The rule follows Voxblox++. At most one pair is merged per frame.
         """
         matched = sorted(set(matches.instance_ids[matches.instance_ids > 0].tolist()))
         self._merge_votes.subtract(combinations(matched, 2))
@@ -289,7 +300,7 @@ class Association:
                     return  # the overlaps are now outdated; other pairs can be merged in later frames
 
     def _same_class(self, table: InstanceTable, a: int, b: int) -> bool:
-        """Return True if the classes of two instances allow a merge; a book and a table, for example, do not."""
+        """Return True if the class distributions of two instances allow a merge."""
         known = [table.class_probabilities(table.records[k])[None] for k in (a, b)]
         return bool(class_agreement(*known)[0, 0] >= self.merge_agreement)
 
@@ -298,9 +309,14 @@ class Association:
 
 
 def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the label space of a map, set by its first frame; `known` is () before the first frame.
+    """Return the label space of the map, which is set by its first frame.
 
-    Raises DataError if a later frame has a different label space.
+    Args:
+        known: The label space of the map, or () before the first frame.
+        found: The label space of the current frame.
+
+    Raises:
+        DataError: If the two differ.
     """
     if known and known != found:
         raise DataError(

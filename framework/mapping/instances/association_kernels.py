@@ -20,10 +20,15 @@ from framework.mapping.voxels.voxel_walk import prefetch_element
 def look_up_instances(
     grid: Grid, evidence: Evidence, depth: Float32, view: Pinhole, stride: int, instance_ids: Int32
 ) -> None:
-    """Fill instance_ids (ceil(H / stride), ceil(W / stride)) with the most likely instances of voxels, 0 = none.
+    """Look up the most likely instance at the measured surface at every stride-th pixel of a frame.
 
-    The voxels are those nearest to the surface points of every stride-th depth reading of every stride-th row of
-    `depth` (H, W), m. `view` contains T_world_camera.
+    Args:
+        grid: The voxel grid.
+        evidence: The label evidence.
+        depth: The depth image (H, W), m.
+        view: The camera with the pose T_world_camera.
+        stride: The distance between the pixels, px.
+        instance_ids: The output (ceil(H / stride), ceil(W / stride)), 0 = none.
     """
     columns = instance_ids.shape[1]
     for row in prange(instance_ids.shape[0]):
@@ -50,7 +55,7 @@ def look_up_instances(
 
 @njit(cache=True, nogil=True)
 def find_seen(instance_ids, seen):
-    """Set seen[id] to True for each instance id in instance_ids (h, w)."""
+    """Set seen[id] to True for each instance in `instance_ids`."""
     for instance in instance_ids.flat:
         if instance > 0:
             seen[instance] = True
@@ -58,7 +63,7 @@ def find_seen(instance_ids, seen):
 
 @device
 def _add_run(count, list_id, label, offsets, clusters, column, votes):
-    """Add `count` pixels of an instance to votes (N + 1, M + 1), in the rows of a list's clusters and the last row."""
+    """Add `count` pixels with one list and one instance to the votes (N + 1, M + 1)."""
     votes[votes.shape[0] - 1, column[label]] += count
     for entry in range(offsets[list_id], offsets[list_id + 1]):
         votes[clusters[entry], column[label]] += count
@@ -66,12 +71,17 @@ def _add_run(count, list_id, label, offsets, clusters, column, votes):
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_votes(points, instance_ids, stride, column, votes):
-    """Add the number of pixels of each cluster (row) on each instance (column) to votes (CHUNKS, N + 1, M + 1).
+    """Count the pixels of each cluster on each instance.
 
-    The last row counts all pixels. `instance_ids` (h, w) samples every stride-th pixel of every stride-th row, and
-    `column` maps an instance id to its column. The kernel counts runs of pixels with the same list and instance,
-    because incrementing a counter in memory for each pixel would be slower.
+    Args:
+        points: The lists of clusters at the pixels.
+        instance_ids: The instance (h, w) at every stride-th pixel of every stride-th row, 0 = none.
+        stride: The distance between the samples, px.
+        column: The column of each instance in `votes`.
+        votes: The counts (CHUNKS, N + 1, M + 1), modified in place. The last row counts all pixels, and the last column
+            is for pixels without an instance.
     """
+    # count runs of pixels with the same list and instance, because incrementing a counter for each pixel is slower
     list_ids, offsets, clusters = points.list_ids, points.offsets, points.clusters
     rows = instance_ids.shape[0]
     for chunk in prange(CHUNKS):

@@ -21,7 +21,10 @@ MIN_VERTICES = 4  # minimum number of mesh vertices of an instance, enough to sp
 
 
 class InstanceClass(Enum):
-    """The source of an instance's class distribution. The paper does not specify it."""
+    """Source of the class distribution of an instance.
+
+    The paper does not specify the source.
+    """
 
     DETECTIONS = "the evidence of its detections"
     VOXELS = "the evidence of its voxels, summed"
@@ -29,10 +32,10 @@ class InstanceClass(Enum):
 
 @dataclass(frozen=True)
 class Confirmation:
-    """Conditions for an instance to be in the `mesh` and the `instances` of a map. Other instances are tentative.
+    """Conditions for an instance to be part of the results.
 
-    `min_confidence` is low because unlikely instances rank last and cost little precision, whereas omitted instances
-    reduce recall.
+    Other instances are tentative. The default of `min_confidence` is low because unlikely instances reduce precision
+    less than missing instances reduce recall.
     """
 
     min_observations: int = 3  # minimum number of frames with a detection to confirm an instance, >= 1
@@ -44,7 +47,12 @@ class Confirmation:
 
     @classmethod
     def of(cls, saved: MapHeader) -> Confirmation:
-        """Return the conditions in the header of a map file. Raises DataError or ConfigError if they are invalid."""
+        """Return the conditions in the header of a map file.
+
+        Raises:
+            DataError: If a value is missing or has the wrong type.
+            ConfigError: If a value is out of range.
+        """
         return cls(saved.whole("min_observations"), saved.number("min_confidence"), saved.number("min_area"))
 
     def is_met(self, record: InstanceRecord) -> bool:
@@ -52,29 +60,34 @@ class Confirmation:
         return record.observations >= self.min_observations and record.confidence >= self.min_confidence
 
     def counts(self, table: InstanceTable) -> Bool:
-        """Return a Boolean array (last id + 1,), indexed by id, True where all conditions except `min_area` are met."""
+        """Return a Boolean array (last id + 1,), True for the instances that meet all conditions.
+
+        The minimum area is ignored.
+        """
         counts = np.zeros(table.last_id + 1, np.bool_)
         for record in table.records.values():
             counts[record.id] = self.is_met(record)
         return counts
 
     def min_vertices(self, voxel_size: float) -> int:
-        """Return the number of mesh vertices of an instance with the area `min_area`; `voxel_size` is in m."""
+        """Return the number of mesh vertices of an instance with the minimum area, given the voxel size, m."""
         return vertices_of_area(self.min_area, voxel_size)
 
     def too_small(self, instance_ids: Int32, voxel_size: float) -> Bool:
-        """Return a Boolean array (V,), True where the instance of a vertex has a smaller area than `min_area`.
+        """Return a Boolean array (V,), True for the vertices of instances with less than the minimum area.
 
-        `instance_ids` (V,) holds the instance of each vertex, and `voxel_size` is in m.
+        Args:
+            instance_ids: The instance (V,) of each vertex, 0 = none.
+            voxel_size: The voxel size, m.
         """
         return np.asarray((np.bincount(instance_ids) < self.min_vertices(voxel_size))[instance_ids])
 
 
 class InstanceTableMap(SceneMap):
-    """A map that keeps its instances in a table.
+    """A map with an instance table.
 
-    `mesh` and `instances` contain the confirmed instances. `render` also contains the tentative instances.
-    `instance_ids` and `most_likely_classes` ignore the minimum area, because computing the area requires a mesh.
+    `mesh` and `instances` contain only confirmed instances, and `render` contains all instances. `instance_ids` and
+    `most_likely_classes` do not create a mesh. Therefore, they ignore the minimum area.
     """
 
     table: InstanceTable
@@ -100,11 +113,18 @@ class InstanceTableMap(SceneMap):
         return {record.id: record.class_evidence for record in confirmed}
 
     def begin(self, classes: tuple[str, ...]) -> None:
-        """Set the label space from the first frame. Raises DataError if a later frame has a different label space."""
+        """Set the label space of the map.
+
+        Raises:
+            DataError: If the map has a different label space.
+        """
         self.classes = agreed_classes(self.classes, classes)
 
     def instances(self) -> Mapping[int, Instance]:
-        """Return the instances that have vertices, by ascending id; boxes are upright if gravity is known."""
+        """Return the instances that have mesh vertices, in ascending order of their ids.
+
+        Oriented boxes are upright if the gravity direction is known.
+        """
         mesh, up, instances = self.mesh(), self.gravity().up, {}
         class_evidence = self.class_evidence()
         for k, vertices in vertices_by_id(mesh.instance_ids).items():
@@ -126,16 +146,19 @@ class InstanceTableMap(SceneMap):
 
 
 def vertices_of_area(area: float, voxel_size: float) -> int:
-    """Return the number of vertices of a surface of `area` m^2, at least MIN_VERTICES.
+    """Return the approximate number of mesh vertices of a surface.
 
-    A vertex counts as voxel_size^2, m^2. The area is exact if the surface is parallel to the grid. The mesh has one
-    vertex for each voxel that the surface crosses, so other surfaces have up to sqrt(3) times as many vertices.
+    Args:
+        area: The area of the surface, m^2.
+        voxel_size: The voxel size, m.
     """
+    # Exact for surfaces parallel to the grid. The mesh has one vertex per voxel that the surface crosses, so other
+    # surfaces have up to sqrt(3) times as many vertices.
     return max(MIN_VERTICES, round(area / voxel_size**2))
 
 
 def vertices_by_id(instance_ids: Int32) -> dict[int, Int32]:
-    """Return the ascending vertex indices (M,) of each instance by id, given the instance id (V,) of each vertex.
+    """Return the ascending vertex indices of each instance by id, given the instance (V,) of each vertex.
 
     Id 0 is omitted.
     """
@@ -145,18 +168,21 @@ def vertices_by_id(instance_ids: Int32) -> dict[int, Int32]:
 
 
 def aligned_box(points: Float32) -> Box:
-    """Return the axis-aligned bounding box of points (M, 3), m, in the world frame."""
+    """Return the axis-aligned bounding box of points (M, 3), m."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     return Box((low + high) / 2, high - low, np.eye(3))
 
 
 def box_around(points: Float32, up: Float64 | None) -> Box:
-    """Return the smallest upright box around points (M, 3), m; if `up` is None, the box along their principal axes."""
+    """Return the upright bounding box of points (M, 3), m, or their oriented box if `up` is None."""
     return oriented_box(points) if up is None else upright_box(points, up)
 
 
 def upright_box(points: Float32, up: Float64) -> Box:
-    """Return the box around points (M, 3), m, with its third axis along the unit vector `up` and minimum footprint."""
+    """Return the bounding box of points (M, 3), m, with its third axis along `up` and the smallest base.
+
+    `up` is a unit vector (3,).
+    """
     ground_axes = np.linalg.svd(up[None])[2][1:]  # (2, 3)
     center = points.mean(axis=0, dtype=np.float64)
     ground, heights = (points - center) @ ground_axes.T, (points - center) @ up
@@ -170,7 +196,10 @@ def upright_box(points: Float32, up: Float64) -> Box:
 
 
 def oriented_box(points: Float32) -> Box:
-    """Return the box along the principal axes of the convex hull of points (M, 3), m, which may be coplanar."""
+    """Return the bounding box along the principal axes of points (M, 3), m.
+
+    The points may be coplanar.
+    """
     import open3d as o3d  # takes 0.5 s and 170 MB; maps with known gravity do not need it
 
     four = np.resize(points, (max(len(points), 4), 3))  # Qhull needs four points; repeated points do not change the box

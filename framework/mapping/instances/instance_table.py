@@ -1,4 +1,4 @@
-"""Instance table: class evidence, observations and confidence of each instance."""
+"""Instance table: the class evidence, observations and confidence of each instance."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ class FrameSet:
 
 @dataclass
 class InstanceRecord:
-    """The history of one instance. `class_evidence` (C,) combines the evidence of its detections."""
+    """The history of one instance.
+
+    `class_evidence` (C,) combines the evidence of all its detections.
+    """
 
     id: int
     class_evidence: Float64
@@ -68,16 +71,16 @@ class InstanceRecord:
 
     @property
     def confidence(self) -> float:
-        """Mean detection score times the fraction of in-view frames with a detection, in [0, 1]."""
+        """Mean detection score times the detection rate in frames with the instance in view, in [0, 1]."""
         mean_score = self.score_sum / max(self.detections, 1)
         return mean_score * self.observations / max(self.visible, self.observations, 1)
 
 
 class InstanceTable:
-    """The instances of a map by id; ids start at 1 and are never reused.
+    """The instances of a map by id.
 
-    Class evidence is combined by the same rule as in the voxels. `logarithmic` is True for log-likelihoods, and False
-    for evidence that is proportional to probability, such as votes.
+    Ids start at 1 and are never reused. Class evidence is combined by the rule `combine`, as in the voxels. It consists
+    of log-likelihoods if `logarithmic` is True, and of votes otherwise.
     """
 
     def __init__(self, combine: Combine = Combine.SUM, logarithmic: bool = True) -> None:
@@ -90,20 +93,25 @@ class InstanceTable:
         self.embedding_space = ""  # space of the embeddings of the instances; "" = no embeddings
 
     def create(self, classes: int, frame_index: int) -> InstanceRecord:
-        """Create an instance in a frame, without observations and with zero evidence for each of `classes` classes."""
+        """Create an instance without observations.
+
+        Args:
+            classes: The number of classes.
+            frame_index: The frame in which the instance is created.
+        """
         self.last_id += 1
         record = InstanceRecord(self.last_id, np.zeros(classes), first_frame=frame_index, last_frame=frame_index)
         self.records[self.last_id] = record
         return record
 
     def begin_recording(self) -> None:
-        """Begin another sequence. Its frame indices may repeat frame indices of previous sequences."""
+        """Prepare for the frames of another sequence, whose indices may repeat those of previous sequences."""
         spans = [span[1] for record in self.records.values() for span in record.in_view.spans[-1:]]
         self._last_before = max([*spans, *(record.last_frame for record in self.records.values())], default=-1)
         self._offset = 0
 
     def number_of(self, frame_index: int) -> int:
-        """Return `frame_index` plus an offset, so that the result exceeds all frame indices of previous sequences."""
+        """Return the frame index plus an offset, so that it exceeds all frame indices of previous sequences."""
         if frame_index + self._offset <= self._last_before:
             self._offset = self._last_before + 1
         return frame_index + self._offset
@@ -116,7 +124,15 @@ class InstanceTable:
         frame_index: int,
         embedding: ObjectEmbedding | None = None,
     ) -> None:
-        """Add one detection to an instance: its class evidence (C,), score, frame and optional embedding."""
+        """Add one detection to an instance.
+
+        Args:
+            instance_id: The instance.
+            class_evidence: The class evidence (C,) of the detection.
+            score: The score of the detection.
+            frame_index: The frame of the detection.
+            embedding: The embedding of the detection.
+        """
         record = self.records[instance_id]
         record.class_evidence = _combined(record.class_evidence, class_evidence, self.combine)
         record.last_frame = max(record.last_frame, frame_index)
@@ -143,13 +159,13 @@ class InstanceTable:
         return self.distribution(record.class_evidence)
 
     def distribution(self, evidence: Float64) -> Float32:
-        """Return the class distribution (C,) for class evidence (C,): the normalized likelihoods or votes."""
+        """Return the class distribution (C,) for class evidence (C,)."""
         likelihood = np.exp(evidence - evidence.max()) if self.logarithmic else evidence
         total = likelihood.sum()
         return np.asarray(likelihood / total if total > 0 else np.full_like(evidence, 1 / len(evidence)), np.float32)
 
     def class_ids(self) -> Int32:
-        """Return the most likely class (last id + 1,) of each instance, indexed by id; -1 = no such instance."""
+        """Return the most likely class (last id + 1,) of each instance, indexed by id, -1 = no such instance."""
         class_ids = np.full(self.last_id + 1, -1, np.int32)
         for record in self.records.values():
             class_ids[record.id] = record.class_evidence.argmax()

@@ -1,4 +1,4 @@
-"""Object embeddings: the mean of the embeddings of an object's detections."""
+"""Object embeddings: the mean embedding of the detections of an object."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_WEIGHT = 1e12  # maximum weight of an embedding
 
 @dataclass(frozen=True)
 class ObjectEmbedding:
-    """The embedding of an object: the weighted sum of the unit embedding vectors of its detections."""
+    """The embedding of an object, stored as the weighted sum of the unit embeddings of its detections."""
 
     sum: Float64  # (D,)
     weight: float  # > 0, the sum of the weights
@@ -32,7 +32,7 @@ class ObjectEmbedding:
 
     @classmethod
     def of(cls, embedding: Float32, weight: float) -> ObjectEmbedding:
-        """Return the weighted sum of a single unit vector (D,)."""
+        """Return the embedding for a single unit vector (D,)."""
         return cls(weight * embedding.astype(np.float64), weight, 1)
 
     def __add__(self, other: ObjectEmbedding) -> ObjectEmbedding:
@@ -45,27 +45,33 @@ class ObjectEmbedding:
 
     @property
     def mean(self) -> Float32:
-        """Unit vector (D,) along the sum; zeros if the vectors cancel out."""
+        """Normalized sum (D,) of the embeddings, or zeros if they cancel out."""
         length = float(np.linalg.norm(self.sum))
         return np.asarray(self.sum / length if length > 0 else self.sum, np.float32)
 
     @property
     def spread(self) -> float:
-        """1 minus the length of the weighted mean of the unit vectors, in [0, 1]; 0 = all equal."""
+        """Spread of the embeddings in [0, 1], 0 = all equal."""
+        # 1 minus the length of the weighted mean of the unit vectors
         return float(np.clip(1 - np.linalg.norm(self.sum) / self.weight, 0, 1))
 
 
 def added(known: ObjectEmbedding | None, new: ObjectEmbedding | None) -> ObjectEmbedding | None:
-    """Return the sum of two embeddings; either may be missing."""
+    """Return the sum of two embeddings, each of which may be None."""
     if known is None or new is None:
         return known or new
     return known + new
 
 
 def agreed_space(known: str, found: str) -> str:
-    """Return the embedding space of a map, set by its first embeddings; `known` is "" before the first embeddings.
+    """Return the embedding space of the map, which is set by its first embeddings.
 
-    Raises DataError if later embeddings are from another space.
+    Args:
+        known: The embedding space of the map, or "" before its first embeddings.
+        found: The space of the current embeddings.
+
+    Raises:
+        DataError: If the two differ.
     """
     if known and known != found:
         raise DataError(
@@ -76,7 +82,10 @@ def agreed_space(known: str, found: str) -> str:
 
 
 def embedding_arrays(embeddings: Mapping[int, ObjectEmbedding]) -> dict[str, Array]:
-    """Return the arrays of a map file for the embeddings of instances, by id; empty without embeddings."""
+    """Return the arrays of embeddings for a map file.
+
+    The result is empty if there are no embeddings.
+    """
     if not embeddings:
         return {}
     values = list(embeddings.values())
@@ -89,9 +98,12 @@ def embedding_arrays(embeddings: Mapping[int, ObjectEmbedding]) -> dict[str, Arr
 
 
 def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, dict[int, ObjectEmbedding]]:
-    """Return the embedding space and the embeddings, by instance id, of a map file.
+    """Return the embedding space and the embeddings by instance id of a map file.
 
-    Returns "" and no embeddings if the file has none. Raises DataError if the embeddings are invalid.
+    The space is "" if the file has no embeddings.
+
+    Raises:
+        DataError: If the embeddings are invalid.
     """
     if SPACE not in plain.values:
         return "", {}

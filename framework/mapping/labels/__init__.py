@@ -1,1 +1,1 @@
-"""Class and instance evidence of voxels."""
+"""Label evidence of the voxels."""

@@ -1,12 +1,12 @@
-"""Operations on all class slots of a voxel.
+"""Operations on the class slots of a voxel.
 
-The sixteen slots of compact storage are one SIMD vector. LLVM unrolls such a short loop before it can vectorize it.
-Therefore, these intrinsics emit vector instructions, which LLVM compiles for any little-endian processor. Exact storage
-has other types and more slots, and uses loops with the same results.
+In compact storage, a voxel has sixteen class slots, which fit into one SIMD vector. Because LLVM does not vectorize
+such short loops, the intrinsics in this module emit vector instructions. Exact storage uses ordinary loops with the
+same results.
 
-A quantized score is a log-odds (or a vote) times the scale of the label rule, rounded. Each entry of `cluster_scores`
-(NO_CLASS + 1,), indexed by class, holds the score of the class in the bits above the lowest NEW_CLASSES bits. Bit m of
-the lowest NEW_CLASSES bits is set for the m-th named class of the cluster.
+A quantized score is the evidence times a scale, rounded to an integer. An array of cluster scores (NO_CLASS + 1,) is
+indexed by class. It contains the quantized score, shifted left by NEW_CLASSES bits. Bit m is set for the m-th named
+class of the cluster.
 """
 
 from __future__ import annotations
@@ -30,23 +30,35 @@ _OPTIONS = {"forceinline": True, "error_model": "numpy", "_nrt": False}  # the o
 
 @device
 def add_scores(classes, scores, cluster_scores, limit):
-    """Add `cluster_scores` (NO_CLASS + 1,) to the `scores` (T,) of the `classes` (T,) of a voxel.
+    """Add the scores of a cluster to the class slots of a voxel.
 
-    Sums below -limit become -limit. Returns the bits of the named classes that have a slot, the number of filled slots,
-    and the largest sum minus `limit`.
+    Returns the bits of the named classes that have a slot, the number of used slots, and the excess of the largest
+    score over `limit`.
+
+    Args:
+        classes: The classes (T,) in the slots.
+        scores: The scores (T,) of the slots, modified in place. They are at least -limit.
+        cluster_scores: The packed scores (NO_CLASS + 1,) of the cluster, indexed by class.
+        limit: The maximum score.
     """
     return _add_scores(classes, scores, cluster_scores, limit)
 
 
 @device
 def most_likely_slot(classes, scores):
-    """Return the slot of the class with the highest score; ties go to the smaller class id."""
+    """Return the slot with the highest score.
+
+    Ties go to the smaller class id.
+    """
     return _most_likely_slot(classes, scores)
 
 
 @device
 def least_likely_slot(scores):
-    """Return the slot with the lowest score; ties go to the first slot."""
+    """Return the slot with the lowest score.
+
+    Ties go to the first slot.
+    """
     return _least_likely_slot(scores)
 
 
@@ -91,7 +103,7 @@ def _all(value: int, number: Any) -> Any:
 
 
 class _Slots:
-    """Emitter of LLVM vector instructions on CLASS_SLOTS numbers, with the `context` and `builder` of an intrinsic."""
+    """Emitter of LLVM vector instructions on class slots."""
 
     def __init__(self, context: Any, builder: Any) -> None:
         self.context = context
@@ -111,7 +123,7 @@ class _Slots:
         stored.align = 1
 
     def gather(self, table: Any, indices: Any) -> Any:
-        """Return the entries of the table at address `table`, at the CLASS_SLOTS byte indices at address `indices`."""
+        """Return the table entries selected by the 8-bit indices stored at address `indices`."""
         found = ir.Constant(_vector(table.type.pointee), ir.Undefined)
         for s in range(CLASS_SLOTS):
             index = self.builder.zext(self.builder.load(self.builder.gep(indices, [_INT32(s)])), _INT32)
@@ -128,7 +140,6 @@ class _Slots:
         return self.builder.bitcast(conditions, ir.IntType(CLASS_SLOTS))
 
     def call(self, name: str, *arguments: Any, of: str = "i16") -> Any:
-        """Call an LLVM intrinsic."""
         result = _INT32 if of.endswith("i32") else _INT16
         kind = ir.FunctionType(result, [argument.type for argument in arguments])
         function = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.{name}.{of}")
@@ -186,7 +197,7 @@ def _least_likely_of_vector(_context: Any, scores: Any) -> Any:
 
 
 def _are_compact(*arrays: Any) -> bool:
-    """Return True if class ids, scores and cluster scores have the types and slots of compact storage."""
+    """Return True if the arrays have the types of compact storage."""
     kinds = (types.uint8, types.int16, types.int32)
     return all(array.dtype == kind for array, kind in zip(arrays, kinds, strict=False))
 

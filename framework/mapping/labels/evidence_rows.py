@@ -1,7 +1,7 @@
-"""Storage and update of the evidence rows of `label_evidence.py`.
+"""Storage and update of the label evidence.
 
-In compact storage, a labeled voxel takes 80 bytes of slots: 8 for each instance slot and 3 for each class slot. A row
-takes 2 KiB. A voxel becomes labeled when it is near the measured surface and projects to a pixel inside a mask.
+In compact storage, the slots of a labeled voxel take 80 bytes, and a row of a block takes 2 KiB. A voxel becomes
+labeled when it is near the measured surface and its pixel is inside a mask.
 """
 
 from __future__ import annotations
@@ -31,28 +31,31 @@ from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
 INSTANCE_SLOTS = 4  # number of instance slots of a voxel in compact storage
-RESERVED = 128  # number of labeled voxels reserved per block of the budget; grows if needed; most blocks need fewer
+RESERVED = 128  # initial capacity for labeled voxels per block of `max_blocks`; most blocks need fewer
 ANY_INSTANCE = np.uint64(2**BITS - 1)  # instance set with every bit set
 SLOTS = Evidence._fields[1:]  # fields with one row per labeled voxel
 
 
 class Storage(Enum):
-    """Labels that a voxel stores: COMPACT = the most likely labels, EXACT = all labels."""
+    """Labels stored in a voxel: the most likely labels (COMPACT) or all labels (EXACT)."""
 
     COMPACT = "compact"
     EXACT = "exact"
 
 
 class NewVoxels(NamedTuple):
-    """Voxels of A seen blocks that get slots in this frame."""
+    """The voxels of A blocks that become labeled in a frame."""
 
     counts: Int32  # (A,) number of new voxels of each block
     rows: Int32  # (A,) evidence row of each block
-    starts: Int32  # (A,) index of each block's first new voxel among the labeled voxels
+    starts: Int32  # (A,) index of the first new voxel of each block among the labeled voxels
 
 
 class EvidenceRows:
-    """Label evidence of a growing voxel grid. The kernels modify `self.evidence`."""
+    """The label evidence of a voxel grid.
+
+    The kernels modify its `evidence`.
+    """
 
     def __init__(
         self,
@@ -94,9 +97,9 @@ class EvidenceRows:
         return Evidence(self.evidence.labeled[: self.row_count], **slots)
 
     def fill(self, saved: Evidence) -> None:
-        """Replace the evidence with a copy of `saved`, which may have fewer slots per voxel.
+        """Replace the evidence with a copy of `saved`.
 
-        `saved` is the evidence of a map file, or the current evidence if the number of instance slots increases.
+        `saved` may have fewer slots per voxel.
         """
         self._instance_slots = max(self._instance_slots, saved.instance_ids.shape[1])
         self._free()
@@ -110,7 +113,11 @@ class EvidenceRows:
             array[:, given.shape[1] :] = 0
 
     def begin(self, classes: int) -> None:
-        """Set the number of classes before the first update. Raises DataError if there are too many."""
+        """Set the number of classes before the first update.
+
+        Raises:
+            DataError: If there are too many classes.
+        """
         if classes > NO_CLASS:
             raise DataError(f"detector: expected at most {NO_CLASS} classes, got {classes}")
         if self.storage is Storage.EXACT:
@@ -118,7 +125,12 @@ class EvidenceRows:
             self._free()
 
     def update(self, seen: SeenBlocks, measurement: Measurement) -> None:
-        """Update the voxels near the measured surface in the blocks that a frame updated."""
+        """Update the label evidence of the voxels near the measured surface.
+
+        Args:
+            seen: The blocks updated by the frame, and their voxels near the surface.
+            measurement: The evidence of the clusters of the frame.
+        """
         if not (measurement.instance_id.any() or len(measurement.clusters)):
             return  # no evidence for or against any instance or class
         new = NewVoxels(*np.empty((3, len(seen.blocks)), np.int32))
@@ -134,18 +146,14 @@ class EvidenceRows:
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:
-        """Combine the evidence for instance `dropped` with the evidence for `kept` in every voxel.
-
-        Merging visits only the rows whose instance set contains the bit of `dropped`.
-        """
+        """Add the evidence for instance `dropped` to the evidence for `kept` in every voxel."""
         row_bits = self._row_bits[: self.row_count]
         merge_instances(self.evidence, row_bits, np.int32(kept), np.int32(dropped), int(self.combine))
 
     def classes_of_instances(self, counts: Bool, classes: int) -> Float64:
-        """Return the class evidence (ids + 1, classes) of each instance, indexed by id, summed over its voxels.
+        """Return the class evidence (ids + 1, classes) of the instances, summed over their voxels.
 
-        A voxel belongs to its most likely instance among those with `counts[id]` True. The evidence of the other
-        instances is 0.
+        A voxel belongs to its most likely instance with `counts[id]` True. All other instances have an evidence of 0.
         """
         sums = np.zeros((len(counts), classes), np.int64)
         sum_classes_of_instances(self.in_use(), counts, sums)
@@ -165,12 +173,13 @@ class EvidenceRows:
         self.evidence = Evidence(self._labeled, **{name: self._slots[name] for name in SLOTS})
 
     def _free_classes(self) -> UInt8:
-        """Return the class ids (T,) in the slots of a new voxel: free slots, or every class in exact storage."""
+        """Return the class ids (T,) in the slots of a new voxel."""
+        # exact storage has a slot for every class
         named = np.arange(self._class_slots) if self.storage is Storage.EXACT else np.full(self._class_slots, NO_CLASS)
         return named.astype(np.uint8)
 
     def _make_room(self, blocks: Int32, new: NewVoxels) -> None:
-        """Reserve slots for new voxels and rows for blocks without a row, and fill new.rows and new.starts."""
+        """Reserve slots for new voxels and rows for new blocks, and fill new.rows and new.starts."""
         before = self.row_count
         label_row = self.voxels.grid.label_row
         self._reserve(*number_new(blocks, new.counts, label_row, before, self.voxel_count, new.rows, new.starts))
@@ -178,7 +187,10 @@ class EvidenceRows:
         self._row_bits[before : self.row_count] = 0
 
     def _reserve(self, rows: int, voxels: int) -> None:
-        """Set the number of rows and voxels in use; new rows and voxels are uninitialized."""
+        """Set the number of rows and voxels in use.
+
+        New entries are uninitialized.
+        """
         if rows > len(self._labeled):
             self._labeled = grown(self._labeled, max(rows, 2 * len(self._labeled)))
             self._row_bits = grown(self._row_bits, len(self._labeled))
@@ -188,7 +200,7 @@ class EvidenceRows:
         self._lay_out()
 
     def _make_room_for_instances(self, new: int) -> None:
-        """Double the number of instance slots until every voxel has `new` free slots."""
+        """Double the number of instance slots until every voxel has at least `new` free slots."""
         slots = self._instance_slots
         missing = new - int(fewest_free(self.in_use().instance_ids))
         while missing > 0:

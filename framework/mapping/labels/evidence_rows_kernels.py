@@ -18,18 +18,18 @@ from framework.mapping.voxels.integration_kernels import GROUP
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, device, one_more
 from framework.mapping.voxels.voxel_walk import prefetch_line, prefetch_row
 
-BITS = 64  # number of bits of the instance set of a row or a list; instance k sets bit k % BITS
+BITS = 64  # number of bits of an instance set; instance k sets bit k % BITS
 
 
 @device
 def _has_clusters(measurement, list_id):
-    """Return True if a list has any clusters."""
+    """Return True if a list of clusters is not empty."""
     return measurement.offsets[list_id] < measurement.offsets[list_id + 1]
 
 
 @device
 def _label(evidence, row, n, voxel, free_classes):
-    """Assign the slots at index `voxel` to voxel n of a row, and clear them."""
+    """Assign empty slots to voxel n of a row."""
     evidence.labeled[row, n] = voxel
     for s in range(evidence.instance_ids.shape[1]):
         evidence.instance_ids[voxel, s] = 0
@@ -41,11 +41,8 @@ def _label(evidence, row, n, voxel, free_classes):
 
 @device
 def _prefetch_slots(evidence, voxel):
-    """Prefetch the first and the last cache line of the slots of a labeled voxel.
-
-    In compact storage, these lines contain all of its slots.
-    """
-    size = evidence.instance_ids.strides[0]
+    """Prefetch the first and the last cache line of the slots of a voxel."""
+    size = evidence.instance_ids.strides[0]  # compact storage has no other cache lines
     start = np.int64(voxel) * size
     prefetch_line(evidence.instance_ids, start)
     prefetch_line(evidence.instance_ids, start + size - 1)
@@ -58,7 +55,7 @@ def _instance_bit(instance):
 
 @njit(cache=True, nogil=True)
 def find_list_bits(offsets, clusters, instance_id, list_bits):
-    """Fill list_bits (L,) with the instance set of each list of clusters; instance k sets bit k % BITS."""
+    """Compute the instance set (L,) of each list of clusters."""
     for i in range(list_bits.shape[0]):
         list_bits[i] = 0
         for entry in range(offsets[i], offsets[i + 1]):
@@ -67,10 +64,17 @@ def find_list_bits(offsets, clusters, instance_id, list_bits):
 
 @njit(cache=True, nogil=True, parallel=True)
 def update_rows(grid, seen, evidence, measurement, list_bits, row_bits, new, evicted):
-    """Update the voxels near the surface that have slots, and the instance sets row_bits (R,) of their rows.
+    """Update the voxels near the surface that already have slots.
 
-    Sets new (A,) to the number of near voxels of each block that have no slots, but a cluster at their pixel. Sets
-    evicted (A,) to the number of evictions in each block.
+    Args:
+        grid: The voxel grid.
+        seen: The A blocks updated by the frame, and their voxels near the surface.
+        evidence: The label evidence, modified in place.
+        measurement: The evidence of the clusters of the frame.
+        list_bits: The instance set (L,) of each list of clusters.
+        row_bits: The instance set (R,) of each row, modified in place.
+        new: The output (A,), the number of voxels of each block that become labeled.
+        evicted: The output (A,), the number of evicted labels of each block.
     """
     list_ids = measurement.list_ids.ravel()
     blocks = seen.blocks.shape[0]
@@ -103,11 +107,18 @@ def update_rows(grid, seen, evidence, measurement, list_bits, row_bits, new, evi
 
 @njit(cache=True, nogil=True)
 def number_new(blocks, new, row_of, row_count, voxel_count, rows, first_new):
-    """Fill rows (A,) with the row of each block and first_new (A,) with the index of its first new voxel.
+    """Assign rows and slots to the new voxels of each block.
 
-    `blocks` (A,) are the updated blocks, new (A,) the number of new voxels of each, and row_of (B,) the row of every
-    block, -1 = none. A block without a row gets one if it has new voxels. Returns row_count and voxel_count, including
-    the new rows and voxels.
+    Returns the number of rows and the number of labeled voxels, including the new ones.
+
+    Args:
+        blocks: The blocks (A,) updated by the frame.
+        new: The number of new voxels (A,) of each block.
+        row_of: The row (B,) of every block of the grid, -1 = none.
+        row_count: The number of rows before the frame.
+        voxel_count: The number of labeled voxels before the frame.
+        rows: The output (A,), the row of each block, -1 = none.
+        first_new: The output (A,), the index of the first new voxel of each block.
     """
     for a in range(blocks.shape[0]):
         rows[a], first_new[a] = row_of[blocks[a]], voxel_count
@@ -120,9 +131,18 @@ def number_new(blocks, new, row_of, row_count, voxel_count, rows, first_new):
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_new(grid, seen, evidence, measurement, list_bits, row_bits, new, free_classes, evicted):
-    """Assign slots to the `new` voxels of each block, and update them as update_rows() does.
+    """Assign slots to the new voxels of each block, and update them.
 
-    free_classes (T,) are the class ids in the slots of a voxel without evidence. Evictions are added to evicted (A,).
+    Args:
+        grid: The voxel grid.
+        seen: The A blocks updated by the frame, and their voxels near the surface.
+        evidence: The label evidence, modified in place.
+        measurement: The evidence of the clusters of the frame.
+        list_bits: The instance set (L,) of each list of clusters.
+        row_bits: The instance set (R,) of each row, modified in place.
+        new: The new voxels of each block.
+        free_classes: The class ids (T,) in the slots of a voxel without evidence.
+        evicted: The number of evicted labels (A,) of each block, modified in place.
     """
     row_of = grid.label_row  # numba 0.68 loses assignments to an element of a tuple's array within prange
     list_ids = measurement.list_ids.ravel()
@@ -141,7 +161,7 @@ def label_new(grid, seen, evidence, measurement, list_bits, row_bits, new, free_
 
 @njit(cache=True, nogil=True)
 def fewest_free(instance_ids):
-    """Return the smallest number of free slots of any voxel in instance_ids (L, S)."""
+    """Return the smallest number of free instance slots of any voxel."""
     slots = instance_ids.shape[1]
     fewest = slots
     for ids in instance_ids:
@@ -154,7 +174,7 @@ def fewest_free(instance_ids):
 
 @device
 def _merge_voxel(ids, values, kept, dropped, combine):
-    """Combine the evidence of a voxel for instance `dropped`, if any, with the evidence for `kept`, and free a slot."""
+    """Add the evidence of a voxel for instance `dropped` to its evidence for `kept`."""
     for s in range(len(ids)):
         if ids[s] == dropped:
             value = values[s]
@@ -170,9 +190,9 @@ def _merge_voxel(ids, values, kept, dropped, combine):
 
 @njit(cache=True, nogil=True, parallel=True)
 def merge_instances(evidence, row_bits, kept, dropped, combine):
-    """Merge instance `dropped` into `kept` in the rows whose row_bits (R,) contain the bit of `dropped`.
+    """Merge instance `dropped` into `kept` in every voxel.
 
-    Adds the bit of `kept` to these rows.
+    Only the rows whose instance set (R,) may contain `dropped` are visited.
     """
     for row in prange(row_bits.shape[0]):
         if row_bits[row] & _instance_bit(dropped):
@@ -184,9 +204,9 @@ def merge_instances(evidence, row_bits, kept, dropped, combine):
 
 @njit(cache=True, nogil=True)
 def sum_classes_of_instances(evidence, counts, sums):
-    """Add the quantized class scores of every labeled voxel to the sums (ids + 1, C) of its instance.
+    """Add the class scores of every labeled voxel to the sums (ids + 1, C) of its instance.
 
-    The instance of a voxel is its most likely instance among those with `counts[id]` True.
+    The instance of a voxel is its most likely instance with `counts[id]` True.
     """
     for voxel in range(evidence.class_ids.shape[0]):
         instance = best_counted_instance(evidence, voxel, counts)

@@ -1,28 +1,26 @@
-"""Label evidence of the voxels: the likelihood of each instance and class, and its update from a frame.
+"""Label evidence of the voxels: the likelihood of each instance and class.
 
-The paper's rule is a voxel-wise Bayesian update by two independent recursions, eqs. (7) and (8) of docs/method.md:
+The paper updates each voxel by two independent Bayesian recursions, eqs. (7) and (8) of docs/method.md:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t)
 
 Here, c is a class or an instance, I_t is image t, O_u is the label observed at the pixel u of the voxel, and Z
 normalizes the distribution.
 
-In log space, the update is a sum of log-likelihoods that starts from a uniform distribution. Only ratios matter.
-Therefore, a voxel stores the log-odds of each label over the unnamed labels. A cluster *names* its instance and its
-most likely classes. A label is unnamed if no cluster named it at this voxel. Other rules (counts, latest, most
-confident) store other values and combine new evidence with old evidence differently; see `Combine`.
+In log space, the update is a sum of log-likelihoods. A cluster *names* its instance and its most likely classes. A
+voxel stores the log-odds of each label that a cluster named at this voxel over the unnamed labels. Other label rules
+combine new and old evidence differently; see `Combine`.
 
-A block has an evidence row once one of its voxels has labels. Each labeled voxel has slots. There are B blocks, R
-rows, L labeled voxels, and S instance slots and T class slots per labeled voxel.
+A block has an evidence row if any of its voxels has labels. Each labeled voxel has S instance slots and T class slots.
+There are B blocks, R rows and L labeled voxels.
 
     grid.label_row[block] ----> labeled[row, n] -------> instance_ids[voxel, :]   instance_value[voxel, :]
        -1 = no row                -1 = no slots          class_ids[voxel, :]      class_value[voxel, :]
        (B,)                       (R, 512)               (L, S) and (L, T), best label in slot 0
 
-Compact storage keeps the most likely labels and evicts the least likely label when another label is named. The evidence
-of an evicted or unnamed label is lost. Exact storage has a slot for every class and as many instance slots as needed.
-Tests compare compact with exact storage. Class evidence is quantized, so that it is small and independent of the order
-of summation.
+Compact storage keeps only the most likely labels. If a new label needs a slot, the least likely label is evicted, and
+its evidence is lost. Exact storage keeps all labels. Class evidence is quantized, so that it is small and independent
+of the order of summation.
 """
 
 from __future__ import annotations
@@ -41,10 +39,10 @@ MAX_CLUSTER_SCORE = 2**15 - 1 - MAX_SCORE  # maximum quantized score of a cluste
 
 
 class Evidence(NamedTuple):
-    """Label evidence of all voxels; see the diagram in the module docstring.
+    """The label evidence of all voxels.
 
-    Voxels are visited in any order. Therefore, the slots of a voxel are contiguous: the arrays of slots are views of
-    one structured array. In compact storage, the slots of a voxel take 80 bytes.
+    See the module docstring. The arrays of slots are views of one structured array, so that the slots of a voxel are
+    contiguous in memory.
     """
 
     labeled: Int32  # (R, 512) index of a voxel among the voxels with slots, -1 = no slots
@@ -55,7 +53,7 @@ class Evidence(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """Evidence of the N clusters of one frame for C classes."""
+    """The evidence of the N clusters of one frame for C classes."""
 
     list_ids: Int32  # (H, W) list of clusters of each pixel, 0 = no cluster; see PixelLists
     offsets: Int32  # (L + 1,) start of each of the L lists in `clusters`
@@ -71,15 +69,19 @@ class Measurement(NamedTuple):
 
 
 def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8, UInt8]:
-    """Return the evidence of N clusters over their unnamed classes, their named classes, and the named bits.
+    """Return the class evidence relative to the unnamed classes, the named classes and their bits.
 
-    If the `evidence` (N, C) is log-likelihoods, a cluster names its NEW_CLASSES most likely classes, and each unnamed
-    class gets the mean likelihood of the unnamed classes. Otherwise, a cluster names its most likely class, and has no
-    evidence for other classes.
+    With log-likelihoods, a cluster names its NEW_CLASSES most likely classes. Every unnamed class gets the mean
+    likelihood of the unnamed classes. Otherwise, a cluster names only its most likely class.
+
+    Args:
+        evidence: The class evidence (N, C) of the clusters.
+        logarithmic: True if the evidence is log-likelihoods.
 
     Returns:
-        Evidence (N, C) over the unnamed classes; named classes (N, NEW_CLASSES), padded with the first named class;
-        named bits (N, NO_CLASS + 1), 2^m for the m-th named class, 0 = unnamed.
+        The relative evidence (N, C).
+        The named classes (N, NEW_CLASSES), padded with the first named class.
+        The bits (N, NO_CLASS + 1), 2^m for the m-th named class and 0 for unnamed classes.
     """
     c = evidence.shape[1]
     names = min(c, NEW_CLASSES) if logarithmic else min(c, 1)
@@ -100,10 +102,16 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
 
 
 def pack_class_scores(relative: Float64, scale: int, named_bit: UInt8, kind: type[np.signedinteger[Any]]) -> Integers:
-    """Return the evidence `relative` (N, C) over the unnamed classes, quantized and packed with `named_bit`.
+    """Return the quantized class evidence (N, NO_CLASS + 1) of the clusters, packed with the named bits.
 
-    `named_bit` and the result, of type `kind`, are (N, NO_CLASS + 1). The lowest NEW_CLASSES bits of an entry hold the
-    named bit, and the bits above hold the evidence times `scale`, rounded. Therefore, a class slot needs one look-up.
+    An entry contains the named bit in its lowest NEW_CLASSES bits, and the quantized evidence above. A single look-up
+    then reads both.
+
+    Args:
+        relative: The class evidence (N, C) relative to the unnamed classes.
+        scale: The quantized score for evidence of 1.
+        named_bit: The bits (N, NO_CLASS + 1) of the named classes.
+        kind: The integer type of the result.
     """
     packed = named_bit.astype(np.int64)
     packed[:, : relative.shape[1]] += np.rint(relative * scale).astype(np.int64) << NEW_CLASSES

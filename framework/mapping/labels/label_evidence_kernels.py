@@ -19,7 +19,7 @@ from framework.mapping.voxels.voxel_grid_kernels import device
 
 
 class Combine(IntEnum):
-    """Rule for combining new evidence for a label with its old evidence."""
+    """Rule for combining new and old evidence for a label."""
 
     SUM = 0
     LARGEST = 1
@@ -32,29 +32,29 @@ SUM, LARGEST, LATEST = (int(combine) for combine in Combine)  # for the kernels
 
 @device
 def label_row(grid, block):
-    """Return the row of a block in Evidence.labeled, -1 = no row; block -1 = no block."""
+    """Return the evidence row of a block, -1 = none."""
     return grid.label_row[block] if block >= 0 else np.int32(-1)
 
 
 @device
 def labeled_voxel(grid, evidence, block, n):
-    """Return the index of voxel n of a block among the labeled voxels, -1 = no slots; block -1 = no block."""
+    """Return the index of voxel n of a block among the labeled voxels, -1 = none.
+
+    The block is -1 if it is not allocated.
+    """
     row = label_row(grid, block)
     return evidence.labeled[row, n] if row >= 0 else np.int32(-1)
 
 
 @device
 def best_instance(evidence, voxel):
-    """Return the most likely instance of a labeled voxel, 0 if unnamed instances are more likely."""
+    """Return the most likely instance of a labeled voxel, 0 = none."""
     return evidence.instance_ids[voxel, 0] if evidence.instance_value[voxel, 0] > 0 else np.int32(0)
 
 
 @device
 def best_counted_instance(evidence, voxel, counts):
-    """Return the most likely instance of a labeled voxel among those with `counts[id]` True.
-
-    Returns 0 if unnamed instances are more likely.
-    """
+    """Return the most likely instance of a labeled voxel with `counts[id]` True, 0 = none."""
     best = np.int32(0)
     best_value = np.float32(0.0)
     for s in range(evidence.instance_ids.shape[1]):
@@ -75,11 +75,19 @@ def best_class(evidence, voxel):
 
 @device
 def add_evidence(labels, values, free, label, added, combine, limit):
-    """Combine the evidence `added` with the value of a label, by the rule `combine`, and limit sums to +-`limit`.
+    """Add evidence for one label to the slots of a voxel.
 
-    `labels` and `values` are the slots (S,) of a voxel, and `free` is the label of a free slot. A new label gets a free
-    slot. If no slot is free, it replaces the least likely label if that label has less evidence. Returns 1 if a label
-    was evicted or not stored, otherwise 0.
+    If all slots are used, the label replaces the least likely label with less evidence. Returns 1 if a label was
+    evicted or not stored, otherwise 0.
+
+    Args:
+        labels: The labels (S,) in the slots, modified in place.
+        values: The values (S,) of the slots, modified in place.
+        free: The label of a free slot.
+        label: The label.
+        added: The evidence for the label.
+        combine: The rule for combining new and old evidence.
+        limit: The maximum absolute value of a sum.
     """
     if combine == LATEST:
         for s in range(1, len(labels)):
@@ -107,11 +115,12 @@ def add_evidence(labels, values, free, label, added, combine, limit):
 
 @device
 def best_first(labels, values, free):
-    """Swap the most likely label into slot 0. Ties go to the smaller label, so that slot order has no effect."""
+    """Swap the most likely label into slot 0."""
     best = 0
     for s in range(1, len(labels)):
         if labels[s] == free:  # slots are filled from the front
             break
+        # ties go to the smaller label, so that slot order has no effect
         if values[s] > values[best] or (values[s] == values[best] and labels[s] < labels[best]):
             best = s
     if best > 0:
@@ -121,7 +130,7 @@ def best_first(labels, values, free):
 
 @device
 def best_class_first(classes, scores):
-    """Swap the most likely class into slot 0, as best_first() does."""
+    """Swap the most likely class into slot 0."""
     best = most_likely_slot(classes, scores)
     if best > 0:
         classes[0], classes[best] = classes[best], classes[0]
@@ -130,7 +139,7 @@ def best_class_first(classes, scores):
 
 @device
 def sum_classes(classes, scores, measurement, k):
-    """Add the class scores of cluster k to the class slots of a voxel. Returns the number of classes not kept."""
+    """Add the class scores of cluster k to the slots of a voxel, and return the number of classes not kept."""
     limit, cluster_scores = measurement.max_score, measurement.class_scores[k]
     known, filled, excess = add_scores(classes, scores, cluster_scores, limit)
     for s in range(filled if excess > 0 else 0):  # subtracting preserves the differences between scores
@@ -163,9 +172,9 @@ def sum_classes(classes, scores, measurement, k):
 
 @device
 def update_voxel(evidence, voxel, measurement, list_id):
-    """Update the instance and class evidence of a labeled voxel, by both recursions, from the clusters at its pixel.
+    """Update the instance and class evidence of a labeled voxel, and return the number of evicted labels.
 
-    These are the clusters of list `list_id`. Returns the number of evictions.
+    The evidence comes from the clusters in a list, which are those at the pixel of the voxel.
     """
     start, end = measurement.offsets[list_id], measurement.offsets[list_id + 1]
     ids = evidence.instance_ids[voxel]

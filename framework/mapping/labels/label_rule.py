@@ -33,7 +33,7 @@ EXACT_BITS = 16  # additional bits of class scores in exact storage
 
 
 class LabelRule(NamedTuple):
-    """Storage and combination of the evidence for labels."""
+    """Rule for combining the evidence for labels."""
 
     combine: Combine  # rule for combining new evidence with old evidence
     logarithmic: bool  # True = evidence is log-likelihoods; False = proportional to probability, such as votes
@@ -45,7 +45,7 @@ class LabelRule(NamedTuple):
 
 
 class DetectionEvidence(NamedTuple):
-    """Evidence of a frame's N clusters."""
+    """The evidence of the N clusters of a frame."""
 
     instances: Float32  # (N,) evidence for the matched instance of each cluster, relative to any other instance
     classes: Float64  # (N, C) evidence for each class
@@ -53,17 +53,17 @@ class DetectionEvidence(NamedTuple):
 
 
 def floored_log(class_probabilities: Float32, floor: float) -> Float64:
-    """Return the class log-likelihoods (N, C), log P(O_u = c | I_t) of eq. (7) in docs/method.md, of N detections.
+    """Return the class log-likelihoods (N, C) of the detections.
 
-    Each distribution in `class_probabilities` (N, C) is mixed with a fraction `floor` of the uniform distribution, so
-    that a probability of 0 does not exclude a class.
+    Each distribution is mixed with a fraction `floor` of the uniform distribution, so that a probability of 0 does not
+    exclude a class.
     """
-    p = class_probabilities.astype(np.float64)
+    p = class_probabilities.astype(np.float64)  # log P(O_u = c | I_t) of eq. (7) in docs/method.md
     return np.asarray(np.log((1 - floor) * p + floor / max(p.shape[1], 1)))
 
 
 def vote_for_best(clusters: PointClusters, weights: Float32) -> DetectionEvidence:
-    """Return one vote per cluster, with the weight in `weights` (N,), for its instance and its most likely class."""
+    """Return one vote per cluster for its instance and its most likely class, with the given weights (N,)."""
     classes = np.zeros(clusters.class_probabilities.shape)
     if len(clusters):
         classes[np.arange(len(clusters)), clusters.class_probabilities.argmax(axis=1)] = weights
@@ -72,11 +72,11 @@ def vote_for_best(clusters: PointClusters, weights: Float32) -> DetectionEvidenc
 
 @dataclass
 class LabeledVoxels:
-    """Parameters of voxel blocks with label evidence."""
+    """Parameters of a voxel map with label evidence."""
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    # maximum area ratio (smaller / larger) of two overlapping clusters to assign their common pixels to the smaller one
+    # maximum area ratio (smaller / larger) of two overlapping clusters whose common pixels belong to the smaller one
     # only, in [0, 1]; 0 = off
     occlusion_area_ratio: float = 0.25
     # minimum fraction of an instance inside a larger mask of another class for the mask not to update the instance
@@ -91,13 +91,17 @@ class LabeledVoxels:
         check_bounds(self, occlusion_area_ratio=(0.0, 1.0), support_overlap=(0.0, 1.0))
 
     def new_map(self, rule: LabelRule) -> InstanceMap:
-        """Return an empty map for this rule."""
+        """Return an empty map for the given label rule."""
         volume = self.hashing.new_volume()
         labels = EvidenceRows(volume.voxels, rule.combine, self.storage, rule.quantization(self.storage))
         return InstanceMap(volume, labels, rule.logarithmic, self.confirmation, self.instance_class)
 
     def continued(self, scene: SceneMap, rule: LabelRule) -> InstanceMap:
-        """Return the stored map, prepared for new frames. Raises ConfigError if its parameters or its rule differ."""
+        """Return the stored map, prepared for new frames.
+
+        Raises:
+            ConfigError: If its parameters or its label rule differ from the current ones.
+        """
         if not isinstance(scene, InstanceMap):
             raise ConfigError(
                 f"fuser: expected a stored InstanceMap, got {type(scene).__name__}; choose the fuser that made the map"
@@ -135,7 +139,7 @@ class LabeledVoxels:
     ) -> Measurement:
         """Return the evidence of the clusters of a frame for the voxel update.
 
-        The lists of `points` are reduced by the occlusion order and the support rule.
+        A cluster has no effect at the pixels where the occlusion order or the support rule excludes it.
         """
         updating = np.ones_like(matches.instance_ids) if self.update_unmatched else matches.instance_ids
         points = keep_on_top(points, updating, self.occlusion_area_ratio)
@@ -166,10 +170,8 @@ class LabeledVoxels:
     def supported_instances(self, table: InstanceTable, matches: Matches) -> Bool:
         """Return a Boolean array (N, ids + 1), True where the object of a cluster supports an instance.
 
-        For example, a table supports a book. A supported instance is confirmed and of another class. At least the
-        fraction `support_overlap` of its visible pixels is inside the mask of the cluster, and it has at most half as
-        many pixels as the cluster. The mask of the large object covers the instance, but is not evidence for the voxels
-        of the instance.
+        For example, a table supports a book. The mask of the table may cover the book, but is no evidence for its
+        voxels. The supported instance is confirmed, has another class, is much smaller and is mostly inside the mask.
         """
         overlaps, clusters = matches.overlaps, matches.clusters
         supported = np.zeros((len(clusters), table.last_id + 1), np.bool_)

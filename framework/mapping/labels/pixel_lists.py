@@ -1,7 +1,7 @@
 """Pixel lists: the clusters at each pixel of overlapping masks.
 
 Only a few different combinations of clusters occur. Each combination is one list, and each pixel stores the index of
-its list, so that operations on lists are fast. Example for two overlapping masks of clusters 0 and 1 (* = both):
+its list. The example has two overlapping masks of clusters 0 and 1 (* = both):
 
     masks        list_ids (H, W)      list   clusters    offsets     clusters array
     0 0 .        1 1 0                0      none        0           [0, 0, 1, 1]
@@ -9,7 +9,7 @@ its list, so that operations on lists are fast. Example for two overlapping mask
     . 1 1        0 3 3                2      0, 1        1
                                       3      1           3           offsets[4] = 4
 
-The number of pixels shared by two clusters determines the occlusion order and duplicate detections of an object.
+The number of pixels shared by two clusters determines the occlusion order and duplicate detections.
 """
 
 from __future__ import annotations
@@ -31,7 +31,10 @@ from framework.mapping.labels.pixel_lists_kernels import (
 
 
 class PixelLists(NamedTuple):
-    """L lists of N clusters. The clusters of list i are clusters[offsets[i] : offsets[i + 1]]."""
+    """The L lists of clusters of an image.
+
+    List i contains clusters[offsets[i] : offsets[i + 1]].
+    """
 
     list_ids: Int32  # (H, W) list of each pixel; list 0 is empty
     pixel_counts: Int32  # (L,) number of pixels of each list
@@ -41,7 +44,10 @@ class PixelLists(NamedTuple):
 
 
 class ListTree(NamedTuple):
-    """Tree of the lists during construction. A list consists of its head, which is one cluster, and its parent list."""
+    """Tree of lists under construction.
+
+    A list consists of one cluster, its head, and the clusters of its parent list.
+    """
 
     head: Int32  # (capacity,) head of each list
     parent: Int32  # (capacity,) parent of each list
@@ -52,9 +58,14 @@ class ListTree(NamedTuple):
 
 
 def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
-    """Return the clusters at each pixel of an image of `shape` (height, width), from the pixels of their points.
+    """Return the clusters at each pixel of an image.
 
-    Lists without pixels are empty. Raises DataError if a pixel is outside the image.
+    Args:
+        clusters: The clusters, with the pixels of their points.
+        shape: The height and width of the image.
+
+    Raises:
+        DataError: If a pixel is outside the image.
     """
     list_ids = np.empty(shape, np.int32)
     capacity = len(clusters.cluster) + 1
@@ -71,11 +82,14 @@ def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> Pix
 
 
 def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> PixelLists:
-    """Remove clusters that have no instance or are much larger than another cluster at the pixel; return the lists.
+    """Remove clusters without an instance, and clusters that are much larger than another cluster at the same pixel.
 
-    Large masks are coarse and cover small objects, such as a book on a couch. Therefore, a pixel keeps only clusters
-    that are at most 1 / `area_ratio` times as large as its smallest cluster. If `area_ratio` is 0, a pixel keeps all
-    clusters with an instance. `instance_ids` (N,) holds the instance of each cluster, 0 = none.
+    Large masks are coarse and cover small objects, such as a book on a couch.
+
+    Args:
+        points: The lists of clusters at the pixels.
+        instance_ids: The instance (N,) of each cluster, 0 = none.
+        area_ratio: The minimum area ratio of the smallest cluster at a pixel and any other cluster that is kept.
     """
     offsets, kept = np.empty_like(points.offsets), np.empty_like(points.clusters)
     keep_smallest(points.pixel_counts, points.offsets, points.clusters, instance_ids, area_ratio, offsets, kept)
@@ -83,13 +97,13 @@ def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> P
 
 
 def remove_supports(points: PixelLists, supported: Bool, seen: Int32, stride: int) -> PixelLists:
-    """Remove each cluster from the pixels of the instances that its object supports, and return the new lists.
+    """Remove each cluster from the pixels of the instances that its object supports.
 
     Args:
-        points: Lists of clusters at the pixels.
-        supported: (N, ids + 1) True where the object of the cluster supports the instance.
-        seen: Instance in the map at every stride-th pixel of every stride-th row, 0 = none.
-        stride: Distance between the samples in `seen`, px.
+        points: The lists of clusters at the pixels.
+        supported: A Boolean array (N, ids + 1), True where the object of a cluster supports an instance.
+        seen: The instance of the map at every stride-th pixel of every stride-th row, 0 = none.
+        stride: The distance between the samples in `seen`, px.
     """
     instances = np.flatnonzero(supported.any(axis=0))
     column = np.zeros(supported.shape[1], np.int32)

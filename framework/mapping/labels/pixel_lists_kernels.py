@@ -12,8 +12,9 @@ CHUNKS = 16  # number of chunks of image rows
 
 @device
 def _are_inside(coordinates, width, height):
-    """Return True if all P pixels are inside the image; `coordinates` (2 P,) alternates u and v."""
-    right = bottom = np.uint32(0)  # negative coordinates become large unsigned numbers
+    """Return True if all pixels are inside the image."""
+    # coordinates alternate u and v; negative coordinates become large unsigned numbers
+    right = bottom = np.uint32(0)
     for p in range(coordinates.shape[0] // 2):
         right = max(right, np.uint32(coordinates[2 * p]))
         bottom = max(bottom, np.uint32(coordinates[2 * p + 1]))
@@ -22,10 +23,15 @@ def _are_inside(coordinates, width, height):
 
 @njit(cache=True, nogil=True)
 def link_points(coordinates, cluster, list_ids, tree):
-    """Fill list_ids (H, W) and the ListTree, whose capacity is the number of points plus one.
+    """Build the tree of lists and the list (H, W) of each pixel, and return the number of lists.
 
-    `coordinates` (2 P,) alternates u and v of the points, and `cluster` (P,) is the cluster of each point, < 0 = none.
-    Returns the number of lists, 0 if a point is outside the image.
+    The result is 0 if a point is outside the image.
+
+    Args:
+        coordinates: The pixels (2 P,) of the points, alternating u and v.
+        cluster: The cluster (P,) of each point, negative = none.
+        list_ids: The output (H, W).
+        tree: The output, with a capacity of P + 1 lists.
     """
     head, parent, child, sibling, pixel_count, length = tree
     width = list_ids.shape[1]
@@ -67,7 +73,7 @@ def link_points(coordinates, cluster, list_ids, tree):
 
 @njit(cache=True, nogil=True)
 def write_lists(head, parent, offsets, clusters):
-    """Write the clusters of each list into the flat array `clusters`, from offsets[list] on."""
+    """Write the clusters of each list to the flat array `clusters`."""
     for i in range(offsets.shape[0] - 1):
         list_id = i
         for entry in range(offsets[i], offsets[i + 1]):
@@ -77,7 +83,7 @@ def write_lists(head, parent, offsets, clusters):
 
 @njit(cache=True, nogil=True)
 def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kept_offsets, kept):
-    """Write the lists of keep_on_top() to kept_offsets (L + 1,) and kept; `kept` is as long as `clusters`."""
+    """Write the reduced lists of keep_on_top() to `kept_offsets` (L + 1,) and `kept`."""
     sizes = np.zeros(instance_ids.shape[0], np.float64)
     for i in range(pixel_counts.shape[0]):
         for entry in range(offsets[i], offsets[i + 1]):
@@ -99,10 +105,16 @@ def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kep
 
 @njit(cache=True, nogil=True, parallel=True)
 def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
-    """Fill new_ids (H, W) with replacement[i, column[k]] for pixels of list i at instance k of the map.
+    """Replace the list of each pixel, depending on the instance of the map at this pixel.
 
-    `seen` holds the instance at every stride-th pixel of every stride-th row, and column[k] is 0 for instances without
-    a replacement. Adds the number of pixels that get each new list to moved (CHUNKS, lists), initially 0.
+    Args:
+        list_ids: The list (H, W) of each pixel.
+        seen: The instance at every stride-th pixel of every stride-th row, 0 = none.
+        stride: The distance between the samples in `seen`, px.
+        column: The column of each instance in `replacement`, 0 = no replacement.
+        replacement: The new list (L, 1 + J) for each list and instance.
+        new_ids: The output (H, W).
+        moved: The number of pixels (CHUNKS, lists) that get each new list, modified in place.
     """
     height, width = list_ids.shape
     for chunk in prange(CHUNKS):
@@ -121,11 +133,19 @@ def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
 
 @njit(cache=True, nogil=True)
 def lists_without(offsets, clusters, supported, instances, replacement, origin, ends, kept):
-    """Fill replacement (L, 1 + J) with the list that replaces each list at pixels of each instance in `instances` (J,).
+    """Create the lists that replace others at the pixels of supported instances.
 
-    Column 0 is for pixels without one of these instances. Sets `origin` to the list that each new list replaces, `kept`
-    to the clusters of the new lists, and `ends` to the end of each new list in `kept`. Returns the number of new lists
-    and the number of their clusters.
+    Returns the number of new lists and the number of their clusters.
+
+    Args:
+        offsets: The start (L + 1,) of each list in `clusters`.
+        clusters: The clusters of the lists.
+        supported: A Boolean array (N, ids + 1), True where the object of a cluster supports an instance.
+        instances: The supported instances (J,).
+        replacement: The output (L, 1 + J), the new list for each list and instance. Column 0 is for other pixels.
+        origin: The output, the list that each new list replaces.
+        ends: The output, the end of each new list in `kept`.
+        kept: The output, the clusters of the new lists.
     """
     lists = offsets.shape[0] - 1
     new = length = 0

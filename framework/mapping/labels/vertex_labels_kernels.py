@@ -1,4 +1,4 @@
-"""Kernels for the color, instance and class of mesh vertices."""
+"""Kernels for the colors and labels of mesh vertices."""
 
 from __future__ import annotations
 
@@ -17,16 +17,20 @@ from framework.mapping.voxels.voxel_grid_kernels import (
 from framework.mapping.voxels.voxel_walk import voxel_number
 
 CORNERS = 8  # number of voxels around a vertex
-REACH = 2.0  # maximum distance of voting voxels from the surface, voxels; farther ones may have labels of other objects
+REACH = 2.0  # maximum distance of voting voxels from the surface, voxels; farther voxels may belong to other objects
 CHUNK = 1024  # number of vertices that share scratch arrays
 
 
 @device
 def corner_voxels(grid, vertex, blocks, voxels, weights):
-    """Fill `blocks`, `voxels` and `weights`, (8,) each, for the eight voxels around a world-frame vertex (3,), m.
+    """Find the eight voxels around a vertex (3,), m, and return True if any of their blocks has label evidence.
 
-    `blocks` are block indices, -1 = not allocated, `voxels` are indices in the block, and `weights` are trilinear.
-    Returns True if the block of any voxel has label evidence.
+    Args:
+        grid: The voxel grid.
+        vertex: The vertex (3,) in the world frame, m.
+        blocks: The output (8,), the block of each voxel, -1 = not allocated.
+        voxels: The output (8,), the index of each voxel in its block.
+        weights: The output (8,), the trilinear weights.
     """
     scale = np.float32(1.0) / grid.voxel_size
     x, y, z = vertex[0] * scale, vertex[1] * scale, vertex[2] * scale
@@ -46,7 +50,7 @@ def corner_voxels(grid, vertex, blocks, voxels, weights):
 
 @device
 def keep_near(grid, blocks, voxels, weights):
-    """Set the weights (8,) of unobserved voxels and of voxels farther than REACH from the surface to 0."""
+    """Set the weights (8,) of voxels that are unobserved or far from the surface to 0."""
     near = np.float32(REACH) * grid.voxel_size
     for c in range(CORNERS):
         stored = grid.tsdf[blocks[c], voxels[c]] if blocks[c] >= 0 else np.int16(UNSEEN)
@@ -56,9 +60,9 @@ def keep_near(grid, blocks, voxels, weights):
 
 @device
 def majority(labels, weights):
-    """Return the index of the voxel with the largest weight among the voxels with the majority label; -1 = no majority.
+    """Return the index of the largest weight (8,) among the voxels with the majority label, -1 = no majority.
 
-    The majority label is the positive entry of `labels` (8,) with more than half of the total of `weights` (8,).
+    The majority label is positive and has more than half of the total weight.
     """
     total = np.float32(0.0)
     for c in range(CORNERS):
@@ -78,38 +82,52 @@ def majority(labels, weights):
 
 @device
 def _elect(grid, evidence, counts, blocks, voxels, weights, ids):
-    """Return the instance and class of a vertex by majority vote of its eight voxels; 0 and -1 without a majority."""
+    """Return the instance and the class of a vertex by majority vote of its eight voxels."""
     keep_near(grid, blocks, voxels, weights)
     for c in range(CORNERS):
         voxel = labeled_voxel(grid, evidence, blocks[c], voxels[c]) if weights[c] > 0 else np.int32(-1)
         ids[c] = best_counted_instance(evidence, voxel, counts) if voxel >= 0 else np.int32(0)
     elected = majority(ids, weights)
-    if elected < 0:
+    if elected < 0:  # no majority
         return np.int32(0), np.int32(-1)
     return ids[elected], best_class(evidence, labeled_voxel(grid, evidence, blocks[elected], voxels[elected]))
 
 
 @device
 def color_of(color, voxel, out):
-    """Write the RGB color of a voxel, numbered as in an UnlabeledMesh, into `out` (3,), in [0, 255]."""
+    """Write the color of a voxel to `out` (3,), RGB.
+
+    The voxel is numbered as in an UnlabeledMesh.
+    """
     red, green, blue = unpack_color(color[voxel // BLOCK_VOXELS, voxel % BLOCK_VOXELS])
     out[0], out[1], out[2] = red / 4, green / 4, blue / 4
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def color_vertices(color, voxels, colors):
-    """Fill colors (V, 3) with the RGB of voxels (V,), numbered as in an UnlabeledMesh."""
+    """Fill the colors (V, 3), RGB, of voxels (V,).
+
+    The voxels are numbered as in an UnlabeledMesh.
+    """
     for v in prange(len(voxels)):
         color_of(color, voxels[v], colors[v])
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_vertices(grid, evidence, counts, surface, colors, instance_ids, class_ids):
-    """Fill colors (V, 3), instance_ids (V,), 0 = none, and class_ids (V,), -1 = none, of an UnlabeledMesh's vertices.
+    """Fill the color, instance and class of each vertex of a mesh.
 
     The color comes from the nearest voxel. The instance is the majority of the eight surrounding voxels, weighted
-    trilinearly. Each voxel votes for its most likely instance among those with `counts[id]` True. The class comes from
-    the voxel with the largest weight in the majority. Vertices without an instance have no class.
+    trilinearly. The class comes from the voxel with the largest weight in the majority.
+
+    Args:
+        grid: The voxel grid.
+        evidence: The label evidence.
+        counts: A Boolean array, True for the instance ids that can be assigned.
+        surface: The mesh without labels.
+        colors: The output (V, 3), RGB.
+        instance_ids: The output (V,), 0 = none.
+        class_ids: The output (V,), -1 = none.
     """
     vertices = surface.vertices
     for chunk in prange(-(-len(vertices) // CHUNK)):

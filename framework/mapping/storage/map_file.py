@@ -1,4 +1,4 @@
-"""Map files: one .npz with a JSON header and the arrays of the map, written atomically."""
+"""Map files: .npz archives with a JSON header and the arrays of the map."""
 
 from __future__ import annotations
 
@@ -30,15 +30,18 @@ LARGEST_HEADER = 2**28  # maximum size of the header, bytes; an hour of mapping 
 LARGEST_ID = 2**24  # maximum instance id
 MAX_EVIDENCE = 1e12  # maximum absolute evidence for a class
 MAX_ARRAYS = 100  # maximum number of arrays listed in the header of a file
-MAX_MEMORY_FRACTION = 0.5  # maximum fraction of the machine's memory for a loaded map
+MAX_MEMORY_FRACTION = 0.5  # maximum size of a loaded map, as a fraction of the memory
 
 
 class _TooLargeError(DataError):
-    """A map file that exceeds the memory limit. Its message contains the fix."""
+    """Error for a map file that exceeds the memory limit."""
 
 
 def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-    """Write the header and the arrays to a .npz file without timestamps, readable by np.load."""
+    """Write a header and arrays to a map file.
+
+    The file has no timestamps and can be read by np.load.
+    """
     if not isinstance(cast(object, path), str | Path):
         raise DataError(f"map file: expected a path, got {path!r:.60}")
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -54,8 +57,10 @@ def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, 
 def read_map(path: Path | str, expected_format: object, names: Sequence[str]) -> tuple[MapHeader, dict[str, Any]]:
     """Return the header, the named arrays and any embeddings of a map file.
 
-    Raises DataError for other files and formats, and for wrong checksums. Array sizes are checked against the file and
-    the memory of the machine before allocation.
+    Array sizes are checked against the file and the available memory before allocation.
+
+    Raises:
+        DataError: If the file is no map file, has another format or is damaged.
     """
     with map_file_errors(path), _opened(path) as archive:
         header = _header(archive)
@@ -71,21 +76,29 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
 
 
 def read_arrays(path: Path | str, expected_format: object) -> dict[str, Array]:
-    """Return the arrays listed as `names` in the header of a file. Raises DataError as read_map() does."""
+    """Return the arrays that the header of a file lists as `names`.
+
+    Raises:
+        DataError: If the file has another format or is damaged.
+    """
     with map_file_errors(path), _opened(path) as archive:
         names = _header(archive).items("names")
     return read_map(path, expected_format, [str(name) for name in names[:MAX_ARRAYS]])[1]
 
 
 def read_format(path: Path | str) -> str:
-    """Return the format of a map file. Raises DataError for other files."""
+    """Return the format of a map file.
+
+    Raises:
+        DataError: If the file is no map file.
+    """
     with map_file_errors(path), _opened(path) as archive:
         return str(_header(archive).values.get("format"))
 
 
 @contextmanager
 def map_file_errors(path: Path | str) -> Iterator[None]:
-    """Convert errors during reading of a map file into a DataError that names the file."""
+    """Convert errors while reading a map file to a DataError with the path of the file."""
     try:
         yield
     except _TooLargeError as error:
@@ -120,7 +133,7 @@ def _header(archive: zipfile.ZipFile) -> MapHeader:
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Array:
-    """Return an array of the archive. Raises DataError if its size disagrees with its shape."""
+    """Return an array of the archive after checking its size."""
     info = archive.getinfo(f"{name}.npy")
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
@@ -146,7 +159,7 @@ def machine_memory() -> int:
 
 
 def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], length: int, prefix: str = "") -> None:
-    """Raise DataError unless the arrays have `length` rows, and the types and row shapes of the `expected` arrays.
+    """Raise DataError unless the arrays have `length` rows, and the types and row shapes of the expected arrays.
 
     The names in `arrays` begin with `prefix`.
     """
@@ -155,14 +168,14 @@ def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], lengt
 
 
 def check_known(name: str, array: Array, known: Iterable[int]) -> None:
-    """Raise DataError unless all values of the array are in `known`, because kernels use them as indices."""
-    unknown = array[~np.isin(array, list(known))]
+    """Raise DataError unless all values of the array are in `known`."""
+    unknown = array[~np.isin(array, list(known))]  # kernels would use them as indices
     if unknown.size:
         raise DataError(f"{name}: expected ids in the map, got {unknown[0]}")
 
 
 def check_numbers(name: str, numbers: Array, count: int) -> None:
-    """Raise DataError unless the array contains each integer from 0 to `count` - 1 once, and otherwise only -1."""
+    """Raise DataError unless the array contains each index below `count` exactly once, and otherwise only -1."""
     used = numbers[numbers != -1]
     beyond = used[(used < 0) | (used >= count)]
     if beyond.size:
@@ -185,7 +198,7 @@ def check_blocks(coords: Any) -> None:
 
 
 def plain_table(table: InstanceTable) -> dict[str, Any]:
-    """Return an instance table as JSON values, without the embeddings, which `table_arrays` returns."""
+    """Return an instance table as JSON values, without its embeddings."""
     space = {SPACE: table.embedding_space} if table_arrays(table) else {}
     return {
         "combine": table.combine.name,
@@ -208,13 +221,25 @@ def _plain_record(record: InstanceRecord) -> dict[str, Any]:
 
 
 def table_arrays(table: InstanceTable) -> dict[str, Array]:
-    """Return the arrays of an instance table's embeddings; empty without embeddings."""
+    """Return the arrays of the embeddings of an instance table.
+
+    The result is empty if there are no embeddings.
+    """
     embeddings = {k: record.embedding for k, record in table.records.items() if record.embedding is not None}
     return embedding_arrays(embeddings)
 
 
 def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> InstanceTable:
-    """Return the instance table of a map file with `classes` classes. Raises DataError if the table is invalid."""
+    """Return the instance table of a map file.
+
+    Args:
+        plain: The table in the header.
+        classes: The number of classes.
+        arrays: The arrays of the file.
+
+    Raises:
+        DataError: If the table is invalid.
+    """
     table = InstanceTable(plain.option("combine", Combine), plain.flag("logarithmic"))
     table.last_id = plain.whole("last_id", 0, LARGEST_ID)
     for entry in plain.parts("instances"):

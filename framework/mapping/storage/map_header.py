@@ -1,4 +1,7 @@
-"""Header of a map file, with validation of each value because the file is untrusted."""
+"""Header of a map file.
+
+Map files are untrusted, so each value is validated.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,17 @@ Option = TypeVar("Option", bound=Enum)
 
 @dataclass(frozen=True)
 class MapHeader:
-    """A JSON object in the header. Each method reads one key, and raises DataError if its value is invalid."""
+    """A JSON object in the header of a map file.
+
+    Each method reads one key. All methods raise DataError for invalid values.
+    """
 
     values: Mapping[str, Any]
     name: str = "header"
 
     @classmethod
     def of(cls, found: object, name: str = "header") -> MapHeader:
-        """Return a JSON object as a header. Raises DataError for other types."""
+        """Return the header for a JSON object."""
         if not isinstance(found, dict):
             raise DataError(f"{name}: expected a JSON object, got {found!r:.60}")
         return cls(found, name)
@@ -48,9 +54,10 @@ class MapHeader:
         return found
 
     def number(self, key: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> float:
-        """Return a finite number in [low, high], with a relative tolerance of 1e-6 for float32 rounding."""
+        """Return a finite number within the bounds."""
         found, (low, high) = self._value(key), bounds
         is_number = isinstance(found, int | float) and not isinstance(found, bool) and math.isfinite(found)
+        # with a tolerance for the rounding of float32
         if not is_number or not low - 1e-6 * abs(low) <= found <= high + 1e-6 * abs(high):
             raise self._error(key, f"a number in [{low:g}, {high:g}]", found)
         return float(found)
@@ -74,7 +81,7 @@ class MapHeader:
         return options[found]
 
     def classes(self) -> tuple[str, ...]:
-        """Return the names of the map's classes."""
+        """Return the names of the classes."""
         found = self.items("classes")
         names = [name for name in found if isinstance(name, str) and len(name) <= LONGEST_NAME]
         if len(names) < len(found) or len(found) > MAX_CLASSES:
@@ -92,7 +99,11 @@ class MapHeader:
 
 
 def whole(name: str, found: object, low: int = 0, high: int = LARGEST_COUNT) -> int:
-    """Return an integer in [low, high]. For other values, raises a DataError that names the key."""
+    """Return an integer in [low, high].
+
+    Raises:
+        DataError: If the value is not such an integer. The message contains `name`.
+    """
     if isinstance(found, bool) or not isinstance(found, int) or not low <= found <= high:
         raise DataError(f"{name}: expected an integer in [{low}, {high}], got {found!r:.60}")
     return found

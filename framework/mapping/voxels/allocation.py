@@ -1,8 +1,7 @@
-"""Allocation and selection of the blocks that a frame updates.
+"""Selection and allocation of the blocks that a frame updates.
 
-These are the blocks along the truncation bands of the depth readings, and existing blocks in the free space in front of
-them. Candidates are gathered in a fixed number of chunks of image rows, and blocks are numbered serially. Therefore,
-the map does not depend on the number of threads.
+A frame updates the blocks near the measured surface and existing blocks in the free space in front of it. The image is
+divided into a fixed number of chunks of rows, so that the result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -19,9 +18,9 @@ from framework.mapping.voxels.integration_parameters import Sensor, pinhole
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, FARTHEST_BLOCK
 
-MAX_SAMPLES = 4096  # maximum number of samples along the band of a reading, half a block apart; 6 by default
+MAX_SAMPLES = 4096  # maximum number of samples along the truncation band of a reading, half a block apart
 REPEATS = 8  # maximum mean number of entries of a block in the lists of all chunks
-MIN_KEYS = 2**20  # number of block keys that any frame may have, 8 MB; the block budget limits larger numbers
+MIN_KEYS = 2**20  # number of block keys (8 MB) that a frame may have for any `max_blocks`
 
 
 class Allocator:
@@ -41,9 +40,11 @@ class Allocator:
     def active_blocks(self, frame: Frame, T_world_camera: Float64) -> Int32:
         """Return the indices (A,) of the blocks that a frame updates.
 
-        These are the blocks around the measured surface, allocated if new, and existing blocks in front of it.
+        Blocks around the measured surface are allocated if they do not exist.
 
-        Raises MapFullError if the block budget is reached.
+        Raises:
+            MapFullError: If the map needs too many blocks.
+            FrameError: If the pose is outside the range of block coordinates.
         """
         self._frames += 1
         found = self.allocate(frame.camera, frame.depth, T_world_camera)
@@ -56,12 +57,15 @@ class Allocator:
         return active[:count].copy()
 
     def allocate(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
-        """Allocate the blocks along the truncation bands of `depth` (H, W), m.
+        """Allocate the blocks near the measured surface, and return their indices (N,), with repetitions.
 
-        Returns the indices (N,) of these blocks, with repetitions.
+        Args:
+            camera: The camera.
+            depth: The depth image (H, W), m.
+            T_world_camera: The camera pose (4, 4).
 
         Raises:
-            MapFullError: If the block budget is reached. No memory is allocated if a single frame exceeds the budget.
+            MapFullError: If the map needs too many blocks.
             FrameError: If the pose is outside the range of block coordinates.
         """
         return self.voxels.allocate(self._surface_coords(camera, depth, T_world_camera))
@@ -107,7 +111,7 @@ class Allocator:
 
 
 def _longest_ray(camera: Camera) -> float:
-    """Return the length, per m of depth, of the ray through the corner farthest from the principal point."""
+    """Return the length of the longest ray of the camera per m of depth."""
     x = max(camera.cx, camera.width - camera.cx) / camera.fx
     y = max(camera.cy, camera.height - camera.cy) / camera.fy
     return float(np.sqrt(1 + x * x + y * y))

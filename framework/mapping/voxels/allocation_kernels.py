@@ -1,4 +1,4 @@
-"""Kernels of allocation.py: blocks along truncation bands, and blocks in the view frustum."""
+"""Kernels of allocation.py."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PROBES = 4  # number of probed pixels along each side of a block in the image, t
 
 @device
 def _remembered(recent, key):
-    """Return True if the key is in `recent` (RECENT,); otherwise add it."""
+    """Return True if the key is in the cache, otherwise add it."""
     slot = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(54)
     if recent[slot] == key:
         return True
@@ -28,11 +28,11 @@ def _remembered(recent, key):
 
 @device
 def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
-    """Write the keys of the blocks at `samples` points along the truncation band of each reading of a row to keys[1:].
+    """Write the keys of the blocks along the truncation bands of an image row to keys[1:].
 
-    `readings` (W,), m, are every stride-th depth reading of image row v. Readings out of range get NO_KEY.
-    The loop reads local variables only, so that the compiler vectorizes it.
+    `readings` are every stride-th depth reading of row v, m. Readings out of range get NO_KEY.
     """
+    # local variables, so that the compiler vectorizes the loop
     width = readings.shape[0]
     first_x, first_y, first_z = ray_direction(view, 0, v)
     second_x, second_y, second_z = ray_direction(view, stride, v)
@@ -55,10 +55,17 @@ def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def surface_blocks(depth, view, sensor, block_size, stride, samples, found, counts):
-    """Write the keys of blocks along the band of every stride-th depth reading to `found` (CHUNKS, M), by chunk.
+    """Write the keys of the blocks along the truncation bands of a depth image to `found` (CHUNKS, M).
 
-    Only every stride-th row is used, and `block_size` is in m. Writes the number of keys of each chunk to counts
-    (CHUNKS,); counts above M mean that `found` is too small.
+    Args:
+        depth: The depth image (H, W), m. Every stride-th pixel of every stride-th row is used.
+        view: The camera with the pose T_world_camera.
+        sensor: The parameters of the volume.
+        block_size: The side of a block, m.
+        stride: The distance between the used pixels, px.
+        samples: The number of samples along a truncation band.
+        found: The output.
+        counts: The number of keys (CHUNKS,) of each chunk. If a count exceeds M, `found` is too small.
     """
     height, width = depth.shape
     rows, columns = (height + stride - 1) // stride, (width + stride - 1) // stride
@@ -96,10 +103,7 @@ def unpack(keys, coords):
 
 @device
 def _extent(camera, size, margin):
-    """Return half the side lengths, m, of the camera-aligned box around a world-aligned cube, plus `margin`.
-
-    The cube has the side length `size`, m.
-    """
+    """Return half the side lengths of the camera-aligned box around a world-aligned cube, plus a margin, m."""
     half = np.float32(0.5) * size
     return (
         half * (abs(camera.R[0, 0]) + abs(camera.R[0, 1]) + abs(camera.R[0, 2])) + margin,
@@ -110,10 +114,17 @@ def _extent(camera, size, margin):
 
 @device
 def _bounds(camera, x, y, z, extent, near, far, shape):
-    """Return (visible, z0, z1, u0, u1, v0, v1): the depth range, m, and the inclusive pixel window of a box in view.
+    """Return (visible, z0, z1, u0, u1, v0, v1), the depth range, m, and the pixel window of a camera-aligned box.
 
-    The box is aligned with the camera axes. Its center is the world point (x, y, z), m, and `extent` is half its side
-    lengths, m. Depths are limited to [near, far], m, and pixels to an image of `shape` (H, W).
+    Args:
+        camera: The camera with the pose T_camera_world.
+        x: The first world coordinate of the center, m.
+        y: The second world coordinate of the center, m.
+        z: The third world coordinate of the center, m.
+        extent: Half the side lengths of the box, m.
+        near: The minimum depth, m.
+        far: The maximum depth, m.
+        shape: The height and width of the image.
     """
     height, width = shape
     pz = camera.R[2, 0] * x + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
@@ -137,10 +148,10 @@ def _bounds(camera, x, y, z, extent, near, far, shape):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def solid_blocks_in_view(grid, region_count, block_count, camera, near, far, shape):
-    """Return the blocks (N,) in view that contain a surface, their depths (N, 2) and their pixel windows (N, 4).
+    """Return the blocks (N,) in view that contain a surface, their depths (N, 2), m, and pixel windows (N, 4).
 
-    Depths are the nearest and the farthest, m. Windows are u0, u1, v0, v1, inclusive. `camera` contains T_camera_world.
-    Tests every region of the map, and every block of the regions in view.
+    The depths are the minimum and the maximum. The windows are u0, u1, v0, v1, inclusive. The pose in `camera` is
+    T_camera_world.
     """
     blocks = np.empty(block_count, np.int32)
     depths = np.empty((block_count, 2), np.float32)
@@ -176,7 +187,7 @@ def solid_blocks_in_view(grid, region_count, block_count, camera, near, far, sha
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sees_through(depth, sensor, z0, pixels):
-    """Return True if a probed depth reading in the block's pixel window is behind the block's minimum depth z0, m."""
+    """Return True if any probed depth reading in a pixel window is behind the depth z0, m."""
     u0, u1, v0, v1 = pixels
     for row in range(PROBES):
         v = v0 + (v1 - v0) * row // (PROBES - 1)
@@ -189,10 +200,18 @@ def _sees_through(depth, sensor, z0, pixels):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def choose_blocks(grid, found, region_count, depth, camera, sensor, stamp, frame, active):
-    """Write the blocks `found` (N,) and the existing blocks in front of the surface to `active`. Returns their number.
+    """Write the blocks that a frame updates to `active`, each once, and return their number.
 
-    Each block is written once. `stamp` (B,) holds the last frame in which each block was active; `frame` is the current
-    frame. `camera` contains T_camera_world.
+    Args:
+        grid: The voxel grid.
+        found: The blocks (N,) along the truncation bands, with repetitions.
+        region_count: The number of regions.
+        depth: The depth image (H, W), m.
+        camera: The camera with the pose T_camera_world.
+        sensor: The parameters of the volume.
+        stamp: The last frame (B,) in which each block was active.
+        frame: The current frame.
+        active: The output.
     """
     n = 0
     for i in range(found.shape[0]):

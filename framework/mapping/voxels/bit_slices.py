@@ -1,6 +1,6 @@
-"""Slices of 8 x 8 voxels of a block as the bits of a 64-bit word: voxel (x, y) is bit 8 y + x.
+"""Bit operations on slices of 8 x 8 voxels.
 
-Shifted words compare 64 voxels with their neighbors at once.
+A slice is a 64-bit word. Voxel (x, y) is bit 8 y + x. Shifts of a word compare 64 voxels with their neighbors at once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ _LAST_COLUMN = np.uint64(0x8080808080808080)
 
 @device
 def count_bits(word):
-    """Return the number of set bits. LLVM compiles this idiom to one instruction."""
+    """Return the number of set bits."""
+    # LLVM compiles this idiom to one instruction
     word -= (word >> ONE) & np.uint64(0x5555555555555555)
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
@@ -34,23 +35,35 @@ def lowest_bit(word):
 
 @device
 def ahead_x(word, beyond):
-    """Return the slice with bit (x + 1, y) of `word` at (x, y); `beyond` is the slice of the next block along x."""
+    """Return the slice shifted so that (x, y) holds the bit of (x + 1, y).
+
+    The last column comes from `beyond`, the slice of the next block along x.
+    """
     return ((word & ~_FIRST_COLUMN) >> ONE) | ((beyond & _FIRST_COLUMN) << _TO_LAST_COLUMN)
 
 
 @device
 def ahead_y(word, beyond):
-    """Return the slice with bit (x, y + 1) of `word` at (x, y); `beyond` is the slice of the next block along y."""
+    """Return the slice shifted so that (x, y) holds the bit of (x, y + 1).
+
+    The last row comes from `beyond`, the slice of the next block along y.
+    """
     return (word >> _EIGHT) | (beyond << _TO_LAST_ROW)
 
 
 @device
 def behind_x(word, before):
-    """Return the slice with bit (x - 1, y) of `word` at (x, y); `before` is the slice of the previous block along x."""
+    """Return the slice shifted so that (x, y) holds the bit of (x - 1, y).
+
+    The first column comes from `before`, the slice of the previous block along x.
+    """
     return ((word & ~_LAST_COLUMN) << ONE) | ((before & _LAST_COLUMN) >> _TO_LAST_COLUMN)
 
 
 @device
 def behind_y(word, before):
-    """Return the slice with bit (x, y - 1) of `word` at (x, y); `before` is the slice of the previous block along y."""
+    """Return the slice shifted so that (x, y) holds the bit of (x, y - 1).
+
+    The first row comes from `before`, the slice of the previous block along y.
+    """
     return (word << _EIGHT) | (before >> _TO_LAST_ROW)

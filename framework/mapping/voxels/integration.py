@@ -1,9 +1,8 @@
-"""Integration of depth images into the running averages of the visible voxels.
+"""Integration of depth images into the TSDF.
 
-The signed distance is projective: it is measured along the z axis of the camera. Its running average is the TSDF of
-Curless and Levoy (1996). The truncation distance increases with depth, as the sensor noise does. Observations have full
-weight up to the depth at which sensor noise starts to increase. Beyond this depth, the weight is inversely proportional
-to the square of the depth.
+The signed distance is measured along the z axis of the camera. Each voxel stores its running average (Curless and
+Levoy, 1996). The truncation distance increases with depth, because sensor noise does. Readings beyond
+`full_weight_depth` have a lower weight for the same reason.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ from framework.mapping.voxels.integration_parameters import Sensor, pinhole
 from framework.mapping.voxels.voxel_grid import VoxelGrid, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-GOLDEN = 0.6180339887498949  # golden ratio - 1; the rounding offsets frac(k * GOLDEN) avoid biased averages
+GOLDEN = 0.6180339887498949  # golden ratio - 1; rounding offsets frac(frame * GOLDEN) avoid biased averages
 
 
 class SeenBlocks(NamedTuple):
-    """The A blocks updated by a frame and their voxels near the measured surface, valid until the next frame.
+    """The A blocks that a frame updates, and their voxels near the measured surface.
 
-    The near voxels of a block are contiguous. There are gaps between groups of GROUP blocks.
+    The voxels of one block are contiguous in the arrays. The arrays are reused for the next frame.
     """
 
     blocks: Int32  # (A,) block indices
@@ -38,7 +37,6 @@ class SeenBlocks(NamedTuple):
 
 
 def _near_lists(blocks: int) -> tuple[UInt16, Int32]:
-    """Return uninitialized arrays near_voxel and near_pixel for a number of blocks."""
     return np.empty(blocks * BLOCK_VOXELS, np.uint16), np.empty(blocks * BLOCK_VOXELS, np.int32)
 
 
@@ -57,24 +55,31 @@ class Integrator:
         return {**vars(self), "_near_voxel": self._near_voxel[:0], "_near_pixel": self._near_pixel[:0]}
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near_band: float) -> SeenBlocks:
-        """Integrate one frame, and return the updated blocks and their voxels within `near_band` m of the surface.
+        """Integrate one frame, and return the updated blocks.
 
-        Raises MapFullError if the block budget is reached; in this case the frame is not integrated.
+        Args:
+            frame: The frame.
+            T_world_camera: The camera pose (4, 4).
+            near_band: The maximum distance of the listed voxels from the measured surface, m.
+
+        Raises:
+            MapFullError: If the map needs too many blocks. The frame is then not integrated.
         """
         return self._update(frame, T_world_camera, near_band, self._allocator.active_blocks(frame, T_world_camera))
 
     def integrate_object(self, frame: Frame, T_world_camera: Float64, near_band: float, mask: Bool) -> SeenBlocks:
-        """Integrate one frame into the grid of one object, and return the same data as `integrate`.
+        """Integrate one frame into the grid of a single object, and return the updated blocks.
 
-        The grid grows only within the object's `mask` (H, W). Depth readings outside the mask also update the existing
-        blocks.
+        New blocks are allocated only inside the `mask` (H, W) of the object. Existing blocks are also updated outside
+        the mask.
         """
         depth = np.where(mask, frame.depth, np.float32(0.0))
         self._allocator.allocate(frame.camera, depth, T_world_camera)
         return self._update(frame, T_world_camera, near_band, np.arange(self.voxels.block_count, dtype=np.int32))
 
     def _sensor_of(self, frame: Frame) -> Sensor:
-        """Return the parameters, with full_weight_depth raised to the value of the frame's sensor if that is larger."""
+        """Return the sensor parameters for a frame."""
+        # the full-weight depth of the sensor of the frame, if larger
         full_weight_depth = max(self.sensor.full_weight_depth, np.float32(frame.sensor.noise.full_weight_depth))
         return self.sensor._replace(full_weight_depth=full_weight_depth)
 

@@ -29,11 +29,12 @@ MIN_WEIGHT_BEHIND = 0.02
 
 @device
 def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
-    """Project the voxels of a block (eq. (6) of docs/method.md) to pixel indices and depths.
+    """Compute the pixel (512,) and the depth, m, of each voxel of a block.
 
-    `camera` contains T_camera_world. Writes the indices to pixel (512,) and the depths, m, to scratch[:512]. Voxels
-    outside the image get pixel 0 and a depth larger than any reading.
+    The pose in `camera` is T_camera_world. The depths are written to the first half of `scratch`. Voxels outside the
+    image get pixel 0 and a depth larger than any reading.
     """
+    # eq. (6) of docs/method.md
     zero, half, one = np.float32(0.0), np.float32(0.5), np.float32(1.0)
     seven, three = np.int32(7), np.int32(3)
     width = np.int32(shape[1])
@@ -69,12 +70,18 @@ def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
 def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_band, scratch):
     """Update the running averages of the distances and weights (512,) of a block.
 
-    On input, scratch[:512] holds the depths, m, of the voxels, and scratch[512:] their depth readings, m. On output,
-    scratch[:512] holds their distances to the measured surface, m, and scratch[512:] the weights of the new
-    observations in the color averages, 0 = no color. `voxel` is the voxel size, m, and `to_units` the stored distance
-    units per m.
+    Returns the number of voxels with a new color, and the number of voxels near the surface.
 
-    Returns the number of voxels with a new color, and the number of voxels within near_band m of the surface.
+    Args:
+        tsdf: The stored distances (512,), modified in place.
+        weight: The weights (512,), modified in place.
+        voxel: The voxel size, m.
+        to_units: The stored distance units per m.
+        sensor: The parameters of the volume.
+        rounding: The offset in [0, 1) before rounding down.
+        near_band: The maximum distance of near voxels from the surface, m.
+        scratch: The depth of each voxel, then the depth reading of each voxel, m. They are replaced by the distance to
+            the surface, m, and by the weight of the new color, 0 = no color.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     full2 = sensor.full_weight_depth * sensor.full_weight_depth
@@ -113,10 +120,16 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
 
 @device
 def _average_colors(packed, color, pixel, start, rounding, scratch, seen):
-    """Update the running averages of the packed colors (512,) of a block, in the layer that begins at voxel `start`.
+    """Update the running averages of the packed colors of one layer of a block.
 
-    `color` holds the RGBA bytes of the pixels, `pixel` (512,) the pixel of each voxel, and scratch[512:] the weights of
-    the new observations, 0 = none. `seen` (64,) is scratch memory.
+    Args:
+        packed: The packed colors (512,) of the block, modified in place.
+        color: The RGBA bytes of the image.
+        pixel: The pixel (512,) of each voxel.
+        start: The first voxel of the layer.
+        rounding: The offset in [0, 1) before rounding down.
+        scratch: The weights of the new colors in the second half, 0 = no color.
+        seen: Scratch memory (64,).
     """
     byte, one_byte, two_bytes = np.int32(255), np.int32(8), np.int32(16)
     zero, one, four, brightest = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(4 * 255)
@@ -140,7 +153,7 @@ def _average_colors(packed, color, pixel, start, rounding, scratch, seen):
 
 @device
 def _is_colored(scratch, start):
-    """Return True if any voxel of the layer that begins at `start` has a nonzero color weight in scratch[512:]."""
+    """Return True if any voxel of the layer has a new color."""
     largest = np.float32(0.0)
     for n in range(LAYER_VOXELS):
         largest = max(largest, scratch[start + n + BLOCK_VOXELS])
@@ -149,14 +162,13 @@ def _is_colored(scratch, start):
 
 @device
 def _list_near(pixel, near_band, near_voxel, near_pixel, entry, scratch):
-    """List the voxels whose distance in scratch[:512] is in [-near_band, near_band], m, and their pixels.
+    """List the voxels of a block near the surface, and their pixels, from index `entry` on.
 
-    The list begins at index `entry` of near_voxel and near_pixel. The comparisons of a layer are bits of a word, so
-    that the compiler vectorizes them.
+    The first half of `scratch` contains the distance of each voxel to the surface, m.
     """
     for layer in range(BLOCK_SIDE):
         begin = layer * LAYER_VOXELS
-        word = np.uint64(0)
+        word = np.uint64(0)  # comparisons of a layer as bits, which the compiler vectorizes
         for n in range(LAYER_VOXELS):
             word |= np.uint64(abs(scratch[begin + n]) <= near_band) << np.uint64(n)
         while word != np.uint64(0):
@@ -169,15 +181,21 @@ def _list_near(pixel, near_band, near_voxel, near_pixel, entry, scratch):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def integrate(grid, seen, depth, color, camera, sensor, rounding, near_band):
-    """Update distance, weight and color of the voxels of `seen.blocks` that are visible in the depth image.
+    """Update the distance, weight and color of the voxels that are visible in a depth image.
 
-    Writes the voxels within near_band m of the measured surface to `seen`. `color` (H, W) holds the RGBA bytes of the
-    pixels, and `camera` contains T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers.
-
-    A block is updated in vectorized passes over its 512 voxels. The passes have no branches and read images in separate
-    loops. They share one scratch array, so that the compiler can prove that arrays do not overlap.
+    Args:
+        grid: The voxel grid.
+        seen: The blocks to update. Their voxels near the surface are written to the other arrays.
+        depth: The depth image (H, W), m.
+        color: The RGBA bytes (H, W) of the color image.
+        camera: The camera with the pose T_camera_world.
+        sensor: The parameters of the volume.
+        rounding: The offset in [0, 1) before values are rounded down to integers.
+        near_band: The maximum distance of near voxels from the surface, m.
     """
-    # numba 0.68 loses assignments to an element of a tuple's array within prange
+    # The passes over the voxels of a block have no branches and share one scratch array, so that the compiler can
+    # vectorize them.
+    # Numba 0.68 loses assignments to an element of a tuple's array within prange.
     active, near_start, near_count, near_voxel, near_pixel = seen
     solid = grid.solid
     shape = depth.shape

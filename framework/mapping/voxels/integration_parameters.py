@@ -41,7 +41,10 @@ class Sensor(NamedTuple):
 
 
 class Pinhole(NamedTuple):
-    """A camera (fx, fy, cx, cy in px) and its pose, in single precision."""
+    """A camera and its pose in single precision.
+
+    The intrinsics are in px.
+    """
 
     fx: np.float32
     fy: np.float32
@@ -52,7 +55,10 @@ class Pinhole(NamedTuple):
 
 
 def pinhole(camera: Camera, T: Float64) -> Pinhole:
-    """Return `camera` with the pose `T`, T_world_camera or T_camera_world depending on the kernel."""
+    """Return the pinhole camera with the given pose (4, 4).
+
+    Depending on the kernel, the pose is T_world_camera or its inverse.
+    """
     return Pinhole(
         fx=np.float32(camera.fx),
         fy=np.float32(camera.fy),

@@ -1,16 +1,13 @@
-"""Extraction of the map's surface as a triangle mesh by surface nets (Gibson 1998), updated by block.
+"""Surface extraction by surface nets (Gibson, 1998).
 
-A cell is the cube between eight neighboring voxels. A cell with a sign change between its corners has one vertex, the
-mean of the zero crossings on its edges. An edge with a sign change joins the vertices of its four cells in a quad.
-Compared with marching cubes, surface nets need no table, have half the vertices, and give better triangle shapes.
-Compared with dual contouring, the vertices are farther from sharp edges, and closer to the surface under depth noise.
+A cell is the cube between eight neighboring voxels. If the signs of its corners differ, the cell has one vertex, at the
+mean of the zero crossings on its edges. Each edge with a sign change connects the vertices of its four cells to a quad.
+Compared with marching cubes, surface nets have half the vertices and better triangle shapes.
 
-Few voxels are near the surface, so the search tests 64 voxels at once as bits of a word. Only cells with a vertex are
-visited individually. The index of a vertex is the number of set bits before its own bit.
+The search for cells tests 64 voxels at once as bits of a word. The index of a vertex is the number of set bits before
+its own bit.
 
-A block stores 192 bytes of words and 32 bytes of indices between updates. Its vertices are recomputed if voxels
-of its cells change, in the block itself or in adjacent blocks. All other vertices are copied. The result depends on the
-grid alone.
+Updates recompute only the vertices of blocks whose cells have changed. The result depends on the grid alone.
 """
 
 from __future__ import annotations
@@ -33,8 +30,8 @@ from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE
 
 # Maximum difference between the signed distances at the corners of a cell, voxels. Cells with a larger difference are
-# on a silhouette, between truncated free space and hidden space. The limit is high, because projective distances on
-# oblique surfaces are larger by a factor of 1 / cos(viewing angle).
+# on a silhouette, between free space and hidden space. The limit is high, because distances along the camera axis are
+# too large on oblique surfaces.
 MAX_JUMP = 8.0
 
 
@@ -47,7 +44,7 @@ class UnlabeledMesh(NamedTuple):
 
 
 class SurfaceNets:
-    """The surface of a voxel grid. `changed` marks modified blocks, and `extract` updates the surface."""
+    """The surface of a voxel grid, updated block by block."""
 
     def __init__(self, voxels: VoxelGrid) -> None:
         self.voxels = voxels
@@ -60,12 +57,18 @@ class SurfaceNets:
         self._surface = UnlabeledMesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.int32))
 
     def changed(self, blocks: Int32) -> None:
-        """Mark blocks (A,) whose voxels have changed. `extract` marks new blocks itself."""
+        """Mark blocks (A,) whose voxels have changed.
+
+        New blocks need not be marked.
+        """
         known = blocks[blocks < len(self._changed)]
         self._changed[known] = True
 
     def extract(self) -> UnlabeledMesh:
-        """Return the current surface. The order of vertices and triangles depends on the grid alone."""
+        """Return the current surface.
+
+        The order of the vertices and triangles depends on the grid alone.
+        """
         grid, count = self.voxels.grid, self.voxels.block_count
         self._grow(count)
         changed = np.flatnonzero(self._changed).astype(np.int32)

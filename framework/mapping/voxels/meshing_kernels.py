@@ -12,7 +12,7 @@ from framework.mapping.voxels.voxel_walk import voxel_number
 
 @device
 def _blocks_before(grid, block, out):
-    """Write the 2 x 2 x 2 blocks at offsets 0 or -1 along x, y and z from a block to `out` (8,), -1 = none."""
+    """Find the eight blocks at offset 0 or -1 along each axis from a block, -1 = not allocated."""
     key, region = NO_LOOK_UP
     bx, by, bz = grid.block_coords[block, 0], grid.block_coords[block, 1], grid.block_coords[block, 2]
     for o in range(8):
@@ -21,7 +21,14 @@ def _blocks_before(grid, block, out):
 
 @njit(cache=True, nogil=True, parallel=True)
 def pack(tsdf, blocks, inside, seen):
-    """Pack one bit per voxel of the blocks into `inside`, 1 = negative, and `seen`, 1 = observed; (B + 1, 8) each."""
+    """Pack the signs of the distances and the observed voxels of blocks into bits.
+
+    Args:
+        tsdf: The stored distances (B, 512).
+        blocks: The blocks to update.
+        inside: The output (B + 1, 8); a bit is 1 if the distance is negative.
+        seen: The output (B + 1, 8); a bit is 1 if the voxel was observed.
+    """
     for b in prange(len(blocks)):
         block = blocks[b]
         for z in range(BLOCK_SIDE):
@@ -37,7 +44,7 @@ def pack(tsdf, blocks, inside, seen):
 
 @njit(cache=True, nogil=True, parallel=True)
 def mark_stale(grid, changed, stale):
-    """Set `stale` (B,) to True for the blocks that have a cell with a corner in a changed block."""
+    """Mark the blocks with a cell whose corner is in a changed block, in `stale` (B,)."""
     for b in prange(len(changed)):
         before = np.empty(8, np.int32)
         _blocks_before(grid, changed[b], before)
@@ -48,10 +55,10 @@ def mark_stale(grid, changed, stale):
 
 @device
 def _any_and_all(words, around, z):
-    """Return two words with one bit per cell: 1 if any, and 1 if all, of its four corners in slice z are set.
+    """Return, as bits, the cells with any corner set and the cells with all corners set in slice z.
 
-    `words` (B + 1, 8) has one bit per voxel. `around` (8,) are the blocks at +0 or +1
-    along each axis. Slice z = 8 is slice 0 of the next block.
+    Here, the corners are the four voxels of the cell in the slice. Slice 8 is slice 0 of the next block. `around` are
+    the eight blocks at offset 0 or +1 along each axis.
     """
     up = 4 * (z >> 3)
     z &= 7
@@ -64,7 +71,7 @@ def _any_and_all(words, around, z):
 
 @device
 def _cell_corners(tsdf, around, x, y, z, corners):
-    """Write the stored distances at the corners of cell (x, y, z) of a block to corners (8,), x fastest."""
+    """Read the stored distances at the eight corners of cell (x, y, z) of a block, x fastest."""
     for c in range(8):
         i, j, k = x + (c & 1), y + ((c >> 1) & 1), z + (c >> 2)
         corners[c] = tsdf[around[(i >> 3) + 2 * (j >> 3) + 4 * (k >> 3)], voxel_number(i, j, k)]
@@ -72,9 +79,9 @@ def _cell_corners(tsdf, around, x, y, z, corners):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_cells(grid, blocks, inside, seen, most_jump, cells):
-    """Pack one bit per cell of the blocks into `cells` (B + 1, 8), 1 = has a vertex.
+    """Find the cells of blocks that have a vertex, as bits (B + 1, 8).
 
-    `most_jump` is MAX_JUMP in stored units.
+    A cell has no vertex if its distances differ by more than `most_jump`, in stored units.
     """
     tsdf = grid.tsdf
     for b in prange(len(blocks)):
@@ -103,7 +110,7 @@ def find_cells(grid, blocks, inside, seen, most_jump, cells):
 
 @njit(cache=True, nogil=True)
 def number_slices(cells, starts):
-    """Write the index of the first vertex of each slice to `starts` (B, 8). Returns the number of vertices."""
+    """Write the index of the first vertex of each slice to `starts` (B, 8), and return the number of vertices."""
     total = 0
     for block in range(len(starts)):
         for z in range(BLOCK_SIDE):
@@ -114,7 +121,7 @@ def number_slices(cells, starts):
 
 @device
 def _crossing(a, b):
-    """Return (1, position of the zero crossing as a fraction from a to b), or (0, 0) if a and b have the same sign."""
+    """Return (1, position between a and b) of a zero crossing, or (0, 0) if there is none."""
     crosses = (a ^ b) < 0
     where = np.float32(a) / np.float32(a - b if crosses else 1)
     return (np.float32(1.0), where) if crosses else (np.float32(0.0), np.float32(0.0))
@@ -122,7 +129,7 @@ def _crossing(a, b):
 
 @device
 def _cell_vertex(corners):
-    """Return the mean zero crossing (x, y, z) of the twelve edges of a cell, in voxels from the first corner."""
+    """Return the mean (x, y, z) of the zero crossings on the edges of a cell, in voxels."""
     x = y = z = crossings = np.float32(0.0)
     for edge in range(4):  # along each axis, at (u, v) along the other two axes
         u, v = np.float32(edge & 1), np.float32(edge >> 1)
@@ -138,10 +145,17 @@ def _cell_vertex(corners):
 
 @njit(cache=True, nogil=True, parallel=True)
 def place_vertices(grid, stale, cells, starts, old_starts, old, vertices, voxels):
-    """Fill vertices (V, 3), m, in the world frame, and their nearest voxels (V,), numbered as in an UnlabeledMesh.
+    """Compute the vertices of stale blocks, and copy all other vertices from the old surface.
 
-    Computes the vertices of blocks with `stale` (B,) True. Copies the others from the `old` surface, in which the first
-    vertices of the slices have the indices `old_starts` (B, 8).
+    Args:
+        grid: The voxel grid.
+        stale: The blocks (B,) to recompute.
+        cells: The cells (B + 1, 8) with a vertex, as bits.
+        starts: The index (B, 8) of the first vertex of each slice.
+        old_starts: The indices (B, 8) in the old surface.
+        old: The old surface.
+        vertices: The output (V, 3) in the world frame, m.
+        voxels: The output (V,), the voxel nearest to each vertex; see UnlabeledMesh.
     """
     tsdf, block_coords, voxel_size = grid.tsdf, grid.block_coords, grid.voxel_size
     half = np.float32(0.5)
@@ -178,10 +192,10 @@ def place_vertices(grid, stale, cells, starts, old_starts, old, vertices, voxels
 
 @device
 def _find_quads(inside, cells, around, before, z):
-    """Return three words for the edges with a quad along x, y and z from the voxels of slice z.
+    """Return the edges with a quad along x, y and z, as bits, from the voxels of slice z.
 
-    An edge has a quad if it changes sign and its four cells have a vertex. `around` and `before` are the block's
-    neighbors on the positive and the negative side.
+    An edge has a quad if its ends have different signs and its four cells have a vertex. `around` and `before` are the
+    neighbors of the block on the positive and the negative side.
     """
     block = around[0]
     here = inside[block, z]
@@ -226,7 +240,7 @@ def count_quads(grid, inside, cells, counts):
 
 @device
 def _vertex(cells, starts, before, x, y, z):
-    """Return the vertex index of cell (x, y, z) of a block. Coordinates of -1 refer to the blocks in `before` (8,)."""
+    """Return the vertex index of cell (x, y, z) of a block, where -1 refers to the previous block."""
     block = before[(x < 0) + 2 * (y < 0) + 4 * (z < 0)]
     n = np.uint64((y & 7) * 8 + (x & 7))
     return starts[block, z & 7] + count_bits(cells[block, z & 7] & ((ONE << n) - ONE))
@@ -234,7 +248,10 @@ def _vertex(cells, starts, before, x, y, z):
 
 @njit(cache=True, nogil=True, parallel=True)
 def write_triangles(grid, inside, cells, starts, quad_starts, counts, triangles):
-    """Write two triangles for each quad to `triangles` (F, 3). The first row of a block is 2 * quad_starts[block]."""
+    """Write two triangles for each quad to `triangles` (F, 3).
+
+    The triangles of a block begin at row 2 * quad_starts[block].
+    """
     for block in prange(len(counts)):
         if counts[block] == 0:
             continue

@@ -1,15 +1,13 @@
-"""Ray casting of a camera view of the map, by sphere tracing through its blocks from coarse to fine.
+"""Ray casting of camera views, from coarse to fine.
 
-1. Project the blocks in view to image tiles. This bounds the depths that the rays of each tile search.
-2. Cast a ray every few pixels. The ray skips absent regions and blocks in one step each and advances by the stored
-   distance. The surface is where the field changes from positive to negative.
-3. If neighboring rays hit the same surface, interpolate the depths of the pixels between them. Refine these depths on
-   the trilinear field by Newton's method, one image row at a time. If this fails, run a full search for the pixel.
+1. The blocks in view are projected to image tiles. This bounds the depth range of the rays in each tile. 2. A coarse
+grid of rays is cast by sphere tracing. Rays skip empty regions and blocks in one step. 3. Depths between neighboring
+rays on one surface are interpolated and refined by Newton's method. If this fails, the pixel is searched individually.
 
-Interpolation could miss a surface that is narrower than the spacing of the coarse rays. Therefore, the spacing is kept
-below the size of the map's details. At depths where the spacing is larger, all pixels are searched.
+The spacing of the coarse rays is smaller than the details of the map, so that interpolation misses no surface. Where
+the spacing is larger, all pixels are searched.
 
-Rays are o + z * d, where the origin o is in voxels, the depth z in m and d in voxels per m.
+Rays are o + z * d. The origin o is in voxels, the depth z in m and the direction d in voxels per m.
 """
 
 from __future__ import annotations
@@ -39,9 +37,9 @@ MAX_STRIDE = 8  # maximum distance between coarse rays, px
 
 
 def tile_bounds(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float32]:
-    """Return the minimum and maximum depth (Y, X), m, of the blocks in view in each tile of TILE x TILE pixels.
+    """Return the minimum and maximum depth (Y, X), m, of the blocks in view in each image tile.
 
-    In a tile without blocks, the minimum is larger than the maximum.
+    If a tile has no blocks, the minimum is larger than the maximum.
     """
     tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
     tile_near, tile_far = np.full(tiles, sensor.max_depth), np.full(tiles, sensor.min_depth)
@@ -57,10 +55,18 @@ def cast_view(
     voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None,
     kind: SensorKind = SensorKind.KINECT_V1,
 ) -> tuple[Float32, Float32]:  # fmt: skip
-    """Return the depth (H, W), m, and the world-frame normals (H, W, 3) of the visible surface; depth 0 = no surface.
+    """Return the depth (H, W), m, and the normals (H, W, 3) of the visible surface.
 
-    With depth `readings` (H, W), m, of a sensor `kind`, only the surface near the readings or in front of them is
-    searched.
+    The depth is 0 where there is no surface.
+
+    Args:
+        voxels: The voxel grid.
+        sensor: The parameters of the volume.
+        camera: The camera of the view.
+        T_world_camera: The camera pose (4, 4).
+        readings: The depth image (H, W), m, of a sensor at this pose. If given, only the surface near or in front of
+            these depths is searched.
+        kind: The sensor that measured `readings`.
     """
     tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
     view = pinhole(camera, T_world_camera)
@@ -81,13 +87,14 @@ def cast_view(
 
 
 def _stride(camera: Camera, voxel_size: float, max_depth: float) -> int:
-    """Return the spacing of coarse rays in px, a power of 2, that resolves the map's details at any depth."""
+    """Return the spacing of the coarse rays, px, a power of 2."""
+    # resolves the details of the map at any depth
     resolved = DETAIL * voxel_size * min(camera.fx, camera.fy) / max_depth
     return 1 << int(np.log2(min(max(resolved, 1.0), MAX_STRIDE)))
 
 
 def render(voxels: VoxelGrid, evidence: Evidence, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> View:
-    """Return the view of the map, with labels, between the minimum and the maximum depth of `sensor`."""
+    """Return the view of the map with labels."""
     surface = render_surface(voxels, sensor, camera, T_world_camera)
     instance_ids = np.empty(camera.shape, np.int32)
     class_ids = np.empty(camera.shape, np.int32)
@@ -99,9 +106,12 @@ def render_surface(
     voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None,
     kind: SensorKind = SensorKind.KINECT_V1,
 ) -> SurfaceView:  # fmt: skip
-    """Return the view without labels; see `cast_view` for `readings` (H, W), m, and `kind`.
+    """Return the view of the map without labels.
 
-    Raises DataError if the camera, its pose or the readings are invalid.
+    See `cast_view` for the arguments.
+
+    Raises:
+        DataError: If the camera, its pose or the readings are invalid.
     """
     check_view(camera, T_world_camera)
     if readings is not None:

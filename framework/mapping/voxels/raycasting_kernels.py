@@ -34,7 +34,7 @@ MAX_SHIFT = 10.0  # maximum distance between a depth reading and the surface of 
 
 @device
 def _ray(view, scale, u, v):
-    """Return (d, step): the ray of pixel (u, v), voxels per m of depth, and the depth step, m, of a voxel along it."""
+    """Return the ray of a pixel, voxels per m of depth, and the depth of one voxel along the ray, m."""
     dx, dy, dz = ray_direction(view, u, v)
     dx, dy, dz = dx * scale, dy * scale, dz * scale
     return (dx, dy, dz), np.float32(1.0) / np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -42,16 +42,15 @@ def _ray(view, scale, u, v):
 
 @device
 def _refined(grid, o, d, step, z, reach, key, region):
-    """Return (z, nx, ny, nz, key, region): the zero of the trilinear field within `reach` m of depth z.
+    """Return (z, nx, ny, nz, key, region) of the zero crossing near depth z.
 
-    The ray is o + z * d, in voxels, and `step` is the depth step, m, of a voxel along it. (nx, ny, nz) is the gradient,
-    stored units per voxel. z is 0 if there is no zero. A zero where the field increases along the ray is a back face
-    and is ignored. See find_block() for `key` and `region`.
+    z is 0 if there is no front face within `reach`, m. The gradient (nx, ny, nz) is in stored units per voxel. See
+    find_block() for `key` and `region`.
     """
     zero = np.float32(0.0)
     nx = ny = nz = zero
     start = z
-    for _ in range(REFINEMENTS):
+    for _ in range(REFINEMENTS):  # Newton's method
         x, y, w = o[0] + z * d[0], o[1] + z * d[1], o[2] + z * d[2]
         i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(w))
         block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
@@ -72,9 +71,9 @@ def _refined(grid, o, d, step, z, reach, key, region):
 
 @device
 def _first_surface(grid, o, d, step, near, far, key, region):
-    """Return (z, nx, ny, nz, key, region) of the first front face between depths `near` and `far`, m; z is 0 if none.
+    """Return (z, nx, ny, nz, key, region) of the first front face between two depths.
 
-    See _refined() for the parameters and the other results.
+    z is 0 if there is no front face. See _refined() for the parameters.
     """
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     to_voxels = grid.tsdf_unit / grid.voxel_size
@@ -115,10 +114,13 @@ def _first_surface(grid, o, d, step, near, far, key, region):
 
 @njit(cache=True, nogil=True)
 def bound_tiles(depths, pixels, tile_near, tile_far):
-    """Extend the depth bounds tile_near and tile_far (Y, X), m, of the tiles to include N blocks.
+    """Extend the depth bounds of the tiles to include the given blocks.
 
-    `depths` (N, 2), m, are the minimum and maximum depths of the blocks. `pixels` (N, 4) are their windows u0, u1, v0,
-    v1, inclusive.
+    Args:
+        depths: The minimum and maximum depth (N, 2) of each block, m.
+        pixels: The pixel window (N, 4) of each block: u0, u1, v0, v1, inclusive.
+        tile_near: The minimum depth (Y, X) of each tile, m, modified in place.
+        tile_far: The maximum depth (Y, X) of each tile, m, modified in place.
     """
     for n in range(depths.shape[0]):
         u0, u1, v0, v1 = pixels[n]
@@ -130,10 +132,16 @@ def bound_tiles(depths, pixels, tile_near, tile_far):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
-    """Fill `depth` (m) at every stride-th pixel, and in the last row and column of an image, by a full search.
+    """Cast a ray at every stride-th pixel, and in the last row and column of the image.
 
-    `shape` is (H, W). `depth` is (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1), 0 = no surface. `view`
-    contains T_world_camera.
+    Args:
+        grid: The voxel grid.
+        view: The camera with the pose T_world_camera.
+        tile_near: The minimum depth (Y, X) of each tile, m.
+        tile_far: The maximum depth (Y, X) of each tile, m.
+        stride: The spacing of the rays, px.
+        shape: The height and width of the image.
+        depth: The output (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1), m, 0 = no surface.
     """
     scale = np.float32(1.0) / grid.voxel_size
     for y in prange(depth.shape[0]):
@@ -150,11 +158,20 @@ def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
 
 @device
 def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near, far, corners):
-    """Bound the search in the cells (X,) of pixels between two rows of coarse depths (X + 1,), m, -1 = not searched.
+    """Find the depth range to search in each cell between two rows of coarse rays.
 
-    Sets near and far (X,) to the depth range, m, of a surface in the cell; far 0 = no surface. Sets corners (4, X) to
-    the inverse depths of the surface, 1 / m, in row order, if the cell has exactly one surface, otherwise to 0.
-    `resolved` is the maximum depth, m, at which coarse rays resolve all details, and `voxel` is the voxel size, m.
+    Args:
+        above: The depths (X + 1,) of the upper rays, m, -1 = not searched.
+        below: The depths (X + 1,) of the lower rays, m, -1 = not searched.
+        row_near: The minimum depth of each tile in this image row, m.
+        row_far: The maximum depth of each tile in this image row, m.
+        stride: The spacing of the rays, px.
+        voxel: The voxel size, m.
+        resolved: The maximum depth at which the rays resolve all details, m.
+        near: The output (X,), the minimum depth of each cell, m.
+        far: The output (X,), the maximum depth of each cell, m, 0 = no surface.
+        corners: The output (4, X), the inverse depths of the surface, 1 / m, in row order. They are 0 unless the cell
+            has exactly one surface.
     """
     zero, one, none = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
     margin, rise = np.float32(MARGIN) * voxel, np.float32(STEEPEST) * voxel
@@ -191,9 +208,9 @@ def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near
 
 @device
 def _start_row(corners, b, stride, limits, depth):
-    """Fill depth (W,), m, by interpolation between the corners (4, X) of the cells; 0 = unknown.
+    """Interpolate the depths (W,) of an image row between the corners of its cells, 0 = unknown.
 
-    `b` is the vertical position between the upper corners (0) and the lower corners (1).
+    The vertical position `b` is 0 at the upper corners and 1 at the lower corners.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     width = depth.shape[0]
@@ -209,10 +226,18 @@ def _start_row(corners, b, stride, limits, depth):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, normals):
-    """Fill depth (H, W), m, and world-frame normals (H, W, 3) of the visible surface; 0 = none.
+    """Compute the depth and the normal of the visible surface at every pixel.
 
-    `view` contains T_world_camera. `coarse` is the result of cast_coarse() or cast_near(). No pixel is searched beyond
-    its depth in `limits` (H, W), m. Normals are the normalized gradients of the trilinear field.
+    Args:
+        grid: The voxel grid.
+        view: The camera with the pose T_world_camera.
+        tile_near: The minimum depth (Y, X) of each tile, m.
+        tile_far: The maximum depth (Y, X) of each tile, m.
+        limits: The maximum depth (H, W) of each pixel, m.
+        stride: The spacing of the coarse rays, px.
+        coarse: The depths of the coarse rays, from cast_coarse() or cast_near().
+        depth: The output (H, W), m, 0 = no surface.
+        normals: The output (H, W, 3) in the world frame, the normalized gradients of the field.
     """
     height, width = depth.shape
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -262,13 +287,20 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, depth):
-    """Fill `depth` as cast_coarse() does, but start the search at the camera's depth readings (H, W), m.
+    """Cast the rays of cast_coarse(), starting at the depth readings of a sensor.
 
-    No pixel is searched beyond its depth in `limits` (H, W), m. If the limit is 0, the depth is -1 (not searched),
-    because neighboring pixels may still be searched. `noise` contains the depth noise parameters of the sensor.
+    Pixels with a limit of 0 are not searched. Their depth is -1.
 
-    Depth readings are noisy, and a wrong pose displaces them. Therefore, the search starts at the extrapolation of the
-    two previous rays if the reading agrees with it. Otherwise it starts at the reading plus the last displacement.
+    Args:
+        grid: The voxel grid.
+        view: The camera with the pose T_world_camera.
+        tile_near: The minimum depth (Y, X) of each tile, m.
+        tile_far: The maximum depth (Y, X) of each tile, m.
+        limits: The maximum depth (H, W) of each pixel, m.
+        stride: The spacing of the rays, px.
+        readings: The depth readings (H, W), m.
+        noise: The depth noise parameters of the sensor.
+        depth: The output, as in cast_coarse().
     """
     height, width = readings.shape
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -286,6 +318,8 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, 
             reading = readings[v, u]
             if limits[v, u] > zero:
                 d, step = _ray(view, scale, u, v)
+                # Readings are noisy and displaced by pose errors. Start at the extrapolation of the two previous rays
+                # if it agrees with the reading.
                 start = reading + shift
                 reach = np.float32(REACH) * voxel + np.float32(3.0) * axial_sigma_single(reading, noise)
                 if last_but_one > zero and last > zero:
@@ -305,9 +339,9 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def paint(grid, view, depth, color):
-    """Fill color (H, W, 3), RGB, with the color of the map at the surface at `depth` (H, W), m.
+    """Fill the colors (H, W, 3), RGB, of the surface at the given depths (H, W), m.
 
-    `view` contains T_world_camera.
+    The pose in `view` is T_world_camera.
     """
     height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size
@@ -321,7 +355,10 @@ def paint(grid, view, depth, color):
 
 @device
 def voxel_seen(grid, view, u, v, z, key, region):
-    """Return (block, index, key, region) of the voxel nearest to pixel (u, v) at depth z, m; see find_block()."""
+    """Return (block, index, key, region) of the voxel nearest to pixel (u, v) at depth z, m.
+
+    See find_block() for `key` and `region`.
+    """
     scale = np.float32(1.0) / grid.voxel_size
     half = np.float32(0.5)
     x, y, w = seen_point(view, u, v, z)
@@ -334,9 +371,15 @@ def voxel_seen(grid, view, u, v, z, key, region):
 
 @njit(cache=True, nogil=True, parallel=True)
 def label(grid, evidence, view, depth, instance_ids, class_ids):
-    """Fill instance_ids, 0 = none, and class_ids, -1 = none, (H, W) from the voxels nearest to the surface.
+    """Fill the instance and class of each pixel from the voxel nearest to the surface.
 
-    The surface is at `depth` (H, W), m. `view` contains T_world_camera.
+    Args:
+        grid: The voxel grid.
+        evidence: The label evidence.
+        view: The camera with the pose T_world_camera.
+        depth: The depth (H, W) of the surface, m.
+        instance_ids: The output (H, W), 0 = none.
+        class_ids: The output (H, W), -1 = none.
     """
     height, width = depth.shape
     for v in prange(height):

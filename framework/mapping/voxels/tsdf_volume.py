@@ -1,4 +1,4 @@
-"""TSDF volume with integration, surface extraction, ray casting and serialization, and its parameters."""
+"""TSDF volume and its parameters."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NO_BLOCKS = np.zeros(0, np.int32)
 
 
 class TsdfVolume:
-    """A TSDF: voxels, their integrator and their cached surface."""
+    """A TSDF volume: voxels, integration, surface, ray casting and saving."""
 
     def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int) -> None:
         self.sensor = sensor
@@ -52,9 +52,15 @@ class TsdfVolume:
         return self.voxels.block_count * BLOCK_VOXELS
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near: float) -> SeenBlocks:
-        """Integrate one frame, and return the updated blocks and their voxels within `near` m of the surface.
+        """Integrate one frame, and return the updated blocks and their voxels near the measured surface.
 
-        Raises MapFullError if the block budget is reached; in this case the frame is not integrated.
+        Args:
+            frame: The frame.
+            T_world_camera: The camera pose (4, 4).
+            near: The maximum distance of the listed voxels from the measured surface, m.
+
+        Raises:
+            MapFullError: If the map needs too many blocks. The frame is then not integrated.
         """
         seen = self.integrator.integrate(frame, T_world_camera, near)
         self.gravity_estimator.add_frame(T_world_camera, frame.up)
@@ -62,11 +68,11 @@ class TsdfVolume:
         return seen
 
     def renew_colors(self) -> None:
-        """Mark all colors as outdated, so that the next observation of each voxel replaces its color."""
+        """Replace the color of each voxel by its next observation."""
         mark_outdated(self.voxels.grid.color, self.voxels.block_count)
 
     def changed(self, blocks: Int32 | None = None) -> None:
-        """Invalidate derived data after a change of the voxels in `blocks` (A,); None = in any block."""
+        """Invalidate the cached surface after a change of voxels in the given blocks, None = any block."""
         self._mesh = self._gravity = None
         if blocks is None:
             self._nets = None
@@ -79,14 +85,14 @@ class TsdfVolume:
         return self._nets.extract()
 
     def gravity(self) -> Gravity:
-        """Return the direction of gravity; cached until the volume changes."""
+        """Return the gravity direction, cached until the volume changes."""
         if self._gravity is None:
             surface = self.surface()
             self._gravity = self.gravity_estimator.estimate(surface.vertices, surface.triangles)
         return self._gravity
 
     def mesh(self, label: Callable[[UnlabeledMesh], InstanceMesh]) -> InstanceMesh:
-        """Return the current surface, labeled by `label`; cached until the volume changes."""
+        """Return the surface with the labels from `label`, cached until the volume changes."""
         if self._mesh is None:
             self._mesh = label(self.surface())
         return self._mesh
@@ -100,7 +106,7 @@ class TsdfVolume:
         return render_surface(self.voxels, self.sensor, camera, T_world_camera, depth, sensor)
 
     def saved(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """Return the entries for the header of a map file, and the arrays."""
+        """Return the header entries and the arrays for a map file."""
         b = self.voxels.block_count
         header = {
             "voxel_size": self.voxel_size,
@@ -113,7 +119,16 @@ class TsdfVolume:
 
     @classmethod
     def load(cls, header: MapHeader, arrays: dict[str, Any], rows: int) -> TsdfVolume:
-        """Return the volume of a map file with `rows` evidence rows. Raises DataError if the file is invalid."""
+        """Return the volume in a map file.
+
+        Args:
+            header: The header of the file.
+            arrays: The arrays of the file.
+            rows: The number of evidence rows in the file.
+
+        Raises:
+            DataError: If the file is invalid.
+        """
         saved = header.part("sensor")
         sensor = Sensor(**{name: np.float32(saved.number(name, BOUNDS[name])) for name in Sensor._fields})
         max_blocks = header.whole("max_blocks", 1, MAX_BLOCKS)
@@ -126,7 +141,10 @@ class TsdfVolume:
         return volume
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Copy the arrays of a map file into an empty volume. The caller checks their types and shapes first."""
+        """Copy the arrays of a map file into this empty volume.
+
+        The caller must check their types and shapes.
+        """
         coords = arrays["block_coords"]
         check_blocks(coords)
         self.voxels.allocate(coords)
@@ -138,7 +156,7 @@ class TsdfVolume:
 
 @dataclass
 class Tsdf:
-    """Parameters of a truncated signed distance field with labels near the measured surface."""
+    """Parameters of a TSDF with labels near the measured surface."""
 
     voxel_size: float = 0.01  # side of a voxel, m, > 0
     truncation: float = 4.0  # truncation distance at depth 0, in voxels, in [1, 100]
@@ -160,7 +178,7 @@ class Tsdf:
 
 @dataclass
 class VoxelHashing:
-    """Parameters of a truncated signed distance field in voxel blocks."""
+    """Parameters of a TSDF in voxel blocks."""
 
     tsdf: Tsdf = field(default_factory=Tsdf)
     truncation_slope: float = 0.01  # increase of the truncation distance with depth, m per m, >= 0

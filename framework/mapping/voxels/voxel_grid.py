@@ -1,15 +1,14 @@
-"""Voxel hashing: blocks of 8^3 voxels in a hash table, allocated near observed surfaces.
+"""Voxel hashing: blocks of 8^3 voxels, allocated near observed surfaces.
 
-The method is that of Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing" (2013). The hash table
-holds regions of 8^3 blocks. A region is a dense table of block indices. Neighboring look-ups along a ray or a row of
-voxels are usually in the same region. Therefore, nearly all look-ups cost one comparison and one load, and a ray skips
-an unmapped region in one step.
+The method follows Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing" (2013). The hash table
+contains regions of 8^3 blocks, and each region is a dense table of block indices. Successive look-ups are usually in
+the same region, so most of them do not access the hash table. Rays skip an empty region in one step.
 
-Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory, x varies fastest: voxel
-(x, y, z) of a block has the index (z * 8 + y) * 8 + x.
+Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. Voxel (x, y, z) of a block has the index (z
+* 8 + y) * 8 + x.
 
-A voxel takes 8 bytes (distance 2, weight 2, color 4), and 8.15 bytes including the tables of blocks and regions. Label
-evidence takes additional memory; see evidence_rows.py.
+A voxel takes 8 bytes: 2 for the distance, 2 for the weight and 4 for the color. Label evidence takes additional memory;
+see evidence_rows.py.
 """
 
 from __future__ import annotations
@@ -39,9 +38,9 @@ FIRST_RESERVED = 1024  # initial capacity, blocks or voxels
 
 
 class Grid(NamedTuple):
-    """The arrays of a VoxelGrid for the kernels.
+    """The arrays of a VoxelGrid.
 
-    B (blocks) and S (regions) are capacities; only the first entries are in use.
+    B and S are the capacities for blocks and regions. Only the first entries are in use.
     """
 
     voxel_size: np.float32  # m
@@ -63,7 +62,6 @@ OF_BLOCKS = Grid._fields[Grid._fields.index("block_coords") :]  # fields of shap
 
 
 def _free_blocks(count: int) -> dict[str, Any]:
-    """Return the arrays OF_BLOCKS for `count` blocks."""
     return {
         "block_coords": np.empty((count, 3), np.int32),
         "neighbors": np.empty((count, 8), np.int32),
@@ -76,9 +74,10 @@ def _free_blocks(count: int) -> dict[str, Any]:
 
 
 def reserved(most: int, make: Callable[[int], Made]) -> Made:
-    """Return the uninitialized arrays make(most), which take no memory until written and never need to grow.
+    """Return make(most), which should allocate uninitialized arrays with enough rows to never grow.
 
-    With limited address space (Windows, `ulimit -v`, no overcommit), return make(FIRST_RESERVED), which can grow.
+    Uninitialized arrays take no memory until they are written. If the address space is limited (Windows, `ulimit -v`),
+    return smaller arrays, which can grow.
     """
     first = min(most, FIRST_RESERVED)
     if resource is None or resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
@@ -90,7 +89,10 @@ def reserved(most: int, make: Callable[[int], Made]) -> Made:
 
 
 class VoxelGrid:
-    """Voxel grid with growing arrays. The kernels modify `self.grid`."""
+    """A growing voxel grid.
+
+    The kernels modify its `grid`.
+    """
 
     def __init__(self, voxel_size: float, max_truncation: float, max_blocks: int) -> None:
         self.max_blocks = max_blocks
@@ -120,9 +122,12 @@ class VoxelGrid:
         return int(grid.table_keys.nbytes + grid.table_regions.nbytes + regions + blocks)
 
     def allocate(self, coords: Int32) -> Int32:
-        """Return the block indices (N,) at block coordinates (N, 3). Missing blocks are allocated in the given order.
+        """Return the block indices (N,) at block coordinates (N, 3).
 
-        Raises MapFullError if more than `max_blocks` are needed; blocks allocated before the error remain.
+        Missing blocks are allocated in the given order.
+
+        Raises:
+            MapFullError: If more than `max_blocks` are needed. Blocks allocated before the error remain.
         """
         done, blocks = 0, np.empty(len(coords), np.int32)
         while True:
@@ -160,7 +165,10 @@ class VoxelGrid:
 
 
 def grown(array: npt.NDArray[Element], length: int, zeros: bool = False) -> npt.NDArray[Element]:
-    """Return a copy of `array` with `length` rows. New rows are uninitialized, or 0 if `zeros` is True."""
+    """Return a copy of an array with `length` rows.
+
+    New rows are uninitialized, or 0 if `zeros` is True.
+    """
     longer = (np.zeros if zeros else np.empty)((length, *array.shape[1:]), array.dtype)
     longer[: len(array)] = array
     return longer

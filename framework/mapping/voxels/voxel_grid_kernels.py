@@ -18,7 +18,8 @@ device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nr
 
 @device
 def one_more(count, condition):
-    """Return count + condition as int32. Numba would add in 64 bits, so that half as many numbers fit into a vector."""
+    """Return count + 1 if the condition is True, otherwise count."""
+    # int32, because Numba would add in 64 bits, and half as many numbers would fit into a vector
     return np.int32(count + (np.int32(1) if condition else np.int32(0)))
 
 
@@ -30,7 +31,10 @@ _KEY_MASK = (1 << _KEY_BITS) - 1
 
 @device
 def pack_key(x, y, z):
-    """Return the key, >= 0, of the coordinates (x, y, z) of a region or a block, each in [-2^20, 2^20)."""
+    """Return the key of the coordinates of a region or a block.
+
+    Coordinates are in [-2^20, 2^20). Keys are nonnegative.
+    """
     return (
         ((np.int64(x) + _KEY_OFFSET) & _KEY_MASK) << (2 * _KEY_BITS)
         | ((np.int64(y) + _KEY_OFFSET) & _KEY_MASK) << _KEY_BITS
@@ -50,17 +54,17 @@ def unpack_key(key):
 
 @device
 def _slot(key, size):
-    """Return the first slot for `key` in a table of `size` slots (Fibonacci hashing)."""
+    """Return the first slot to probe for a key in a hash table (Fibonacci hashing)."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64(mixed >> np.uint64(32)) & (size - 1)
 
 
 @device
 def find_region(grid, key):
-    """Return the index of the region with this key by linear probing, -1 = none."""
+    """Return the index of the region with the given key, -1 = none."""
     size = grid.table_keys.shape[0]
     slot = _slot(key, size)
-    while True:
+    while True:  # linear probing
         found = grid.table_keys[slot]
         if found == key:
             return grid.table_regions[slot]
@@ -77,9 +81,10 @@ def child_number(bx, by, bz):
 
 @device
 def find_block(grid, bx, by, bz, last_key, last_region):
-    """Return (block, key, region) at block coordinates (bx, by, bz); block -1 = not allocated, region -1 = none.
+    """Return (block, key, region) at block coordinates (bx, by, bz).
 
-    `last_key` and `last_region` come from the previous call. This cache makes look-ups in the same region fast.
+    The block is -1 if it is not allocated, and the region is -1 if it does not exist. Pass the key and the region of
+    the previous call. Look-ups in the same region are then fast.
     """
     key = pack_key(bx >> 3, by >> 3, bz >> 3)
     if key != last_key:
@@ -91,10 +96,10 @@ def find_block(grid, bx, by, bz, last_key, last_region):
 
 @njit(cache=True, nogil=True)
 def insert_blocks(grid, coords, start, region_count, block_count, blocks):
-    """Allocate the new blocks of coords[start:] in order, and write the index of each block to blocks (N,).
+    """Allocate the blocks at the given coordinates, from index `start` on, and write their indices to `blocks` (N,).
 
-    Returns (next, region_count, block_count). If next < len(coords), a capacity is exhausted: grow the arrays and call
-    again.
+    Returns (next, region_count, block_count). If `next` is less than the number of coordinates, the arrays are full.
+    The caller then grows the arrays and calls the function again.
     """
     size = grid.table_keys.shape[0]
     region, last_key = np.int32(-1), np.int64(NO_KEY)
@@ -139,7 +144,6 @@ def insert_blocks(grid, coords, start, region_count, block_count, blocks):
 
 @njit(cache=True, nogil=True)
 def _link_neighbors(grid, block):
-    """Link a new block and its neighbors."""
     bx, by, bz = grid.block_coords[block, 0], grid.block_coords[block, 1], grid.block_coords[block, 2]
     key, region = NO_LOOK_UP
     for c in range(8):
@@ -151,7 +155,7 @@ def _link_neighbors(grid, block):
             grid.neighbors[before, c] = block
 
 
-# NumPy scalars and casts, because otherwise numba computes in 64 bits and half as many numbers fit into a vector
+# NumPy scalars, because Numba would compute in 64 bits, and half as many numbers would fit into a vector
 _CHANNEL = np.int32(1023)
 _GREEN = np.int32(10)
 _BLUE = np.int32(20)
@@ -161,13 +165,14 @@ OUTDATED = np.uint32(1 << 31)  # marker bit of a color that the next observation
 
 @device
 def pack_color(red, green, blue):
-    """Return a packed color from channels in quarters of an 8-bit level, 0 to 1020. Ten bits let averages converge."""
+    """Return a packed color from channels in [0, 1020], i.e. quarters of an 8-bit level."""
+    # ten bits per channel, because averages of 8-bit levels would not converge
     return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE) | COLORED
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def mark_outdated(color, blocks):
-    """Mark the packed colors (B, 512) of the first `blocks` blocks as outdated."""
+    """Mark the packed colors (B, 512) of the first blocks as outdated."""
     for block in prange(blocks):
         for n in range(BLOCK_VOXELS):
             packed = color[block, n]
@@ -176,7 +181,7 @@ def mark_outdated(color, blocks):
 
 @device
 def unpack_color(packed):
-    """Return (red, green, blue), float32, in quarters of an 8-bit level."""
+    """Return the channels (red, green, blue) of a packed color, in quarters of an 8-bit level."""
     bits = np.int32(packed)
     return (
         np.float32(np.int32(bits & _CHANNEL)),
@@ -187,7 +192,7 @@ def unpack_color(packed):
 
 @device
 def is_solid(tsdf):
-    """Return True if an observed voxel of a block with distances tsdf (512,) is behind a surface."""
+    """Return True if any observed voxel of a block is behind a surface."""
     lowest = np.int16(0)
     for n in range(BLOCK_VOXELS):
         stored = tsdf[n]
@@ -197,7 +202,7 @@ def is_solid(tsdf):
 
 @njit(cache=True, nogil=True)
 def find_solid_blocks(grid, block_count):
-    """Set grid.solid of the first `block_count` blocks from their distances."""
+    """Find the blocks with a voxel behind a surface, among the first `block_count` blocks."""
     for block in range(block_count):
         grid.solid[block] = is_solid(grid.tsdf[block])
 

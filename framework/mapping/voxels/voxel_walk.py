@@ -1,8 +1,7 @@
-"""Device functions that read the voxel grid: rays, cell borders, trilinear fields, and memory prefetch.
+"""Device functions for rays, trilinear interpolation and prefetching in the voxel grid.
 
-Functions for a whole image row work in passes that the compiler vectorizes. Look-ups branch and wait for memory, while
-arithmetic does not. Therefore, one pass gathers the eight corners of each point with many concurrent loads. Another
-pass does the arithmetic for eight pixels at a time. The last axis of their arrays is the pixel.
+Functions for a whole image row first gather the eight corners of every point, and then do the arithmetic. The compiler
+can vectorize the arithmetic because it does not branch. The last axis of these arrays is the pixel.
 """
 
 from __future__ import annotations
@@ -23,7 +22,10 @@ _READ, _L2, _DATA = 0, 2, 1  # arguments of llvm.prefetch: for reading, into the
 
 @device
 def ray_direction(view, u, v):
-    """Return the world-frame ray (dx, dy, dz) of pixel (u, v), m per m of depth. `view` contains T_world_camera."""
+    """Return the world-frame ray (dx, dy, dz) of a pixel, scaled to unit depth.
+
+    The pose in `view` is T_world_camera.
+    """
     ray_x = (np.float32(u) - view.cx) / view.fx
     ray_y = (np.float32(v) - view.cy) / view.fy
     return (
@@ -35,14 +37,17 @@ def ray_direction(view, u, v):
 
 @device
 def seen_point(view, u, v, z):
-    """Return the world point (x, y, z), m, of pixel (u, v) at depth z, m. `view` contains T_world_camera."""
+    """Return the world point (x, y, z), m, of pixel (u, v) at depth z, m.
+
+    The pose in `view` is T_world_camera.
+    """
     dx, dy, dz = ray_direction(view, u, v)
     return view.t[0] + z * dx, view.t[1] + z * dy, view.t[2] + z * dz
 
 
 @device
 def _leave_slab(z, start, d, inverse_d, size, inverse_size):
-    """Return the parameter at which the ray leaves its cell along one axis; see leave_cell()."""
+    """Return the ray parameter at which the ray leaves its cell along one axis."""
     cell = np.floor((start + z * d) * inverse_size)
     # not the sign of d: a ray parallel to the slab has a huge inverse_d and leaves the slab far away
     if inverse_d > np.float32(0.0):
@@ -52,9 +57,15 @@ def _leave_slab(z, start, d, inverse_d, size, inverse_size):
 
 @device
 def leave_cell(z, start, d, inverse_d, size, inverse_size):
-    """Return the parameter at which the ray start + z * d leaves the grid cell that contains its point at z.
+    """Return the ray parameter at which a ray leaves the grid cell that contains it at z.
 
-    Cells have the side `size`. `start`, `d` and `inverse_d` are triples. `inverse_d` is 1 / d, a huge number if d is 0.
+    Args:
+        z: The ray parameter of a point in the cell.
+        start: The origin of the ray, a triple.
+        d: The direction of the ray, a triple.
+        inverse_d: The inverse of each component of `d`; see inverses().
+        size: The side of a cell.
+        inverse_size: The inverse of `size`.
     """
     exit_x = _leave_slab(z, start[0], d[0], inverse_d[0], size, inverse_size)
     exit_y = _leave_slab(z, start[1], d[1], inverse_d[1], size, inverse_size)
@@ -64,7 +75,10 @@ def leave_cell(z, start, d, inverse_d, size, inverse_size):
 
 @device
 def inverses(d):
-    """Return 1 / d for each entry of a triple; entries near 0 are replaced by a tiny value."""
+    """Return the inverse of each entry of a triple.
+
+    Entries near 0 are replaced by a tiny value.
+    """
     tiny = np.float32(1e-12)
     x = d[0] if abs(d[0]) > tiny else tiny
     y = d[1] if abs(d[1]) > tiny else tiny
@@ -80,14 +94,24 @@ def voxel_number(i, j, k):
 
 @device
 def _of_neighbor(grid, values, block, neighbor, n, missing):
-    """Return entry n of values (B, 512) of a block's neighbor, or `missing` if the neighbor is absent."""
+    """Return entry n of the values of a neighboring block, or `missing` if the block is not allocated."""
     there = grid.neighbors[np.uint32(block), np.uint32(neighbor)]
     return values[np.uint32(there), np.uint32(n)] if there >= 0 else missing
 
 
 @device
 def corners(grid, values, block, i, j, k, missing):
-    """Return the `values` (B, 512) of the eight voxels (i, j, k) + {0, 1}^3, x fastest; `block` contains (i, j, k)."""
+    """Return the values of the eight voxels at the corners of a cell, x fastest.
+
+    Args:
+        grid: The voxel grid.
+        values: One value (B, 512) per voxel.
+        block: The block that contains voxel (i, j, k).
+        i: The first index of the first corner.
+        j: The second index of the first corner.
+        k: The third index of the first corner.
+        missing: The value of voxels in blocks that are not allocated.
+    """
     x, y, z = i & 7, j & 7, k & 7
     n = (z * 8 + y) * 8 + x
     here = np.uint32(block)
@@ -102,7 +126,7 @@ def corners(grid, values, block, i, j, k, missing):
             values[here, np.uint32(n + 72)],
             values[here, np.uint32(n + 73)],
         )
-    # the carry of a coordinate into the next block is the bit of this coordinate in the neighbor's index
+    # neighbor index: bit 0, 1 or 2 is set if x, y or z is in the next block
     next_x, next_y, next_z = (x + 1) & 7, ((y + 1) & 7) * 8, ((z + 1) & 7) * 64
     over_x, over_y, over_z = (x + 1) >> 3, ((y + 1) >> 3) << 1, ((z + 1) >> 3) << 2
     y *= 8
@@ -121,9 +145,9 @@ def corners(grid, values, block, i, j, k, missing):
 
 @device
 def interpolate(s, fx, fy, fz):
-    """Return (value, d/dx, d/dy, d/dz) at fractions (fx, fy, fz) of a voxel between eight corners `s`, x fastest.
+    """Return the trilinear interpolation between eight corners, and its three derivatives per voxel.
 
-    The derivatives are per voxel.
+    The corners `s` are ordered with x fastest. The position (fx, fy, fz) is a fraction of a voxel.
     """
     x00, x10, x01, x11 = np.float32(s[0]), np.float32(s[2]), np.float32(s[4]), np.float32(s[6])
     dx00, dx10 = np.float32(s[1]) - x00, np.float32(s[3]) - x10
@@ -140,16 +164,16 @@ def interpolate(s, fx, fy, fz):
 
 @device
 def all_seen(s):
-    """Return True if all eight voxels with the stored distances `s` were observed."""
+    """Return True if all eight voxels were observed, given their stored distances."""
     return min(min(min(s[0], s[1]), min(s[2], s[3])), min(min(s[4], s[5]), min(s[6], s[7]))) != UNSEEN
 
 
 @device
 def trilinear(grid, block, x, y, z):
-    """Return (value, d/dx, d/dy, d/dz, valid): the distance and its gradient at (x, y, z), voxels, in stored units.
+    """Return (distance, d/dx, d/dy, d/dz, valid) at a point, in stored units.
 
-    `block` contains the voxel at the floor of the point. The result is valid if all eight voxels around the point were
-    observed.
+    The point is in voxels, and `block` contains the voxel at its floor. The result is valid if all eight voxels around
+    the point were observed.
     """
     i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z))
     s = corners(grid, grid.tsdf, block, i, j, k, np.int16(UNSEEN))
@@ -159,7 +183,7 @@ def trilinear(grid, block, x, y, z):
 
 @device
 def _add_color(red, green, blue, total, packed, weight):
-    """Return the sums after adding a packed color and its weight. A voxel without a color adds nothing."""
+    """Add a packed color and its weight to the sums, unless the voxel has no color."""
     weight = weight if packed & COLORED else np.float32(0.0)
     r, g, b = unpack_color(packed)
     return red + weight * r, green + weight * g, blue + weight * b, total + weight
@@ -167,9 +191,9 @@ def _add_color(red, green, blue, total, packed, weight):
 
 @device
 def blend(p, x1, y1, z1):
-    """Return (red, green, blue) in [0, 255] at fractions (x1, y1, z1) of a voxel between eight packed colors.
+    """Return the trilinear interpolation (red, green, blue), in [0, 255], between eight packed colors.
 
-    Voxels without a color are ignored.
+    The position (x1, y1, z1) is a fraction of a voxel. Voxels without a color are ignored.
     """
     one, zero = np.float32(1.0), np.float32(0.0)
     x0, y0, z0 = one - x1, one - y1, one - z1
@@ -187,7 +211,7 @@ def blend(p, x1, y1, z1):
 
 @intrinsic
 def prefetch_line(_typing_context: Any, array: Any, offset: Any) -> Any:
-    """Prefetch the cache line at `offset` bytes after the first element of an array."""
+    """Prefetch the cache line that contains the byte at `offset` in an array."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         byte, int32 = ir.IntType(8), ir.IntType(32)
@@ -218,9 +242,9 @@ def prefetch_row(array, row):
 
 @device
 def directions(view, scale, v):
-    """Return the world-frame ray of pixel (0, v), voxels per m of depth, and its change per pixel.
+    """Return the world-frame ray of pixel (0, v) and its change per pixel, in voxels per m of depth.
 
-    `scale` is in voxels per m, and `view` contains T_world_camera.
+    The scale is in voxels per m. The pose in `view` is T_world_camera.
     """
     x, y, z = ray_direction(view, 0, v)
     # not the difference of two rays, because its rounding error would accumulate along the row
@@ -230,9 +254,14 @@ def directions(view, scale, v):
 
 @device
 def points_of_row(view, scale, v, depth, points):
-    """Fill `points` (3, W), world frame, in voxels, with the points of image row v at `depth` (W,), m.
+    """Compute the world points of an image row, in voxels, from its depths.
 
-    `scale` is in voxels per m, and `view` contains T_world_camera.
+    Args:
+        view: The camera with the pose T_world_camera.
+        scale: The number of voxels per m.
+        v: The image row.
+        depth: The depths (W,), m.
+        points: The output (3, W).
     """
     origin, change = directions(view, scale, v)
     tx, ty, tz = view.t[0] * scale, view.t[1] * scale, view.t[2] * scale
@@ -246,9 +275,15 @@ def points_of_row(view, scale, v, depth, points):
 
 @device
 def gather_corners(grid, values, depth, points, missing, found):
-    """Fill found (8, W) with `values` (B, 512) of the eight voxels around each point (3, W).
+    """Gather the values of the eight voxels around each point of an image row.
 
-    Values are `missing` where no block is allocated or the pixel has no depth.
+    Args:
+        grid: The voxel grid.
+        values: One value (B, 512) per voxel.
+        depth: The depths (W,) of the pixels, 0 = no depth.
+        points: The points (3, W), in voxels.
+        missing: The value if the block is not allocated or the pixel has no depth.
+        found: The output (8, W).
     """
     key, region = NO_LOOK_UP
     for n in range(depth.shape[0]):
@@ -272,11 +307,22 @@ def gather_corners(grid, values, depth, points, missing, found):
 
 @device
 def step_to_surface(view, scale, v, found, points, converged, reach, limits, depth, normals):
-    """Move each depth (W,), m, by one Newton step along its ray to the zero of the trilinear field.
+    """Move the depths of an image row by one Newton step toward the surface.
 
-    `found` (8, W) holds the distances around `points` (3, W). A depth becomes 0 if the field is unknown, if it does not
-    decrease along the ray, or if the zero is farther than `reach` voxels or beyond `limits` (W,), m. A depth is negated
-    if the step is longer than `converged` voxels. Sets normals (3, W) to the normalized gradients.
+    A depth becomes 0 if the field is unknown or does not decrease along the ray. The depth also becomes 0 if the
+    surface is too far away. A depth that has not converged is negated.
+
+    Args:
+        view: The camera with the pose T_world_camera.
+        scale: The number of voxels per m.
+        v: The image row.
+        found: The stored distances (8, W) around the points.
+        points: The points (3, W) at the depths, in voxels.
+        converged: The maximum length of the last step, voxels.
+        reach: The maximum length of a step, voxels.
+        limits: The maximum depths (W,), m.
+        depth: The depths (W,), m, modified in place.
+        normals: The output (3, W), the normalized gradients.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     origin, change = directions(view, scale, v)
@@ -301,9 +347,12 @@ def step_to_surface(view, scale, v, found, points, converged, reach, limits, dep
 
 @device
 def blend_colors(found, points, color):
-    """Fill color (W, 3), RGB, by interpolation between the packed colors `found` (8, W) around `points` (3, W).
+    """Interpolate the colors of an image row between the voxels around each point.
 
-    `points`, in voxels, is overwritten.
+    Args:
+        found: The packed colors (8, W) around the points.
+        points: The points (3, W), in voxels. They are overwritten.
+        color: The output (W, 3), RGB.
     """
     half = np.float32(0.5)
     for n in range(points.shape[1]):

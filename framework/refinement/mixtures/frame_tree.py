@@ -1,9 +1,9 @@
-"""Tree of Gaussian mixtures over all masks of a frame, our first interpretation of section 3.2.2 of the paper.
+"""Tree of Gaussian mixtures over all masks of a frame.
 
-Level 1 has one Gaussian per mask, and a point is initially assigned to the Gaussian of its mask. Every further level
-splits each node into children, which are fitted to the node's own points. A point belongs to the mask of its most
-probable leaf. The split and the number of levels are our choice, because the paper names a hierarchical EM algorithm
-without these details.
+This is our first interpretation of section 3.2.2 of the paper. The first level has one Gaussian per mask, which is
+fitted with the points of the mask as initial responsibilities. Every further level splits each node into children,
+which are fitted to the points of the node. A point belongs to the mask of its most probable leaf. The paper names a
+hierarchical EM algorithm, but neither the split nor the number of levels.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MIN_SPLIT_POINTS = 32  # minimum number of points of a node to be split
 
 
 class Initialization(Enum):
-    """Initial responsibilities of the Gaussians of level 1."""
+    """Initial responsibilities of the Gaussians of the first level."""
 
     MASKS = "masks, our interpretation of the paper"
     K_MEANS = "k-means over the frame's points, started at the masks' means, the usual method"
@@ -34,13 +34,13 @@ class Initialization(Enum):
 
 @dataclass(frozen=True)
 class FrameTree:
-    """A tree over the points of N masks."""
+    """A tree of Gaussians over the points of N masks."""
 
     levels: tuple[Level, ...]
     masks: tuple[Int64, ...]  # for each level, the mask (M,) of each of its M nodes
 
     def leaves(self) -> tuple[Float64, Float64, Float64, Int64]:
-        """Return the weights (L,), means (L, 3), m, covariances (L, 3, 3), m^2, and masks (L,) of the L leaves."""
+        """Return the weights (L,), means (L, 3), m, covariances (L, 3, 3), m^2, and masks (L,) of the leaves."""
         parts = []
         for k, (level, masks) in enumerate(zip(self.levels, self.masks, strict=True)):
             below = self.levels[k + 1].firsts if k + 1 < len(self.levels) else np.zeros(len(level) + 1, np.int64)
@@ -50,7 +50,7 @@ class FrameTree:
         return weights, means, covariances, masks
 
     def masks_of(self, points: Float32) -> Int32:
-        """Return the mask (S,) of the most probable leaf for each of S points (S, 3), m; -1 if the tree has no leaf."""
+        """Return the mask (S,) of the most probable leaf for each point (S, 3), m, -1 = none."""
         weights, means, covariances, masks = self.leaves()
         best = np.empty(len(points), np.int32)
         find_most_probable(points, coefficients(weights, means, covariances), best)
@@ -61,12 +61,18 @@ def grow(
     points: Float32, masks: Int32, count: int, settings: EmSettings, *, levels: int, children: int,
     gaussians_per_mask: int, initialization: Initialization, min_support: float,
 ) -> FrameTree:  # fmt: skip
-    """Grow a tree of at most `levels` levels over S points (S, 3), m, of `count` masks.
+    """Fit a tree of Gaussians to the points of a frame.
 
-    `masks`: the mask (S,) of each point, in ascending order. Level 1 has `gaussians_per_mask` Gaussians for each mask,
-    with initial responsibilities by `initialization`. A node with at least MIN_SPLIT_POINTS points gets `children`
-    children (2, 4 or 8). A node is dropped in favor of its siblings if its weight is below `min_support` (fraction of
-    all points), or if it has too few points for a covariance.
+    Args:
+        points: The points (S, 3), m.
+        masks: The mask (S,) of each point, in ascending order.
+        count: The number of masks.
+        settings: The settings of expectation maximization.
+        levels: The maximum number of levels.
+        children: The number of children of a node: 2, 4 or 8.
+        gaussians_per_mask: The number of Gaussians per mask at the first level.
+        initialization: The initial responsibilities at the first level.
+        min_support: The minimum weight of a node, as a fraction of all points. Nodes with less weight are removed.
     """
     labels = _start(points, masks, count, gaussians_per_mask, initialization, settings.max_iterations)
     components = count * gaussians_per_mask
@@ -92,11 +98,15 @@ def grow(
 
 
 def corners(means: Float64, covariances: Float64, children: int) -> Mixtures:
-    """Return the initial children of M Gaussians as M mixtures of J = `children` components, with J = 2, 4 or 8.
+    """Return the initial children of M Gaussians, as M mixtures with equal weights.
 
-    `means`: (M, 3), m. `covariances`: (M, 3, 3), m^2. The children are offset from the mean by plus and minus one
-    standard deviation along the longest one, two or three principal axes. They have equal weights and a quarter of the
+    The children are one standard deviation from the mean along the longest principal axes. They have a quarter of the
     covariance.
+
+    Args:
+        means: The means (M, 3), m.
+        covariances: The covariances (M, 3, 3), m^2.
+        children: The number of children of each Gaussian: 2, 4 or 8.
     """
     count, axes = len(means), children.bit_length() - 1
     values, vectors = np.linalg.eigh(covariances)  # ascending
@@ -115,9 +125,9 @@ def corners(means: Float64, covariances: Float64, children: int) -> Mixtures:
 
 
 def _level(fitted: Mixtures, chosen: Int64, above: Float64, min_support: float) -> tuple[Level, Int64]:
-    """Return the level below Q nodes with weights `above` (Q,), and the component of each new node in its mixture.
+    """Return the level below nodes with the given weights, and the component of each new node in its mixture.
 
-    `fitted`: the mixtures of the nodes with indices `chosen`; other nodes get no children.
+    Only the nodes with indices `chosen` get children.
     """
     boxes = np.zeros((len(chosen), 2, 3))  # without a uniform component
     level = level_below(fitted, boxes, chosen, above, min_support)
@@ -128,12 +138,9 @@ def _level(fitted: Mixtures, chosen: Int64, above: Float64, min_support: float) 
 def _start(
     points: Float32, masks: Int32, count: int, gaussians: int, initialization: Initialization, max_iterations: int
 ) -> Int32:
-    """Return the index (S,) of the initial Gaussian of each point (S, 3), m, with ascending `masks` (S,).
-
-    Mask k has the Gaussians k * `gaussians` to (k + 1) * `gaussians` - 1.
-    """
+    """Return the index (S,) of the initial Gaussian of each point."""
     starts = np.searchsorted(masks, np.arange(count + 1))
-    labels = np.asarray(masks * np.int32(gaussians), np.int32)
+    labels = np.asarray(masks * np.int32(gaussians), np.int32)  # the first Gaussian of each mask
     if gaussians > 1:
         labels += cut(points, starts, gaussians)
     if initialization is Initialization.MASKS:

@@ -13,9 +13,14 @@ from framework.refinement.mixtures.mixture_tree_kernels import take_better
 
 @njit(cache=True, nogil=True)
 def keep_best_cluster(pixels: Int32, cluster: Int32, rank: Int32, owner: Int32, kept: Bool) -> None:
-    """Set `kept` (P,) to True for points whose cluster has the lowest `rank` (N,) of the clusters at their pixel.
+    """Keep a point only if its cluster has the lowest rank of all clusters at its pixel.
 
-    `pixels`: (P, 2) u, v. `cluster`: (P,), -1 = none. `owner`: (H, W), initially -1, becomes this cluster.
+    Args:
+        pixels: The pixels (P, 2), u and v, of the points.
+        cluster: The cluster (P,) of each point, -1 = none.
+        rank: The rank (N,) of each cluster.
+        owner: The output (H, W), the cluster with the lowest rank at each pixel; initially -1.
+        kept: The output (P,), True for points to keep.
     """
     for i in range(len(cluster)):
         k, u, v = cluster[i], pixels[i, 0], pixels[i, 1]
@@ -27,9 +32,12 @@ def keep_best_cluster(pixels: Int32, cluster: Int32, rank: Int32, owner: Int32, 
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_most_probable(points: Float32, rows: Float32, best: Int32) -> None:
-    """Set `best` (S,) to the Gaussian with the largest weighted density at each point (S, 3), m; -1 = none.
+    """Find the Gaussian with the largest weighted density at each point.
 
-    `rows`: the coefficients (M, 10) of the Gaussians, from `coefficients`. Ties go to the first Gaussian.
+    Args:
+        points: The points (S, 3), m.
+        rows: The coefficients (M, 10) of the Gaussians, from coefficients().
+        best: The output (S,), -1 = none. Ties go to the first Gaussian.
     """
     for block in prange((len(points) + BLOCK - 1) // BLOCK):
         begin = block * BLOCK

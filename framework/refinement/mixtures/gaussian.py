@@ -1,7 +1,7 @@
-"""Vectorized Gaussian densities and moments of blocks of points: the inner loops of expectation maximization.
+"""Vectorized Gaussian densities and moments for expectation maximization.
 
-The exponential and the eigenvalues have custom implementations. Numba does not vectorize NumPy's exp without Intel's
-SVML, and calls LAPACK for each 3x3 matrix.
+The exponential is custom, because Numba does not vectorize the exponential of NumPy without Intel SVML. The eigenvalues
+are custom, because Numba calls LAPACK for each 3x3 matrix.
 """
 
 from __future__ import annotations
@@ -15,18 +15,22 @@ from framework.data import Float32, Float64
 
 LOG_2PI = float(np.log(2 * np.pi))
 JACOBI_SWEEPS = 6  # maximum number of sweeps; 4 suffice for a 3x3 matrix in double precision
-# ratio of the sum of squared off-diagonal elements to the squared trace; below it, eigenvalues are exact to 14 digits
-NEGLIGIBLE = 1e-28
+NEGLIGIBLE = 1e-28  # sum of squared off-diagonal elements, relative to the squared trace, at which Jacobi stops
 ABSENT = np.float32(-1e30)  # log density of a component with weight 0; finite, so that differences are finite
 FACTORS = 64  # number of factors per logarithm; with up to 10^4 components, the product stays below 1e256
-SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and respect infinities
+SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags for vectorization; infinities remain valid
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32) -> None:
-    """Set out[i] = log(pi_k N(x_i | mu_k, Sigma_k)) for the points (x[i], y[i], z[i]), m.
+    """Compute the weighted log density of one Gaussian at each point.
 
-    `row`: the coefficients (10,) of component k, from `set_coefficients`.
+    Args:
+        x: The first coordinate (n,) of the points, m.
+        y: The second coordinate (n,) of the points, m.
+        z: The third coordinate (n,) of the points, m.
+        row: The coefficients (10,) of the Gaussian, from set_coefficients().
+        out: The output (n,).
     """
     c, mx, my, mz = row[0], row[1], row[2], row[3]  # unpacking the array takes longer than the loop
     w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
@@ -39,7 +43,7 @@ def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to_density(x: Float32, y: Float32, z: Float32, row: Float32, values: Float32) -> None:
-    """Set values[i] to the maximum of values[i] and the log density of point i, as in `log_densities`."""
+    """Raise each value to the weighted log density of one Gaussian at the point, if larger."""
     c, mx, my, mz = row[0], row[1], row[2], row[3]
     w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
@@ -59,17 +63,15 @@ def add_to(values: Float32, summands: Float32) -> None:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to(values: Float32, others: Float32, n: int) -> None:
-    """Set the first `n` values to max(values, others), with a comparison, because max() would not be vectorized."""
-    for i in range(n):
+    """Set the first `n` values to max(values, others)."""
+    for i in range(n):  # a comparison, because max() would not be vectorized
         values[i] = others[i] if others[i] > values[i] else values[i]
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def _exp(t: np.float32) -> np.float32:
-    """Return exp(t) for t <= 0 with a relative error of 3e-7, as 2^k * 2^r with |r| <= 1/2, in vectorizable code.
-
-    The result is at least exp(-50) = 2e-22, because denormal numbers are slow.
-    """
+    """Return exp(t) for t <= 0 with a relative error of 3e-7, and at least exp(-50)."""
+    # 2^k * 2^r with |r| <= 1/2, in vectorizable code; denormal numbers would be slow
     t = max(t, np.float32(-50.0)) * np.float32(1.4426950408889634)
     k = math.floor(t + np.float32(0.5))
     r = t - np.float32(k)
@@ -91,7 +93,7 @@ def constant_exponential(log_density: np.float32, largest: Float32, evidence: Fl
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int) -> None:
-    """Set the first `n` log densities in `densities` to exp(densities - largest), and add them to `evidence`."""
+    """Replace the first `n` log densities by exp(densities - largest), and add them to `evidence`."""
     for i in range(n):
         densities[i] = _exp(densities[i] - largest[i])
         evidence[i] += densities[i]
@@ -99,12 +101,9 @@ def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int
 
 @njit(cache=True, nogil=True)
 def log_evidence(largest: Float32, evidence: Float32, n: int) -> float:
-    """Return sum_i largest[i] + log(evidence[i]) over the first `n` points, with one logarithm per FACTORS points.
-
-    The logarithm is that of a product of evidences, each between 1 and 1 + the number of components.
-    """
+    """Return the sum of largest + log(evidence) over the first `n` points."""
     total = 0.0
-    for begin in range(0, n, FACTORS):
+    for begin in range(0, n, FACTORS):  # one logarithm of a product; factors are in [1, 1 + number of components]
         end = min(begin + FACTORS, n)
         total += _sum(largest[begin:end]) + math.log(_product(evidence[begin:end]))
     return total
@@ -128,7 +127,7 @@ def _product(values: Float32) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def invert(values: Float32, others: Float32, n: int) -> float:
-    """Set the first `n` values to 1 / values; return the sum of others / values with the old values."""
+    """Replace the first `n` values by 1 / values, and return the sum of others / values."""
     total = np.float32(0.0)
     for i in range(n):
         values[i] = np.float32(1.0) / values[i]
@@ -138,9 +137,10 @@ def invert(values: Float32, others: Float32, n: int) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: Float32, moment: Float64) -> None:
-    """Add sum_i gamma_i (1, x_i, x_i x_i^T) with gamma_i = densities[i] * scale[i] to `moment` (10,).
+    """Add the moments of the points, weighted by densities * scale, to `moment` (10,).
 
-    The last six entries are the upper triangle of the symmetric matrix. Single precision suffices within a block.
+    The moments are the weight, the weighted coordinates (3) and the upper triangle of their outer product (6). Single
+    precision suffices within a block.
     """
     zero = np.float32(0.0)
     s, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -163,7 +163,7 @@ def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: F
 
 @njit(cache=True, nogil=True)
 def add_point(moment: Float64, point: Float32, center: Float64, gamma: float) -> None:
-    """Add gamma * (1, x, x x^T) with x = point - center to `moment` (10,), as in `add_moments`."""
+    """Add the moments of `point` relative to `center`, weighted by `gamma`, to `moment` (10,)."""
     x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
     gx, gy, gz = gamma * x, gamma * y, gamma * z
     moment[0] += gamma
@@ -180,8 +180,8 @@ def add_point(moment: Float64, point: Float32, center: Float64, gamma: float) ->
 
 @njit(cache=True, nogil=True)
 def floor_eigenvalues(Sigma: Float64, floor: float) -> None:
-    """Raise the eigenvalues of a symmetric (3, 3) matrix to at least `floor`, in place (cyclic Jacobi)."""
-    A, V = Sigma.copy(), np.eye(3)
+    """Raise the eigenvalues of a symmetric 3x3 matrix to at least `floor`, in place."""
+    A, V = Sigma.copy(), np.eye(3)  # cyclic Jacobi method
     for _ in range(JACOBI_SWEEPS):
         if A[0, 1] * A[0, 1] + A[0, 2] * A[0, 2] + A[1, 2] * A[1, 2] < NEGLIGIBLE * (A[0, 0] + A[1, 1] + A[2, 2]) ** 2:
             break
@@ -211,10 +211,9 @@ def floor_eigenvalues(Sigma: Float64, floor: float) -> None:
 
 @njit(cache=True, nogil=True)
 def set_coefficients(weight: float, mean: Float64, Sigma: Float64, row: Float32) -> None:
-    """Set `row` (10,) to log(pi_k / sqrt((2 pi)^3 |Sigma|)), mu_k, and the rows of L^-1, where Sigma = L L^T.
-
-    In single precision, whitening by L^-1 is accurate even where terms with Sigma^-1 would cancel.
-    """
+    """Set the coefficients (10,) of a Gaussian for log_densities()."""
+    # The coefficients are log(pi / sqrt((2 pi)^3 |Sigma|)), mu and the rows of L^-1, where Sigma = L L^T. In single
+    # precision, whitening by L^-1 is accurate even where terms with Sigma^-1 would cancel.
     if weight <= 0.0:
         row[:] = 0.0
         row[0] = ABSENT

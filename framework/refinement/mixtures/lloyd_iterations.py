@@ -1,6 +1,6 @@
-"""Lloyd's k-means for many point sets in parallel, and initialization of k-means and expectation maximization.
+"""K-means for many point sets in parallel, and initialization of expectation maximization.
 
-scikit-learn fits one set per call, which takes much longer for the masks of a frame.
+scikit-learn fits one set per call, which is much slower for the masks of a frame.
 """
 
 from __future__ import annotations
@@ -13,11 +13,15 @@ from framework.refinement.neighborhood import Neighborhoods
 
 
 def cluster(points: Float32, starts: Int64, centers: Float64, max_iterations: int) -> tuple[Int32, Float64]:
-    """Return the labels (S,) and centers (N, K, 3), m, of k-means on N sets of points with K centers each.
+    """Run k-means on N sets of points, and return the labels (S,) and the centers (N, K, 3), m.
 
-    `points[starts[k]:starts[k + 1]]`, m, is set k; there are S points in total. `centers` (N, K, 3), m, are the initial
-    centers. Iteration ends when no label changes, or after `max_iterations`. A center without points stays in place.
-    Ties go to the first center.
+    A center without points does not move. Ties go to the first center.
+
+    Args:
+        points: The points (S, 3) of all sets, m.
+        starts: The start (N + 1,) of each set in `points`.
+        centers: The initial centers (N, K, 3), m.
+        max_iterations: The maximum number of iterations. Iteration also ends if no label changes.
     """
     labels = np.full(len(points), -1, np.int32)
     centers = centers.copy()
@@ -26,27 +30,36 @@ def cluster(points: Float32, starts: Int64, centers: Float64, max_iterations: in
 
 
 def nearest_centers(points: Float32, begins: Int64, ends: Int64, centers: Float64) -> Int32:
-    """Return the index (S,) in [0, K) of the center nearest to each point (S, 3), m; -1 outside the ranges.
+    """Return the index (S,) of the center nearest to each point, -1 = the point is in no set.
 
-    `points[begins[k]:ends[k]]` is set k, with its own `centers[k]` (K, 3), m.
+    Args:
+        points: The points (S, 3), m.
+        begins: The start (N,) of each set in `points`.
+        ends: The end (N,) of each set in `points`.
+        centers: The centers (N, K, 3) of each set, m.
     """
     return np.asarray(nearest_all(points, begins, ends, centers), np.int32)
 
 
 def depth_groups(points: Float32, starts: Int64, groups: int) -> Float64:
-    """Return the means (N, groups, 3), m, of `groups` groups of points in each of N sets, to initialize `cluster`.
+    """Return the means (N, groups, 3), m, of groups of points at different depths.
 
-    Set k is `points[starts[k]:starts[k + 1]]`, m, camera frame. Its points are divided by depth, the third coordinate,
-    into groups of equal size. Depth separates an occluder, the supporting surface and the wall behind the object. For a
-    set with fewer points than groups, centers are repeated. For an empty set, they are 0.
+    The points of each set are divided by depth into groups of equal size. The groups roughly separate an occluder, the
+    supporting surface and the wall behind the object. Sets with fewer points than groups have repeated means. The means
+    of empty sets are 0.
+
+    Args:
+        points: The points (S, 3) in the camera frame, m.
+        starts: The start (N + 1,) of each set in `points`.
+        groups: The number of groups of each set.
     """
     return np.asarray(group_depths(points, starts, groups), np.float64)
 
 
 def start_centers(around: Neighborhoods, object_centers: int, background_centers: int) -> Float64:
-    """Return the initial centers (N, object_centers + background_centers, 3), m, of k-means for N masks.
+    """Return the initial centers (N, object_centers + background_centers, 3), m, of k-means.
 
-    The first are the `depth_groups` of the mask, and the others are those of its ring.
+    The object centers are the depth groups of the mask. The background centers are the depth groups of its ring.
     """
     of_ring = around.of_ring
     mask_starts = np.concatenate([[0], np.cumsum(around.mask_counts)])
@@ -59,11 +72,18 @@ def start_centers(around: Neighborhoods, object_centers: int, background_centers
 def start_labels(
     around: Neighborhoods, log_odds: Float32, object_components: int, background_components: int, iterations: int
 ) -> Int32:
-    """Return the initial component (S,) of each point for EM: object components first, then background components.
+    """Return the initial component (S,) of each point for expectation maximization.
 
-    Lloyd's algorithm groups the ring's points and, separately, the mask's points with `log_odds` (S,) of at least 0. It
-    starts from groups of equal size by depth and runs for at most `iterations` iterations. The mask's other points get
-    the nearest group of the ring, or an object component if there are no background components.
+    Object components come first, then background components. Lloyd's algorithm groups the points of the ring and,
+    separately, the points of the mask that are likely on the object. The other points of the mask get the nearest group
+    of the ring.
+
+    Args:
+        around: The points of the masks and their rings.
+        log_odds: The log-odds (S,) that a point is on the object.
+        object_components: The number of object components.
+        background_components: The number of background components. If 0, all points of a mask get object components.
+        iterations: The maximum number of iterations.
     """
     labels = np.empty(len(around.points_camera), np.int32)
     start_all(

@@ -10,7 +10,7 @@ from framework.data import Bool, Float32, Float64, Int32, Int64
 
 @njit(cache=True, nogil=True, parallel=True)
 def lloyd_all(points: Float32, starts: Int64, centers: Float64, max_iterations: int, labels: Int32) -> None:
-    """Run Lloyd iterations on each set `points[starts[k]:starts[k + 1]]`; update `centers` and `labels` in place."""
+    """Run k-means on each set of points, and update `centers` and `labels` in place."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             lloyd(points[starts[k] : starts[k + 1]], centers[k], max_iterations, labels[starts[k] : starts[k + 1]])
@@ -18,7 +18,7 @@ def lloyd_all(points: Float32, starts: Int64, centers: Float64, max_iterations: 
 
 @njit(cache=True, nogil=True)
 def lloyd(points: Float32, centers: Float64, max_iterations: int, labels: Int32) -> None:
-    """Run Lloyd iterations on one set (S, 3); update `centers` (K, 3) and `labels` (S,) in place."""
+    """Run k-means on one set of points (S, 3), and update `centers` (K, 3) and `labels` (S,) in place."""
     sums = np.zeros((len(centers), 4))
     for _ in range(max_iterations):
         changed = False
@@ -53,7 +53,7 @@ def nearest(point: Float32, centers: Float64) -> int:
 
 @njit(cache=True, nogil=True, parallel=True)
 def nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) -> Int32:
-    """Return the result of `nearest_centers`."""
+    """Return the labels of nearest_centers()."""
     labels = np.full(len(points), -1, np.int32)
     for k in range(len(begins)):
         for i in prange(begins[k], ends[k]):
@@ -63,7 +63,7 @@ def nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) -
 
 @njit(cache=True, nogil=True, parallel=True)
 def group_depths(points: Float32, starts: Int64, groups: int) -> Float64:
-    """Return the `depth_groups` (N, groups, 3), m, of each set."""
+    """Return the means of depth_groups()."""
     means = np.zeros((len(starts) - 1, groups, 3))
     for k in prange(len(starts) - 1):
         means[k] = depth_groups_of(points[starts[k] : starts[k + 1]], groups)
@@ -72,7 +72,7 @@ def group_depths(points: Float32, starts: Int64, groups: int) -> Float64:
 
 @njit(cache=True, nogil=True)
 def depth_groups_of(points: Float32, groups: int) -> Float64:
-    """Return the `depth_groups` (groups, 3), m, of one set."""
+    """Return the means (groups, 3), m, of depth_groups() for one set."""
     n, means = len(points), np.zeros((groups, 3))
     if n == 0:
         return means
@@ -88,7 +88,8 @@ def depth_groups_of(points: Float32, groups: int) -> Float64:
 
 @njit(cache=True, nogil=True)
 def _by_depth(points: Float32) -> Int64:
-    """Return the indices of the points by increasing depth. This stable radix sort compiles faster than np.argsort."""
+    """Return the indices of the points in order of increasing depth."""
+    # stable radix sort, because np.argsort compiles slowly
     n = len(points)
     depths = np.empty(n, np.float32)
     for i in range(n):
@@ -117,7 +118,10 @@ def start_all(
     points: Float32, log_odds: Float32, starts: Int64, mask_counts: Int64, object_components: int,
     background_components: int, iterations: int, labels: Int32,
 ) -> None:  # fmt: skip
-    """Set `labels` (S,) to the initial component of each point; see `start_labels` for the arguments."""
+    """Set the initial component (S,) of each point.
+
+    See start_labels().
+    """
     for k in prange(len(starts) - 1):
         own = slice(starts[k], starts[k + 1])
         _start_one(
@@ -149,10 +153,7 @@ def _start_one(
 
 @njit(cache=True, nogil=True)
 def _group(points: Float32, chosen: Bool, groups: int, first_label: int, iterations: int, labels: Int32) -> Float64:
-    """Group the chosen points by Lloyd iterations from groups by depth; return the centers (groups, 3), m.
-
-    Set their labels to `first_label` plus the index of their group. Other labels are unchanged.
-    """
+    """Group the chosen points by k-means, set their labels, and return the centers (groups, 3), m."""
     own, own_labels, count = np.empty_like(points), np.empty(len(points), np.int32), 0
     for i in range(len(points)):
         if chosen[i]:

@@ -1,8 +1,8 @@
 """Gaussian mixtures with a uniform outlier component, fitted to many point sets in parallel.
 
-Equations of docs/method.md: (1) the mixture, (2) the E-step, (3, 4) the M-step. The uniform component follows
-Eckart et al., "Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016. scikit-learn's mixture has no uniform
-component and no per-point evidence, and is slower (tests/benchmarks/test_refiners.py).
+The method is expectation maximization, eqs. (1) to (4) of docs/method.md. The uniform component follows Eckart et al.,
+"Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016. The mixtures of scikit-learn are slower and have no
+uniform component.
 """
 
 from __future__ import annotations
@@ -29,14 +29,19 @@ def fit(
     points: Float32, starts: Int64, labels: Int32, components: int, settings: EmSettings, *,
     prior_log_odds: Float32 | None = None, own_components: int = 1,
 ) -> Mixtures:  # fmt: skip
-    """Fit a mixture to each point set `points[starts[k]:starts[k + 1]]` by expectation maximization.
+    """Fit a mixture to each set of points by expectation maximization.
 
-    `points`: (S, 3), m. `labels` (S,) in [0, `components`) are hard responsibilities for the first M-step. The uniform
-    component covers the set's bounding box.
+    The uniform component covers the bounding box of the set.
 
-    `prior_log_odds` (S,) is the evidence of each point for the first `own_components`. Their densities at point i are
-    multiplied by exp(prior_log_odds[i]) in eq. (2). The log-likelihood uses the weighted densities, so it is defined
-    only up to a constant.
+    Args:
+        points: The points (S, 3) of all sets, m.
+        starts: The start (N + 1,) of each set in `points`.
+        labels: The initial component (S,) of each point.
+        components: The number of components of each mixture.
+        settings: The settings of expectation maximization.
+        prior_log_odds: The log-odds (S,) of each point for the first `own_components`; None = 0. They scale the
+            densities of these components, so that log-likelihoods are defined only up to a constant.
+        own_components: The number of components that `prior_log_odds` refers to.
     """
     n = len(starts) - 1
     shape, odds = (n, components), _zeros_if_none(prior_log_odds, points)
@@ -49,7 +54,14 @@ def fit(
 
 
 def improve(points: Float32, starts: Int64, mixtures: Mixtures, settings: EmSettings) -> None:
-    """Run EM in place on each point set `points[starts[k]:starts[k + 1]]`, starting from the current mixture k."""
+    """Run expectation maximization on each set of points, starting from the current mixtures.
+
+    Args:
+        points: The points (S, 3) of all sets, m.
+        starts: The start (N + 1,) of each set in `points`.
+        mixtures: The mixtures, modified in place.
+        settings: The settings of expectation maximization.
+    """
     improve_all(points, starts, np.zeros(len(points), np.float32), settings, mixtures)
 
 
@@ -57,11 +69,19 @@ def likely_members(
     points: Float32, begins: Int64, ends: Int64, mixtures: Mixtures, *, own_components: int, min_posterior: float,
     prior_log_odds: Float32 | None = None,
 ) -> Bool:  # fmt: skip
-    """Return an array (S,), True for `points[begins[k]:ends[k]]` with a posterior above `min_posterior` in mixture k.
+    """Return a Boolean array (S,), True for points that belong to the object with a high posterior probability.
 
-    The posterior is the probability of the first `own_components`, which form the object. Their densities at point i
-    are multiplied by exp(prior_log_odds[i]), as in `fit`; None = 0. For a mixture without components, all entries are
-    True, because there is no evidence against the points. Entries outside the ranges are False.
+    The first `own_components` of each mixture are the object. If a mixture has no components, its points are True.
+    Points outside the sets are False.
+
+    Args:
+        points: The points (S, 3), m.
+        begins: The start (N,) of each set in `points`.
+        ends: The end (N,) of each set in `points`.
+        mixtures: The mixture of each set.
+        own_components: The number of components of the object.
+        min_posterior: The minimum posterior probability.
+        prior_log_odds: The log-odds (S,) of each point for the object, as in fit(); None = 0.
     """
     weights, means, covariances = mixtures.weights, mixtures.means, mixtures.covariances
     rows = coefficients(weights.ravel(), means.reshape(-1, 3), covariances.reshape(-1, 3, 3))
@@ -75,7 +95,7 @@ def likely_members(
 
 
 def blocks_of(begins: Int64, ends: Int64, size: int) -> Blocks:
-    """Return blocks of at most `size` points that cover each range of points from begins[k] to ends[k] - 1."""
+    """Return blocks of at most `size` points that cover the given ranges of points."""
     counts = -(-(ends - begins) // size)
     owner = np.repeat(np.arange(len(counts)), counts)
     firsts = begins[owner] + size * (np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts))
@@ -83,7 +103,7 @@ def blocks_of(begins: Int64, ends: Int64, size: int) -> Blocks:
 
 
 def log_densities_of(densities: Float64) -> Float32:
-    """Return log(densities); ABSENT for densities of 0."""
+    """Return the logarithm of densities, or ABSENT for densities of 0."""
     return np.where(densities > 0, np.log(np.maximum(densities, 1e-300)), ABSENT).astype(np.float32)
 
 

@@ -40,7 +40,10 @@ class EmSettings(NamedTuple):
 
 
 class Mixtures(NamedTuple):
-    """N mixtures of K Gaussians and one uniform component each. An absent component has weight 0."""
+    """N mixtures of K Gaussians and one uniform component each.
+
+    A component with weight 0 is absent.
+    """
 
     weights: Float64  # (N, K) pi_k
     means: Float64  # (N, K, 3) mu_k, m
@@ -52,7 +55,7 @@ class Mixtures(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """B blocks of consecutive points; all points of a block belong to one set."""
+    """B blocks of consecutive points of the same set."""
 
     sets: Int64  # (B,) index of the set
     begins: Int64  # (B,) index of the first point
@@ -64,7 +67,10 @@ def fit_all(
     points: Float32, starts: Int64, labels: Int32, odds: Float32, own_components: int, settings: EmSettings,
     mixtures: Mixtures,
 ) -> None:  # fmt: skip
-    """Fit the mixture of each point set; see `mixture.fit` for the arguments. `mixtures` is set in place."""
+    """Fit a mixture to each set of points.
+
+    The result is written to `mixtures`. See mixture.fit().
+    """
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             own = slice(starts[k], starts[k + 1])
@@ -73,16 +79,13 @@ def fit_all(
 
 @njit(cache=True, nogil=True, parallel=True)
 def improve_all(points: Float32, starts: Int64, odds: Float32, settings: EmSettings, mixtures: Mixtures) -> None:
-    """Run EM on the mixture of each point set, starting from its current parameters; update `mixtures` in place.
-
-    `odds`: the log-odds (S,) of the points; unused, because no component forms the object.
-    """
+    """Run expectation maximization on each set of points, starting from the current mixtures."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             own = slice(starts[k], starts[k + 1])
             center, volume = _center_and_volume(points[own], settings.variance_floor)
             mixtures.outlier_weights[k], mixtures.outlier_densities[k] = settings.outlier_fraction, 1.0 / volume
-            _iterate(points[own], odds[own], 0, center, settings, mixtures, k)
+            _iterate(points[own], odds[own], 0, center, settings, mixtures, k)  # odds are unused for 0 own components
 
 
 @njit(cache=True, nogil=True)
@@ -104,7 +107,7 @@ def _iterate(
     points: Float32, odds: Float32, own_components: int, center: Float64, settings: EmSettings, mixtures: Mixtures,
     k: int,
 ) -> None:  # fmt: skip
-    """Run EM on mixture k, starting from its current components."""
+    """Run expectation maximization on mixture k, starting from its current components."""
     weights, means, covariances = mixtures.weights[k], mixtures.means[k], mixtures.covariances[k]
     outlier_weights, log_likelihoods = mixtures.outlier_weights, mixtures.log_likelihoods
     variance_floor, count, components = settings.variance_floor, len(points), len(weights)
@@ -146,11 +149,11 @@ def _any_left(weights: Float64) -> bool:
 def _expect(
     xyz: Float32, odds: Float32, own_components: int, rows: Float32, log_outlier: np.float32, moments: Float64
 ) -> tuple[float, float]:
-    """Run the E-step, eq. (2), on centered points `xyz` (3, S), m, and add to the moments (K, 10) of the M-step.
+    """Run the E-step on centered points (3, S), and add to the moments (K, 10) for the M-step.
 
-    Returns sum_i log p(x_i), and N_k of the uniform component, the sum of its responsibilities.
+    Returns the log-likelihood and the sum of the responsibilities of the uniform component.
     """
-    components = len(rows)
+    components = len(rows)  # eq. (2) of docs/method.md
     densities = np.empty((components, BLOCK), np.float32)
     largest, evidence = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     outliers_before = np.empty(BLOCK, np.float32)
@@ -181,11 +184,11 @@ def _maximize(
     moments: Float64, center: Float64, count: int, variance_floor: float, weights: Float64, means: Float64,
     covariances: Float64,
 ) -> None:  # fmt: skip
-    """Run the M-step, eqs. (3) and (4), on the moments (K, 10) of `count` points relative to `center`, m.
+    """Run the M-step: compute the weights, means and covariances of the components from their moments (K, 10).
 
-    Set the weights, means and covariances of the components in place. A component with too few points gets weight 0.
+    A component with too few points gets weight 0.
     """
-    for j in range(len(weights)):
+    for j in range(len(weights)):  # eqs. (3) and (4) of docs/method.md
         N_k = moments[j, 0]
         if N_k < MIN_SUPPORT:
             weights[j] = 0.0
@@ -205,9 +208,9 @@ def _maximize(
 
 @njit(cache=True, nogil=True)
 def _center_and_volume(points: Float32, variance_floor: float) -> tuple[Float64, float]:
-    """Return the mean (3,), m, of points (S, 3), m, and the volume of their bounding box, m^3.
+    """Return the mean of the points (3,), m, and the volume of their bounding box, m^3.
 
-    A side of the box is at least 4 times the square root of `variance_floor`.
+    The box has a minimum side that depends on `variance_floor`, m^2.
     """
     center, low, high = np.zeros(3), np.empty(3), np.empty(3)
     for a in range(3):
@@ -226,7 +229,7 @@ def _center_and_volume(points: Float32, variance_floor: float) -> tuple[Float64,
 
 @njit(cache=True, nogil=True)
 def coefficients(weights: Float64, means: Float64, covariances: Float64) -> Float32:
-    """Return the coefficient rows (M, 10) of M Gaussians for `log_densities`."""
+    """Return the coefficients (M, 10) of Gaussians for log_densities()."""
     rows = np.zeros((len(weights), 10), np.float32)
     for j in range(len(weights)):
         set_coefficients(weights[j], means[j], covariances[j], rows[j])
@@ -238,11 +241,19 @@ def claim(
     points: Float32, blocks: Blocks, odds: Float32, rows: Float32, log_outliers: Float32, own_components: int,
     min_posterior: float, claimed: Bool,
 ) -> None:  # fmt: skip
-    """Set `claimed` (S,) to True for points of the blocks with a posterior above `min_posterior`.
+    """Find the points that belong to the object.
 
-    The posterior is own / (own + others), where `own` is the density of the first `own_components` times exp(odds), and
-    `others` is the density of the other components and the uniform component. `rows`: (N, K, 10), from `coefficients`.
-    `log_outliers`: log density (N,) of the uniform component times its weight.
+    See likely_members().
+
+    Args:
+        points: The points (S, 3), m.
+        blocks: The blocks of points to process.
+        odds: The log-odds (S,) of each point for the object.
+        rows: The coefficients (N, K, 10) of the mixtures, from coefficients().
+        log_outliers: The weighted log density (N,) of the uniform components.
+        own_components: The number of components of the object.
+        min_posterior: The minimum posterior probability.
+        claimed: The output (S,).
     """
     for b in prange(len(blocks.sets)):
         k, begin, end = blocks.sets[b], blocks.begins[b], blocks.ends[b]
@@ -263,11 +274,8 @@ def _claim_batch(
     points: Float32, odds: Float32, rows: Float32, log_outlier: np.float32, own_components: int, min_posterior: float,
     claimed: Bool,
 ) -> None:  # fmt: skip
-    """Run `claim` for one batch of points of one mixture, mostly without exponentials.
-
-    Exponentials are unnecessary for most points, because a sum of n terms is between its largest term and n times this
-    term.
-    """
+    """Find the points of one mixture that belong to the object."""
+    # Most points need no exponentials, because a sum of n terms is between its largest term and n times this term.
     components = len(rows)
     log_bound = math.log(min_posterior / (1.0 - min_posterior))
     certain = np.float32(log_bound + math.log(components - own_components + 1.0) + MARGIN)

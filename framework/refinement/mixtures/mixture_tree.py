@@ -1,8 +1,8 @@
-"""Hierarchical Gaussian mixtures: trees over many point sets, grown level by level in parallel.
+"""Trees of Gaussian mixtures over many point sets.
 
-The method follows Eckart, Kim, Troccoli, Kelly and Kautz, "Accelerated Generative Models for 3D Point Cloud Data", CVPR
-2016. Every node is a small mixture of its own points, and a point descends only to its best child. With J children per
-node, a level costs J Gaussians per point; a flat mixture with as many components costs J^level.
+The method follows Eckart et al., "Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016. Every node is a
+small mixture of its own points, and each point descends only to its best child. This is much faster than a flat mixture
+with as many components.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from framework.refinement.neighborhood_kernels import grouped
 
 @dataclass(frozen=True)
 class Level:
-    """M nodes of one level, below the Q nodes of the level above; for the first level, Q is the number of trees.
+    """The M nodes of one level, and their relation to the Q nodes of the level above.
 
     The children of node q are the rows `firsts[q]:firsts[q + 1]`. A node without children is a leaf. Weights are
-    fractions of the whole tree: a node's weight is the sum over its children and their uniform component.
+    fractions of the whole tree. The first level is below the root of each tree.
     """
 
     weights: Float64  # (M,) pi, above 0
@@ -32,19 +32,19 @@ class Level:
     covariances: Float64  # (M, 3, 3) Sigma, m^2
     firsts: Int64  # (Q + 1,) start of the children of each node
     outlier_weights: Float64  # (Q,) pi of the uniform component among the children of node q; 0 for a leaf
-    outlier_boxes: Float64  # (Q, 2, 3) m, minimum and maximum corner of the uniform component's box
+    outlier_boxes: Float64  # (Q, 2, 3) m, minimum and maximum corner of the box of the uniform component
 
     def __len__(self) -> int:
         return len(self.weights)
 
     @property
     def parents(self) -> Int64:
-        """Parent (M,) of each node in the level above; at the first level, its tree."""
+        """Parent (M,) of each node in the level above."""
         return np.repeat(np.arange(len(self.firsts) - 1), np.diff(self.firsts))
 
     @property
     def outlier_densities(self) -> Float64:
-        """Density (Q,) of the uniform component, 1 / m^3; 0 for a leaf."""
+        """Density (Q,) of the uniform component, 1 / m^3, 0 for a leaf."""
         volumes = np.prod(self.outlier_boxes[:, 1] - self.outlier_boxes[:, 0], axis=1)
         return np.asarray(np.where(volumes > 0, 1.0 / np.where(volumes > 0, volumes, 1.0), 0.0), np.float64)
 
@@ -56,10 +56,15 @@ class MixtureTree:
     levels: tuple[Level, ...]  # coarsest first; at least one
 
     def best_nodes(self, k: int, points: Float32, starts: Int64) -> Int64:
-        """Return the best node (S,) of level `k` for each of S points; -1 = the uniform component is more likely.
+        """Return the best node (S,) of level k for each point.
 
-        `points[starts[q]:starts[q + 1]]`, m, are the points of node q of the level above. The best node of a point is
-        the child of its node with the largest weighted density.
+        The best node of a point is the child of its current node with the largest weighted density. The result is -1 if
+        the uniform component is more likely.
+
+        Args:
+            k: The level.
+            points: The points (S, 3), sorted by their node in the level above, m.
+            starts: The start (Q + 1,) of the points of each node in the level above.
         """
         ratios, outlier_ratios = np.ones(len(self.levels[k]), np.float32), np.ones(len(starts) - 1, np.float32)
         log_odds = np.zeros(len(points), np.float32)
@@ -68,11 +73,17 @@ class MixtureTree:
     def best_nodes_with_posteriors(
         self, k: int, points: Float32, starts: Int64, ratios: Float32, outlier_ratios: Float32, log_odds: Float32
     ) -> tuple[Int64, Float32]:
-        """Return the best node (S,) of each point, as in `best_nodes`, and the posterior (S,) of the object.
+        """Return the best node (S,) of each point, and its posterior probability (S,) for the object.
 
-        The posterior uses the densities of level `k`. `ratios` (M,) are the object's fractions of the nodes' densities,
-        and `outlier_ratios` (Q,) are its fractions of the uniform components. `log_odds` (S,): the object's density at
-        a point is multiplied by exp(log_odds). The posterior is 0 if the point's node in the level above is a leaf.
+        The posterior is 0 if the node of the point in the level above is a leaf.
+
+        Args:
+            k: The level.
+            points: The points (S, 3), sorted by their node in the level above, m.
+            starts: The start (Q + 1,) of the points of each node in the level above.
+            ratios: The object fraction (M,) of the density of each node.
+            outlier_ratios: The object fraction (Q,) of each uniform component.
+            log_odds: The log-odds (S,) of each point for the object.
         """
         level = self.levels[k]
         child, posterior = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
@@ -89,12 +100,19 @@ def fit(
     points: Float32, starts: Int64, settings: EmSettings, *, levels: int, children: int, min_support: float,
     min_points: int,
 ) -> MixtureTree:  # fmt: skip
-    """Grow a tree of at most `levels` levels over each point set `points[starts[k]:starts[k + 1]]`.
+    """Fit a tree of mixtures to each set of points.
 
-    A node with at least `min_points` points gets `children` children, fitted to its points by `mixture.fit` with the
-    labels of `cut`. Each point then descends to its best child, or remains at the node if the uniform component is more
-    likely. A child with a weight below `min_support` is dropped in favor of its siblings. A set with too few points has
-    no nodes.
+    A node with enough points gets children, which are fitted to its points. Each point then descends to its best child,
+    or remains at the node if the uniform component is more likely. A set with too few points has no nodes.
+
+    Args:
+        points: The points (S, 3) of all sets, m.
+        starts: The start (N + 1,) of each set in `points`.
+        settings: The settings of expectation maximization.
+        levels: The maximum number of levels.
+        children: The number of children of a node.
+        min_support: The minimum weight of a child. Children with less weight are removed.
+        min_points: The minimum number of points of a node with children.
     """
     grown: list[Level] = []
     above = np.ones(len(starts) - 1)  # weights of the points' current nodes
@@ -117,10 +135,15 @@ def fit(
 
 
 def cut(points: Float32, starts: Int64, groups: int) -> Int32:
-    """Return labels (S,) in [0, groups) that divide each set into compact groups, to initialize `mixture.fit`.
+    """Divide each set of points into compact groups, and return their labels (S,).
 
-    Set k is `points[starts[k]:starts[k + 1]]`, m. Variance-based bisection cuts the group with the largest scatter
-    along one axis at its mean. A group is not cut if one part would have too few points for a component.
+    The labels initialize expectation maximization. The group with the largest scatter along one axis is cut at its
+    mean, until there are enough groups. A group is not cut if one part would have too few points for a component.
+
+    Args:
+        points: The points (S, 3) of all sets, m.
+        starts: The start (N + 1,) of each set in `points`.
+        groups: The number of groups of each set.
     """
     labels = np.zeros(len(points), np.int32)
     cut_all(points, starts, groups, labels)
@@ -128,11 +151,16 @@ def cut(points: Float32, starts: Int64, groups: int) -> Int32:
 
 
 def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: float) -> Float32:
-    """Return the object's fraction (M,) of the density of each node j.
+    """Return the object fraction (M,) of the density of each node.
 
-    `log_odds[starts[j]:starts[j + 1]]` are the log-likelihood ratios o_i of object to background of the node's points.
-    The fraction rho maximizes sum_i log(rho exp(o_i) + 1 - rho). The fraction of the parent, `above` (M,), has the
-    weight of `above_points` additional points. rho is computed by EM over the classes of the points.
+    The fraction is the maximum-likelihood estimate from the points of the node, with the fraction of its parent as a
+    prior.
+
+    Args:
+        log_odds: The log-odds (S,) of the points for the object, sorted by node.
+        starts: The start (M + 1,) of the points of each node.
+        above: The object fraction (M,) of the parent of each node.
+        above_points: The weight of the prior, in points.
     """
     ratios = above.astype(np.float32)
     set_own_ratios(log_odds, starts, above_points, ratios)
@@ -140,10 +168,15 @@ def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: f
 
 
 def object_ratios(tree: MixtureTree, sample: Neighborhoods, odds: Float32, parent_points: float) -> list[Float32]:
-    """Return, for each level, the object's fraction (M,) of the density of each of its M nodes; see `own_ratios`.
+    """Return, for each level, the object fraction (M,) of the density of each node.
 
-    `odds`: the log-odds (S,) of the points of `sample` for the object. The fraction of the parent has the weight of
-    `parent_points` points. The fraction above the first level is 0.5.
+    See own_ratios().
+
+    Args:
+        tree: The trees.
+        sample: The points of the masks and their rings.
+        odds: The log-odds (S,) of the points for the object.
+        parent_points: The weight of the prior, in points. The prior of the first level is 0.5.
     """
     points, starts = sample.points_camera, sample.starts
     above, ratios = np.full(len(sample), 0.5, np.float32), []
@@ -156,10 +189,16 @@ def object_ratios(tree: MixtureTree, sample: Neighborhoods, odds: Float32, paren
 
 
 def claimed(tree: MixtureTree, ratios: list[Float32], own: Neighborhoods, odds: Float32, min_posterior: float) -> Bool:
-    """Return an array (S,), True for points with a posterior of the object above `min_posterior` at their last level.
+    """Return a Boolean array (S,), True for points that belong to the object with a high posterior probability.
 
-    `own`: the S points of the masks. `odds`: their log-odds (S,) for the object. `ratios`: from `object_ratios`. The
-    last level of a point is the deepest level with children of its node.
+    The posterior is computed at the deepest level that the point reaches.
+
+    Args:
+        tree: The trees.
+        ratios: The object fractions, from object_ratios().
+        own: The points of the masks.
+        odds: The log-odds (S,) of the points for the object.
+        min_posterior: The minimum posterior probability.
     """
     claimed, remaining = np.zeros(len(own.points_camera), bool), np.arange(len(own.points_camera))
     points, starts = own.points_camera, own.starts
@@ -175,10 +214,14 @@ def claimed(tree: MixtureTree, ratios: list[Float32], own: Neighborhoods, odds: 
 
 
 def level_below(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64, min_support: float) -> Level:
-    """Return the level below Q nodes with weights `above` (Q,). Only the nodes with indices `chosen` have children.
+    """Return the level below nodes with the given weights (Q,).
 
-    `fitted`: their mixtures. `boxes`: the boxes (chosen, 2, 3), m, of their uniform components. A child with a weight
-    below `min_support` is dropped.
+    Args:
+        fitted: The mixtures of the nodes that get children.
+        boxes: The boxes (chosen, 2, 3) of their uniform components, m.
+        chosen: The indices of these nodes. All other nodes become leaves.
+        above: The weights (Q,) of all nodes.
+        min_support: The minimum weight of a child. Children with less weight are removed.
     """
     kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
     survivors = np.count_nonzero(kept, axis=1)
@@ -197,9 +240,12 @@ def level_below(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64,
 
 
 def ranges(points: Float32, starts: Int64, chosen: Int64) -> tuple[Float32, Int64]:
-    """Return the points of the sets with the ascending indices `chosen`, and the starts (chosen + 1,) of these sets.
+    """Return the points of the chosen sets, and the start (chosen + 1,) of each of these sets.
 
-    Set k is `points[starts[k]:starts[k + 1]]`.
+    Args:
+        points: The points of all sets.
+        starts: The start of each set in `points`.
+        chosen: The ascending indices of the chosen sets.
     """
     counts = np.diff(starts)
     if len(chosen) == len(counts):

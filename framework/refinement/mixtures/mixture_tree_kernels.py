@@ -9,12 +9,15 @@ from framework.data import Float32, Float64, Int32, Int64
 from framework.refinement.mixtures.gaussian import SIMD, constant_exponential, exponentials, log_densities
 from framework.refinement.mixtures.mixture_kernels import MIN_SUPPORT, Blocks
 
-RATIO_ITERATIONS = 20  # number of EM iterations for an object fraction; for distinct classes, each halves the error
+RATIO_ITERATIONS = 20  # number of EM iterations for an object fraction; with clear evidence, each halves the error
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
-    """Set `labels` (S,) to the groups of each set of points; see `cut`."""
+    """Divide each set of points into groups, and set their labels (S,).
+
+    See cut().
+    """
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             _cut_one(points[starts[k] : starts[k + 1]], groups, labels[starts[k] : starts[k + 1]])
@@ -22,10 +25,7 @@ def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _cut_one(points: Float32, groups: int, labels: Int32) -> None:
-    """Run `cut` on one set. The members of a group are contiguous in `order`, so that a cut reads only its own group.
-
-    `labels` are initially 0.
-    """
+    # the points of a group are contiguous in `order`, so that a cut reads only its own group
     n = len(points)
     order, upper = np.arange(n), np.empty(n, np.int64)
     begins, ends = np.zeros(groups, np.int64), np.zeros(groups, np.int64)
@@ -64,7 +64,7 @@ def _cut_one(points: Float32, groups: int, labels: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _measure(points: Float32, members: Int64, mean: Float64, scatter: Float64) -> None:
-    """Set `mean` (3,), m, and `scatter` (3,), the sum of squared deviations along each axis, m^2, of the members."""
+    """Set the mean (3,), m, and the sum of squared deviations (3,), m^2, of the given points along each axis."""
     origin = points[members[0]]  # offsets from a member avoid cancellation in the variance
     count, sums, squares = len(members), np.zeros(3), np.zeros(3)
     for i in members:
@@ -79,7 +79,10 @@ def _measure(points: Float32, members: Int64, mean: Float64, scatter: Float64) -
 
 @njit(cache=True, nogil=True)
 def bounding_boxes(points: Float32, starts: Int64, least_side: float) -> Float64:
-    """Return the bounding box (N, 2, 3), m, of each set, with sides of at least `least_side`, m."""
+    """Return the bounding box (N, 2, 3), m, of each set of points.
+
+    The sides are at least `least_side`, m.
+    """
     boxes = np.zeros((len(starts) - 1, 2, 3))
     for k in range(len(starts) - 1):
         for a in range(3):
@@ -96,10 +99,9 @@ def pass_down(
     points: Float32, log_odds: Float32, blocks: Blocks, rows: Float32, ratios: Float32, firsts: Int64,
     log_outliers: Float32, outlier_ratios: Float32, child: Int64, posterior: Float32,
 ) -> None:  # fmt: skip
-    """Set `child` (S,) and `posterior` (S,) for the points of the blocks; the set of a block is their node.
+    """Find the best child and the posterior probability for the object of each point.
 
-    `child` is the child with the largest weighted density at each point; -1 = uniform component or leaf. `posterior` is
-    the posterior probability of the object; see `MixtureTree.best_nodes_with_posteriors`.
+    See MixtureTree.best_nodes_with_posteriors(). The set of a block is the node of its points.
     """
     for b in prange(len(blocks.sets)):
         q, own = blocks.sets[b], slice(blocks.begins[b], blocks.ends[b])
@@ -144,7 +146,7 @@ def _pass_block(
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def take_better(densities: Float32, j: np.int32, largest: Float32, best: Int32) -> None:
-    """Set `best` to `j`, and `largest` to the density, where `densities` exceeds `largest`."""
+    """Where `densities` exceeds `largest`, set `largest` to the density and `best` to `j`."""
     for i in range(len(largest)):
         better = densities[i] > largest[i]
         best[i] = j if better else best[i]
@@ -159,7 +161,10 @@ def _add_scaled(densities: Float32, scale: np.float32, values: Float32) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def set_own_ratios(log_odds: Float32, starts: Int64, above_points: float, ratios: Float32) -> None:
-    """Replace the parents' fractions in `ratios` (M,) with the fractions of the nodes; see `own_ratios`."""
+    """Replace the object fractions (M,) of the parents by those of the nodes.
+
+    See own_ratios().
+    """
     for j in prange(len(starts) - 1):
         if starts[j + 1] > starts[j]:
             odds = np.exp(log_odds[starts[j] : starts[j + 1]])
@@ -168,7 +173,7 @@ def set_own_ratios(log_odds: Float32, starts: Int64, above_points: float, ratios
 
 @njit(cache=True, nogil=True)
 def _likeliest_ratio(odds: Float32, above: float, above_points: float) -> float:
-    ratio = 0.5
+    ratio = 0.5  # EM maximizes sum_i log(ratio * odds_i + 1 - ratio)
     for _ in range(RATIO_ITERATIONS):
         own = above_points * above
         for odd in odds:

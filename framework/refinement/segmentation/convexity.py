@@ -1,7 +1,7 @@
-"""Convex segments of a depth image: connected components without depth jumps or concave creases.
+"""Convex segments of a depth image.
 
-The method computes normals from depth, marks edges at depth jumps and concave surfaces, closes the edges, and labels
-connected components. It follows these papers:
+The method computes normals from depth, and marks edges at depth jumps and concave creases. The segments are the
+connected components without edges. It follows these papers:
 
 - Tateno, Tombari and Navab, "Real-Time and Scalable Incremental Segmentation on Dense SLAM", IROS 2015
 - Furrer et al., "Incremental Object Database: Building 3D Models from Multiple Partial Observations", IROS 2018
@@ -9,8 +9,8 @@ connected components. It follows these papers:
 
 Three changes make borders sharper in the presence of sensor noise:
 
-- planes are fitted in inverse depth, which is linear on a plane in space, in cells of a few pixels;
-- at a crease, each cell takes the plane of an adjacent window on its own side (the filter of Kuwahara et al. 1976);
+- planes are fitted in inverse depth, which is linear on a plane, in cells of a few pixels;
+- at a crease, each cell uses the plane of an adjacent window on its own side (Kuwahara et al., 1976);
 - pixels at edges join the adjacent segment that best predicts their depth.
 """
 
@@ -49,11 +49,17 @@ def segments(
     depth: Float32, camera: Camera, *, cell: int, window: int, limits: Limits, closing: int, min_pixels: int,
     sensor: SensorKind = SensorKind.KINECT_V1,
 ) -> tuple[Int32, int]:  # fmt: skip
-    """Return the segment label (H, W) of each pixel, in [0, count) or -1 = none, and the number of segments, count.
+    """Return the segment (H, W) of each pixel, -1 = none, and the number of segments.
 
-    `depth`: (H, W) m, 0 = no reading. Planes are fitted to windows of (2 `window` + 1)^2 cells of `cell` x `cell` px.
-    Gaps of up to 2 `closing` cells in edges are closed. Segments of fewer than `min_pixels` pixels are merged with
-    their neighbors. `sensor` determines the noise.
+    Args:
+        depth: The depth image (H, W), m, 0 = no reading.
+        camera: The camera.
+        cell: The side of a cell, px.
+        window: The radius of the windows for plane fits, cells.
+        limits: The limits for a continuous and convex surface.
+        closing: The radius of the morphological closing of edges, cells.
+        min_pixels: The minimum number of pixels of a segment. Smaller segments are merged with their neighbors.
+        sensor: The sensor, which determines the noise.
     """
     slope = np.float32(limits.max_slope * cell * 2 / (camera.fx + camera.fy))  # relative change of depth per cell
     pinhole = np.array(
@@ -75,18 +81,21 @@ def segments(
 
 
 def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> float:
-    """Return the standard deviation, rad, of the angle between two normals, fitted at 1 m with `depth_noise`, m.
+    """Return the standard deviation of the angle between two fitted normals at a depth of 1 m, rad.
 
-    Normals are fitted to windows of (2 `window` + 1)^2 cells of `cell` x `cell` px. At depth z and for the same noise,
-    the result is proportional to 1 / z. The slope of a line through M readings has the standard deviation sigma /
-    (sqrt(M) * rms offset).
+    Args:
+        depth_noise: The standard deviation of depth, m.
+        window: The radius of the windows for plane fits, cells.
+        cell: The side of a cell, px.
+        camera: The camera.
     """
+    # the slope of a line through M readings has the standard deviation sigma / (sqrt(M) * rms offset)
     readings = (cell * (2 * window + 1)) ** 2
     offset = cell * np.sqrt(window * (window + 1) / 3) * 2 / (camera.fx + camera.fy)  # m at 1 m
     return float(np.sqrt(2.0) * depth_noise / (np.sqrt(readings) * offset))
 
 
 def _closed(edges: Bool, radius: int) -> Bool:
-    """Return the edges after morphological closing with a square of side 2 `radius` + 1 cells."""
+    """Return the edges after morphological closing with a square of the given radius, cells."""
     square = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     return np.asarray(cv2.morphologyEx(edges.view(np.uint8), cv2.MORPH_CLOSE, square), np.bool_)

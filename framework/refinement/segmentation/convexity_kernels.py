@@ -14,40 +14,49 @@ from framework.sensors.noise_models_kernels import axial_sigma, axial_sigma_sing
 
 MIN_CELLS = 6  # minimum number of cells of a plane fit; any three cells fit a plane exactly
 MIN_SPREAD = 0.1  # minimum determinant of the covariance of the positions in a window, cells^4; 0 for a line
-SWITCH = 1.5  # minimum factor by which an adjacent window must fit better than the cell's own window
+SWITCH = 1.5  # minimum factor by which an adjacent window must fit better than the window of the cell
 STRIP = 16  # number of rows of cells in a strip; strips are connected in parallel
 
 
 class Noise(NamedTuple):
-    """Noise limits, flat because parallel kernels do not accept nested tuples."""
+    """Noise limits.
+
+    The tuple is flat because parallel kernels do not accept nested tuples.
+    """
 
     factor: float  # depth difference that counts as noise, standard deviations
     min_noise: float  # minimum standard deviation of depth, m
-    least: float  # coefficients of the sensor's DepthNoise
+    least: float  # coefficients of the DepthNoise of the sensor
     near: float
     growth: float
 
 
-_axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the caller's fast-math flags
+_axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the fast-math flags of the caller
 
 
 @njit(cache=True, nogil=True)
 def _sigma(z: float, noise: Noise) -> float:
-    """Return the standard deviation of a reading at depth `z`, both in m."""
+    """Return the standard deviation of a depth reading, m, at depth `z`, m."""
     return float(max(axial_sigma(z, noise), noise.min_noise))
 
 
 @njit(cache=True, nogil=True)
 def _noise_at(inverse: float, noise: Noise) -> np.float32:
-    """Return the maximum difference of inverse depth, 1 / m, that counts as noise at the inverse depth `inverse`."""
+    """Return the maximum noise of inverse depth, 1 / m, at the given inverse depth."""
     return np.float32(noise.factor * _sigma(1.0 / inverse, noise) * inverse * inverse)
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def mean_inverse_depth(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Float32:
-    """Return the mean inverse depth (rows, columns), 1 / m, of the nearest surface in each cell; 0 = no reading.
+    """Return the mean inverse depth (rows, columns), 1 / m, of the nearest surface in each cell.
 
-    `depth`: (H, W), m. `cell`: side of a cell, px. `slope`: maximum relative change of depth on a surface per cell.
+    The result is 0 for cells without a reading.
+
+    Args:
+        depth: The depth image (H, W), m.
+        cell: The side of a cell, px.
+        noise: The noise limits.
+        slope: The maximum relative change of depth on a surface per cell.
     """
     height, width = depth.shape
     rows, columns = -(-height // cell), -(-width // cell)
@@ -78,10 +87,9 @@ def _add_offset(
     own: Float32, other: Float32, gate: Float32, gate_slope: Float32, x: np.float32, y: np.float32, reach: np.float32,
     sums: Float32,
 ) -> None:  # fmt: skip
-    """Add the moments of the cells at one offset (x, y), cells, to the `sums` (10, columns) of the cells of a row.
+    """Add the moments of the cells at one offset to the sums (10, columns) of the cells of a row.
 
-    `own` and `other`: inverse depth, 1 / m, of the cells and of the cells at the offset. Pairs whose difference is
-    above gate + gate_slope * reach are skipped; `reach` is the length of the offset, cells.
+    Cells with a larger depth difference than gate + gate_slope * reach are skipped.
     """
     zero, one = np.float32(0), np.float32(1)
     n, sx, sy, sxx, sxy, syy, se, sxe, sye, see = sums
@@ -104,9 +112,10 @@ def _add_offset(
 
 @njit(cache=True, nogil=True, parallel=True)
 def fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -> Float32:
-    """Return the fit (4, rows, columns) around each cell: a, b, c of inverse depth a x + b y + c, and the residual.
+    """Fit a plane to the window around each cell.
 
-    Inverse depth is in 1 / m, x and y in cells. The residual is the mean squared residual, inf without a fit.
+    Returns (4, rows, columns): the coefficients a, b and c of the inverse depth a x + b y + c, and the mean squared
+    residual. x and y are in cells, and inverse depth is in 1 / m. The residual is inf if no plane can be fitted.
     """
     rows, columns = inverse.shape
     fits = np.zeros((4, rows, columns), np.float32)
@@ -133,7 +142,7 @@ def fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def _solve(own: Float32, sums: Float32, fit: Float32) -> None:
-    """Fit e = a x + b y + c to the window of each cell of a row by least squares (centered normal equations)."""
+    """Fit a plane to the window of each cell of a row by least squares."""
     zero, one = np.float32(0), np.float32(1)
     n, sx, sy, sxx, sxy, syy, se, sxe, sye, see = sums
     for c in range(len(own)):
@@ -153,9 +162,10 @@ def _solve(own: Float32, sums: Float32, fit: Float32) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def best_planes(inverse: Float32, fits: Float32, window: int, noise: Noise) -> Float32:
-    """Return the plane a, b, c (3, rows, columns) of the best-fitting window around or adjacent to each cell.
+    """Return the plane (3, rows, columns) of the window with the best fit around or next to each cell.
 
-    Within noise, the window around the cell is preferred. c = 0 if no window fits.
+    If the fits differ only by noise, the window around the cell is used. The last coefficient is 0 if no window has a
+    plane.
     """
     rows, columns = inverse.shape
     planes = fits[:3].copy()
@@ -202,10 +212,14 @@ def _take_better(
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float) -> Bool:
-    """Return an array (rows, columns), True at edges: no plane, or a surface border between opposite neighbors.
+    """Return a Boolean array (rows, columns), True at the edges of surfaces and at cells without a plane.
 
-    `planes`: from `best_planes`. `pinhole`: fx, fy, cx, cy, in cells. `max_angle`: see `Limits`. `normal_sigma_1m`:
-    from `normal_sigma`, for a depth noise of 1 m.
+    Args:
+        planes: The planes (3, rows, columns), from best_planes().
+        pinhole: The intrinsics fx, fy, cx, cy, in cells.
+        noise: The noise limits.
+        max_angle: The maximum angle of a concave bend, rad.
+        normal_sigma_1m: The result of normal_sigma() per depth noise, rad/m.
     """
     _, rows, columns = planes.shape
     surface = np.empty((9, rows, columns), np.float32)
@@ -233,13 +247,13 @@ def _set_surface(
     plane: Float32, y: np.float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float,
     surface: Float32,
 ) -> None:  # fmt: skip
-    """Set the surface (9, columns) of a row.
+    """Compute the surface (9, columns) of a row of cells.
 
-    The entries are unit normals (3) away from the camera, plane distances, m, and points (3), m. The last two are the
-    noise of the distance to a plane, m, and the minimum cosine between normals of a flat surface.
-
-    1 / z = A (u - cx) + B (v - cy) + C is the plane (A fx, B fy, C) . p = 1. Without a plane, the point is 0.
+    The entries are the unit normal (3) away from the camera, the plane distance, m, and the point (3), m. They are
+    followed by the noise of the distance to a plane, m, and the minimum cosine between normals of a flat surface. The
+    point is 0 if the cell has no plane.
     """
+    # 1 / z = A (u - cx) + B (v - cy) + C is the plane (A fx, B fy, C) . p = 1
     zero, one = np.float32(0), np.float32(1)
     fx, fy, cx, _ = pinhole
     a, b, d = plane
@@ -264,21 +278,21 @@ def _set_surface(
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool) -> None:
-    """Mark a cell if its two opposite neighbors are too far off each other's plane or form a concave crease.
+    """Mark the cells whose opposite neighbors are on different surfaces or form a concave crease.
 
-    `spacing` is the distance between the neighbors at a depth of 1 m, m per m. At a convex edge, each neighbor may be
-    this far behind the other's plane.
+    `spacing` is the distance of the neighbors at a depth of 1 m, m.
     """
     zero = np.float32(0)
     ax, ay, az, ad, apx, apy, apz, gate, min_cosine = one
     bx, by, bz, bd, bpx, bpy, bpz, _, _ = other
     for c in range(len(edges)):
-        # distance of each neighbor's point in front of the other's plane
+        # distance of the point of each neighbor in front of the plane of the other neighbor
         h = ad[c] - (ax[c] * bpx[c] + ay[c] * bpy[c] + az[c] * bpz[c])
         g = bd[c] - (bx[c] * apx[c] + by[c] * apy[c] + bz[c] * apz[c])
         cosine = ax[c] * bx[c] + ay[c] * by[c] + az[c] * bz[c]
         far, near = h if h > zero else -h, g if g > zero else -g
         z = apz[c] if apz[c] < bpz[c] else bpz[c]
+        # at a convex edge, a neighbor may be behind the plane of the other neighbor by the distance between them
         jump = (far if far < near else near) > gate[c] + (spacing * z if h * g > zero else zero)
         concave = (h + g > zero) & (cosine < min_cosine[c])
         both = (apz[c] > zero) & (bpz[c] > zero)
@@ -289,7 +303,7 @@ def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool
 def _unite_row(
     inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, r: int, upwards: bool, parents: Int32
 ) -> None:
-    """Unite the cells of row `r` with their left or (`upwards`) upper neighbors, except at edges and depth jumps."""
+    """Unite the cells of a row with their left or upper neighbors, except at edges and depth jumps."""
     columns = inverse.shape[1]
     step = columns if upwards else 1
     flat_inverse, flat_edges = inverse.ravel(), edges.ravel()
@@ -304,9 +318,9 @@ def _unite_row(
 
 @njit(cache=True, nogil=True, parallel=True)
 def connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, min_cells: int) -> tuple[Int32, int]:
-    """Return the component label (rows, columns) of each cell and the number of components, count.
+    """Return the connected component (rows, columns) of each cell, and the number of components.
 
-    Labels are in [0, count); -1 = an edge, or a component of fewer than `min_cells` cells.
+    The component is -1 at edges and in components with fewer than `min_cells` cells.
     """
     rows, columns = inverse.shape
     parents = np.arange(rows * columns).astype(np.int32)
@@ -339,7 +353,10 @@ def connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, mi
 
 @njit(cache=True, nogil=True)  # too little work for threads
 def absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> tuple[Int32, Float32]:
-    """Return labels and planes grown by one cell. An unlabeled cell joins the neighbor that best predicts its depth."""
+    """Return the labels and planes, grown by one cell.
+
+    An unlabeled cell joins the neighbor that best predicts its depth.
+    """
     rows, columns = inverse.shape
     new_labels, new_planes = labels.copy(), planes.copy()
     for r in range(rows):
@@ -365,9 +382,9 @@ def absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> 
 def pixel_labels(
     depth: Float32, inverse: Float32, labels: Int32, planes: Float32, cell: int, noise: Noise, slope: np.float32
 ) -> Int32:
-    """Return, for each pixel (H, W), the label of the nearby cell whose plane best predicts its depth.
+    """Return the label (H, W) of each pixel, from the nearby cell whose plane best predicts its depth.
 
-    Without a prediction, a pixel near the mean of its own cell gets the label of this cell.
+    If no plane predicts the depth, the pixel gets the label of its own cell if its depth is similar.
     """
     height, width = depth.shape
     rows, columns = labels.shape
@@ -416,7 +433,7 @@ def pixel_labels(
 
 @njit(cache=True, nogil=True)
 def _plane_of_cell(planes: Float32, inverse: Float32, r: int, c: int, plane: Float32) -> None:
-    """Set `plane` to a, b, c of a cell; without a fit, to the plane of constant depth."""
+    """Set `plane` (3,) to the plane of a cell, or to constant depth if the cell has no plane."""
     if planes[2, r, c] > 0:
         plane[0], plane[1], plane[2] = planes[0, r, c], planes[1, r, c], planes[2, r, c]
     else:

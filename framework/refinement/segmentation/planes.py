@@ -1,13 +1,11 @@
-"""Large planes of a depth image by region growing on a coarse grid of cells.
+"""Detection of large planes in a depth image.
 
-The method follows PEAC (Feng, Taguchi and Kamat, "Fast Plane Extraction in Organized Point Clouds Using Agglomerative
-Hierarchical Clustering", ICRA 2014) and CAPE (Proenca and Gao, "Fast Cylinder and Plane Extraction from Depth Cameras
-for Visual Odometry", IROS 2018). Planes are fitted in inverse depth.
+Planes grow over a coarse grid of cells. The method follows PEAC (Feng et al., ICRA 2014) and CAPE (Proenca and Gao,
+IROS 2018). Here, planes are fitted in inverse depth, where the noise of stereo and structured-light sensors is
+constant. Open3D's RANSAC finds one plane at a time and does not use the image grid.
 
-On a plane n . p = d, the inverse depth is q = 1 / z = m . r, with r = ((u - cx) / fx, (v - cy) / fy, 1) and m = n / d.
-It is linear in the pixel coordinates. Therefore, a fit is a 3x3 system, and the moments of a union of cells are sums.
-The noise of stereo and structured-light sensors grows with z^2 and is constant in inverse depth. Open3D's RANSAC finds
-one plane at a time by random sampling and does not use the image grid.
+On the plane n . p = d, the inverse depth is m . r, where m = n / d and r = ((u - cx) / fx, (v - cy) / fy, 1). Inverse
+depth is linear in the pixel coordinates. Therefore, a fit is a 3x3 system, and moments of cells can be added.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ class Planes:
     m: Float64  # (K, 3) 1/m, normal / distance; a point p in camera coordinates is on plane k if m . p = 1
     deviations: Float64  # (K,) 1/m, rms deviation of the inverse depth of the readings, limited to the allowed noise
     areas: Float64  # (K,) visible area, m^2
-    fractions: Float64  # (K,) fraction of the frame's readings
+    fractions: Float64  # (K,) fraction of all readings of the frame
     behind: Float64  # (K,) ratio of readings behind the plane to readings on the plane
 
     def __len__(self) -> int:
@@ -48,7 +46,7 @@ class Planes:
 
     @property
     def normals(self) -> Float64:
-        """Unit normals (K, 3) in camera coordinates, towards the camera."""
+        """Unit normals (K, 3) in the camera frame, toward the camera."""
         return np.asarray(-self.m / np.linalg.norm(self.m, axis=1, keepdims=True))
 
     def chosen(self, which: Bool) -> Planes:
@@ -57,13 +55,16 @@ class Planes:
 
 
 def find_planes(frame: Frame, distance: float, noise: float, min_area: float) -> Planes:
-    """Return the planes with a visible area of at least `min_area` m^2, of which at least a quarter is connected.
+    """Return the large planes of a frame.
 
-    A cell of 16x16 px belongs to a plane if the rms distance of its readings is at most `distance`, m, along the
-    normal, plus the noise. `noise`, 1/m, is the noise of inverse depth for KINECT_V1, so that the noise at depth z is
-    `noise` * z^2. It is scaled up for sensors with more noise. A plane starts at the flattest free cell and grows over
-    adjacent cells. Then all cells of the frame that are on the plane are added, including cells on the other side of an
-    occluder.
+    A plane starts at the flattest free cell and grows over adjacent cells. Then, all other cells on the plane are
+    added, such as cells on the other side of an occluder.
+
+    Args:
+        frame: The frame.
+        distance: The maximum rms distance of the readings of a cell to the plane, m, in addition to the noise.
+        noise: The noise of inverse depth for KINECT_V1, 1/m. It is scaled up for sensors with more noise.
+        min_area: The minimum visible area of a plane, m^2. At least a quarter of it must be connected.
     """
     height, width = frame.camera.shape
     sensor = frame.sensor.noise
@@ -85,8 +86,7 @@ def find_planes(frame: Frame, distance: float, noise: float, min_area: float) ->
 def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
     """Return 1 + the index of the nearest plane (H, W) for each depth reading, 0 = none.
 
-    A reading is on a plane if its distance along the normal is at most `distance`, m, plus three standard deviations of
-    the plane's noise.
+    A reading is on a plane if its distance to the plane is at most `distance`, m, plus three standard deviations.
     """
     image = np.zeros(frame.depth.shape, np.uint8)
     if len(planes):
@@ -99,10 +99,19 @@ def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
 
 
 def off_planes(clusters: PointClusters, on_plane: UInt8, planes: int, max_own: float) -> tuple[Bool, Bool]:
-    """Return a point array (P,), True for points to keep, and a pixel array (H, W), True for structure.
+    """Find the points of clusters that are not on planes.
 
-    `on_plane` is the `plane_image`. A cluster's points on a plane are removed if they are at most a fraction `max_own`
-    of the plane's readings. Structure pixels are on a plane, and not in a cluster that keeps its points on this plane.
+    A cluster keeps its points on a plane only if they are a large part of the plane.
+
+    Args:
+        clusters: The clusters.
+        on_plane: The plane (H, W) of each pixel, from plane_image().
+        planes: The number of planes.
+        max_own: The maximum fraction of the readings of a plane that is removed from a cluster.
+
+    Returns:
+        A Boolean array (P,), True for points to keep.
+        A Boolean array (H, W), True for pixels on planes without kept points.
     """
     structure = on_plane > 0
     rows = len(clusters) + 1  # the last row is for points of no cluster

@@ -16,16 +16,17 @@ CELL = 16  # side of a cell, px: 9 cm at 3 m and 540 px focal length, smaller th
 STEP = 2  # stride of the readings used in a cell, px
 FULL = (CELL // STEP) ** 2  # number of readings in a full cell
 REFITS = 3  # number of passes that collect the cells of a plane again; the last pass hardly changes the plane
-TRIM = 1.5  # maximum deviation of a cell in a fit, times the median deviation of the plane's cells
+TRIM = 1.5  # maximum deviation of a cell in a fit, relative to the median deviation of all cells on the plane
 SIGMAS = 3.0  # maximum distance of a reading on a plane, in standard deviations of the noise
 MAX_PLANES = 32  # maximum number of planes; frames have fewer large planes
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def sum_moments(depth: Float32, pinhole: Float32, moments: Float64) -> None:
-    """Set `moments` (rows, columns, 10) to the sums of 1, x, y, x x, x y, y y, q, x q, y q, q q over each cell.
+    """Compute the moments (rows, columns, 10) of the depth readings in each cell.
 
-    For each reading, x = (u - cx) / fx, y = (v - cy) / fy, and q = 1 / depth, 1/m. `pinhole`: fx, fy, cx, cy, px.
+    The moments are the sums of 1, x, y, x x, x y, y y, q, x q, y q, q q over the readings. Here, x = (u - cx) / fx, y =
+    (v - cy) / fy, and q is the inverse depth, 1/m. `pinhole` contains fx, fy, cx, cy, px.
     """
     height, width = depth.shape
     fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
@@ -54,11 +55,8 @@ def sum_moments(depth: Float32, pinhole: Float32, moments: Float64) -> None:
 
 @njit(cache=True, nogil=True)
 def _solve(moment: Float64, m: Float64) -> bool:
-    """Set `m` (3,), 1/m, to the least-squares plane of the readings; return False if the plane is not determined.
-
-    `moment`: the sums (10,) of the readings, from `sum_moments`. The system is solved by Cramer's rule. The normal
-    equations are centered, because x and y vary within a cell by only a hundredth of their size.
-    """
+    """Fit a plane (3,) to readings by least squares, and return False if there is no unique plane."""
+    # centered normal equations, because x and y vary only little within a cell; solved by Cramer's rule
     n = moment[0]
     if n < 3:
         return False
@@ -76,7 +74,7 @@ def _solve(moment: Float64, m: Float64) -> bool:
 
 @njit(cache=True, nogil=True)
 def _deviation(moment: Float64, m: Float64) -> float:
-    """Return the root mean square of q - m . r over the readings with the sums `moment` (10,), 1/m."""
+    """Return the root mean square deviation of readings from a plane in inverse depth, 1/m, given their moments."""
     n, sx, sy, sxx, sxy = moment[0], moment[1], moment[2], moment[3], moment[4]
     syy, sq, sxq, syq, sqq = moment[5], moment[6], moment[7], moment[8], moment[9]
     a, b, c = m[0], m[1], m[2]
@@ -92,34 +90,34 @@ def _length(m: Float64) -> float:
 
 @njit(cache=True, nogil=True)
 def _allowed(moment: Float64, noise: float, sensor: DepthNoise) -> float:
-    """Return the maximum rms deviation of inverse depth, 1/m, at the mean depth of a cell for this sensor.
-
-    The noise of KINECT_V1 is the minimum, because real floors and walls are not flat.
-    """
+    """Return the maximum rms deviation of a cell from a plane in inverse depth, 1/m."""
+    # at least the noise of KINECT_V1, because real floors and walls are not flat
     return float(noise * max(noise_ratio(moment[0] / moment[6], sensor), 1.0))
 
 
 @njit(cache=True, nogil=True)
 def _lies_in(moment: Float64, m: Float64, distance: float, noise: float, sensor: DepthNoise) -> bool:
-    """Return True if a cell is on the plane. The distance at inverse depth q is |q - m . r| / (|m| q)."""
+    """Return True if a cell is on the plane."""
     allowed = _allowed(moment, noise, sensor)
+    # the distance at inverse depth q is |q - m . r| / (|m| q)
     return bool(_deviation(moment, m) <= allowed + distance * _length(m) * moment[6] / moment[0])
 
 
 @njit(cache=True, nogil=True)
 def _area(moment: Float64, m: Float64, spacing: float) -> float:
-    """Return the cell's area on the plane, m^2: a reading covers spacing^2 z^2 / |n . r| = spacing^2 |m| z^3."""
+    """Return the area of a cell on the plane, m^2."""
     n = moment[0]
     z = n / moment[6]
+    # a reading covers spacing^2 z^2 / |n . r| = spacing^2 |m| z^3
     return float(n * spacing * spacing * _length(m) * z * z * z)
 
 
 @njit(cache=True, nogil=True)
 def write_flatness(cells: Float64, distance: float, noise: float, sensor: DepthNoise, flatness: Float64) -> None:
-    """Set `flatness` (C,) to the rms deviation, 1/m, of each of C cells that can start a plane; skip the other cells.
+    """Compute the rms deviation (C,) of each cell that can start a plane, in inverse depth, 1/m.
 
-    `cells`: the sums (C, 10) of the cells, from `sum_moments`. A cell can start a plane if at least half of its
-    readings exist and it is flat. See `find_planes` for the other arguments.
+    A cell can start a plane if it is flat and has at least half of its readings. The entries of other cells are not
+    changed.
     """
     m = np.zeros(3)
     for i in range(len(cells)):
@@ -132,11 +130,21 @@ def find_plane_cells(
     cells: Float64, columns: int, seeds: Int64, free: Bool, distance: float, noise: float, sensor: DepthNoise,
     min_area: float, spacing: float, found: Float64,
 ) -> int:  # fmt: skip
-    """Set the first K rows of `found` to the planes, and `free` (C,) to False at their cells; return K.
+    """Find the planes of a frame, and return their number.
 
-    A row contains the values of `Planes`: m (3), deviation, area, fraction and behind. `cells`: the sums (C, 10) of the
-    cells, row by row. `columns`: number of cells per row. `seeds`: the cells that can start a plane, flattest first.
-    `spacing`: the distance of neighboring readings at 1 m, m. See `find_planes` for the other arguments.
+    See find_planes() for the method.
+
+    Args:
+        cells: The moments (C, 10) of the cells, row by row.
+        columns: The number of cells per row.
+        seeds: The cells that can start a plane, flattest first.
+        free: The cells (C,) that belong to no plane, modified in place.
+        distance: The maximum rms distance of a cell to the plane, m, in addition to the noise.
+        noise: The noise of inverse depth for KINECT_V1, 1/m.
+        sensor: The noise parameters of the sensor.
+        min_area: The minimum visible area of a plane, m^2.
+        spacing: The distance of neighboring readings at a depth of 1 m, m.
+        found: The output (MAX_PLANES, 7): m (3), deviation, area, fraction and behind, as in Planes.
     """
     m, total = np.zeros(3), np.zeros(10)
     tried = np.zeros(len(cells), np.bool_)
@@ -183,10 +191,9 @@ def _grow(
     cells: Float64, columns: int, seed: int, free: Bool, distance: float, noise: float, sensor: DepthNoise, m: Float64,
     region: Int64,
 ) -> int:  # fmt: skip
-    """Grow a plane from the cell `seed`.
+    """Grow a plane from a cell, and return the number of its cells.
 
-    Set `region` (C,) to the indices of its cells and `m` (3,), 1/m, to the plane; return the number of cells. The plane
-    is refitted after each added cell. `cells`: (C, 10) moments from `sum_moments`.
+    The plane (3,) is written to `m`, and its cells to `region`. The plane is refitted after each added cell.
     """
     seen, total = np.zeros(len(cells), np.bool_), cells[seed].copy()
     _solve(total, m)
@@ -217,7 +224,7 @@ def _grow(
 def _collect(
     cells: Float64, free: Bool, m: Float64, distance: float, noise: float, sensor: DepthNoise, deviations: Float64
 ) -> None:
-    """Set `deviations` (C,) to the rms deviation, 1/m, of each free cell on the plane `m`, infinity for other cells."""
+    """Compute the rms deviation (C,) of each free cell on the plane, infinity for all other cells."""
     slope = distance * _length(m)
     for i in range(len(cells)):
         deviations[i] = np.inf
@@ -229,11 +236,9 @@ def _collect(
 
 @njit(cache=True, nogil=True)
 def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> None:
-    """Set `m` to the plane of the best-fitting cells, at least half of them, and `total` (10,) to their summed moments.
-
-    The best-fitting cells are those with `deviations` (C,) of at most TRIM times the median. The other cells are on
-    both sides of the intersection of two planes, and would tilt the planes towards each other.
-    """
+    """Refit a plane to its best-fitting cells, and set `total` (10,) to their moments."""
+    # Use the cells with at most TRIM times the median deviation. The others are at the intersection of two planes and
+    # would tilt the planes toward each other.
     inside, count = np.empty(len(deviations)), 0
     for i in range(len(deviations)):
         if deviations[i] < np.inf:
@@ -255,10 +260,8 @@ def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> N
 
 @njit(cache=True, nogil=True)
 def _order(values: Float64, k: int) -> float:
-    """Return the value with index `k` in ascending order, and reorder the values (Hoare 1961, "Find").
-
-    np.median compiles more slowly.
-    """
+    """Return the value with index k in ascending order, and reorder the values."""
+    # Hoare's selection algorithm (1961), because np.median compiles slowly
     low, high = 0, len(values) - 1
     while low < high:
         pivot = values[(low + high) // 2]
@@ -282,10 +285,7 @@ def _order(values: Float64, k: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _readings_behind(cells: Float64, m: Float64, deviation: float, distance: float) -> float:
-    """Return the number of readings in cells whose mean inverse depth is significantly behind the plane `m`.
-
-    `deviation`: the noise of the plane, 1/m. `distance`: the maximum distance from a plane along the normal, m.
-    """
+    """Return the number of readings in cells that are clearly behind the plane."""
     behind = 0.0
     for i in range(len(cells)):
         n = cells[i, 0]
@@ -302,10 +302,18 @@ def label_points(
     depth: Float32, pinhole: Float32, m: Float32, lengths: Float32, reach: Float32, sigmas: Float32,
     image: UInt8,
 ) -> None:  # fmt: skip
-    """Set `image` (H, W) to 1 + the index of the nearest plane of each depth reading that is on a plane.
+    """Set `image` (H, W) to 1 + the index of the nearest plane of each depth reading on a plane.
 
-    `m`: the planes (K, 3), 1/m. `lengths`: |m| (K,), 1/m. A reading at depth z is on plane k if |z m . r - 1| is at
-    most reach[k] + sigmas[k] * z; `reach` (K,) has no unit, and `sigmas` (K,) is in 1/m.
+    A reading at depth z is on plane k if |z m . r - 1| <= reach[k] + sigmas[k] z; see planes.py.
+
+    Args:
+        depth: The depth image (H, W), m.
+        pinhole: The intrinsics fx, fy, cx, cy, px.
+        m: The planes (K, 3), 1/m.
+        lengths: The norms (K,) of `m`, 1/m.
+        reach: The maximum distance (K,), relative to the distance of the plane.
+        sigmas: The maximum noise (K,) of inverse depth, 1/m.
+        image: The output (H, W).
     """
     fx, fy, cx, cy = pinhole
     for v in prange(depth.shape[0]):
@@ -325,10 +333,18 @@ def label_points(
 def find_off_planes(
     cluster: Int32, pixels: Int32, on_plane: UInt8, max_own: float, counts: Int64, stays: Bool, structure: Bool
 ) -> Bool:
-    """Return an array (P,), True for the points to keep, and set `structure` to False at kept points on planes.
+    """Return a Boolean array (P,), True for the points to keep.
 
-    `counts` (parts, N + 1, K + 1), initially 0, are the numbers of points by cluster and plane. `stays` (N + 1, K + 1),
-    initially True, are the pairs of cluster and plane whose points are kept. See `off_planes`.
+    See off_planes().
+
+    Args:
+        cluster: The cluster (P,) of each point, -1 = none.
+        pixels: The pixels (P, 2), u and v, of the points.
+        on_plane: The plane (H, W) of each pixel, 0 = none.
+        max_own: The maximum fraction of the readings of a plane that is removed from a cluster.
+        counts: The number of points by cluster and plane (parts, N + 1, K + 1), initially 0.
+        stays: The pairs of cluster and plane (N + 1, K + 1) whose points are kept, initially True.
+        structure: The pixels (H, W) on planes, set to False at kept points.
     """
     labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
     for part in prange(len(counts)):
@@ -344,10 +360,8 @@ def find_off_planes(
 
 @njit(cache=True, nogil=True)
 def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
-    """Set `stays` to True where a cluster has more than a fraction `max_own` of a plane's readings, else to False.
-
-    The last row (points of no cluster) and column 0 (points on no plane) stay unchanged.
-    """
+    """Decide for each cluster and plane whether the points are kept."""
+    # points that belong to no cluster (last row) or to no plane (column 0) are always kept
     parts, rows, columns = counts.shape
     for label in range(1, columns):
         most = max_own * _count(on_plane.ravel(), label)
@@ -360,13 +374,9 @@ def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
 
 @njit(cache=True, nogil=True)
 def _count_on_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, labels: UInt8, counts: Int64) -> None:
-    """Add the numbers of points by cluster and plane to `counts` (N + 1, K + 1), and set `labels` to their planes.
-
-    A label is 1 + the index of the plane, 0 = none. Runs of equal labels are counted together, to avoid a write for
-    each point.
-    """
+    """Count the points by cluster and plane, and set `labels` to the plane of each point, 0 = none."""
     k, label, count = 0, 0, 0
-    for i in range(len(cluster)):
+    for i in range(len(cluster)):  # count runs of equal labels, to avoid a write for each point
         labels[i] = on_plane[pixels[i, 1], pixels[i, 0]]
         if labels[i] != label or cluster[i] != k:
             counts[k, label] += count

@@ -1,4 +1,4 @@
-"""Owner mask of each segment of the depth image, and clusters of the owned segments.
+"""Assignment of segments of the depth image to masks.
 
 The assignment rule follows Voxblox++ (Grinvald et al., RA-L 2019).
 """
@@ -15,9 +15,9 @@ from framework.geometry import nearest_rotation, transform
 from framework.refinement.refine import keep_points
 from framework.refinement.segmentation.segment_owners_kernels import find_owners, judged
 
-# minimum square root of the scatter's second eigenvalue, m; single precision then shifts points at 5 m by under 0.1 mm
+# minimum square root of the second eigenvalue of the scatter of points, m; below it, the camera pose is inaccurate
 MIN_SPREAD = 0.02
-SAMPLE = 4096  # number of evenly spaced points; more points change the pose by less than single precision
+SAMPLE = 4096  # approximate number of points used to compute the camera pose
 TOLERANCE = 1e-3  # maximum distance of a point from its depth reading, m
 
 
@@ -26,9 +26,15 @@ def owned_segments(
 ) -> PointClusters:
     """Return the clusters without points outside their segments.
 
-    `labels`: the segment (H, W) of each pixel in [0, `count`), -1 = none. A segment belongs to the mask that covers the
-    most of its pixels, if these are more than a fraction `min_overlap` of the segment. With `whole_segments`, the
-    readings of a cluster's segments outside its mask are added to the cluster, if the points determine the camera pose.
+    A segment belongs to the mask that covers the most of its pixels.
+
+    Args:
+        clusters: The clusters.
+        frame: The frame.
+        labels: The segment (H, W) of each pixel, -1 = none.
+        count: The number of segments.
+        min_overlap: The minimum fraction of a segment inside the mask that it belongs to.
+        whole_segments: True to add all readings of its segments to a cluster, also outside its mask.
     """
     owners = find_owners(clusters.pixels, clusters.cluster, len(clusters), labels, count, min_overlap)
     kept, missing, missing_owner = judged(clusters.pixels, clusters.cluster, labels, owners)
@@ -46,11 +52,13 @@ def owned_segments(
 
 
 def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
-    """Return the T_world_camera (4, 4) that maps the depth readings at the clusters' pixels to the clusters' points.
+    """Return the camera pose T_world_camera (4, 4), computed from the points of the clusters.
 
-    The pose is the least-squares rigid motion (Arun, Huang and Blostein, "Least-Squares Fitting of Two 3-D Point Sets",
-    PAMI 1987). Returns None if there are too few points or if all points are on one line; SciPy's align_vectors would
-    only warn. Raises DataError if the points are not from the readings of this frame.
+    The pose is the least-squares rigid motion between the depth readings and the points (Arun et al., 1987). It is None
+    if there are too few points or if all points are on one line.
+
+    Raises:
+        DataError: If the points are not from the depth readings of this frame.
     """
     step = max(len(clusters.pixels) // SAMPLE, 1)
     points_world = clusters.points_world[::step].astype(np.float64)
@@ -73,12 +81,12 @@ def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
 
 
 def points_at(pixels: Int32, frame: Frame, T_world_camera: Float64) -> Float32:
-    """Return the world-frame points (P, 3), m, of `frame` at `pixels` (P, 2), u and v, as computed by `lift`."""
+    """Return the world points (P, 3), m, of the depth readings at the given pixels (P, 2), u and v."""
     return np.asarray(transform(T_world_camera, _readings(pixels, frame)), np.float32)
 
 
 def _readings(pixels: Int32, frame: Frame) -> Float64:
-    """Return the depth readings at `pixels` (P, 2), u and v, as camera-frame points (P, 3), m."""
+    """Return the depth readings at the given pixels as points (P, 3) in the camera frame, m."""
     camera = frame.camera
     z = frame.depth[pixels[:, 1], pixels[:, 0]].astype(np.float64)
     return np.stack([(pixels[:, 0] - camera.cx) / camera.fx * z, (pixels[:, 1] - camera.cy) / camera.fy * z, z], axis=1)

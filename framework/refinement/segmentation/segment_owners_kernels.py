@@ -10,10 +10,17 @@ from framework.data import Bool, Int32
 
 @njit(cache=True, nogil=True)
 def find_owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, count: int, min_overlap: float) -> Int32:
-    """Return the cluster (count,) with the most points in each of `count` segments; -1 = none. Ties go to the first.
+    """Return the cluster (count,) with the most points in each segment, -1 = none.
 
-    `pixels`: (P, 2) u, v. `cluster`: (P,) in [0, `clusters`), -1 = none. `labels`: (H, W), -1 = no segment. The points
-    must cover more than a fraction `min_overlap` of the segment.
+    Ties go to the first cluster.
+
+    Args:
+        pixels: The pixels (P, 2), u and v, of the points.
+        cluster: The cluster (P,) of each point, -1 = none.
+        clusters: The number of clusters.
+        labels: The segment (H, W) of each pixel, -1 = none.
+        count: The number of segments.
+        min_overlap: The minimum fraction of the segment that the points must cover.
     """
     sizes, covered = np.zeros(count, np.int64), np.zeros((count, clusters), np.int64)
     for label in labels.ravel():
@@ -33,11 +40,20 @@ def find_owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, cou
 
 @njit(cache=True, nogil=True)
 def judged(pixels: Int32, cluster: Int32, labels: Int32, owners: Int32) -> tuple[Bool, Int32, Int32]:
-    """Return an array (P,), True for points to keep, and the A uncovered pixels of owned segments with their owners.
+    """Find the points to keep, and the pixels of segments that are not covered by their cluster.
 
-    Points are kept if their cluster owns their segment, or if they belong to no cluster. A pixel of a segment with an
-    owner is uncovered if it has no kept point. Returns the uncovered pixels as (A, 2), u and v, and their owners, which
-    are clusters, as (A,). See `find_owners` for the arguments.
+    Points are kept if their cluster owns their segment, or if they belong to no cluster.
+
+    Args:
+        pixels: The pixels (P, 2), u and v, of the points.
+        cluster: The cluster (P,) of each point, -1 = none.
+        labels: The segment (H, W) of each pixel, -1 = none.
+        owners: The cluster that owns each segment, -1 = none.
+
+    Returns:
+        A Boolean array (P,), True for points to keep.
+        The uncovered pixels (A, 2), u and v, of owned segments.
+        The owner (A,) of each uncovered pixel.
     """
     height, width = labels.shape
     kept, covered = np.ones(len(cluster), np.bool_), np.zeros(labels.shape, np.bool_)

@@ -1,4 +1,7 @@
-"""Union-find for kernels: `parents[cell]` is a cell of the same component, and a root is its own parent."""
+"""Union-find for kernels.
+
+`parents[cell]` is a cell of the same component. The root of a component is its own parent.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ from framework.data import Int32
 
 @njit(cache=True, nogil=True)
 def root(parents: Int32, cell: int) -> int:
-    """Return the root of the component of a cell; path halving updates `parents`."""
-    while parents[cell] != cell:
+    """Return the root of the component of a cell."""
+    while parents[cell] != cell:  # with path halving
         parents[cell] = parents[parents[cell]]
         cell = parents[cell]
     return cell
@@ -18,7 +21,10 @@ def root(parents: Int32, cell: int) -> int:
 
 @njit(cache=True, nogil=True)
 def unite(parents: Int32, a: int, b: int) -> None:
-    """Join the components of two cells. The smaller root remains, so that the root of a component is its first cell."""
+    """Join the components of two cells.
+
+    The smaller root remains.
+    """
     a, b = root(parents, a), root(parents, b)
     if a < b:
         parents[b] = a

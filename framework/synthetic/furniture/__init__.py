@@ -1,1 +1,1 @@
-"""Furniture and furniture groups of synthetic scenes."""
+"""Furniture of synthetic scenes."""

@@ -1,4 +1,4 @@
-"""Clutter: objects with an instance id but no class, excluded from evaluation."""
+"""Random clutter, i.e. objects without a class that are excluded from evaluation."""
 
 from __future__ import annotations
 
@@ -199,7 +199,10 @@ def bowl(rng: Rng) -> Furniture:
 
 
 def painting(rng: Rng) -> Furniture:
-    """Return a framed painting with its back at y = 0."""
+    """Return a framed painting.
+
+    The back is at y = 0.
+    """
     piece = Furniture("picture")
     width, height = rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.65)
     frame = paints.wood(rng)
@@ -212,7 +215,10 @@ def painting(rng: Rng) -> Furniture:
 
 
 def window(rng: Rng) -> Furniture:
-    """Return a window with curtains, its back at y = 0 and its sill at z = 0."""
+    """Return a window with curtains.
+
+    The back is at y = 0, and the sill is at z = 0.
+    """
     piece = Furniture("window")
     width, height = rng.uniform(1.2, 1.5), rng.uniform(1.15, 1.3)
     white = paints.paint(rng, (0.92, 0.92, 0.90))
@@ -238,7 +244,10 @@ def window(rng: Rng) -> Furniture:
 
 
 def door(rng: Rng) -> Furniture:
-    """Return a closed door in its frame, with its back at y = 0."""
+    """Return a closed door in its frame.
+
+    The back is at y = 0.
+    """
     piece = Furniture("door")
     leaf = paints.wood(rng) if rng.uniform() < 0.5 else paints.paint(rng, (0.90, 0.89, 0.86))
     frame, steel = paints.paint(rng, (0.93, 0.92, 0.90)), paints.metal(rng)
@@ -252,7 +261,7 @@ def door(rng: Rng) -> Furniture:
 
 
 def rug(rng: Rng, width: float, depth: float) -> Furniture:
-    """Return a random rug with sides of `width` and `depth` m."""
+    """Return a random rug with the given side lengths, m."""
     piece = Furniture("rug")
     base = paints.pick(rng, paints.CLOTHS)
     other = paints.shade(paints.pick(rng, paints.CLOTHS), 1.2)
@@ -271,7 +280,10 @@ def partition(rng: Rng) -> Furniture:
 
 
 def ceiling_lamp(rng: Rng) -> Furniture:
-    """Return a hanging globe lamp; the ceiling is at z = 0."""
+    """Return a hanging globe lamp.
+
+    The ceiling is at z = 0.
+    """
     piece = Furniture("ceiling lamp")
     globe = [(-0.34, 0.06), (-0.30, 0.15), (-0.22, 0.19), (-0.14, 0.13), (-0.10, 0.03)]
     piece.add(lathe(globe, 28, 0.05), _glowing(rng))
@@ -289,7 +301,7 @@ def throw_cushion(rng: Rng) -> Furniture:
 
 
 def blanket(rng: Rng, width: float, depth: float) -> Furniture:
-    """Return a blanket with sides of `width` and `depth` m and with creases up to 3 cm high."""
+    """Return a creased blanket with the given side lengths, m."""
     piece = Furniture("blanket")
     sheet = rounded_box(width, depth, 0.03, 0.012, 2, WEAVE)
     piece.add(_crumpled(sheet, rng, 0.03, 0.05), paints.patterned_cloth(rng), z=0.015)
@@ -308,7 +320,10 @@ def clothes(rng: Rng) -> Furniture:
 
 
 def _crumpled(sheet: Solid, rng: Rng, height: float, fringe: float) -> Solid:
-    """Return the sheet with creases up to `height` m high and horizontal displacements up to `fringe` m."""
+    """Add random creases to a sheet.
+
+    `height` is the maximum height of the creases, and `fringe` is the maximum horizontal displacement, m.
+    """
     a, b, c, d = rng.uniform(0, 2 * np.pi, 4)
 
     def crumple(p: Float64) -> Float64:

@@ -1,4 +1,4 @@
-"""Difficult furniture groups: objects on beds, couches and tables, rows of identical objects, touching neighbors."""
+"""Difficult furniture groups, with cluttered surfaces, identical objects and touching neighbors."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def cluttered_bed_group(rng: Rng) -> Group:
 
 
 def cluttered_couch_group(rng: Rng) -> Group:
-    """Return a couch with cushions, a blanket, a bag and books, and a cluttered coffee table that touches the couch."""
+    """Return a cluttered couch and a cluttered coffee table that touch each other."""
     group = cluttered_couch(rng)
     front = float(group.pieces[0].bounds()[1][1])
     table = tabletops.coffee_table(rng)
@@ -71,7 +71,7 @@ def cluttered_couch(rng: Rng) -> Group:
 
 
 def _in_leather(couch: Furniture, rng: Rng) -> Furniture:
-    """Return a couch with black leather in place of its fabric."""
+    """Replace the fabric of a couch by black leather."""
     hide = paints.leather(rng)
     parts = [(solid, hide if material.texture is Texture.FABRIC else material) for solid, material in couch.parts]
     return Furniture(couch.kind, couch.class_name, parts)
@@ -100,10 +100,17 @@ def _clutter_couch(group: Group, rng: Rng) -> None:
 def _scatter(
     group: Group, lying: list[Furniture], low: Float64, high: Float64, rng: Rng, things: list[Furniture]
 ) -> None:
-    """Place `things` on the first object of `lying`, in the area from the corner `low` (2,) to `high` (2,), m.
+    """Place objects at random free positions on a piece of furniture.
 
-    The other objects of `lying` are already on the first object and are obstacles. Placed objects may overlap blankets,
-    but not other objects. Objects without a free position are omitted.
+    Objects may overlap blankets, but not other objects. Objects without a free position are omitted.
+
+    Args:
+        group: The group to which the objects are added.
+        lying: The furniture, followed by the objects that are already on it.
+        low: The lower corner (2,) of the area, m.
+        high: The upper corner (2,) of the area, m.
+        rng: The random number generator.
+        things: The objects to place.
     """
     lying = [*lying]
     in_the_way = [np.stack(piece.bounds()) for piece in lying[1:]]
@@ -121,10 +128,9 @@ def _scatter(
 
 
 def _placed_at_random(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Furniture:
-    """Return `thing` with a random rotation about z and a random position.
+    """Move an object to a random position in an area and rotate it at random.
 
-    The object is inside the area from the corner `low` (2,) to the corner `high` (2,), m. An object larger than the
-    area is centered on it.
+    An object that is larger than the area is centered. `low` and `high` are the corners (2,) of the area, m.
     """
     turned = thing.placed(0.0, 0.0, 0.0, np.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.3, 0.3))
     turned_low, turned_high = turned.bounds()
@@ -135,19 +141,19 @@ def _placed_at_random(thing: Furniture, low: Float64, high: Float64, rng: Rng) -
 
 
 def _overlap(box: Float64, other: Float64) -> bool:
-    """Return True if two boxes (2, 3), m, overlap as seen from above."""
+    """Return True if two boxes (2, 3), m, overlap in x and y."""
     return bool((np.minimum(box[1], other[1])[:2] > np.maximum(box[0], other[0])[:2]).all())
 
 
 def _height(pieces: list[Furniture], low: Float64, high: Float64) -> float:
-    """Return the height, m, of the objects' highest vertex in the area from `low` (2,) to `high` (2,), m."""
+    """Return the height, m, of the highest vertex in the area from `low` (2,) to `high` (2,), m."""
     vertices = np.concatenate([solid.vertices for piece in pieces for solid, _ in piece.parts])
     within = ((vertices[:, :2] >= low) & (vertices[:, :2] <= high)).all(axis=1)
     return float(vertices[within, 2].max())
 
 
 def chair_row(rng: Rng, count: int) -> Group:
-    """Return a row of `count` identical, touching chairs along the wall, some with objects on them."""
+    """Return a row of identical chairs that touch each other, some with objects on them."""
     group = Group("chair row")
     chair = seating.chair(rng)
     pitch = size(chair)[0] + _touch(rng)
@@ -171,7 +177,7 @@ def _lay_on_seat(group: Group, chair: Furniture, thing: Furniture) -> None:
 
 
 def desk_row(rng: Rng, count: int) -> Group:
-    """Return a row of `count` identical, touching desks with identical office chairs and different objects."""
+    """Return a row of identical desks that touch each other, with chairs and random objects."""
     group = Group("desk row")
     desk, chair = tabletops.desk(rng), seating.office_chair(rng)
     pitch = size(desk)[0] + _touch(rng)
@@ -184,7 +190,7 @@ def desk_row(rng: Rng, count: int) -> Group:
 
 
 def laid_table_group(rng: Rng) -> Group:
-    """Return a long table with many objects, two adjacent chairs, and one or two chairs at its ends, all identical."""
+    """Return a long table with many objects and three or four identical chairs."""
     group = Group("dining")
     table = tabletops.long_table(rng)
     table = group.add(table, y=against_wall(table))
@@ -202,9 +208,9 @@ def laid_table_group(rng: Rng) -> Group:
 
 
 def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Furniture:
-    """Push a chair under a table until its back or arms touch the table, add it to the group, and return it.
+    """Push a chair under a table until they touch, and add it to the group.
 
-    The table faces +y. The chair is offset by `x` m from the middle of the table.
+    The table faces +y. `x` is the offset of the chair from the middle of the table, m.
     """
     low, high = table.bounds()
     turned = chair.placed(0, 0, 0, np.pi)
@@ -214,7 +220,7 @@ def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Fu
 
 
 def _between(piece: Furniture, bottom: float, top: float) -> Float64:
-    """Return the vertices (N, 3), m, of an object with heights from `bottom` - SPACING to `top` + SPACING, m."""
+    """Return the vertices (N, 3), m, of an object between two heights, m."""
     solids = [solid.vertices for solid, _ in piece.parts]
     reaching = [v for v in solids if v[:, 2].max() > bottom and v[:, 2].min() < top]
     sections = [v[(v[:, 2] > bottom - SPACING) & (v[:, 2] < top + SPACING)] for v in reaching]
@@ -222,7 +228,10 @@ def _between(piece: Furniture, bottom: float, top: float) -> Float64:
 
 
 def strew_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) -> None:
-    """Place `things` at free positions on the flat top of `table`; omit objects without a free position."""
+    """Place objects at random free positions on a table.
+
+    Objects without a free position are omitted.
+    """
     low, high = table.bounds()
     there: list[Float64] = []
     for thing in things:
@@ -242,7 +251,7 @@ def _touch(rng: Rng) -> float:
 
 
 def board_group(rng: Rng) -> Group:
-    """Return a low sideboard with piles and rows of books, and a bag next to it."""
+    """Return a low sideboard with books and other objects, and a bag next to it."""
     group = Group("board")
     board = clutter.low_board(rng)
     board = group.add(board, y=against_wall(board))
@@ -255,7 +264,7 @@ def board_group(rng: Rng) -> Group:
 
 
 def laden(name: str, support: Furniture, rng: Rng) -> Group:
-    """Return a group called `name`: the object `support`, such as a cupboard, with objects on top."""
+    """Return a group with a piece of furniture and objects on top."""
     group = single(name, support)
     strew_on(group, group.pieces[0], rng, small_things.some(rng, small_things.ON_TOPS, 2))
     return group

@@ -1,4 +1,4 @@
-"""Refrigerators, televisions, toilets and backpacks."""
+"""Random refrigerators, televisions, toilets and backpacks."""
 
 from __future__ import annotations
 
@@ -94,10 +94,9 @@ def toilet(rng: Rng) -> Furniture:
 
 
 def _ring(a: float, b: float, inner_a: float, inner_b: float, height: float, front: float, inner_front: float) -> Solid:
-    """Return a toilet seat: an egg-shaped ring with its center at y = 0.03 m, from z = 0 to `height` m.
+    """Return a toilet seat, an egg-shaped ring with its base at z = 0.
 
-    `a`, `b` and `front` describe the outer edge, as in Section. `inner_a`, `inner_b` and `inner_front` describe the
-    inner edge.
+    `a`, `b` and `front` describe the outer edge as in Section. The other parameters describe the inner edge.
     """
     n, m = 40, 8
     around, across = np.meshgrid(np.linspace(0, 2 * np.pi, n + 1), np.linspace(0, 2 * np.pi, m + 1), indexing="ij")

@@ -1,6 +1,6 @@
-"""Furniture groups, such as a bed with a nightstand or a table with chairs and objects.
+"""Furniture groups, such as a table with chairs.
 
-A group has its back at y = 0 and faces +y.
+The back of a group is at y = 0, and the group faces +y.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ WALL_GAP = 0.015  # m, gap between a wall and adjacent furniture
 
 @dataclass
 class Group:
-    """Furniture and objects in a common frame."""
+    """Pieces of furniture that are placed together."""
 
     name: str
     pieces: list[Furniture] = field(default_factory=list)
@@ -36,35 +36,39 @@ class Group:
 
     @property
     def boxes(self) -> Float64:
-        """Axis-aligned boxes (N, 2, 3) of the objects, m."""
+        """Axis-aligned bounding boxes (N, 2, 3) of the objects, m."""
         return np.array([piece.bounds() for piece in self.pieces])
 
     @property
     def solid(self) -> Bool:
-        """Mask (N,) of the solid objects: all objects except rugs."""
+        """Mask (N,) of all objects except rugs."""
         return np.array([piece.kind != "rug" for piece in self.pieces])
 
 
 def against_wall(piece: Furniture) -> float:
-    """Return the y offset, m, that places the back of an object at the distance WALL_GAP from the wall at y = 0."""
+    """Return the y offset, m, at which an object almost touches the wall at y = 0."""
     return WALL_GAP - float(piece.bounds()[0][1])
 
 
 def on_top(piece: Furniture) -> float:
-    """Return the height, m, of the plane 1 mm above an object, on which other objects are placed."""
+    """Return the height, m, at which objects are placed on a piece of furniture."""
     return float(piece.bounds()[1][2]) + 0.001
 
 
 def size(piece: Furniture) -> Float64:
-    """Return the size (3,), m, of an object's axis-aligned box."""
+    """Return the size (3,), m, of an object."""
     low, high = piece.bounds()
     return high - low
 
 
 def next_to(piece: Furniture, other: Furniture, side: int, gap: float) -> float:
-    """Return the x offset (m) that places `piece` next to `other` with a gap of `gap` m.
+    """Return the x offset, m, at which an object is next to another object.
 
-    The piece is on the +x side (`side` = 1) or on the -x side (`side` = -1).
+    Args:
+        piece: The object to place.
+        other: The other object.
+        side: 1 = the +x side, -1 = the -x side.
+        gap: The gap between the objects, m.
     """
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
     return float(other_high[0] + gap - low[0] if side > 0 else other_low[0] - gap - high[0])
@@ -88,7 +92,7 @@ def couch_group(rng: Rng) -> Group:
 
 
 def with_low_table(couch: Furniture, rng: Rng) -> Group:
-    """Return a group of `couch`, a rug and a coffee table."""
+    """Return a group with a couch, a rug and a coffee table."""
     group = Group("couch")
     couch = group.add(couch, y=against_wall(couch))
     front = couch.bounds()[1][1]
@@ -101,7 +105,7 @@ def with_low_table(couch: Furniture, rng: Rng) -> Group:
 
 
 def put_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) -> None:
-    """Place `things` on a table, side by side along its length."""
+    """Place objects side by side on a table."""
     low, high = table.bounds()
     slots = np.linspace(low[0], high[0], len(things) + 1)
     for thing, left, right in zip(things, slots[:-1], slots[1:], strict=True):
@@ -125,7 +129,7 @@ def tv_group(rng: Rng) -> Group:
 
 
 def dining_group(rng: Rng) -> Group:
-    """Return a table with chairs on up to three sides. Two of the chairs are side by side and nearly touch."""
+    """Return a table with two to four chairs, two of which are side by side."""
     group = Group("dining")
     table = tabletops.dining_table(rng)
     group.add(table, y=against_wall(table) + 0.03)
@@ -193,9 +197,13 @@ def desk_group(rng: Rng) -> Group:
 
 
 def single(name: str, piece: Furniture, z: float = 0.0, hung: bool = False) -> Group:
-    """Return a group with one object at the height `z` m.
+    """Return a group with one object.
 
-    The back of the object is at the distance WALL_GAP from the wall, or 2 mm if `hung` is True.
+    Args:
+        name: The name of the group.
+        piece: The object.
+        z: The height of the object, m.
+        hung: True = the object hangs on the wall.
     """
     group = Group(name)
     group.add(piece, y=0.002 if hung else against_wall(piece), z=z)

@@ -1,4 +1,4 @@
-"""Random beds, chairs and couches of common sizes."""
+"""Random beds, chairs and couches."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def bare_couch(rng: Rng) -> Furniture:
 
 
 def _couch_body(rng: Rng) -> tuple[Furniture, float, float, float]:
-    """Return a couch without pillows, and its width, its depth and the width of its arms, m."""
+    """Return a couch without pillows, with its width, its depth and the width of its arms, m."""
     piece = Furniture("couch", "couch")
     cover, feet = paints.cloth(rng), paints.wood(rng)
     seats = int(rng.integers(2, 4))

@@ -1,4 +1,7 @@
-"""Small objects and shelves with small objects; only books have a class."""
+"""Random small objects, and shelves with objects.
+
+Only books have a class.
+"""
 
 from __future__ import annotations
 
@@ -90,7 +93,7 @@ def carton_stack(rng: Rng) -> Furniture:
 
 
 def book_row(rng: Rng) -> Furniture:
-    """Return a row of upright books, labeled as one instance like a pile of books."""
+    """Return a row of upright books, labeled as one instance."""
     row = Furniture("row of books", "book")
     end = 0.0
     for _ in range(int(rng.integers(5, 9))):
@@ -106,7 +109,7 @@ def book_row(rng: Rng) -> Furniture:
 
 
 def shelf(rng: Rng) -> Furniture:
-    """Return an open shelf and its contents as one object without a class."""
+    """Return an open shelf with objects, labeled as one instance without a class."""
     piece = Furniture("shelf")
     wood = paints.wood(rng)
     width, depth, height = rng.uniform(0.75, 1.0), 0.30, rng.uniform(1.5, 1.9)
@@ -123,9 +126,15 @@ def shelf(rng: Rng) -> Furniture:
 
 
 def _fill(piece: Furniture, rng: Rng, start: float, end: float, z: float, height: float) -> None:
-    """Place binders, boxes and gaps side by side on a shelf board.
+    """Place binders and boxes side by side on a shelf board.
 
-    The board is at the height `z` m, and extends from `start` to `end` m along x. Objects are at most `height` m high.
+    Args:
+        piece: The shelf.
+        rng: The random number generator.
+        start: The start of the board along x, m.
+        end: The end of the board along x, m.
+        z: The height of the board, m.
+        height: The maximum height of the objects, m.
     """
     x = start
     while True:
@@ -147,5 +156,5 @@ ON_TOPS: tuple[MakeThing, ...] = (clutter.carton, clutter.throw_cushion, basket,
 
 
 def some(rng: Rng, makers: tuple[MakeThing, ...], count: int) -> list[Furniture]:
-    """Return `count` objects, each created by a randomly selected function of `makers`."""
+    """Return random objects, each created by one of the functions in `makers`."""
     return [makers[int(rng.integers(len(makers)))](rng) for _ in range(count)]

@@ -1,9 +1,10 @@
-"""Shapes of furniture: rounded boxes, lofts and tubes, as triangles with smooth normals.
+"""Geometric shapes for furniture, as triangle meshes with smooth normals.
 
-A shape is created at the origin, with z up and lengths in meters. Its texture coordinates are its initial 3D
-coordinates in meters, so that a solid texture moves with the shape. Faces are subdivided, because light is baked into
-the vertices. `segments` is the number of subdivisions of a rounded edge or of a circumference. `spacing` is the maximum
-distance between adjacent vertices on flat faces, m.
+A shape is created at the origin, with z up and lengths in m. Its texture coordinates are its initial 3D coordinates, so
+that a solid texture moves with the shape. Flat faces are subdivided, because light is stored at the vertices.
+
+Common parameters are `segments`, the number of subdivisions of a rounded edge or circumference, and `spacing`, the
+maximum distance between vertices on flat faces, m.
 """
 
 from __future__ import annotations
@@ -22,7 +23,10 @@ WELD = 1e-6  # m, rounding of vertex positions for the test whether they are equ
 
 @dataclass(frozen=True)
 class Solid:
-    """A triangle mesh; triangles are counterclockwise as seen from outside."""
+    """A triangle mesh with texture coordinates.
+
+    Triangles are counterclockwise as seen from outside.
+    """
 
     vertices: Float64  # (V, 3) m
     normals: Float64  # (V, 3) unit vectors
@@ -33,19 +37,19 @@ class Solid:
         return replace(self, vertices=self.vertices + np.array([x, y, z]))
 
     def turned(self, axis: str, angle: float) -> Solid:
-        """Return a copy rotated by `angle` rad about the axis x, y or z through the origin."""
+        """Return a copy that is rotated about the axis x, y or z by an angle in rad."""
         R = axis_rotation(axis, angle)
         return replace(self, vertices=_turn(R, self.vertices), normals=_turn(R, self.normals))
 
     def deformed(self, shape: Callable[[Float64], Float64]) -> Solid:
-        """Return a copy with `shape` applied to the vertices (V, 3), m, and with recomputed normals."""
+        """Return a copy with a function applied to the vertices (V, 3), m."""
         vertices = shape(self.vertices.copy())
         return replace(self, vertices=vertices, normals=smooth_normals(vertices, self.triangles))
 
     def flat(self, along: int, up: int) -> Solid:
-        """Return a copy with texture coordinates (s, t, 0) for image textures, in meters from the lower corner.
+        """Return a copy with 2D texture coordinates (s, t, 0), m.
 
-        s and t run along the axes `along` and `up` of the vertex coordinates (0 = x, 1 = y, 2 = z).
+        The origin is the lower corner. `along` and `up` are the axes of s and t (0 = x, 1 = y, 2 = z).
         """
         s = self.vertices[:, along] - self.vertices[:, along].min()
         t = self.vertices[:, up] - self.vertices[:, up].min()
@@ -53,7 +57,7 @@ class Solid:
 
 
 def axis_rotation(axis: str, angle: float) -> Float64:
-    """Return the rotation matrix (3, 3) by `angle` rad about the axis x, y or z."""
+    """Return the rotation matrix (3, 3) for an angle in rad about the axis x, y or z."""
     c, s = np.cos(angle), np.sin(angle)
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
@@ -63,15 +67,16 @@ def axis_rotation(axis: str, angle: float) -> Float64:
 
 
 def _turn(R: Float64, vectors: Float64) -> Float64:
-    """Return the vectors (V, 3) rotated by R (3, 3).
-
-    BLAS is not used, because its rounding may depend on the number of threads.
-    """
+    """Rotate vectors (V, 3)."""
+    # without BLAS, because its rounding may depend on the number of threads
     return np.asarray(np.einsum("ck,vk->vc", R, vectors))
 
 
 def smooth_normals(vertices: Float64, triangles: Int32) -> Float64:
-    """Return the area-weighted normals (V, 3) of the vertices; vertices at equal positions share a normal."""
+    """Return the area-weighted vertex normals (V, 3).
+
+    Vertices at the same position share a normal.
+    """
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     faces = np.cross(b - a, c - a)
     _, point = np.unique(np.round(vertices / WELD).astype(np.int64), axis=0, return_inverse=True)
@@ -86,7 +91,10 @@ def smooth_normals(vertices: Float64, triangles: Int32) -> Float64:
 def rounded_box(
     x: float, y: float, z: float, radius: float = 0.004, segments: int = 1, spacing: float = SPACING
 ) -> Solid:
-    """Return a box with side lengths x, y, z m and edges rounded by `radius` m."""
+    """Return a box with rounded edges.
+
+    Lengths are in m.
+    """
     half = np.array([x, y, z]) / 2
     radius = min(radius, float(half.min()) * 0.999)
     inner = half - radius
@@ -114,15 +122,15 @@ def rounded_box(
 
 
 def _grain_first(vertices: Float64, size: Float64) -> Float64:
-    """Return the vertices (V, 3), m, as texture coordinates, with the axis of the longest side first.
-
-    Because of this order, wood grain runs along a board. `size` (3,) contains the side lengths, m.
-    """
+    """Return texture coordinates (V, 3), m, for which wood grain runs along the longest side."""
     return vertices[:, np.argsort(-size, kind="stable")]
 
 
 def cushion(x: float, y: float, z: float, plump: float = 0.5) -> Solid:
-    """Return a pillow with side lengths x, y, z m, whose thickness decreases by the fraction `plump` at the seam."""
+    """Return a pillow with side lengths in m.
+
+    The thickness decreases by the fraction `plump` towards the seam.
+    """
     box = rounded_box(x, y, z, radius=0.45 * z, segments=4, spacing=min(x, y) / 9)
 
     def swell(p: Float64) -> Float64:
@@ -137,7 +145,7 @@ def cushion(x: float, y: float, z: float, plump: float = 0.5) -> Solid:
 
 @dataclass(frozen=True)
 class Section:
-    """A horizontal section of a loft: the superellipse |x/a|^n + |y/b|^n = 1, moved to the center (x, y)."""
+    """A horizontal section of a loft: the superellipse |x/a|^n + |y/b|^n = 1 around a center."""
 
     z: float  # m, height of the section
     a: float  # m, half width along x
@@ -149,7 +157,7 @@ class Section:
 
 
 def loft(sections: Sequence[Section], segments: int = 24, spacing: float = SPACING) -> Solid:
-    """Return the solid through `sections`, from bottom to top, with flat ends."""
+    """Return a solid that connects horizontal sections, from bottom to top."""
     cuts = [sections[0]]
     for below, above in pairwise(sections):
         length = np.hypot(above.z - below.z, max(abs(above.a - below.a), abs(above.b - below.b)))
@@ -188,24 +196,33 @@ def loft(sections: Sequence[Section], segments: int = 24, spacing: float = SPACI
 
 
 def lathe(profile: Sequence[tuple[float, float]], segments: int = 24, spacing: float = SPACING) -> Solid:
-    """Return the solid of revolution about z through (height, radius) pairs, m."""
+    """Return a solid of revolution about z from (height, radius) pairs, m."""
     return loft([Section(z, r, r) for z, r in profile], segments, spacing)
 
 
 def cylinder(radius: float, height: float, top_radius: float | None = None, segments: int = 20) -> Solid:
-    """Return a cylinder or a conical frustum on z = 0, lengths in m; `top_radius` None = `radius`."""
+    """Return a cylinder, or a frustum of a cone, on z = 0.
+
+    Lengths are in m. If `top_radius` is None, it is equal to `radius`.
+    """
     top = radius if top_radius is None else top_radius
     return lathe([(0.0, radius), (height, top)], segments)
 
 
 def leg(thickness: float, height: float, taper: float = 0.7) -> Solid:
-    """Return a square leg on z = 0 that is `thickness` m wide at the top and `taper` times as wide at the bottom."""
+    """Return a square furniture leg on z = 0.
+
+    Args:
+        thickness: The width at the top, m.
+        height: The height, m.
+        taper: The width at the bottom, relative to the width at the top.
+    """
     a = thickness / 2
     return loft([Section(0.0, taper * a, taper * a, n=8), Section(height, a, a, n=8)], segments=16)
 
 
 def tube(points: Sequence[tuple[float, float, float]] | Float64, radius: float, segments: int = 10) -> Solid:
-    """Return a round rod of `radius` m along a polyline (N, 3), m, whose bends are smoothed by a Catmull-Rom spline."""
+    """Return a round rod along a smoothed polyline (N, 3), m."""
     path = _spline(np.asarray(points, np.float64))
     tangents = np.gradient(path, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
@@ -235,9 +252,9 @@ def _spline(points: Float64) -> Float64:
 
 
 def panel(width: float, height: float, spacing: float = 0.1) -> Solid:
-    """Return a flat rectangle of `width` x `height` m in the plane y = 0 that faces +y.
+    """Return a flat rectangle in the plane y = 0 that faces +y.
 
-    Its texture coordinates are (s, t, 0) in meters from the lower left corner.
+    Lengths are in m. The texture coordinates (s, t, 0) begin at the lower left corner.
     """
     s, t = (np.linspace(0, side, max(2, int(np.ceil(side / spacing)) + 1)) for side in (width, height))
     S, T = np.meshgrid(s, t, indexing="ij")
@@ -249,7 +266,10 @@ def panel(width: float, height: float, spacing: float = 0.1) -> Solid:
 
 
 def grid_triangles(rows: int, columns: int, flip: bool) -> Int32:
-    """Return the triangles (F, 3) of a grid of rows x columns vertices, two per cell; `flip` reverses their winding."""
+    """Return the triangles (F, 3) of a grid of vertices, two per cell.
+
+    `flip` reverses the order of the vertices.
+    """
     index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
     triangles = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Tables and books."""
+"""Random tables and books."""
 
 from __future__ import annotations
 
@@ -35,7 +35,10 @@ def desk(rng: Rng) -> Furniture:
 
 
 def coffee_table(rng: Rng) -> Furniture:
-    """Return a low table. Its class is dining table, as in COCO's annotations."""
+    """Return a low table.
+
+    Its class is dining table, as in COCO.
+    """
     size = rng.uniform(0.85, 1.1), rng.uniform(0.48, 0.58), rng.uniform(0.38, 0.44)
     return _table("coffee table", *size, paints.wood(rng), 0.05)
 
@@ -61,7 +64,7 @@ def book(rng: Rng) -> Furniture:
 
 
 def book_pile(rng: Rng) -> Furniture:
-    """Return a pile of three or four books, labeled as one instance like "books" in SceneNN."""
+    """Return a pile of three or four books, labeled as one instance."""
     piece = Furniture("pile of books", "book")
     z = 0.0
     for k in range(int(rng.integers(3, 5))):

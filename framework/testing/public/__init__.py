@@ -1,1 +1,1 @@
-"""The submodules of `instancemap`, which is a single file: instancemap.py sets `__path__` to this folder."""
+"""Submodules of `instancemap`. instancemap.py sets its `__path__` to this folder."""

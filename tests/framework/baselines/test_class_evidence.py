@@ -1,4 +1,4 @@
-"""Tests of the class evidence of one voxel, compared with a dense recursion over all classes."""
+"""Tests for the class evidence of a voxel, compared with a recursion over all classes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def one_voxel(classes: int) -> ClassEvidence:
 
 
 def masks_of(log_ratio: np.ndarray, frame: int = 0) -> MaskClasses:
-    """Return N one-pixel masks in one image row, with these log ratios (N, C) of their classes."""
+    """Return N masks of one pixel each, with the log ratios (N, C) of their classes."""
     n, c = log_ratio.shape
     clusters = PointClusters(
         np.zeros((n, 3), np.float32),
@@ -44,7 +44,7 @@ def observe(evidence, masks, k):
 
 
 def sums(evidence: ClassEvidence, classes: int) -> np.ndarray:
-    """Return the summed log ratios (C,) of the classes that are stored in the voxel."""
+    """Return the summed log ratios (C,) of the voxel. Classes without a slot have the common value."""
     found = np.full(classes, evidence.rest[0, 0], np.float64)
     for label, value in zip(evidence.class_ids[0, 0], evidence.log_ratio[0, 0], strict=True):
         if label != NO_CLASS:
@@ -63,7 +63,7 @@ def test_class_evidence_few_classes_match_dense_recursion() -> None:
 
 
 def test_class_evidence_of_later_class_includes_earlier_masks() -> None:
-    """Each mask has its own log ratios for 8 of 14 classes and an equal log ratio for the others."""
+    """Each mask has separate log ratios for 8 of the 14 classes and a common log ratio for the others."""
     rng = np.random.default_rng(1)
     log_ratios = np.full((20, 14), -3.0)
     for row in log_ratios:
@@ -79,7 +79,7 @@ def test_class_evidence_full_voxel_evicts_least_likely_class() -> None:
     masks, evidence = masks_of(message), one_voxel(40)
     assert evidence.class_ids.shape[2] == CLASS_SLOTS
     assert [observe(evidence, masks, k) for k in range(3)] == [0, 0, 8]
-    # summed log ratios: classes 0 to 7: 1 - 5 - 5; 8 to 15: -5 + 2 - 5; 16 to 23: -5 - 5 + 9
+    # summed log ratios: 1 - 5 - 5 for classes 0 to 7, -5 + 2 - 5 for 8 to 15, and -5 - 5 + 9 for 16 to 23
     assert set(evidence.class_ids[0, 0].tolist()) == set(range(8, 24))
     assert evidence.class_ids[0, 0, 0] == 16
     assert evidence.log_ratio[0, 0, 0] == pytest.approx(-1)

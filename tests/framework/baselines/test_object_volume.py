@@ -1,4 +1,4 @@
-"""Tests of the pixel windows of boxes, compared with projected points inside the boxes."""
+"""Tests for the image windows of 3D boxes."""
 
 import numpy as np
 
@@ -33,7 +33,8 @@ def test_box_window_contains_all_visible_points() -> None:
 def test_box_window_in_front_of_camera_is_tight() -> None:
     low, high = np.array([[-0.1, -0.1, 1.0]]), np.array([[0.1, 0.1, 2.0]])
     [window] = boxes_in_view(CAMERA, np.eye(4), low, high, NEAR).tolist()
-    assert window == [14, 12, 23, 20]  # 18 ± 3.5 px and 15.5 ± 3.3 px, rounded outward
+    # the box extends over 18 ± 3.5 px and 15.5 ± 3.3 px; its window is rounded outward
+    assert window == [14, 12, 23, 20]
 
 
 def test_box_window_behind_camera_is_empty() -> None:

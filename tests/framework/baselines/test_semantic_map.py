@@ -1,4 +1,4 @@
-"""Tests of connected components on small meshes, compared with hand-computed results and SciPy."""
+"""Tests for the connected components of a semantic map on small meshes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the check of the delay between color and depth."""
+"""Tests for the check of the delay between color and depth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.framework.tracking.test_color_delay import CAMERA, delayed_frames
 
 
 class Delayed(RGBDSequence):
-    """A sequence with poses, in which color is captured `delay` s after depth."""
+    """Sequence with poses whose color images are captured `delay` s after the depth images."""
 
     def __init__(self, delay: float, speed: float = 1.0, constant: float | None = None) -> None:
         self.frames = [replace(frame, T_world_camera=pose) for frame, pose in delayed_frames(delay, 60, speed)]

@@ -1,4 +1,4 @@
-"""Tests of the detection of a delay between poses and frames, with exact points."""
+"""Tests for the detection of a delay between poses and frames."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ IDENTITY_FIT = (PoseFit(PoseReading(), 1.0, np.zeros(0)),)
 
 
 def uneven_path() -> list[Float64]:
-    """Return the poses of a camera whose velocity changes from frame to frame."""
+    """Return the poses of a camera with varying velocity."""
     chosen = np.random.default_rng(0)
     poses = [np.eye(4)]
     for _ in range(FRAMES - 1):
@@ -30,12 +30,12 @@ def uneven_path() -> list[Float64]:
 
 
 def uniform_path() -> list[Float64]:
-    """Return the poses of a camera whose velocity is constant."""
+    """Return the poses of a camera with constant velocity."""
     return [exp_se3(k * np.array([0.01, 0.0, 0.005, 0.0, 0.01, 0.0])) for k in range(FRAMES)]
 
 
 def pairs_of(true: Sequence[Float64], stored: Sequence[Float64 | None], noise: float = 0.0) -> list[MatchedPair]:
-    """Return pairs of frames with stored poses and image matches; `noise` is the standard deviation of matches, px."""
+    """Return matched pairs of frames with stored poses. `noise` is the standard deviation of the matches, px."""
     pairs = []
     for k, step in ((k, step) for k in range(8, FRAMES - 24, 6) for step in (4, 8, 16)):
         chosen = np.random.default_rng(k)
@@ -51,7 +51,7 @@ def pairs_of(true: Sequence[Float64], stored: Sequence[Float64 | None], noise: f
 
 
 def late(poses: Sequence[Float64], frames: int) -> list[Float64 | None]:
-    """Return the poses stored `frames` frames late; None for frames without a pose."""
+    """Return the poses, delayed by `frames` frames. Frames without a pose have None."""
     return [poses[k - frames] if 0 <= k - frames < len(poses) else None for k in range(len(poses))]
 
 

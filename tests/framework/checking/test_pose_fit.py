@@ -1,4 +1,4 @@
-"""Tests of the detection of pose conventions, with exact points."""
+"""Tests for the detection of pose conventions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ BLANK = np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32)
 def pair(
     T_world_first: Float64, T_world_second: Float64, stored: Callable[[Float64], Float64], seed: int
 ) -> MatchedPair:
-    """Return two frames of a point cloud with their stored poses and image matches."""
+    """Return a matched pair of frames that see the same random points.
+
+    `stored` converts the true poses to the stored ones.
+    """
     chosen = np.random.default_rng(seed)
     points = np.column_stack([chosen.uniform(-0.6, 0.6, (60, 2)), chosen.uniform(1.5, 3, 60)])
     T_second_first = inverse(T_world_second) @ T_world_first
@@ -61,7 +64,7 @@ def test_pose_fit_of_correct_poses_has_no_error() -> None:
 @pytest.mark.parametrize("reading", list(readings()), ids=repr)
 def test_pose_fit_identifies_reading_from_moving_camera(reading: PoseReading) -> None:
     def stored(T_world_camera: Float64) -> Float64:
-        """Return the stored pose that the reading converts to T_world_camera."""
+        """Return the stored pose for T_world_camera in the convention of `reading`."""
         T = T_world_camera.copy()
         T[:3, :3] = T[:3, :3] @ reading.camera_axes.R_axes_camera.T
         if reading.pose_kind is PoseKind.T_CAMERA_WORLD:
@@ -78,7 +81,7 @@ def test_pose_fit_identifies_reading_from_moving_camera(reading: PoseReading) ->
 
 
 def test_pose_fit_reports_ambiguous_axes_of_pan() -> None:
-    """For rotations about the vertical image axis, inverted poses and poses in OpenGL axes are equivalent."""
+    """If the camera only pans, inverted poses and poses in OpenGL axes describe the same motion."""
     judged = judge(pairs_of(walk(2, pan_only=True), inverse), PoseReading(), 1000.0, 2.0)
     [fault] = judged.findings
     assert fault.verdict is Verdict.ERROR
@@ -111,7 +114,7 @@ def test_pose_fit_in_configured_axes_is_correct() -> None:
 
 
 def test_pose_fit_keeps_configured_unit_in_axes_search() -> None:
-    """The poses are inverted and in millimeters. If the unit is set, only the inversion is reported."""
+    """The stored poses are inverted and in millimeters. With the correct unit, only the inversion is reported."""
 
     def stored(T: Float64) -> Float64:
         inverted = inverse(T)

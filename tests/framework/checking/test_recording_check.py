@@ -1,4 +1,4 @@
-"""Tests of the recording check: valid recordings pass, and each wrong convention is named."""
+"""Tests for the check of recordings. Each wrong convention must be reported with the setting that corrects it."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
 
 
 def in_axes(axes: CameraAxes) -> Callable[[Float64], Float64]:
-    """Return a function that converts the pose of a camera to other camera axes."""
+    """Return a function that converts a camera pose to other camera axes."""
     T_axes_camera = np.eye(4)
     T_axes_camera[:3, :3] = axes.R_axes_camera
     return lambda T_world_camera: T_world_camera @ inverse(T_axes_camera)
 
 
 def scalar_first(T: Float64) -> Float64:
-    """Return the pose that results if the quaternion w x y z is read as x y z w."""
+    """Return the pose that results if a quaternion in the order w x y z is read as x y z w."""
     misread = T.copy()
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
     misread[:3, :3] = Rotation.from_quat((w, x, y, z)).as_matrix()
@@ -138,7 +138,7 @@ def test_recording_check_of_valid_recordings_reports_no_error(shared_data: Path)
 
 
 def test_recording_check_applies_configured_conventions(tmp_path: Path) -> None:
-    """The recording is valid with the correct parameters, and invalid again with other values."""
+    """With the correct parameters, the damaged recording has no errors. Other values are reported."""
     place = write_damaged(tmp_path / "damaged", DESK, pose=both, scale=2.0, depth_late=1, poses_late=-2)
     reading = PoseReading(PoseKind.T_CAMERA_WORLD, CameraAxes.OPENGL, pose_delay=-2)
     depth = DepthReading(depth_scale=5000, depth_delay=1)
@@ -150,7 +150,7 @@ def test_recording_check_applies_configured_conventions(tmp_path: Path) -> None:
 
 
 def test_recording_check_reports_clock_delay_in_two_units(tmp_path: Path) -> None:
-    """The recording is the desk in TUM format; its pose timestamps are 0.1 s late."""
+    """The pose timestamps of the desk in TUM format are 0.1 s late. The delay is reported in frames and in seconds."""
     shutil.copytree(DESK.folder, tmp_path / DESK.name)
     path = tmp_path / DESK.name / "groundtruth.txt"
     words = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
@@ -176,7 +176,7 @@ def test_recording_check_unrelated_poses_fit_no_convention(tmp_path: Path) -> No
 
 @dataclass
 class MovedDepth(RGBDSequence):
-    """The desk with depth images warped by an affine matrix (2, 3) in px, as if from a second camera."""
+    """The desk with depth images warped by an affine matrix (2, 3), px, like images of a separate depth camera."""
 
     moved: Float64
 
@@ -200,14 +200,13 @@ def test_recording_check_reports_unregistered_depth(zoom: float, x: float, y: fl
     assert "not registered" in fault.text
     if zoom == 1:
         found_x, found_y = (float(number) for number in re.findall(r"([+-][0-9.]+) %", fault.text))
-        assert found_x == pytest.approx(
-            -100 * x / 640, abs=0.4
-        )  # % of the image width; the reported shift is the correction
+        # % of the image width; the reported shift corrects the offset
+        assert found_x == pytest.approx(-100 * x / 640, abs=0.4)
         assert found_y == pytest.approx(-100 * y / 640, abs=0.4)
 
 
 def test_recording_check_half_frame_color_delay_gives_note() -> None:
-    """The desk begins with a rotation of 20 px per frame. A Kinect captures color and depth at different times."""
+    """The image moves by 20 px per frame at the beginning, and a Kinect captures color and depth separately."""
     [note] = [
         finding for finding in check(replace(DESK, stop=6), FARTHEST).findings if finding.subject == "color and depth"
     ]
@@ -217,7 +216,7 @@ def test_recording_check_half_frame_color_delay_gives_note() -> None:
 
 @dataclass
 class Part(RGBDSequence):
-    """The first `count` frames of the desk without poses; `change` modifies each frame."""
+    """The first `count` frames of the desk, without poses and changed by `change`."""
 
     count: int
     change: Callable[[Frame], Frame] = lambda frame: frame

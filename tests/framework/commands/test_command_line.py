@@ -1,4 +1,4 @@
-"""Tests of the directory names of sweeps and of the exit of commands."""
+"""Tests for the directory names of sweeps and of the exit of commands."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def test_print_for_directories_continues_after_error(
 
 
 @pytest.mark.parametrize("command", ["tables", "figures", "evaluate", "plugins"])
-def test_command_with_closed_pipe_ends_silently(command: str) -> None:
-    """Example: `python -m framework tables DIR | head -1`."""
+def test_command_with_closed_pipe_ends_without_output(command: str) -> None:
+    """An example is `python -m framework tables DIR | head -1`."""
     reader, writer = os.pipe()
     os.close(reader)
     arguments = [sys.executable, "-m", "framework", command, "--help"]
@@ -62,5 +62,5 @@ def test_command_with_closed_pipe_ends_silently(command: str) -> None:
     ],
 )
 def test_config_dirs_are_read_from_command_line(words: list[str], folders: list[str]) -> None:
-    """The command without arguments, which maps the desk, has no config directories."""
+    """Without arguments, the command maps the desk and has no config directories."""
     assert _config_dirs(words) == [Path(folder) for folder in folders]

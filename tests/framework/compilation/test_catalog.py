@@ -1,4 +1,4 @@
-"""Tests of kernels.txt, the list of all kernels of a run. A run after `compile` compiles no kernels."""
+"""Tests for kernels.txt, the list of all kernels. After `compile`, a run compiles no kernels."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def test_kernel_signature_text_round_trip_is_exact() -> None:
 
 @pytest.mark.acceptance
 def test_kernel_catalog_contains_all_called_kernels() -> None:
-    """Run the demo, a synthetic scene, and every other refiner, fuser and tracker.
+    """Run the demo, a synthetic scene, and all other refiners, fusers and trackers.
 
-    `python -m tests.support.kernel_calls` updates kernels.txt.
+    To update kernels.txt, run `python -m tests.support.kernel_calls`.
     """
     if missing := [kernel for kernel in listed(DEFAULT, OTHERS) if not kernel.is_compiled()]:
         compile_all(missing)  # like `make test`
@@ -91,7 +91,7 @@ def twice(x):
 
 @pytest.fixture
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Write two kernel modules that worker processes can import; return the file of the callee."""
+    """Write two kernel modules that worker processes can import. Return the file of the called kernel."""
     (tmp_path / "kernel_caller.py").write_text(SMALL)
     callee = tmp_path / "kernel_callee.py"
     callee.write_text(CALLEE.format(2))
@@ -153,7 +153,7 @@ def test_compile_for_run_waits_for_other_process(
 ) -> None:
     kernel = Kernel("kernel_caller", "small", "int64")
     monkeypatch.setattr(catalog, "listed", lambda *_: [kernel])
-    importlib.import_module("kernel_caller")  # as a run imports the modules of its stages
+    importlib.import_module("kernel_caller")  # a run imports the modules of its stages
     lock = FileLock(Path(kernel.dispatcher._cache.cache_path) / "compiling.lock")
     Path(lock.lock_file).parent.mkdir(exist_ok=True)
     caplog.set_level("INFO")

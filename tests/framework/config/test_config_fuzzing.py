@@ -1,4 +1,4 @@
-"""Fuzz tests of option YAML files: an option is built or rejected with a one-line error.
+"""Fuzz tests for option YAML files. An option must be built or rejected with a one-line error.
 
 `INSTANCEMAP_FUZZ=2000 pytest tests/framework/config/test_config_fuzzing.py` tries 1000 cases.
 """
@@ -53,7 +53,7 @@ TOKENS = (
         b"~: 1\n",
     ),
 )
-SLOWEST = 5.0  # maximum CPU time, s; elapsed time would depend on other processes
+SLOWEST = 5.0  # s, maximum CPU time; wall time would depend on other processes
 BOMB = "a0: &a0 [x]\n" + "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12))
 
 
@@ -65,7 +65,7 @@ def option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def line_of(option: Path, content: bytes) -> str:
-    """Return the error line of the option; "" if it was built. Fail for any other outcome."""
+    """Return the error line of the option, or "" if the option was built. Fail for any other outcome."""
     option.write_bytes(content)
     began = time.process_time()
     try:
@@ -120,7 +120,7 @@ def test_config_option_linked_to_device_raises(option: Path) -> None:
         composed("~dataset", "detector=mine")
 
 
-def test_stored_config_with_alias_bomb_raises(tmp_path: Path) -> None:
+def test_stored_config_with_nested_aliases_raises(tmp_path: Path) -> None:
     from framework.runs.stored_runs import read_yaml
 
     (tmp_path / "config.yaml").write_text(BOMB)

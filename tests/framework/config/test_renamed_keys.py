@@ -1,4 +1,7 @@
-"""Tests of renamed config keys: old keys are rejected with the new key, and no config contains them."""
+"""Tests for renamed config keys.
+
+Old keys are rejected with the name of the new key, and no config contains old keys.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the validation of experiment rows."""
+"""Tests for the validation of experiment rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of original recordings from dataset publishers, apps and drivers, with known values."""
+"""Tests for original recordings of datasets, apps and drivers, compared with known values."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ GAP = (1305031244.897635, 1305031244.997688)  # times of the color images with d
 
 @pytest.fixture(scope="module")
 def originals(shared_data: Path) -> Path:
-    """Return `shared/data/originals`; skip the test if it is missing."""
+    """Return `shared/data/originals`. Skip the test if the folder is missing."""
     if not (shared_data / "originals").is_dir():
         pytest.skip(f"{shared_data / 'originals'} does not exist")
     return shared_data / "originals"
 
 
 def readings(depth: np.ndarray) -> tuple[float, float, float]:
-    """Return the smallest and largest valid depth in the unit of `depth`, and the fraction of valid pixels."""
+    """Return the minimum and the maximum of the valid depth, and the fraction of valid pixels."""
     return float(depth[depth > 0].min()), float(depth[depth > 0].max()), float((depth > 0).mean())
 
 
@@ -61,14 +61,14 @@ def raw(path: Path) -> np.ndarray:
 
 
 def run(*overrides: str) -> tuple[RGBDSequence, RunResult]:
-    """Run the default stages without detection; return the sequence and the result."""
+    """Run the default stages without a detector, and return the sequence and the result."""
     config = composed("detector=none", "fuser.voxel_size=0.02", *overrides)
     sequence = build(RGBDSequence, config.dataset)
     return sequence, begin(config).run(sequence)
 
 
 def check_map_shows_its_frames(sequence: RGBDSequence, result: RunResult) -> None:
-    """Check that depth rendered at the pose of each frame has a median error below half a voxel (0.01 m)."""
+    """Check that the depth rendered at each tracked pose has a median error below 0.01 m, half a voxel."""
     for k, tracked in enumerate(result.tracked):
         frame = sequence[k]
         seen = result.scene.render(frame.camera, tracked.pose.T_world_camera).depth
@@ -231,7 +231,7 @@ def test_replica_excerpt_skips_frames_with_missing_images(originals: Path, tmp_p
 
 
 def given_poses(tracker: PoseTracker, sequence: RGBDSequence) -> RunResult:
-    """Run minimal stages with given poses; only reading the frames takes time."""
+    """Run with given poses and minimal stages, which is faster than tracking."""
     return Pipeline(NoDetections(), tracker, KeepAll(), GridFuser(), prefetch=0).run(sequence)
 
 
@@ -253,7 +253,7 @@ def test_tum_excerpt_reads_available_images(originals: Path) -> None:
 
 
 def test_tum_pose_is_interpolated_between_neighbors(originals: Path) -> None:
-    """Lines 689 and 690 of groundtruth.txt are at ...2.8231 and ...2.8332 s; the frame is 26 % of the way between."""
+    """The time of the frame is between those of lines 689 and 690 of groundtruth.txt, at a fraction of 0.26."""
     T_world_camera = TumRgbd(originals / "tum_rgbd", scene=FREIBURG1_RPY)[99].T_world_camera
     assert T_world_camera is not None
     share = (0.825767 - 0.8231) / (0.8332 - 0.8231)
@@ -280,7 +280,7 @@ def test_tum_is_mapped(originals: Path) -> None:
 
 
 def around_the_gap(originals: Path, folder: Path) -> TumRgbd:
-    """Return the frames around a gap in the motion capture, with their times and poses but with other images."""
+    """Return the frames around a gap in the motion capture. All frames share one color and one depth image."""
     source = originals / "tum_rgbd" / FREIBURG1_RPY
     target = folder / FREIBURG1_RPY
     target.mkdir()
@@ -309,7 +309,7 @@ def test_tum_frames_in_motion_capture_gap_are_skipped(
     expected = f"2 of {len(times)} frames skipped because they have no pose; the first: frame {times.index(GAP[0])}"
     assert [message.startswith(expected) for message in output] == [True, True]
     for ours, theirs in zip(results[GroundTruth].tracked, results[TrajectoryFile].tracked, strict=True):
-        # one run interpolates poses; the other uses the nearest pose, up to 20 ms away at 0.3 m/s
+        # poses are interpolated in one run; in the other, the nearest pose is up to 20 ms away, at 0.3 m/s
         np.testing.assert_allclose(ours.pose.T_world_camera[:3, 3], theirs.pose.T_world_camera[:3, 3], atol=0.01)
 
 
@@ -330,7 +330,7 @@ def test_tum_run_in_motion_capture_gap_raises_one_line_error(originals: Path, tm
 
 
 def test_scannet_first_release_names_are_known(shared_data: Path) -> None:
-    """The label table writes `trashcan` and `dishrack` with a space. COCO has neither class."""
+    """The label table has `trash can` and `dish rack` with a space. Both have no class in COCO."""
     root = shared_data / "scannet_scene0000"
     if not root.is_dir():
         pytest.skip(f"{root} does not exist")
@@ -351,4 +351,4 @@ def test_scannet_first_release_names_are_known(shared_data: Path) -> None:
         assert of_label.sum() > 100
         assert (
             np.count_nonzero(mesh.instance_ids[of_label]) < 0.1 * of_label.sum()
-        )  # a later object may contain some segments
+        )  # some segments can belong to a later object

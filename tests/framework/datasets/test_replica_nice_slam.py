@@ -1,4 +1,4 @@
-"""Tests of Replica in NICE-SLAM's layout, with valid and invalid files."""
+"""Tests for Replica in the layout of NICE-SLAM."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def write_camera(root: Path, **changes: Any) -> None:
 
 
 def pose_at(k: int) -> np.ndarray:
-    """Return T_world_camera of frame k, away from the origin and rotated to the right about the camera's y axis."""
+    """Return T_world_camera of frame k. The camera is not at the origin and is rotated about its y axis."""
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = Rotation.from_rotvec([0, 0.3 * k, 0]).as_matrix()
     T_world_camera[:3, 3] = 1, 2, 0.1 * k
@@ -106,7 +106,7 @@ def test_replica_missing_results_or_trajectory_raises(root: Path, name: str) -> 
         ReplicaNiceSlam(root, scene="room0")
 
 
-def test_replica_missing_scene_parameter_raises_with_hint(root: Path) -> None:
+def test_replica_missing_scene_parameter_error_has_fix(root: Path) -> None:
     with pytest.raises(DataError, match=r"cam_params\.json: expected camera parameters .*, such as room0"):
         ReplicaNiceSlam(root)
 

@@ -1,4 +1,4 @@
-"""Tests of RGB-D folders with valid and invalid files."""
+"""Tests for RGB-D folders, including folders with missing or invalid files."""
 
 import json
 import shutil
@@ -145,7 +145,7 @@ def test_rgbd_folder_timestamp_of_unusable_frame_is_ignored(folder, caplog):
 def test_rgbd_folder_has_poses_if_pose_file_exists(folder):
     for k in range(FRAMES):
         set_pose_line(folder, k, f"{k} nan nan nan nan nan nan nan")
-    assert RgbdFolder(folder).has_poses()  # reading reports the errors
+    assert RgbdFolder(folder).has_poses()  # the errors are reported when the frames are read
     (folder / "poses.txt").unlink()
     assert not RgbdFolder(folder).has_poses()
 
@@ -191,7 +191,7 @@ def test_rgbd_folder_scene_truth_skips_frame_with_distant_pose(folder, caplog):
     assert "ground truth: frame skipped: frame 1: " in caplog.text
 
 
-# Errors of the whole sequence, which are raised when it is built.
+# Errors that are raised when the sequence is built
 
 
 def test_rgbd_folder_missing_folder_raises(tmp_path):
@@ -257,7 +257,7 @@ def test_rgbd_folder_duplicate_frame_number_raises(folder):
     "names", [["9.95", "10.05", "10.1", "10.15"], ["1_8", "1_9", "2_0", "2_1"], ["1", "2", "3", "1 - Copy 4"]]
 )
 def test_rgbd_folder_names_differing_in_two_numbers_raise(folder, names):
-    """Sorting by the last digits alone would change the order of the frames."""
+    """Sorted by their last number alone, the frames would be in the wrong order."""
     for kind in ("color", "depth", "instance"):
         for k, name in enumerate(names):
             (folder / kind / f"{k:06d}.png").rename(folder / kind / f"{name}.png")
@@ -287,7 +287,7 @@ def test_rgbd_folder_unreadable_optional_file_raises(folder, name, kind):
 
 
 @pytest.mark.parametrize("key", ["Distortion", "distorsion", "depthscale", "Width"])
-def test_rgbd_folder_misspelled_camera_key_has_suggestion(folder, key):
+def test_rgbd_folder_misspelled_camera_key_error_has_suggestion(folder, key):
     change_camera(folder, **{key: 1})
     with pytest.raises(DataError, match=f"expected a known key, got '{key}'; did you mean"):
         RgbdFolder(folder)
@@ -364,7 +364,7 @@ def test_rgbd_folder_parameter_out_of_range_raises(folder, values):
         RgbdFolder(folder, **values)
 
 
-# Errors of one frame, which are raised when it is read; other frames are readable.
+# Errors that are raised when a frame is read; the other frames are readable
 
 
 def read_all_but(folder, bad):
@@ -465,7 +465,7 @@ def test_rgbd_folder_unnamed_instance_raises_for_its_frame(folder):
     assert "instances.json, got 9" in read_all_but(folder, 1)
 
 
-# Real data.
+# Real data
 
 
 @pytest.mark.parametrize(
@@ -482,7 +482,7 @@ def test_rgbd_folder_real_recordings_are_read(scene, frames, shape, labeled):
         pytest.skip(f"{SHARED / scene} does not exist")
     sequence = RgbdFolder(SHARED, scene=scene)
     assert len(sequence) == frames
-    frame = sequence[frames - 1]  # Frame checks the types and that the pose is rigid
+    frame = sequence[frames - 1]  # Frame checks the types and the rigidity of the pose
     assert frame.depth.shape == shape
     assert 0.3 < np.median(frame.depth[frame.depth > 0]) < 8
     assert frame.T_world_camera is not None
@@ -512,7 +512,7 @@ def test_rgbd_folder_images_are_undistorted(folder):
     assert not np.array_equal(frame.color, picture(0))
 
 
-def test_rgbd_folder_gravity_file_gives_up_direction(folder):
+def test_rgbd_folder_gravity_file_is_read_as_up_vector(folder):
     (folder / "gravity.txt").write_text("0 -9.81 0\nnan nan nan\n0 0 -2\n# the last one\n0.6 -0.8 0\n")
     ups = [frame.up for frame in RgbdFolder(folder, start=1)]
     assert ups[0] is None

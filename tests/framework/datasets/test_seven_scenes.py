@@ -1,4 +1,4 @@
-"""Tests of 7-Scenes in the published format; registration is compared with exact projection."""
+"""Tests for 7-Scenes in the published format."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def pose_at(k: int) -> np.ndarray:
 
 
 def write_pose(folder: Path, k: int, T: np.ndarray) -> None:
-    """Write a pose with eight digits and tabs, as published."""
+    """Write a pose with tabs and eight digits, like the published files."""
     rows = "".join("\t ".join(f"{x:.7e}" for x in row) + "\t \n" for row in T)
     (folder / f"frame-{k:06d}.pose.txt").write_text(rows)
 
@@ -44,7 +44,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def all_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """Return the measured points (P, 3), m, in the camera frame."""
+    """Return the points (P, 3), m, of all pixels with depth, in the camera frame."""
     v, u = np.nonzero(depth)
     return back_project(camera, np.stack([u, v], 1).astype(np.int32), depth[v, u])
 
@@ -55,7 +55,7 @@ def test_seven_scenes_frame_matches_files(folder: Path) -> None:
     frame = sequence[2]
     assert (frame.index, frame.timestamp) == (2, pytest.approx(2 / 30))
     assert (frame.color == (80, 100, 200)).all()
-    assert set(np.unique(frame.depth)) == {0, 2}  # the depth camera does not see the border
+    assert set(np.unique(frame.depth)) == {0, 2}  # the border is outside the view of the depth camera
     assert (frame.depth > 0).mean() == pytest.approx((529 / 585) ** 2, abs=0.02)
     T_depthcamera_camera = inverse(pose_at(2)) @ frame.T_world_camera
     np.testing.assert_allclose(T_depthcamera_camera[:3, :3], np.eye(3), atol=1e-6)
@@ -63,7 +63,7 @@ def test_seven_scenes_frame_matches_files(folder: Path) -> None:
 
 
 def test_seven_scenes_recording_is_mapped(folder: Path) -> None:
-    """The wall 2 m in front of each depth camera is mapped at its true position."""
+    """A wall is 2 m in front of each depth camera."""
     root = folder.parents[1]
     result, points_world = mapped(
         opened("seven_scenes", f"dataset.root={root}", "dataset.scene=chess/seq-01", "dataset.stop=2")
@@ -71,15 +71,15 @@ def test_seven_scenes_recording_is_mapped(folder: Path) -> None:
     assert (result.frames, result.frames_skipped) == (2, 0)
     for k, points in enumerate(np.split(points_world, 2)):
         z = transform(inverse(pose_at(k)), points.astype(np.float64))[:, 2]
-        seen = np.abs(z) > 1e-5  # the tests' fuser maps pixels without depth to the camera position
+        seen = np.abs(z) > 1e-5  # this fuser maps pixels without depth to the camera position
         assert seen.mean() > 0.7
         np.testing.assert_allclose(z[seen], 2, atol=1e-5)
 
 
 def test_seven_scenes_registered_depth_matches_projection() -> None:
-    """Each measured point, projected into the color camera, is within half a pixel of its registered pixel."""
+    """The pixel of each registered point is within half a pixel of its exact projection."""
     raw = np.zeros(DEPTH_CAMERA.shape, np.uint16)
-    raw[20::40, 20::40] = 800 + 10 * np.arange(12 * 16).reshape(12, 16)  # distant pixels with different depths
+    raw[20::40, 20::40] = 800 + 10 * np.arange(12 * 16).reshape(12, 16)  # pixels far apart, each with a different depth
     registered = register(raw)
     points = all_points(DEPTH_CAMERA, raw.astype(np.float32) / 1000) - np.float32([BASELINE, 0, 0])
     seen = project(COLOR_CAMERA, points)
@@ -105,7 +105,7 @@ def test_seven_scenes_registration_keeps_nearest_and_holes() -> None:
     near = np.flatnonzero(row == 1000)
     # x = (u - 320) / 585 m at 1 m, seen from 25 mm to the right
     np.testing.assert_allclose(near[[0, -1]], 320 + 529 * ((np.array([300, 339]) - 320) / 585 - 0.025), atol=0.51)
-    # parallax moves the near strip over the far wall on the left, and leaves a gap on the right
+    # the parallax moves the near strip to the left, over the far wall, and leaves a gap on the right
     assert row[near[0] - 1] == 4000
     gap = np.flatnonzero(row[near[-1] + 1 :] == 4000)[0]
     assert gap == pytest.approx(529 * 0.025 * (1 / 1 - 1 / 4), abs=1.5)

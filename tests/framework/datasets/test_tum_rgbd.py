@@ -1,4 +1,4 @@
-"""Tests of TUM RGB-D in the published format, with valid and invalid files."""
+"""Tests for TUM RGB-D in the published format, including missing and invalid files."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def write_poses(folder: Path, lines: list[str]) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a recording of a wall at z = 2 m: the camera moves at 1 m/s along x, with poses at 100 Hz."""
+    """Return a recording of a wall at z = 2 m. The camera moves at 1 m/s along x, and poses have 100 Hz."""
     folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
     color = [color_time(k) for k in range(FRAMES)]
     depth = [time + DEPTH_DELAY for time in color]
@@ -59,7 +59,7 @@ def test_tum_rgbd_frame_matches_files(folder: Path) -> None:
     assert (len(sequence), sequence.name) == (FRAMES, "rgbd_dataset_freiburg1_xyz")
     frame = sequence[2]
     assert (frame.index, frame.timestamp) == (2, color_time(2))
-    inside = np.s_[40:440, 40:600]  # where the undistorted image is complete
+    inside = np.s_[40:440, 40:600]  # region in which the undistorted image is complete
     assert (frame.color[inside] == (20, 20, 30)).all()
     assert (frame.depth[inside] == 2).all()  # 5000 units per meter
     assert frame.T_world_camera is not None
@@ -78,7 +78,6 @@ def test_tum_rgbd_recording_is_mapped(folder: Path) -> None:
 
 
 def test_tum_rgbd_published_distortion_is_removed(folder: Path) -> None:
-    """The undistorted image of a checkerboard matches the result of OpenCV."""
     board = np.kron(np.indices((15, 20)).sum(axis=0) % 2, np.full((32, 32), 200)).astype(np.uint8)
     path = next((folder / "rgb").glob("*.png"))
     cv2.imwrite(str(path), np.stack([board] * 3, axis=-1))
@@ -145,7 +144,7 @@ def test_tum_rgbd_published_camera_overrides_camera_json(folder: Path) -> None:
 
 
 def test_tum_rgbd_association_is_closest_first_and_one_to_one() -> None:
-    """The depth image at 0.015 s is the nearest for both color images, and is paired with the closer one."""
+    """Both color images are nearest to the depth image at 0.015 s. The closer one gets it."""
     assert associate([0.0, 0.02], [0.015, 0.19], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, 0.035], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, -0.01], 0.02) == [(0, 1), (1, 0)]
@@ -181,7 +180,7 @@ def test_tum_rgbd_duplicate_image_timestamps_keep_first(folder: Path, caplog: py
     for name in ("rgb", "depth"):
         path = folder / f"{name}.txt"
         path.write_text(path.read_text() + path.read_text().replace(".png", "_again.png") * 1000)
-    sequence = TumRgbd(folder)  # 3 million pairs of these lines are within max_time_difference
+    sequence = TumRgbd(folder)  # 3 million pairs are within max_time_difference
     assert [frame.timestamp for frame in sequence] == [color_time(k) for k in range(FRAMES)]
     assert caplog.text.count("rgb.txt: expected unique timestamps, got repeated ones; skipped 3000 images") == 1
     assert caplog.text.count("depth.txt: expected unique timestamps, got repeated ones; skipped 3000 images") == 1

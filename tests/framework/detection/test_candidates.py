@@ -1,4 +1,4 @@
-"""Tests of every candidate layout, compared with a slow reference decoder."""
+"""Tests for the decoding of candidates in every layout, compared with a slow reference."""
 
 import math
 
@@ -146,6 +146,7 @@ def test_best_candidates_are_selected_by_class_and_threshold():
     )
     scores = np.array([[0.5, 0.1], [0.9, 0.1], [0.2, 0.6], [0.3, 0.1], [1.0, 0.0], [0.05, 0.2]], "f4")
     candidates = Candidates(boxes, scores)
-    assert candidates.best(0.25, 0.5, 10).tolist() == [1, 2, 3]  # 1 suppresses 0; 4 has no area; 5 scores too low
+    # 1 suppresses 0, the area of 4 is zero, and the score of 5 is too low
+    assert candidates.best(0.25, 0.5, 10).tolist() == [1, 2, 3]
     assert candidates.best(0.25, 0.95, 10).tolist() == [1, 2, 0, 3]
     assert candidates.best(0.25, 0.95, 2).tolist() == [1, 2]

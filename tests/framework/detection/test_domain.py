@@ -1,4 +1,4 @@
-"""Tests of the warning for images outside the domain of a detector that was trained on rendered rooms."""
+"""Tests for the warning that a detector was trained on another kind of images."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_domain_is_set_only_by_rooms_detector(ready: Callable[[str, str], Any], 
 
 
 def test_domain_of_dataset_marks_rendered_images(tmp_path: Path) -> None:
-    """Folders written by `synthesize` are marked; original SceneNN folders are not."""
+    """Folders of `synthesize` are marked as rendered. Original SceneNN folders are not."""
     assert Synthetic.domain == RENDERED_ROOMS
     option_files.overrides("dataset", "scenenn", tmp_path)
     assert SceneNN(tmp_path).domain == ""

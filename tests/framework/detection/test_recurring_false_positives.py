@@ -1,4 +1,4 @@
-"""Tests of recurring false positives, which keep their 3D position in all views."""
+"""Tests for false positives that recur at the same 3D position."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 
 
 def wall(x: float, names: dict[int, str | None] | None = None, z: float = 3.0) -> Frame:
-    """Return a view of a wall at distance z, m, from position x, m; the left half is instance 1."""
+    """Return a view of a wall at depth z, m, from position x, m. The left half is instance 1."""
     pose = np.eye(4)
     pose[0, 3] = x
     ids = np.zeros((120, 160), np.int32)

@@ -1,4 +1,4 @@
-"""Tests of the detection of output layouts from shapes and values."""
+"""Tests for the detection of output layouts from shapes and values."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ ULTRALYTICS = ExportMetadata(author="Ultralytics")
 
 
 def cells():
-    """Return the boxes (K, 4), px, of all cells of the strides 8, 16 and 32: center x, y, width, height."""
+    """Return the boxes (K, 4), px, of all cells with the strides 8, 16 and 32, as center and size."""
     rng = np.random.default_rng(0)
     rows = []
     for stride in (8, 16, 32):
@@ -31,14 +31,14 @@ def as_unit(boxes):
 
 
 def dense(boxes, classes=CLASSES, objectness=False):
-    """Return a table (1, 4 + C + M, K) of boxes, class scores and mask coefficients, one column per cell."""
+    """Return an output (1, 4 + C + M, K) with one column per cell: box, class scores and mask coefficients."""
     rng = np.random.default_rng(1)
     numbers = classes + MASKS + objectness
     return np.concatenate([boxes, rng.uniform(1e-6, 0.1, (len(boxes), numbers))], axis=1).T[None].astype(np.float32)
 
 
 def detections(boxes, score, label):
-    """Return a table (1, K, 6 + M) after suppression: boxes, score, label and mask coefficients."""
+    """Return an output (1, K, 6 + M) after suppression with box, score, label and mask coefficients."""
     rest = np.full((len(boxes), MASKS), 0.5)
     return np.concatenate([boxes, np.full((len(boxes), 1), score), np.full((len(boxes), 1), label), rest], 1)[None]
 
@@ -49,7 +49,7 @@ def prototypes(channels_last=False):
 
 
 def seen(table, maps=None, **given):
-    """Return the detected layout and the outputs that are read with it."""
+    """Return the detected layout and the outputs that are read with this layout."""
     outputs = {"output0": np.asarray(table, np.float32), "output1": prototypes() if maps is None else maps}
     arguments = {
         "classes": CLASSES,
@@ -98,7 +98,7 @@ def test_detect_layout_detections_have_one_class_each(unit, count):
 
 @pytest.mark.parametrize("count", [0, 30])
 def test_detect_layout_without_detections_defers_box_unit(count):
-    """After suppression there are no rows, or rows of zeros."""
+    """An output after suppression has no rows, or rows of zeros."""
     layout, output = seen(np.zeros((1, count, 6 + MASKS)))
     assert layout.suppressed
     assert layout.unit is None
@@ -119,22 +119,22 @@ def test_detect_layout_inverted_corners_raise():
         seen(detections(boxes, 0.9, 1))
     _, output = seen(detections(boxes, 0.9, 1), boxes=BoxKind.CENTER)
     np.testing.assert_allclose(output.candidates.boxes, as_corners(boxes), atol=1e-4)
-    layout, _ = seen(detections(cells(), 0.9, 1))  # with enough boxes, the format is detected
+    layout, _ = seen(detections(cells(), 0.9, 1))  # the format is detected from a sufficient number of boxes
     assert layout.boxes is BoxKind.CENTER
 
 
 def test_detect_layout_tables_of_equal_width_are_distinguished():
-    """With 2 classes, both tables have 6 + M columns. Only labels are integers; only dense tables have all cells."""
+    """With two classes, both layouts have 6 + M columns."""
     layout, _ = seen(dense(cells(), classes=2).transpose(0, 2, 1), classes=2)
     assert not layout.suppressed
     layout, _ = seen(detections(as_corners(cells())[50:60], 0.7, 1), classes=2)
     assert layout.suppressed
-    below = detections(as_corners(cells())[50:60], 0.0, 0)  # TensorFlow's exports keep boxes below the threshold
+    below = detections(as_corners(cells())[50:60], 0.0, 0)  # exports of TensorFlow keep boxes below the threshold
     layout, output = seen(below, classes=2)
     assert layout.suppressed
     assert output.candidates.class_scores.sum() == 0
     quantized = dense(cells(), classes=2)
-    quantized[:, 4:6] = 0  # scores of cells that are rounded to 0 in 8 bits
+    quantized[:, 4:6] = 0  # in 8 bits, small scores are rounded to 0
     layout, _ = seen(quantized.transpose(0, 2, 1), classes=2)
     assert not layout.suppressed
 

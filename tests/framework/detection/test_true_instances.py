@@ -1,4 +1,4 @@
-"""Tests of the ground-truth instances of a frame."""
+"""Tests for the ground-truth instances of a frame."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Tests of the command `doctor` on this machine and on simulated machines with errors."""
+"""Tests for the command `doctor`, also with simulated errors."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def broken_library(folder: Path, name: str, text: str) -> None:
 
 
 def test_doctor_broken_libraries_are_one_line_errors(tmp_path: Path) -> None:
-    """One library raises an error, and one ends the importing process."""
+    """One library raises an error on import, and the other one ends the process."""
     broken_library(tmp_path, "torch", "raise ImportError('libtorch.so: no such\\nfile')")
     broken_library(tmp_path, "open3d", "import os, signal\nos.kill(os.getpid(), signal.SIGILL)")
     done = doctor(tmp_path, PYTHONPATH=str(tmp_path), HOME=str(tmp_path))
@@ -151,7 +151,7 @@ def test_doctor_networks_list_every_option_with_weights() -> None:
     assert {"with_embeddings", "open_vocabulary.model", "open_vocabulary.mask_model"} < found
 
 
-def test_doctor_networks_list_a_new_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_networks_list_new_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     detectors = tmp_path / "conf" / "detector"
     detectors.mkdir(parents=True)
     (tmp_path / "conf" / "config.yaml").write_text("defaults:\n  - _self_\n  - detector: own\n")

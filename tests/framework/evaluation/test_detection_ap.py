@@ -1,4 +1,4 @@
-"""Tests of the AP of masks and boxes on masks with hand-computed results."""
+"""Tests for the AP of masks and boxes, compared with manual results and pycocotools."""
 
 from __future__ import annotations
 
@@ -102,8 +102,11 @@ def with_boxes(found: Detections, boxes: Sequence[Sequence[float]]) -> Detection
     return replace(found, boxes=np.array(boxes, np.float32))
 
 
-def test_box_ap_depends_on_boxes_alone() -> None:
-    """A mask of 30% of the object has the object's box; a mask of the object has a box of 60%."""
+def test_box_ap_depends_only_on_boxes() -> None:
+    """First, the box is correct and the mask covers 30% of the object.
+
+    Then, the mask is correct and the box covers 60%.
+    """
     masks = np.array([block(0, 0)])
     part = with_boxes(detections([block(0, 0, 3, 10)], (0,), (0.9,)), [[0, 0, 9, 9]])
     result = detection_ap([(masks, ("chair",), part)], CLASSES)
@@ -116,7 +119,7 @@ def test_box_ap_depends_on_boxes_alone() -> None:
 
 
 def test_box_ap_detection_between_unknown_objects_is_wrong() -> None:
-    """It is inside the box around both unknown objects, but on neither of them."""
+    """The detection is inside the common box of both unknown objects, but overlaps neither."""
     masks = np.array([block(0, 0), block(0, 25), block(40, 25)])
     on_one = detections([block(40, 25), block(0, 0)], (0, 0), (0.9, 0.4))
     between = detections([block(20, 25), block(0, 0)], (0, 0), (0.9, 0.4))
@@ -127,7 +130,7 @@ def test_box_ap_detection_between_unknown_objects_is_wrong() -> None:
 
 
 def test_detection_ap_matches_coco_files(tmp_path: Path) -> None:
-    """The reference is pycocotools on files, as its demo uses it, for random boxes and filled masks."""
+    """The reference is pycocotools, applied to files with random boxes and filled masks."""
     rng = np.random.default_rng(0)
     pictures: list[Picture] = []
     annotations, results = [], []

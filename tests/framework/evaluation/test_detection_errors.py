@@ -1,4 +1,4 @@
-"""Tests of detection statistics on rectangles with hand-computed results."""
+"""Tests for detection statistics, with rectangles as masks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ IDS = np.zeros(SHAPE, np.int32)
 IDS[0:20, 0:20] = 3  # a chair
 IDS[30:60, 0:40] = 4  # a bed
 IDS[0:20, 40:60] = 7  # an object without a class
-IDS[0:2, 70:72] = 9  # a chair that is too small to count
+IDS[0:2, 70:72] = 9  # a chair below the minimum size
 TRUTH = FrameTruth(IDS, {3: "chair", 4: "bed", 7: None, 9: "chair"})
 
 
@@ -60,8 +60,8 @@ def test_detection_errors_of_ground_truth_are_zero() -> None:
     assert table["score, standard deviation"] == pytest.approx(0.1)
 
 
-def test_detection_errors_of_oversized_mask_lower_iou() -> None:
-    """A mask of 500 px covers 300 px of the chair, which has 400 px. The IoU is 300 / 600."""
+def test_detection_errors_oversized_mask_has_lower_iou() -> None:
+    """The mask of 500 px covers 300 px of the chair, which has 400 px."""
     table = counted(detections((block(5, 0, 25, 20), 0, 0.8), (BED, 0, 0.6)))
     assert table["mask IoU"] == pytest.approx((300 / 600 + 1) / 2)
     assert table["fraction of the mask on the object"] == pytest.approx((300 / 500 + 1) / 2)
@@ -87,7 +87,7 @@ def test_detection_errors_count_false_detections() -> None:
 
 
 def test_detection_errors_summarize_objects_over_frames() -> None:
-    """The chair is always detected, once as another class; the bed is detected once in eight frames."""
+    """The chair is found in all eight frames, once as another class. The bed is found in one frame."""
     frames = [detections((CHAIR, int(k == 3), 0.5), *([(BED, 1, 0.5)] if k == 0 else [])) for k in range(8)]
     table = counted(*frames)
     assert table["found"] == pytest.approx(9 / 16)

@@ -1,4 +1,4 @@
-"""Tests of instance AP on scenes with hand-computed results."""
+"""Tests for instance AP, compared with manual results."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from framework.data import SceneTruth
 from framework.errors import DataError
 from framework.evaluation.instances import Outcome, PredictedInstances, Transfer, average_precision, evaluate, judge
 
-SPACING = 0.2  # between points, m; more than twice the transfer distance, so that labels do not mix
+SPACING = 0.2  # m, between points; more than twice the transfer distance, so that labels do not mix
 
 
 def line(count: int, offset: float = 0.0) -> np.ndarray:
-    """Return points (count, 3), m, along x."""
+    """Return points (count, 3), m, on a line along x."""
     points = np.zeros((count, 3), np.float32)
     points[:, 0] = SPACING * np.arange(count)
     points[:, 1] = offset
@@ -24,7 +24,7 @@ def line(count: int, offset: float = 0.0) -> np.ndarray:
 
 
 def scene(runs: Sequence[tuple[int, int]], class_names: Mapping[int, str | None]) -> SceneTruth:
-    """Return points on a line, labeled by runs of (instance id, number of points)."""
+    """Return points on a line. `runs` are pairs of an instance id and a number of points."""
     ids = np.repeat([k for k, _ in runs], [n for _, n in runs]).astype(np.int32)
     return SceneTruth(line(len(ids)), ids, class_names)
 
@@ -32,7 +32,7 @@ def scene(runs: Sequence[tuple[int, int]], class_names: Mapping[int, str | None]
 def prediction(
     truth: SceneTruth, runs: Sequence[tuple[int, int]], claims: Mapping[int, tuple[str, float]]
 ) -> PredictedInstances:
-    """Return the true points with new labels; `claims` gives the class and confidence of each predicted id."""
+    """Return the true points with other labels. `claims` are the class and the confidence of each predicted id."""
     ids = np.repeat([k for k, _ in runs], [n for _, n in runs]).astype(np.int32)
     return PredictedInstances(
         truth.points_world[: len(ids)],
@@ -65,10 +65,7 @@ def test_iou_counts_points_outside_true_instance():
 
 
 def test_average_precision_matches_manual_result():
-    """The ranked matches are 1 0 1 1 0, for 5 true instances.
-
-    The precision is 1, 1/2, 2/3, 3/4, 3/5. Its envelope at the matches is 1, 3/4, 3/4.
-    """
+    """The precision is 1, 1/2, 2/3, 3/4, 3/5 and its envelope at the three matches is 1, 3/4, 3/4."""
     assert average_precision(np.array([1, 0, 1, 1, 0], bool), 5) == pytest.approx((1 + 0.75 + 0.75) / 5)
     assert average_precision(np.zeros(0, bool), 3) == 0.0
     with pytest.raises(ValueError, match="average precision: expected at least one ground-truth instance, got none"):
@@ -91,7 +88,7 @@ def test_ap_decreases_with_false_positive_ranked_first():
 
 
 def test_evaluate_matches_each_true_instance_once():
-    """A true instance is split into halves: both have IoU 0.5, and the second one is a false positive."""
+    """The two halves of a true instance have IoU 0.5. Only one of them is matched."""
     truth = scene([(1, 100)], {1: "chair"})
     result = evaluate(prediction(truth, [(5, 50), (6, 50)], {5: ("chair", 0.5), 6: ("chair", 0.6)}), truth)
     score = result.by_class[0.5]["chair"]
@@ -132,7 +129,7 @@ def test_evaluate_does_not_count_match_with_ignored_instance(class_name, points)
 
 
 def test_evaluate_ignores_prediction_on_unknown_instances():
-    """The prediction covers six unknown instances with an IoU of 1/6 each, and nothing else."""
+    """The prediction covers six unknown instances completely. The IoU with each is 1/6."""
     runs = [(1, 100)] + [(k, 120) for k in range(2, 8)]
     truth = scene(runs, {1: "chair"} | dict.fromkeys(range(2, 8)))
     covered = prediction(truth, [(5, 100), (6, 720)], {5: ("chair", 0.5), 6: ("chair", 0.9)})
@@ -143,7 +140,7 @@ def test_evaluate_ignores_prediction_on_unknown_instances():
 
 
 def test_evaluate_ignores_prediction_of_unannotated_class():
-    """The chair is correct, keyboards are not annotated, and the bed is a false positive."""
+    """The annotation has chairs and beds, but no keyboards."""
     truth = replace(scene([(1, 100), (0, 300)], {1: "chair"}), classes=("chair", "bed"))
     found = [(1, 100), (2, 100), (0, 100), (3, 100)]
     claims = {1: ("chair", 0.8), 2: ("keyboard", 0.9), 3: ("bed", 0.7)}
@@ -158,7 +155,7 @@ def test_evaluate_ignores_prediction_of_unannotated_class():
 
 
 def test_evaluate_keeps_prediction_with_evaluated_match():
-    """At IoU 0.25, the prediction matches the chair although most of it is on an unknown instance."""
+    """The prediction matches the chair at IoU 0.25, although it covers an unknown instance even more."""
     truth = scene([(1, 100), (2, 150)], {1: "chair", 2: None})
     result = evaluate(prediction(truth, [(5, 250)], {5: ("chair", 0.5)}), truth)
     assert result.by_class[0.25]["chair"].ap == 1.0
@@ -198,7 +195,7 @@ def test_label_transfer_uses_nearest_background_vertex():
 
 
 def test_label_transfer_to_map_counts_map_vertices():
-    """The prediction contains ten background points. The map has two vertices at each of them."""
+    """The prediction covers ten background points, at which the map has two vertices each."""
     truth = scene([(1, 100), (0, 100)], {1: "chair"})
     dense = prediction(truth, [(5, 110)], {5: ("chair", 1.0)})
     twice = replace(
@@ -257,7 +254,7 @@ def test_label_transfer_tie_is_independent_of_order():
 
 
 def test_evaluate_ignores_unknown_match_only_above_threshold():
-    """The prediction has an IoU of 0.4 with an unknown instance, which is a match at 0.25 but not at 0.5."""
+    """The IoU with the unknown instance is 0.4, i.e. a match at 0.25 but not at 0.5."""
     truth = scene([(1, 100), (2, 40), (0, 60)], {1: "chair", 2: None})
     result = evaluate(prediction(truth, [(5, 100), (6, 100)], {5: ("chair", 0.5), 6: ("chair", 0.9)}), truth)
     assert result.by_class[0.25]["chair"].ignored == 1
@@ -265,12 +262,12 @@ def test_evaluate_ignores_unknown_match_only_above_threshold():
 
 
 def test_evaluate_three_predictions_match_manual_result():
-    """Three predictions have equal confidences.
+    """Three predictions with equal confidences are ranked by id.
 
-    11 has 70 of the 120 points of a chair (IoU 7/12), 12 has the other 50 (IoU 5/12), and 13 has the second chair.
-    At 0.5: right, wrong, right; precision 1, 1/2, 2/3; AP (1 + 2/3) / 2 = 5/6; F1 4/5; PQ (7/12 + 1) / 2.5 = 19/30.
-    From 0.6 on: wrong, wrong, right; AP (1/3) / 2. Mean over the thresholds: (2 * 5/6 + 8 * 1/6) / 10 = 3/10.
-    At 0.25, 12 is also wrong, because its chair is already matched.
+    Predictions 11 and 12 cover 70 and 50 of the 120 points of one chair, and 13 covers the other chair. At IoU 0.5, 11
+    and 13 are correct. The precision is 1, 1/2, 2/3, so that AP = (1 + 2/3) / 2 = 5/6. F1 = 4/5, and PQ = (7/12 + 1) /
+    2.5 = 19/30. From 0.6 on, only 13 is correct and AP = 1/6. The mean AP is (2 * 5/6 + 8 * 1/6) / 10 = 3/10. At 0.25,
+    12 is a duplicate of 11.
     """
     truth = scene([(1, 120), (2, 100)], {1: "chair", 2: "chair"})
     claims = {11: ("chair", 0.9), 12: ("chair", 0.9), 13: ("chair", 0.9)}
@@ -282,9 +279,9 @@ def test_evaluate_three_predictions_match_manual_result():
 
 
 def test_evaluate_ranks_equal_confidences_by_id():
-    """Three predictions on two chairs have equal confidences; the one with the smallest id has 50 of 120 points.
+    """Predictions 11 and 12 cover 50 and 70 of the 120 points of a chair.
 
-    At 0.5: wrong, right, right; AP 2/3. At 0.25, the prediction with 50 points matches the chair; AP 5/6.
+    At IoU 0.5, 11 is wrong, and 12 and 13 are correct, so AP = 2/3. At 0.25, 11 matches the chair and AP = 5/6.
     """
     truth = scene([(1, 120), (2, 100)], {1: "chair", 2: "chair"})
     claims = {11: ("chair", 0.9), 12: ("chair", 0.9), 13: ("chair", 0.9)}
@@ -294,9 +291,9 @@ def test_evaluate_ranks_equal_confidences_by_id():
 
 
 def test_evaluate_metrics_by_class_match_manual_result():
-    """One of two chairs is found with IoU 3/4, and the other one is missed.
+    """One of two chairs is found with IoU 3/4 and one is missed.
 
-    A bed with IoU 3/5 ranks after a false bed. The table is missed.
+    A bed is found with IoU 3/5, but a false bed has a higher confidence. The table is missed.
     """
     truth = scene(
         [(1, 100), (2, 100), (3, 150), (4, 100), (0, 200)], {1: "chair", 2: "chair", 3: "bed", 4: "dining table"}
@@ -306,19 +303,19 @@ def test_evaluate_metrics_by_class_match_manual_result():
     metrics = evaluate(prediction(truth, runs, claims), truth).metrics()
     expected = {
         "ap50.chair": 1 / 2,
-        "ap50.bed": 1 / 2,  # wrong, right: precision 1/2
+        "ap50.bed": 1 / 2,  # the second bed is correct: precision 1/2
         "ap50.dining table": 0,
         "ap50": 1 / 3,
         "ap25.chair": 1 / 2,
-        "ap.chair": 6 / 10 * 1 / 2,  # right at 0.5 to 0.75
-        "ap.bed": 3 / 10 * 1 / 2,  # right at 0.5 to 0.6
+        "ap.chair": 6 / 10 * 1 / 2,  # correct at 0.5 to 0.75
+        "ap.bed": 3 / 10 * 1 / 2,  # correct at 0.5 to 0.6
         "ap.dining table": 0,
         "ap": (3 / 10 + 3 / 20) / 3,
         "precision50": 2 / 4,
         "recall50": 2 / 4,
         "f1_50": 2 / 4,
         "pq50": (3 / 4 / 1.5 + 3 / 5 / 1.5 + 0) / 3,
-        "ap50_agnostic": (1 + 2 / 3) / 4,  # chair, wrong bed, bed, tv: right, wrong, right, wrong
+        "ap50_agnostic": (1 + 2 / 3) / 4,  # ranks: correct chair, wrong bed, correct bed, wrong tv
         "mean_iou": (3 / 4 + 0 + 3 / 5 + 0) / 4,
         "true_count": 4,
         "true_count.chair": 2,
@@ -332,10 +329,10 @@ def test_evaluate_metrics_by_class_match_manual_result():
 
 
 def test_label_transfers_differ_with_vertex_density():
-    """The prediction has 80 of 100 points of a chair and 20 of the wall; the map has 3 vertices per chair point.
+    """The prediction covers 80 of 100 chair points and 20 wall points.
 
-    To the truth, the IoU is 80 / (100 + 20) = 2/3, a match at 4 of the 10 thresholds.
-    To the map, the IoU is 240 / (300 + 20) = 3/4, a match at 6 of the 10 thresholds.
+    The map has three vertices per chair point. The IoU is 80 / (100 + 20) = 2/3 on the true points, which is a match at
+    4 of the 10 thresholds. The IoU is 240 / (300 + 20) = 3/4 on the map, a match at 6 of the 10 thresholds.
     """
     truth = scene([(0, 100), (1, 100)], {1: "chair"})
     once = prediction(truth, [(0, 80), (5, 100), (0, 20)], {5: ("chair", 1.0)})
@@ -355,7 +352,7 @@ def test_label_transfers_differ_with_vertex_density():
 
 @pytest.mark.parametrize("transfer", Transfer)
 def test_label_transfer_distance_limit_is_inclusive(transfer):
-    """The distance of 5/64 m is exact in floating point; it is the hypotenuse for legs of 3/64 m and 4/64 m."""
+    """The distance of 5/64 m is exact in floating point, because the offsets are 3/64 m and 4/64 m."""
     truth = scene([(1, 100)], {1: "chair"})
     moved = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
     moved = replace(moved, points_world=moved.points_world + np.float32([0, 3 / 64, 4 / 64]))
@@ -365,7 +362,7 @@ def test_label_transfer_distance_limit_is_inclusive(transfer):
 
 
 def test_judge_outcomes_match_evaluation_counts():
-    """The predictions are correct, a duplicate, of another class, on an unknown instance, and on no instance."""
+    """Two predictions are on one chair. The others have a wrong class, an unknown instance or no instance."""
     names = {1: "chair", 2: "bed", 3: "chair", 4: None, 5: "book"}
     truth = scene([(1, 120), (2, 100), (3, 100), (4, 100), (5, 100), (0, 100)], names)
     runs = [(11, 80), (12, 40), (13, 100), (0, 100), (14, 100), (0, 100), (15, 100)]

@@ -1,4 +1,4 @@
-"""Tests of the invariances of instance AP in random scenes, and comparison with a slow reference."""
+"""Tests for invariances of instance AP in random scenes. Results are compared with a slow reference."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from framework.evaluation.instances import (
 )
 from tests.support.slow_evaluation import slow_metrics
 
-MIN_POINTS = 12  # minimum number of points of an evaluated ground-truth instance; the scenes are small
+MIN_POINTS = 12  # minimum number of points of an evaluated ground-truth instance in these small scenes
 CLASSES = ("chair", "bed", "couch")
-CLEAR = 1e-5  # margin of nearest-neighbor distances, m; larger than rounding errors
+CLEAR = 1e-5  # m, margin between nearest-neighbor distances; larger than rounding errors
 
 examples = settings(derandomize=True, deadline=None, max_examples=30)
 
 
 @dataclass
 class Drawn:
-    """A scene of slabs along x and a map of it with other slab borders; some classes are unknown."""
+    """Random scene of slabs along x, and a map of the scene with shifted borders. Some classes are unknown."""
 
     truth: SceneTruth
     predictions: PredictedInstances
@@ -75,7 +75,7 @@ def _slabs(points: np.ndarray, ids: np.ndarray, borders: np.ndarray) -> np.ndarr
 
 
 def clear(points: np.ndarray, targets: np.ndarray) -> bool:
-    """Return True if rounding affects neither the nearest point of each target nor its distance limit."""
+    """Return True if the nearest points and their distance limits do not depend on rounding."""
     distances = np.sort(np.linalg.norm(points[None].astype(np.float64) - targets[:, None], axis=2), axis=1)
     return bool(
         (distances[:, 1] - distances[:, 0] > CLEAR).all() and (np.abs(distances[:, 0] - MAX_DISTANCE) > CLEAR).all()
@@ -118,7 +118,7 @@ def test_instance_metrics_are_invariant_to_input_order(transfer: Transfer, drawn
 @examples
 @given(drawn=scenes())
 def test_instance_metrics_are_invariant_to_id_values(transfer: Transfer, drawn: Drawn) -> None:
-    """The order of the ids is kept, because it breaks ties."""
+    """The new ids have the same order, because ties are ranked by id."""
     truth, predictions = drawn.truth, drawn.predictions
     renamed = replace(predictions, ids=predictions.ids**2 + 6, instance_ids=_renamed(predictions.instance_ids))
     true_names = {k**2 + 6: name for k, name in truth.class_names.items()}
@@ -147,7 +147,7 @@ def test_instance_metrics_are_invariant_to_rigid_motion(transfer: Transfer, draw
 @examples
 @given(drawn=scenes())
 def test_instance_metrics_are_invariant_to_source_density(drawn: Drawn) -> None:
-    """Repeated map points change nothing. Doubling all true points changes no fraction."""
+    """Duplicates of some map points have no effect. Duplicates of all true points change no ratio."""
     truth, predictions = drawn.truth, drawn.predictions
     again = drawn.rng.choice(len(predictions.points_world), 60)
     denser_map = replace(
@@ -171,7 +171,9 @@ def test_instance_metrics_are_invariant_to_source_density(drawn: Drawn) -> None:
 @pytest.mark.parametrize("transfer", Transfer)
 @examples
 @given(drawn=scenes(), confidence=st.sampled_from([0.0, 0.3, 1.0]))
-def test_instance_metrics_do_not_rise_with_false_positive(transfer: Transfer, drawn: Drawn, confidence: float) -> None:
+def test_instance_metrics_do_not_increase_with_false_positive(
+    transfer: Transfer, drawn: Drawn, confidence: float
+) -> None:
     predictions = drawn.predictions
     one_more = replace(
         predictions,
@@ -206,7 +208,7 @@ def test_instance_metrics_are_within_bounds(transfer: Transfer, drawn: Drawn) ->
 @examples
 @given(drawn=scenes(unknown=False))
 def test_instance_ap_decreases_with_threshold_if_all_are_known(transfer: Transfer, drawn: Drawn) -> None:
-    """If instances are ignored, a match at a low threshold can replace another match."""
+    """With ignored instances, a match at a low threshold could replace another match."""
     found = drawn.evaluate(transfer, min_points=1)
     agnostic = [found.agnostic[threshold].ap for threshold in (0.25, *IOU_THRESHOLDS)]
     by_class = [found.ap(threshold) for threshold in (0.25, *IOU_THRESHOLDS)]
@@ -218,7 +220,7 @@ def test_instance_ap_decreases_with_threshold_if_all_are_known(transfer: Transfe
 @examples
 @given(drawn=scenes())
 def test_instance_metrics_of_ground_truth_are_one(transfer: Transfer, drawn: Drawn) -> None:
-    """Predictions may be on ignored instances, and the map may be denser than the truth."""
+    """Some instances are ignored, and the map is denser than the ground truth."""
     truth, rng = drawn.truth, drawn.rng
     ids = np.unique(truth.instance_ids[truth.instance_ids > 0])
     again = rng.choice(len(truth.points_world), 60)

@@ -1,4 +1,4 @@
-"""Tests of the evaluation of refiners, on frames with hand-computed results."""
+"""Tests for the evaluation of refiners, compared with manual results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SIZE = 10  # px
 
 
 def frame(instance_ids: np.ndarray | None = None, names: dict[int, str | None] | None = None) -> Frame:
-    """Return a frame of a wall 2 m away; without `names`, every instance is a chair."""
+    """Return a frame of a wall 2 m away. Without `names`, every instance is a chair."""
     truth = None
     if instance_ids is not None:
         truth = FrameTruth(instance_ids, names or {int(i): "chair" for i in np.unique(instance_ids) if i})
@@ -26,7 +26,7 @@ def frame(instance_ids: np.ndarray | None = None, names: dict[int, str | None] |
 
 
 def clusters(*masks: np.ndarray) -> PointClusters:
-    """Return one cluster per mask (SIZE, SIZE)."""
+    """Return a cluster for each mask (SIZE, SIZE)."""
     places = [np.argwhere(mask)[:, ::-1] for mask in masks]
     pixels = np.concatenate([np.zeros((0, 2), np.int64), *places]).astype(np.int32)
     n = len(masks)
@@ -41,7 +41,7 @@ def clusters(*masks: np.ndarray) -> PointClusters:
 
 
 def rows(first: int, last: int) -> np.ndarray:
-    """Return a mask (SIZE, SIZE) of the rows from `first` to `last` - 1."""
+    """Return a mask (SIZE, SIZE) of the rows in [first, last)."""
     mask = np.zeros((SIZE, SIZE), np.bool_)
     mask[first:last] = True
     return mask
@@ -55,7 +55,7 @@ def ids(*objects: np.ndarray) -> np.ndarray:
 
 
 def test_true_fit_uses_object_with_best_iou() -> None:
-    # rows 2 to 7 cover 2 of 4 rows of the first object and 4 of 4 of the second: IoU 20/80 and 40/60
+    # rows 2 to 7 cover half of the first object and all of the second one: IoU 20/80 and 40/60
     seen = frame(ids(rows(0, 4), rows(4, 8)))
     fit = true_fit(clusters(rows(2, 8), rows(9, 10), rows(0, 0)), seen, seen.truth)  # type: ignore[arg-type]
     np.testing.assert_allclose(fit.iou, [40 / 60, 0, 0])
@@ -76,7 +76,7 @@ def test_refinement_excludes_clusters_of_unknown_class() -> None:
     refined = Refinement(seen, before, clusters(rows(4, 5), rows(4, 8)), 1.0)
     assert refined.fit_before is not None
     np.testing.assert_array_equal(refined.fit_before.unknown, [True, False])
-    np.testing.assert_allclose(refined.fit_before.iou, [10 / 80, 40 / 50])  # with the chair
+    np.testing.assert_allclose(refined.fit_before.iou, [10 / 80, 40 / 50])  # IoU with the chair
     np.testing.assert_array_equal(refined.judged_before, [False, True])
     # the first refined cluster is not evaluated, although it is on the chair
     np.testing.assert_array_equal(refined.judged_after, [False, True])

@@ -1,4 +1,4 @@
-"""Tests of trajectory errors of known motions, and comparison with evo."""
+"""Tests for trajectory errors of known motions, also compared with evo."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_trajectory_error_of_rigid_motion_is_zero():
 
 
 def test_trajectory_alignment_does_not_correct_scale():
-    """Positions -1, 0, 1 m are estimated as -1.1, 0, 1.1 m: the residuals are 0.1, 0, 0.1 m."""
+    """The positions -1, 0, 1 m are estimated as -1.1, 0, 1.1 m."""
     true = [exp_se3(np.array([x, 0, 0, 0, 0, 0])) for x in (-1.0, 0.0, 1.0)]
     estimated = [Pose(exp_se3(np.array([1.1 * x, 0, 0, 0, 0, 0]))) for x in (-1.0, 0.0, 1.0)]
     error = evaluate(true, estimated)
@@ -42,14 +42,13 @@ def test_trajectory_alignment_does_not_correct_scale():
 
 
 def test_rpe_measures_rotation_drift_per_step():
-    """The camera is stationary and the estimate rotates by 0.02 rad per frame. The ATE is 0; the RPE is 0.02 rad."""
+    """The camera is static, but the estimate rotates by 0.02 rad per frame."""
     error = evaluate([np.eye(4)] * 10, [Pose(exp_se3(np.array([0, 0, 0, 0, 0.02 * i, 0]))) for i in range(10)])
     assert error.ate_rmse_m == 0.0
     assert error.rpe_rotation_rmse_rad == pytest.approx(0.02, abs=1e-12)
 
 
-def test_umeyama_returns_rotation_for_mirrored_points():
-    """The alignment must not be a reflection."""
+def test_umeyama_of_mirrored_points_is_no_reflection():
     x = rng.normal(size=(10, 3))
     R, _ = umeyama(x, x * [1, 1, -1])
     assert np.linalg.det(R) == pytest.approx(1.0)

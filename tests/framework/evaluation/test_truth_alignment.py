@@ -1,4 +1,4 @@
-"""Tests of the alignment of ground truth to maps with known world frames."""
+"""Tests for the alignment of ground truth with a map."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from framework.evaluation.truth_alignment import in_map_world
 from framework.geometry import exp_se3, inverse, rotation_angle, transform
 
 T_MAP_TRUTH = exp_se3(np.array([3.0, -2.0, 1.0, 0.5, 1.0, -0.7]))
-TIMES = 1305031102.1753 + np.arange(6) / 30  # Unix time: a double has a precision of 2e-7 s
+TIMES = 1305031102.1753 + np.arange(6) / 30  # Unix time, which has a precision of 2e-7 s as a double
 
 
 def path(turns_only: bool = False) -> np.ndarray:
@@ -30,14 +30,14 @@ def truth(given: bool, poses: np.ndarray) -> SceneTruth:
 
 @pytest.mark.parametrize("turns_only", [False, True])
 def test_align_returns_motion_between_trajectories(turns_only: bool) -> None:
-    """If the camera only rotates in place, its positions do not determine the rotation."""
+    """If the camera only rotates, its positions alone do not determine the alignment."""
     poses = path(turns_only)
     np.testing.assert_allclose(align(poses, T_MAP_TRUTH @ poses), T_MAP_TRUTH, atol=1e-12)
     np.testing.assert_allclose(align(poses[:1], T_MAP_TRUTH @ poses[:1]), T_MAP_TRUTH, atol=1e-12)
 
 
 def test_align_is_least_squares_solution() -> None:
-    """No nearby transform has a smaller sum of squared distances of positions and axis points."""
+    """The cost is the sum of squared distances of the positions and of points on the camera axes."""
     P, rng = path(), np.random.default_rng(3)
     Q = np.array([T_MAP_TRUTH @ pose @ exp_se3(rng.normal(0, 0.05, 6)) for pose in P])
     corners = np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]], np.float64)
@@ -71,7 +71,7 @@ def test_in_map_world_given_first_pose_keeps_truth() -> None:
 
 
 def test_in_map_world_without_given_first_pose_aligns_truth() -> None:
-    """The tracker then begins with the identity instead of the true pose."""
+    """In this case, the tracker begins with the identity instead of the true pose."""
     labeled = truth(True, path())
     labeled = replace(labeled, trajectory=ReferenceTrajectory(TIMES[1:], path()[1:], given=True))
     T_map_truth = inverse(path()[0])

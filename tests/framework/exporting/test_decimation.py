@@ -1,4 +1,4 @@
-"""Tests of mesh decimation."""
+"""Tests for mesh decimation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from framework.exporting.decimation import clustered, decimated, with_finer_obje
 
 
 def wavy_plane(n: int = 120) -> InstanceMesh:
-    """Return a wavy surface of 1 m by 1 m, half red and half blue; a square in the middle is an object."""
+    """Return a wavy surface of 1 m by 1 m. One half is red, the other half is blue, and the middle is an object."""
     x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
     vertices = np.stack([x, y, 0.02 * np.sin(12 * x) * np.cos(9 * y)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
@@ -30,7 +30,8 @@ def areas(vertices: np.ndarray, triangles: Int32) -> np.ndarray:
     return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
 
-@pytest.mark.parametrize(("n", "most"), [(120, 8000), (120, 300), (420, 9000)])  # the last mesh is clustered first
+# clustering is used first for the last mesh
+@pytest.mark.parametrize(("n", "most"), [(120, 8000), (120, 300), (420, 9000)])
 def test_decimation_keeps_surface_colors_and_labels(n: int, most: int) -> None:
     mesh = wavy_plane(n)
     light = with_finer_objects(mesh, most)
@@ -82,7 +83,7 @@ def test_decimation_by_clustering_limits_size_of_triangle_soup() -> None:
 
 
 def test_decimation_of_flat_surface_keeps_color_pattern() -> None:
-    """The plane is a checkerboard. Decimation by geometry alone would color only 85 % of the area correctly."""
+    """With decimation by geometry alone, only 85 % of the checkerboard would have the correct color."""
     mesh = wavy_plane(101)
     x, y, _ = mesh.vertices.T
     white = (np.floor(5 * x) + np.floor(5 * y)) % 2 == 0
@@ -103,7 +104,6 @@ def test_decimation_of_flat_surface_keeps_color_pattern() -> None:
 
 @pytest.mark.parametrize("asked", [1, 4, 12])
 def test_decimation_to_few_triangles_keeps_object_volume(asked: int) -> None:
-    """Clustering to so few triangles would merge the object into one cube."""
     ball = trimesh.creation.icosphere(6, 0.1)
     n = len(ball.vertices)
     mesh = InstanceMesh(

@@ -1,4 +1,4 @@
-"""Tests of the mesh exports: positions, sizes and colors of objects."""
+"""Tests for the mesh exports."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TABLE_SIZE, CUBE_SIZE = (1.2, 0.8, 0.75), (0.2, 0.2, 0.2)
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a run whose world frame has y up and its origin above the floor."""
+    """Return a run whose world frame has y up and an origin above the floor."""
     return TURNED.write(tmp_path_factory.mktemp("runs") / "turned")
 
 
@@ -44,7 +44,7 @@ def room(run: Path) -> UprightRoom:
 
 
 def header(data: bytes) -> dict[str, Any]:
-    """Return the JSON of a GLB file."""
+    """Return the JSON part of a GLB file."""
     return dict(json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")]))
 
 
@@ -116,7 +116,7 @@ def test_export_triangles_between_objects_belong_to_room(room: UprightRoom) -> N
     halves = replace(room, mesh=mesh, objects=objects_of(mesh, two))
     found = parts(halves)
     seams = len(found[0].mesh.triangles)
-    assert seams >= 2 * (4 * 3 / 0.1)  # at least those across floor and ceiling
+    assert seams >= 2 * (4 * 3 / 0.1)  # at least the triangles across floor and ceiling
     assert sum(len(part.mesh.triangles) for part in found) == len(mesh.triangles)
     assert (surface_points(halves, 1.0).owner == 0).sum() == seams
 
@@ -154,7 +154,7 @@ def test_glb_colors_are_linear_with_16_bits(room: UprightRoom) -> None:
     np.testing.assert_allclose(color, (0.715694, 0.012983, 0.012983, 1), atol=2e-5)
     every = linear(np.arange(256, dtype=np.uint8))
     assert (every[0], every[255]) == (0, 1)
-    assert len(np.unique(np.rint(every * 65535))) == 256  # all are distinct
+    assert len(np.unique(np.rint(every * 65535))) == 256  # all colors are distinct
 
 
 @pytest.mark.parametrize("coloring", [Coloring.INSTANCE, Coloring.CLASS])
@@ -174,7 +174,6 @@ def test_export_colors_one_object_uniformly(coloring: Coloring, tmp_path: Path) 
 
 
 def test_exported_meshes_are_readable_by_open3d_and_trimesh(run: Path, tmp_path: Path) -> None:
-    """The run's mesh.ply and the exported meshes have the same properties, from the same writer."""
     export(run, [ExportFormat.PLY, ExportFormat.OBJ], tmp_path)
     for path in (run / "mesh.ply", tmp_path / "scene.ply"):
         mesh = read_mesh(path)
@@ -231,7 +230,7 @@ def test_usd_stage_has_semantics_and_collision_shapes(run: Path, tmp_path: Path)
     np.testing.assert_allclose((low, high), ((-0.1, -0.1, 0), (0.1, 0.1, 0.2)), atol=1e-5)
 
 
-def test_usd_export_without_usd_core_raises_install_hint(
+def test_usd_export_without_usd_core_error_names_extra(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
@@ -250,7 +249,7 @@ def test_convex_hull_faces_outward() -> None:
 
 
 def test_glb_normals_of_degenerate_triangles_have_unit_length(room: UprightRoom) -> None:
-    """The Khronos glTF validator requires unit normals even for triangles without area."""
+    """The glTF validator of Khronos requires unit normals, also for degenerate triangles."""
     mesh = replace(room.mesh, vertices=room.mesh.vertices.copy())
     own = room.objects[1].vertices
     mesh.vertices[own[:50]] = mesh.vertices[own[0]]
@@ -264,7 +263,7 @@ def test_glb_normals_of_degenerate_triangles_have_unit_length(room: UprightRoom)
 
 
 def test_export_small_fragments_belong_to_room_not_object(tmp_path: Path) -> None:
-    """Wrong labels at depth edges are small fragments; a table leg is larger."""
+    """Small fragments are caused by wrong labels at depth edges. A table leg is larger."""
     table = [(0.8, 1.0, 0.7, 2.0, 1.8, 0.75), (0.8, 1.0, 0, 0.85, 1.05, 0.65)]
     speck = (3.5, 2.5, 0.9, 3.51, 2.51, 0.91)
     run = ExportedRoom(things={"dining table": [*table, speck]}).write(tmp_path / "run")
@@ -333,7 +332,7 @@ def test_export_escapes_invalid_unicode_class_names(tmp_path: Path) -> None:
 
 
 def test_exported_instance_colors_match_overview(tmp_path: Path) -> None:
-    """An object has the same color in each file, even if another object is unlikely or not exported."""
+    """Colors do not depend on the selected objects or on the confidence of other objects."""
     run = ExportedRoom().write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())
     entries[0]["confidence"] = 0.1
@@ -367,7 +366,7 @@ def test_export_object_with_three_vertices_is_written(tmp_path: Path) -> None:
 
 
 def test_export_mesh_without_triangles_writes_object_vertices(tmp_path: Path) -> None:
-    """Without triangles, every vertex would be a fragment."""
+    """Without triangles, no vertex is connected to others, and none may be removed as a fragment."""
     run = ExportedRoom().write(tmp_path / "run")
     mesh = read_mesh(run / "mesh.ply")
     write_mesh(run / "mesh.ply", replace(mesh, triangles=mesh.triangles[:0]))

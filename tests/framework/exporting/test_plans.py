@@ -1,4 +1,4 @@
-"""Tests of floor plans, ROS maps and scene graphs of rooms with exact geometry."""
+"""Tests for floor plans, ROS maps and scene graphs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.scenes.exported_room import CUBE, TABLE, Y_UP, Block, Exporte
 
 SCHEMA = json.loads((Path(scene_graph.__file__).parent / "scene_graph.schema.json").read_text())
 RESOLUTION = 0.1
-OFF = 0.05  # m, shift of the room along x and y, so that no wall is on a cell border
+OFF = 0.05  # m, offset of the room along x and y; no wall may be on a cell border
 
 
 def stored(tmp_path: Path, **scene: object) -> UprightRoom:
@@ -43,7 +43,7 @@ def room(run: Path) -> UprightRoom:
 
 @pytest.fixture(scope="module")
 def low(room: UprightRoom) -> Plan:
-    """Return a floor plan for a robot that fits under the table."""
+    """Return a floor plan for a robot that is lower than the table."""
     return plan(room, RESOLUTION, 0.5)
 
 
@@ -86,7 +86,7 @@ def test_plan_cells_are_occupied_at_object_footprints(low: Plan, high: Plan) -> 
     inside = (slice(2, -2),) * 2
     assert low.shape == (33, 43)  # 3 x 4 m, and a margin
     assert at(low, 0.825, 1.025) == (True, False)  # a leg
-    assert at(low, 1.4, 1.4) == (False, False)  # under the table, which is not observed
+    assert at(low, 1.4, 1.4) == (False, False)  # under the table, where the floor is not observed
     assert at(high, 1.4, 1.4) == (True, False)
     legs = [(0.825, 1.025), (1.975, 1.025), (0.825, 1.775), (1.975, 1.775)]
     assert all(at(low, *leg)[0] for leg in legs)
@@ -126,19 +126,14 @@ def test_plan_free_cells_are_observed_floor(room: UprightRoom, low: Plan) -> Non
 
 
 def test_plan_looked_through_excludes_occluded_points(room: UprightRoom) -> None:
-    """The points are on the optical axis of a camera that faces the cube."""
+    """All points are on the optical axis of a camera that faces the cube."""
     pose = np.eye(4)
     pose[:3, :3] = looking(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     pose[:3, 3] = (0.4, 1.35, 0.85)
     places = np.array([(0.8, 1.35, 0.85), (1.15, 1.35, 0.85), (1.35, 1.35, 0.85), (1.8, 1.35, 0.85), (0.2, 1.35, 0.85)])
     seen = looked_through(replace(room, poses=pose[None]), places)
-    assert seen.tolist() == [
-        True,
-        True,
-        False,
-        False,
-        False,
-    ]  # two in front of the cube; in it, behind it, behind the camera
+    # two points in front of the cube; in the cube, behind the cube, behind the camera
+    assert seen.tolist() == [True, True, False, False, False]
 
 
 def test_ros_map_matches_map_server_thresholds(run: Path, low: Plan, tmp_path: Path) -> None:
@@ -226,7 +221,7 @@ def test_relations_cube_is_on_table_and_table_on_floor(room: UprightRoom, low: P
 
 
 def test_relations_stacked_object_is_on_object_below(tmp_path: Path) -> None:
-    """The top of the lower object is hidden and missing in the mesh."""
+    """The top of the lower object is occluded and missing in the mesh."""
     lower, upper = (1.2, 1.2, 0.75, 1.4, 1.4, 0.85), (1.2, 1.2, 0.85, 1.4, 1.4, 0.95)
     room = stored(tmp_path, things={"dining table": TABLE, "book": [lower], "other": [upper]})
     found = relations(room, None)
@@ -284,7 +279,7 @@ ARMS: list[Block] = [(1.0, 1.0, 0.4, 1.1, 1.7, 0.7), (1.9, 1.0, 0.4, 2.0, 1.7, 0
 
 @pytest.mark.parametrize("seat", [SEAT, SEAT + ARMS])
 def test_relations_pillow_is_on_couch(seat: list[Block], tmp_path: Path) -> None:
-    """The highest part of the couch is its back, not its seat."""
+    """The back of the couch is higher than its seat."""
     things = {"couch": seat, "pillow": [(1.3, 1.3, 0.4, 1.7, 1.6, 0.6)]}
     assert expected(relations(stored(tmp_path, things=things), None), 2) == [("on", 1)]
 
@@ -311,7 +306,7 @@ def test_scene_graph_matches_schema(run: Path, tmp_path: Path) -> None:
 
 
 def divided(door: float) -> list[Block]:
-    """Return a wall with a door `door` m wide, which divides the floor into two rooms of 4 x 3 m."""
+    """Return a wall that divides the floor into two rooms of 4 x 3 m. Its door is `door` m wide."""
     low, high = 1.5 - door / 2, 1.5 + door / 2
     return [(4.0, 0.0, 0.0, 4.1, low, 2.5), (4.0, high, 0.0, 4.1, 3.0, 2.5)]
 
@@ -338,19 +333,19 @@ def test_scene_graph_door_separates_two_rooms(tmp_path: Path) -> None:
     assert areas == pytest.approx([12, 12], rel=0.1)
 
 
-def test_rooms_wide_opening_does_not_separate(tmp_path: Path) -> None:
+def test_rooms_with_wide_opening_are_one_room(tmp_path: Path) -> None:
     room = stored(tmp_path, **TWO_ROOMS, blocks=divided(1.6))
     assert rooms(plan(room, RESOLUTION, 1.0)).count == 1
 
 
 def by_hand(text: str) -> Plan:
-    """Return a floor plan with cells of 0.5 m from text: # = wall, . = free, o = occupied, space = unknown."""
+    """Return a floor plan from text with cells of 0.5 m: # = wall, . = free, o = occupied, space = unknown."""
     rows = np.array([list(row) for row in text.split("\n")])[::-1]
     free, wall, occupied = rows == ".", rows == "#", rows == "o"
     return Plan(0.5, np.zeros(2), occupied | wall, free, free, wall, np.zeros(rows.shape, np.int32))
 
 
-def test_rooms_are_separated_only_by_walls_with_door() -> None:
+def test_rooms_are_separated_by_wall_with_door() -> None:
     one = by_hand(
         "##############\n#......o.....#\n#......o.....#\n#......o.....#\n#............#\n#.. .........#\n##############"
     )

@@ -1,4 +1,4 @@
-"""Tests of the figures of experiments: included runs, notes about missing runs, and the two output files."""
+"""Tests for the figures of experiments."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def list_objects(directory: Path, class_name: str, vertices: list[int]) -> None:
-    """Write an instances.json with one object for each vertex count in `vertices`."""
+    """Write an instances.json with one object per vertex count in `vertices`."""
     expected = {"class": class_name, "confidence": 0.9, "class_probabilities": {class_name: 1.0}, "observations": 5}
     box = {"center": [0, 0, 0], "extent": [1, 1, 1], "rotation": np.eye(3).tolist()}
     expected |= {"first_frame": 0, "last_frame": 9, "centroid": [0, 0, 0], "obb": box}
@@ -46,7 +46,7 @@ def list_objects(directory: Path, class_name: str, vertices: list[int]) -> None:
 
 
 def run(root: Path, row: str, scene: str, frames: int = 20) -> Path:
-    """Write the outputs of a run that found both boxes."""
+    """Write the outputs of a run in which both boxes were found."""
     directory = root / f"dataset.scene={scene},row={row},seed=0"
     directory.mkdir(parents=True)
     room = {"_target_": "tests.support.scenes.boxes_room.BoxesRoom", "scene": scene}
@@ -75,7 +75,7 @@ def experiment(root: Path, **figure: Any) -> Path:
 
 
 def texts(root: Path) -> list[str]:
-    """Return all texts of the page, including those of diagrams."""
+    """Return all texts of the page, including the texts of diagrams."""
     pictured = Pictured.below(root)
     page = DRAWN[pictured.choice.kind](pictured)
     found = [*page.figure.texts, *(text for axes in page.figure.axes for text in axes.texts)]
@@ -84,7 +84,7 @@ def texts(root: Path) -> list[str]:
 
 @pytest.fixture
 def maps(tmp_path: Path) -> Path:
-    """Write the runs of two rows on two sequences and return their folder; one run of the first row failed."""
+    """Write the runs of two rows on two sequences and return their folder. One run of the first row failed."""
     root = experiment(tmp_path / "figure4", kind="maps", names={"part": "in progress"})
     run(root, "part", "011", frames=8)
     run(root, "whole", "011")
@@ -138,7 +138,7 @@ def test_figure_note_names_overrides_and_data(maps: Path) -> None:
     assert expected in " ".join(note.split())
 
 
-def test_map_figure_omits_damaged_maps_and_missing_truth(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_map_figure_labels_damaged_map_and_missing_truth(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
     (maps / "dataset.scene=011,row=part,seed=0" / "mesh.ply").write_bytes(b"ply\n")
     run(maps, "whole", "gone")
     found = texts(maps)
@@ -185,7 +185,7 @@ def test_map_figure_zoom_adds_second_line(tmp_path: Path) -> None:
     pictured = Pictured.below(root)
     page = DRAWN["maps"](pictured)
     assert len(page.figure.axes) == 6
-    assert [len(axes.patches) for axes in page.figure.axes] == [1, 1, 1, 0, 0, 0]  # the frame of the zoom window
+    assert [len(axes.patches) for axes in page.figure.axes] == [1, 1, 1, 0, 0, 0]  # the border of the zoom window
     names = [[text.get_text() for text in axes.texts] for axes in page.figure.axes[3:]]
     assert all("chair" in one for one in names[1:])
 

@@ -1,4 +1,4 @@
-"""Tests of map panels: an object has the same color and position in all panels."""
+"""Tests for map panels. An object must have the same color and position in all panels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SIZE = (160, 120)
 
 
 def stored(ids: Mapping[int, int]) -> StoredMap:
-    """Return the room's map with new ids for 0 (room), 1 (red box) and 2 (blue box)."""
+    """Return the map of the room with new ids for 0 (room), 1 (red box) and 2 (blue box)."""
     mesh = furnished()
     labels = np.array([ids.get(k, 0) for k in range(3)], np.int32)[mesh.instance_ids]
     names = {key: f"thing {key}" for key in ids.values() if key}
@@ -29,7 +29,7 @@ def stored(ids: Mapping[int, int]) -> StoredMap:
 
 
 def hue(color: np.ndarray) -> np.ndarray:
-    """Return the unit vector (3,) of an RGB color minus its smallest channel; it is independent of the lighting."""
+    """Return the hue of an RGB color as a unit vector (3,). The hue does not depend on the lighting."""
     direction = color - color.min()
     return direction / np.linalg.norm(direction)
 
@@ -41,9 +41,9 @@ def truth() -> SceneTruth:
 
 @pytest.fixture(scope="module")
 def line(truth: SceneTruth) -> PanelLine:
-    """Return a panel line with a missing map, swapped ids and a missed box.
+    """Return a line of panels in which one map is missing, one has swapped ids, and one lacks a box.
 
-    All trajectories have the same length, so the panels show no paths.
+    All trajectories have the same length. In this case, no paths are drawn.
     """
     return panel_line([stored({1: 7, 2: 3}), None, stored({1: 5}), stored({1: 2, 2: 1})], truth, SIZE, zoom=True)
 
@@ -87,7 +87,7 @@ def test_zoom_window_contains_object_missing_in_some_maps(line: PanelLine) -> No
     assert [panel is None for panel in line.zoomed] == [False, True, False, False, False]
     larger = line.zoomed[-1]
     assert larger is not None
-    # the same point of the scene, 2.5 times as far from the window's corner
+    # the same point is 2.5 times as far from the corner of the window
     at = round((v + 0.5 - window.top) * 2.5 - 0.5), round((u + 0.5 - window.left) * 2.5 - 0.5)
     np.testing.assert_allclose(larger.image[at], line.truth.image[v, u], atol=12)
     assert shown(larger) >= {"couch"}

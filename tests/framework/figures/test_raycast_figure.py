@@ -1,4 +1,4 @@
-"""Tests of the panels of a ray-cast view, on a wall with a known view."""
+"""Tests for the panels of a ray-cast view."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ CENTERS = {3: np.zeros(3), 12: np.ones(3)}
 def wall(depth: float = 2.0) -> View:
     """Return the view of a wall `depth` m from a rotated camera.
 
-    The left edge is unmapped, and id 99 is not a listed object.
+    The left edge is unmapped, and id 99 is not in the list of objects.
     """
     T = pose(0.5, -0.2, 0.1, (0.0, 0.3, 0.0))
     depths = np.full(CAMERA.shape, depth, np.float32)

@@ -1,4 +1,4 @@
-"""Tests of the refinement figure: marks and layout on synthetic frames with known results."""
+"""Tests for the refinement figure on synthetic frames."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Masks = list[np.ndarray]
 
 
 def two_walls(height: int = 48, width: int = 64) -> Frame:
-    """Return a gray frame: the left half is 2 m away, the right half 3 m."""
+    """Return a gray frame. The left half is 2 m away, and the right half is 3 m away."""
     depth = np.full((height, width), 2.0, np.float32)
     depth[:, width // 2 :] = 3.0
     camera = Camera(width, height, 60.0, 60.0, (width - 1) / 2, (height - 1) / 2)
@@ -65,7 +65,7 @@ def refined(frame: Frame, before: Masks, after: Masks) -> Refinement:
 
 
 def pixels(figure: Figure) -> np.ndarray:
-    """Return the drawn figure, (H, W, 3) RGB."""
+    """Return the drawn figure as an RGB image (H, W, 3)."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].astype(int)
@@ -142,13 +142,13 @@ def test_refinement_image_is_tinted_and_hatched() -> None:
 
 def test_side_view_shows_depth_distances() -> None:
     frame = two_walls()
-    mask = box(frame, 16, 32, 24, 40)  # bleeds from the near wall to the far one
+    mask = box(frame, 16, 32, 24, 40)  # the mask bleeds from the near wall to the far wall
     change = refined(frame, [mask], [mask & (frame.depth < 2.5)])
     after = ClusterMarks.after(change)
     side = SideView.of(frame, ClusterMarks.before(change), after, 1.7)
     assert side is not None
     at = {column: side.points[(side.rows == 24) & (side.columns == column)][0] for column in (31, 32)}
-    moved = at[32] - at[31]  # the readings are 1 m apart in depth; `x` is their distance along x, m
+    moved = at[32] - at[31]  # m, distance of the two points along x; their depths differ by 1 m
     angle, sign = side_view.AZIMUTH_RAD, np.sign(side.forward)
     x = 0.5 / 60 * 3 + 0.5 / 60 * 2
     assert moved[0] == pytest.approx(sign * np.sin(angle) + x * np.cos(angle), abs=0.01)

@@ -1,4 +1,4 @@
-"""Tests of the curves of stage times and of their labels."""
+"""Tests for the curves of stage times and their labels."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_spread_keeps_label_order_distance_and_mean(places: list[float], gap: fl
     order = np.argsort(places, kind="stable")
     assert (np.diff(np.array(found)[order]) >= gap - 1e-9).all()
     if places:
-        assert np.mean(found) == pytest.approx(np.mean(places), abs=1e-9)  # least-squares offsets sum to 0
+        assert np.mean(found) == pytest.approx(np.mean(places), abs=1e-9)  # the sum of least-squares offsets is 0
     assert np.abs(np.array(spread(found, gap)) - found).max(initial=0) < 1e-9, "expected distant labels at their places"
 
 

@@ -1,4 +1,4 @@
-"""Tests of the file readers (oversized files, byte order marks, pipes) and of atomic writes."""
+"""Tests for atomic writes and for file readers."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ READERS = (
 def test_reader_non_regular_file_raises_without_blocking(
     tmp_path: Path, read: Callable[[Path], object], kind: str
 ) -> None:
-    """Reading a pipe without a writer would block, and /dev/zero never ends."""
+    """A pipe without a writer would block, and /dev/zero has no end."""
     path = tmp_path / "name"
     if kind == "pipe":
         os.mkfifo(path)
@@ -141,7 +141,7 @@ def test_atomic_write_follows_symbolic_link(tmp_path: Path) -> None:
 
 
 def test_atomic_write_failure_names_requested_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The error does not name the temporary file, even if its removal fails on a read-only disk."""
+    """The temporary file is not named, even if its removal fails on a read-only disk."""
 
     def refused(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")

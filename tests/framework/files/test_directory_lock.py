@@ -1,4 +1,4 @@
-"""Tests of directory locks, which last as long as their process."""
+"""Tests for directory locks. A lock must be released when its process ends."""
 
 from __future__ import annotations
 

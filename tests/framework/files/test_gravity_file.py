@@ -1,4 +1,4 @@
-"""Tests of gravity files: round trips and invalid lines."""
+"""Tests for gravity files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the hashes of arrays and folders; stored hashes must not change."""
+"""Tests for the hashes of arrays and folders. Stored hashes must remain valid."""
 
 from __future__ import annotations
 

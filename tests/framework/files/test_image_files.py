@@ -1,4 +1,4 @@
-"""Tests of JPEG and PNG files: valid ones are read exactly, and damaged ones raise."""
+"""Tests for JPEG and PNG files, including damaged files."""
 
 import io
 
@@ -44,14 +44,14 @@ def test_jpeg_gray_has_three_equal_channels() -> None:
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.99])
 def test_jpeg_truncated_with_end_marker_raises(share: float) -> None:
-    """OpenCV would return an image that is gray after the truncation."""
+    """OpenCV returns an image whose missing part is gray."""
     data = JPEG[: int(share * len(JPEG))] + END
     assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None
     assert message(data).startswith("picture.jpg: expected a ")
 
 
 def test_jpeg_with_corrupt_block_raises() -> None:
-    """The entropy-coded data contain invalid codes, end late or contain markers."""
+    """The corrupt data contain invalid codes or markers, or are too long."""
     first = JPEG.index(START_OF_SCAN) + 14
     seen = 0
     for seed in range(40):
@@ -66,7 +66,7 @@ def test_jpeg_with_corrupt_block_raises() -> None:
 
 
 def test_png_animated_raises() -> None:
-    """OpenCV and Pillow read different images of the animation."""
+    """OpenCV and Pillow would read different images of the animation."""
     pictures = [Image.new("RGB", (8, 6), color) for color in ("red", "lime", "blue")]
     written = io.BytesIO()
     pictures[0].save(written, "PNG", save_all=True, append_images=pictures[1:], default_image=True)

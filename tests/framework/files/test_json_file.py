@@ -1,4 +1,4 @@
-"""Tests of JSON files: invalid, too deep or too large files raise a one-line error."""
+"""Tests for JSON files, including files that are invalid, too large or too deeply nested."""
 
 from __future__ import annotations
 

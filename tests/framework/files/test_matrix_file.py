@@ -1,4 +1,4 @@
-"""Tests of matrices in text files: published formats, and errors with line numbers."""
+"""Tests for matrices in text files."""
 
 from __future__ import annotations
 

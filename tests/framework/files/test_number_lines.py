@@ -1,4 +1,4 @@
-"""Tests of lines of numbers: formats, and one-line errors for lines of any length."""
+"""Tests for text files with lines of numbers."""
 
 from __future__ import annotations
 

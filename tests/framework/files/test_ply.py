@@ -1,4 +1,4 @@
-"""Tests of PLY files: all encodings give the same mesh, and errors give the line or byte."""
+"""Tests for PLY files. All encodings must give the same mesh, and errors must name the line or byte."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ end_header
 
 
 def encoded(encoding: str, coordinate: str, count: str, index: str, polygons: list[list[int]]) -> bytes:
-    """Return a PLY file with VERTICES, LABELS and `polygons` among unused elements and properties."""
+    """Return a PLY file with VERTICES, LABELS, `polygons` and some unused elements and properties."""
     codes = {"float": "f", "float64": "d", "uchar": "B", "int32": "i", "int": "i", "short": "h", "uint": "I"}
     order = ">" if encoding == "binary_big_endian" else "<"
     header = f"""ply
@@ -215,7 +215,7 @@ def test_ply_written_file_is_read_by_open3d(tmp_path):
         ),
     ],
 )
-def test_ply_invalid_ascii_error_gives_line_number(tmp_path, old, new, message):
+def test_ply_invalid_ascii_error_reports_location(tmp_path, old, new, message):
     path = written(tmp_path / "a.ply", TRIANGLE.replace(old, new, 1))
     with pytest.raises(DataError, match=f"a.ply(, |: the header's |: ).*({message})") as caught:
         read_ply(path)
@@ -306,7 +306,7 @@ def test_ply_writing_invalid_mesh_leaves_no_file(tmp_path, change, message):
 
 
 def test_ply_arrays_do_not_reference_file_buffer(tmp_path):
-    """Otherwise a mesh of a few MB would keep hundreds of MB in memory."""
+    """A reference would keep the whole file in memory."""
     write_ply(tmp_path / "a.ply", VERTICES, np.array(FANS, np.int32), {"label": LABELS})
     mesh = read_ply(tmp_path / "a.ply")
     assert isinstance(mesh, PlyMesh)

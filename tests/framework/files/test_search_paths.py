@@ -1,4 +1,4 @@
-"""Tests of the resolution of relative paths."""
+"""Tests for the resolution of relative paths."""
 
 from __future__ import annotations
 

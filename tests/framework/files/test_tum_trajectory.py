@@ -1,4 +1,4 @@
-"""Tests of TUM trajectories: round trips, and errors with line numbers."""
+"""Tests for trajectories in TUM format."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_tum_trajectory_round_trip_preserves_poses(tmp_path):
 
 
 def test_tum_trajectory_line_gives_known_pose(tmp_path):
-    """A quarter turn about z maps x to y."""
+    """The rotation is a quarter turn about z, which maps x to y."""
     path = tmp_path / "t.txt"
     path.write_text(f"# {'timestamp tx ty tz qx qy qz qw'}\n\n 0.5 1 2 3 0 0 {np.sqrt(0.5)} {np.sqrt(0.5)}\r\n")
     timestamps, poses = read_tum(path)

@@ -1,4 +1,4 @@
-"""Tests of depth registration to a second camera, with exact synthetic geometry."""
+"""Tests for the registration of depth to a second camera."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_depth_registration_keeps_nearer_of_two_surfaces() -> None:
     shifted = np.eye(4)
     shifted[0, 3] = 0.5
     depth = np.full((30, 40), 4.0, np.float32)
-    depth[:, :10] = 1.0  # moves by 20 px, in front of the far surface, which moves by 5 px
+    depth[:, :10] = 1.0  # moves by 20 px; the far surface moves by 5 px
     found = DepthRegistration(camera, camera, shifted).apply(depth)
     assert set(np.unique(found)) == {0, 1, 4}
     assert (found[:, 18:26] == 1).all()

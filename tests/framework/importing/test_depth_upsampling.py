@@ -1,4 +1,4 @@
-"""Tests of depth upsampling to the color image: exact on planes, and without values between two surfaces."""
+"""Tests for the upsampling of depth to the size of the color image."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ONE = np.full((240, 320, 3), 90, np.uint8)
 
 
 def loops(depth, guide, u, v, color):
-    """Upsample pixel by pixel as documented in `_upsample`."""
+    """Upsample pixel by pixel, as described in `_upsample`."""
     found = np.zeros((len(v), len(u)))
     h, w = depth.shape
     for row, column in np.ndindex(found.shape):
@@ -58,7 +58,6 @@ def test_depth_upsampling_matches_reference_loops() -> None:
 
 @pytest.mark.parametrize("factor", [0.25, 0.5, 0.8])
 def test_depth_upsampling_is_exact_on_planes_and_sharp_at_edges(factor: float) -> None:
-    """The pixel centers of both image sizes follow the convention of `Camera.scaled`."""
     coarse = COLOR.scaled(factor)
     truth, _, color, ids = look(COLOR, np.eye(4))
     depth = look(coarse, np.eye(4))[0].astype(np.float32)
@@ -75,7 +74,7 @@ def test_depth_upsampling_is_exact_on_planes_and_sharp_at_edges(factor: float) -
 
 
 def test_depth_upsampling_selects_surface_by_color_at_edge() -> None:
-    """The step is inside a coarse pixel. With the nearest depth, it would move by up to half a coarse pixel."""
+    """The depth step is inside a coarse pixel. Without color, the step is displaced by up to half a coarse pixel."""
     camera = Camera(40, 40, 40.0, 40.0, 19.5, 19.5)
     truth = np.where(np.arange(40) < 22, 1.0, 2.0)[None].repeat(40, axis=0)
     color = np.where(truth == 1, 40, 200)[..., None].repeat(3, axis=-1).astype(np.uint8)

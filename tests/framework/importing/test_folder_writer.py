@@ -1,4 +1,4 @@
-"""Tests of the written RGB-D folder and of errors after which no folder is left."""
+"""Tests for the writer of RGB-D folders. If there is an error, no folder may remain."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_folder_writer_limits_longer_side_without_upscaling() -> None:
 
 
 def test_folder_writer_resamples_images_to_first_camera(tmp_path: Path) -> None:
-    """A later frame with twice the size shows the same image."""
+    """The second frame shows the same image at twice the size."""
     stripes = np.kron(np.arange(8) % 2, np.full(8, 200))[None, :, None].repeat(48, axis=0).repeat(3, axis=2)
     other = frame(1, camera=CAMERA.scaled(2), color=stripes.astype(np.uint8).repeat(2, axis=0).repeat(2, axis=1))
     write_folder(source(frame(0, color=stripes.astype(np.uint8)), other), tmp_path / "out", Writing())
@@ -135,6 +135,12 @@ def test_open_source_unknown_format_error_lists_formats(tmp_path: Path) -> None:
         open_source(tmp_path / "nowhere")
 
 
+def test_open_source_of_rgbd_folder_names_dataset(tmp_path: Path) -> None:
+    write_folder(source(frame(0)), tmp_path / "out", Writing())
+    with pytest.raises(DataError, match=r"got an RGB-D folder; run instancemap dataset=rgbd_folder dataset.root=.*out"):
+        open_source(tmp_path / "out")
+
+
 def test_open_source_finds_nested_export_folder(tmp_path: Path) -> None:
     write_scanner_app(tmp_path / "outer/2026_11_23", room_frames(1))
     assert open_source(tmp_path / "outer").format == "3D Scanner App"
@@ -143,7 +149,7 @@ def test_open_source_finds_nested_export_folder(tmp_path: Path) -> None:
         open_source(tmp_path / "outer")
 
 
-def test_open_source_zip_file_raises_with_unpack_hint(tmp_path: Path) -> None:
+def test_open_source_zip_file_error_has_fix(tmp_path: Path) -> None:
     (tmp_path / "scan.zip").touch()
     with pytest.raises(DataError, match=r"scan\.zip: expected a folder or recording, got a zip archive; unpack it"):
         open_source(tmp_path / "scan.zip")

@@ -1,4 +1,4 @@
-"""Fuzz tests of exports: a damaged file is skipped, or raises a one-line error."""
+"""Fuzz tests for exports. A damaged file must be skipped or raise a one-line error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the drawing thread, which must not block the mapping loop and logs each failure once."""
+"""Tests for the drawing thread. The thread must not block mapping, and logs each failure once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EXACT = SphereDetector()
 
 @dataclass
 class RecordedDrawing:
-    """Drawing that records its input; `draw_frames` waits for an event or fails if requested."""
+    """Drawing that records its input. On request, `draw_frames` waits for an event or fails."""
 
     waits_for: threading.Event | None = None
     fails: bool = False
@@ -83,7 +83,7 @@ def test_drawing_thread_after_delay_draws_newest_image(room: CornerRoom) -> None
     book.waits_for = going_on
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
-    while not book.threads:  # until it has started to draw and blocks
+    while not book.threads:  # until the thread draws and blocks
         time.sleep(0.001)
     for frame in list(room)[1:]:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
@@ -144,7 +144,7 @@ def test_drawing_thread_map_error_does_not_end_run(room: CornerRoom, caplog: pyt
 
 
 def test_drawing_thread_draws_last_frame_without_successor(room: CornerRoom) -> None:
-    """In a live stream there may be no next frame."""
+    """The last frame must be drawn even if no other frame follows, like in a live stream."""
     book = RecordedDrawing()
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     for frame in room:

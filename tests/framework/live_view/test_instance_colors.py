@@ -1,4 +1,4 @@
-"""Tests of instance colors: constant over time and distinct between neighbors."""
+"""Tests for instance colors. They must be constant over time, and different between neighbors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_instance_colors_paint_only_instance_vertices() -> None:
 
 
 def room_mesh() -> InstanceMesh:
-    """Return the back-projected depth of the first frame as vertices of the room (0) and the spheres (1, 2)."""
+    """Return a mesh whose vertices are the back-projected depth of the first frame, with instance ids 0 to 2."""
     depth, _, color, ids = look(CAMERA, pose_at(0))
     v, u = np.nonzero(depth > 0)
     points = back_project(CAMERA, np.stack([u, v], 1).astype(np.int32), depth[v, u])

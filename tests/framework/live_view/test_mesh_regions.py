@@ -1,4 +1,4 @@
-"""Tests of mesh regions: their parts together equal the mesh, and only changed parts are returned."""
+"""Tests for mesh regions. Together they must equal the mesh, and only changed regions are returned."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def sheet(width: int, height: int, spacing: float = 0.1) -> tuple[np.ndarray, np
 
 
 def corners(vertices: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Return the positions and colors (F, 18) of the corners of each triangle, sorted."""
+    """Return the positions and colors (F, 18) of the corners of all triangles, sorted."""
     rows = np.concatenate([vertices, colors.astype(np.float32)], axis=1)[triangles].reshape(len(triangles), -1)
     return rows[np.lexsort(rows.T)]
 

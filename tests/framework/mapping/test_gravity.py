@@ -1,6 +1,6 @@
-"""Tests of the up direction, the floor height and upright boxes.
+"""Tests for the up direction, the floor height and upright boxes.
 
-The error of the up direction is below 0.1 degrees on exact surfaces, and below 2 degrees with noise and clutter.
+On exact surfaces, the error of the up direction must be below 0.1 degrees, and with noise and clutter below 2 degrees.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from framework.mapping.storage.map_header import MapHeader
 
 
 def rectangle(origin: Float64, a: Float64, b: Float64, cells: int = 12) -> tuple[Float32, Int32]:
-    """Return the vertices, m, and triangles of a rectangle from `origin` along a and b, with normal along a x b."""
+    """Return the vertices, m, and triangles of a rectangle with the edges a and b and the normal a x b."""
     s, t = np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1), indexing="ij")
     vertices = origin + s.reshape(-1, 1) * a + t.reshape(-1, 1) * b
     corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
@@ -38,7 +38,7 @@ X, Y, Z = np.eye(3)
 
 
 def room() -> tuple[Float32, Int32]:
-    """Return the mesh of a floor at z = 0, a table, and two walls of larger area."""
+    """Return the mesh of a floor at z = 0, a table and two walls. The walls are larger than the floor."""
     return joined(
         rectangle(np.zeros(3), 3 * X, 4 * Y),
         rectangle(np.array([1.0, 1, 0.7]), X, Y),
@@ -48,7 +48,7 @@ def room() -> tuple[Float32, Int32]:
 
 
 def held(turned: Float64, downwards: float = 0.5) -> GravityEstimator:
-    """Return the estimator of a hand-held camera that is pitched down by `downwards` rad.
+    """Return the estimator for a hand-held camera that looks down by `downwards` rad.
 
     `turned` (3, 3) is the rotation of the world frame.
     """
@@ -75,7 +75,7 @@ def test_gravity_up_is_found_in_any_orientation(seed: int) -> None:
 
 
 def test_gravity_upward_faces_select_axis() -> None:
-    """A tilted camera sees a table, walls and a surface rotated about x, as in TUM's freiburg1_rpy."""
+    """The camera is tilted. It sees a table, walls and a surface that is rotated about x, like in freiburg1_rpy."""
     vertices, triangles = joined(
         rectangle(np.zeros(3), 2 * X, 2 * Y),
         rectangle(2 * X, 2 * Z, 2 * Y),  # a wall with normal -x in front of the camera, which is tilted toward x
@@ -110,7 +110,7 @@ def test_gravity_without_evidence_is_none() -> None:
 
 
 def test_floor_height_of_unseen_floor_is_none() -> None:
-    """Only a table, its legs and objects below it are visible."""
+    """Only a table, its legs and objects below the table are visible."""
     table = rectangle(np.array([0, 0, 0.7]), X, Y)
     legs = [rectangle(np.array([0.1 * k, 0, 0.0]), 0.3 * Y, 0.6 * Z, 4) for k in range(5)]
     vertices, triangles = joined(table, *legs)
@@ -120,7 +120,8 @@ def test_floor_height_of_unseen_floor_is_none() -> None:
 
 def test_faces_have_normals_areas_and_centers_of_triangles() -> None:
     vertices = np.float32([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 0]])
-    normals, areas, centers = faces(vertices, np.int32([[0, 1, 2], [0, 3, 1]]))  # the second triangle has no area
+    # the area of the second triangle is zero
+    normals, areas, centers = faces(vertices, np.int32([[0, 1, 2], [0, 3, 1]]))
     np.testing.assert_allclose(normals, [[0, 0, 1]])
     np.testing.assert_allclose(areas, [3])
     np.testing.assert_allclose(centers, [[2 / 3, 1, 0]])
@@ -129,7 +130,7 @@ def test_faces_have_normals_areas_and_centers_of_triangles() -> None:
 def sensing(
     turned: Float64, noise: float = 0.0, bias: float = 0.0, frames: int = 40, seed: int = 0
 ) -> GravityEstimator:
-    """Return the estimator of a camera that turns by 360 degrees, with accelerometer `noise` and `bias`, rad."""
+    """Return the estimator for a camera that turns by 360 degrees. `noise` and `bias` of the sensor are in rad."""
     gravity, chosen = GravityEstimator(), np.random.default_rng(seed)
     for k in range(frames):
         looking = Rotation.from_matrix(np.stack([X, -Z, Y], axis=1)) * Rotation.from_euler("x", -0.5)
@@ -148,7 +149,7 @@ def degrees(up: Float64 | None, expected: Float64) -> float:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_gravity_sensor_is_used_without_level_surfaces(seed: int) -> None:
-    """Only a slanted table is visible, in an arbitrarily rotated world."""
+    """Only a slanted table is visible. The rotation of the world frame is arbitrary."""
     turned = Rotation.random(random_state=seed).as_matrix()
     vertices, triangles = rectangle(np.zeros(3), 2 * X, 2 * (np.cos(0.35) * Y + np.sin(0.35) * Z))
     vertices = (vertices @ turned.T).astype(np.float32)
@@ -161,14 +162,14 @@ def test_gravity_sensor_is_used_without_level_surfaces(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_gravity_sensor_noise_and_bias_average_out(seed: int) -> None:
-    """The bias is a rotation about the camera's x axis, whose direction in the world changes with the heading."""
+    """The bias is a rotation about the x axis of the camera. Its direction in the world changes as the camera turns."""
     noise, bias = np.radians(3), np.radians(2)
     assert degrees(sensing(np.eye(3), noise, seed=seed).sensed(), Z) < 3 * np.degrees(noise) / np.sqrt(40)
     assert degrees(sensing(np.eye(3), 0, bias, seed=seed).sensed(), Z) < 1e-3
 
 
 def test_gravity_contradictory_sensor_is_ignored(caplog: pytest.LogCaptureFixture) -> None:
-    """Measurements contradict each other if the axes of the sensor differ from the axes of the camera."""
+    """The measurements contradict each other, because the axes of sensor and camera differ."""
     vertices, triangles = room()
     gravity = held(np.eye(3))
     for k in range(8):

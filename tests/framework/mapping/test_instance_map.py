@@ -1,4 +1,4 @@
-"""Tests of the mesh, instances, saving and loading of a small map with two objects."""
+"""Tests for a map with instances: mesh, instances, saving and loading."""
 
 import json
 import re
@@ -21,7 +21,7 @@ CLASSES = ("chair", "bed")
 
 
 def true_detections(frame: Frame) -> Detections:
-    """Return one exact mask for each visible instance of the analytic scene."""
+    """Return an exact mask for each visible instance of the analytic scene."""
     assert frame.truth is not None
     ids = [i for i in frame.truth.class_names if (frame.truth.instance_ids == i).any()]
     masks = np.array([frame.truth.instance_ids == i for i in ids]).reshape(len(ids), *frame.depth.shape)
@@ -58,7 +58,7 @@ def test_instance_map_triangles_face_camera(scene_map: InstanceMap) -> None:
     mesh = scene_map.mesh()
     a, b, c = (mesh.vertices[mesh.triangles[:, i]].astype(np.float64) for i in range(3))
     normal = np.cross(b - a, c - a)
-    towards = np.einsum("ij,ij->i", normal, -a)  # the camera stayed near the origin
+    towards = np.einsum("ij,ij->i", normal, -a)  # the camera is near the origin
     assert (towards > 0).mean() > 0.99
 
 
@@ -125,7 +125,7 @@ def test_instance_map_damaged_file_raises(scene_map: InstanceMap, tmp_path: Path
         path.write_bytes(damaged)
         with pytest.raises(DataError, match=r"map\.npz"):
             InstanceMap.load(path)
-    entry = whole.rindex(b"tsdf.npy") - 46  # the array's entry in the archive directory, which has no checksum
+    entry = whole.rindex(b"tsdf.npy") - 46  # entry of the array in the directory of the archive, which has no checksum
     for place, bit in ((entry + 8, 0x01), (entry + 33, 0x08), (entry + 46, 0x08)):  # "encrypted", comment length, name
         damaged = bytearray(whole)
         damaged[place] ^= bit
@@ -141,7 +141,7 @@ def test_instance_map_damaged_file_raises(scene_map: InstanceMap, tmp_path: Path
 
 @pytest.mark.parametrize("other", [FORMAT - 1, FORMAT + 1])
 def test_instance_map_file_of_other_format_raises(other: int, tmp_path: Path) -> None:
-    """The version is checked first, because other versions have other arrays."""
+    """The format is checked before the arrays, because the arrays depend on it."""
     path = tmp_path / "map.npz"
     np.savez(path, header=np.frombuffer(json.dumps({"format": other}).encode(), np.uint8))
     expected = re.escape(f"{path}: expected map format {FORMAT}, got {other}; map again")
@@ -175,7 +175,6 @@ def test_oriented_box_of_few_vertices_is_valid(points: int) -> None:
 
 
 def test_instance_map_resumed_after_loading_is_identical(tmp_path: Path) -> None:
-    """A map that is saved, loaded and extended equals one that was never saved."""
     whole, resumed = (assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0) for _ in range(2))
     for k, T in enumerate(walk(4)):
         if k == 2:

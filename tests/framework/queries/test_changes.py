@@ -1,4 +1,4 @@
-"""Tests of changes between two visits: objects removed, added or moved in a known room."""
+"""Tests for changes between two visits of a room. Objects are removed, added or moved."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def visit(sequence: RGBDSequence, *overrides: str) -> Visit:
 def changed_room(
     start: int, without: tuple[int, ...] = (), moved: Mapping[int, tuple[float, float]] | None = None
 ) -> Synthetic:
-    """Return every ninth frame of the office from `start`, without some objects or with some moved by (x, y), m."""
+    """Return every ninth frame of the office from `start`, without some objects or with objects moved by (x, y), m."""
     room = copy(office())
     shift = moved or {}
     objects = [
@@ -81,7 +81,7 @@ def test_changes_of_unchanged_room_are_empty(before: Visit) -> None:
     assert all(0 <= change.probability <= 1 for change in found)
 
 
-def test_changes_removed_objects_vanish_or_appear_if_swapped(before: Visit) -> None:
+def test_changes_removed_objects_appear_if_visits_are_swapped(before: Visit) -> None:
     after = visit(changed_room(1, without=(CHAIR, TABLE)), "detector=ground_truth")
     found = changes(before, after)
     assert expected(found, Kind.VANISHED) == ["chair", "dining table"]
@@ -113,7 +113,7 @@ def test_changes_with_noisy_detector_are_empty() -> None:
 
 
 def test_changes_between_halves_of_real_recording_are_empty(shared_data: Path) -> None:
-    """The halves are the even and odd frames of an apartment, with detections of MaskRCNN2Go."""
+    """The halves are the even and the odd frames of an apartment. The detector is MaskRCNN2Go."""
     halves = [
         visit(RgbdFolder(shared_data / "replica_floor2", start=k, stop=40, stride=2), "fuser.voxel_size=0.04")
         for k in (0, 1)

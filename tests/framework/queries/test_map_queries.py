@@ -1,4 +1,4 @@
-"""Tests of map queries, on growing and on stored maps."""
+"""Tests for queries of growing and of stored maps."""
 
 from __future__ import annotations
 
@@ -72,7 +72,6 @@ def test_map_nearest_returns_object_with_nearest_surface(asked: Map) -> None:
 
 
 def test_map_at_pixel_matches_view(asked: Map) -> None:
-    """All displayed objects can be queried."""
     frame = CornerRoom()[3]
     assert frame.T_world_camera is not None
     view = asked.view(frame.camera, frame.T_world_camera)
@@ -92,7 +91,7 @@ def test_map_at_pixel_matches_view(asked: Map) -> None:
 
 
 def test_map_view_hides_unconfirmed_instances() -> None:
-    """After one frame the map contains objects of a single detection."""
+    """After one frame, each object has a single detection."""
     mapper = Mapper(*STAGES, "fuser.min_observations=3")
     frame = CornerRoom()[0]
     mapper.add(frame)
@@ -137,7 +136,6 @@ def test_mapper_add_reports_new_and_removed_instances() -> None:
 
 
 def test_mapper_add_arrays_equals_add_frame() -> None:
-    """Color, depth, pose and camera give the same map as frames of a sequence."""
     by_hand, by_frame = Mapper(*STAGES, "detector=none"), Mapper(*STAGES, "detector=none")
     for k, frame in enumerate(CornerRoom()):
         by_frame.add(frame)
@@ -171,7 +169,7 @@ def test_mapper_accepts_keyword_parameters(value: str) -> None:
 
 
 def test_mapper_and_command_line_maps_are_identical(tmp_path: Path) -> None:
-    """The first six frames of the demo are tracked, and labeled by the default detector."""
+    """Six frames of the demo are tracked, with the default detector."""
     asked = ("fuser.voxel_size=0.02", "seed=3")
     line = [sys.executable, "-m", "framework", "dataset=desk", "dataset.stop=6", *asked, "hydra.run.dir=run"]
     done = subprocess.run(

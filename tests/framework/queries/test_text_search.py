@@ -1,4 +1,4 @@
-"""Tests of text queries: by embeddings, and by class names and colors."""
+"""Tests for text queries by embeddings and by names of classes and colors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PROBABILITIES = [(0.9, 0.1), (0.2, 0.8), (0.6, 0.4)]
 
 
 def mapped(embeddings: np.ndarray | None, space: str = "words@1") -> Map:
-    """Map the three objects of the analytic room: a chair, a bed and a chair with a lower probability."""
+    """Map the analytic room with a chair, a bed and a chair of lower probability."""
     fuser: MapFuser = registered.built("fuser", "bayesian_tsdf", "fuser.voxel_size=0.08")
     for k, T in enumerate(walk(4)):
         frame = room().frame(T, k)
@@ -149,7 +149,7 @@ def test_query_command_error_is_one_line(
 def test_query_command_with_embeddings_requires_model(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The embedding space of the fixture belongs to no existing model."""
+    """No model is known for the embedding space of the fixture."""
     status, _, err = asked(monkeypatch, capsys, str(run), "a red chair")
     assert (status, len(err.splitlines())) == (1, 1)
     assert "expected the model of the embeddings in detector.model, got none; set --model" in err
@@ -188,7 +188,7 @@ def test_query_with_embeddings_uses_model_of_run(
 
 
 def test_query_accepts_directory_name_and_map(embedded: Map, run: Path, run_without: Path) -> None:
-    """The target is a directory, its name or a map; a run without embeddings is queried by class names."""
+    """Runs without embeddings are queried by class names."""
     assert query is instancemap.query
     answers = [query(run_without, "chairs"), query(str(run_without), "chairs"), query(embedded, "chairs", by="names")]
     assert [answer.by for answer in answers] == ["names"] * 3

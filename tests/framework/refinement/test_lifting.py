@@ -1,4 +1,4 @@
-"""Tests of masks lifted to point clusters, in a room with known geometry."""
+"""Tests for lifting masks to point clusters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from tests.support.scenes.corner_room import CornerRoom, pose_at
 def test_lift_back_projects_depth_to_world_points(room: CornerRoom) -> None:
     frame = room[3]
     assert frame.truth is not None
-    masks = np.stack([frame.truth.instance_ids == 1, frame.truth.instance_ids > 0])  # the second covers the first
+    # the second mask covers the first mask
+    masks = np.stack([frame.truth.instance_ids == 1, frame.truth.instance_ids > 0])
     half = np.full((2, 2), 0.5, np.float32)
     detections = Detections(masks, np.zeros((2, 4), np.float32), np.ones(2, np.float32), half, ("a", "b"))
     clusters = lift(detections, frame, Pose(pose_at(3)))
@@ -44,7 +45,7 @@ def test_lift_skips_pixels_without_depth(room: CornerRoom) -> None:
 
 
 def test_lift_mask_size_mismatch_raises(room: CornerRoom) -> None:
-    frame, shape = room[0], (1, 1)  # NumPy would broadcast this shape to the image
+    frame, shape = room[0], (1, 1)  # NumPy could broadcast this shape
     masks = np.ones((1, *shape), np.bool_)
     one = np.ones((1, 1), np.float32)
     with pytest.raises(DataError, match=r"frame 0: expected masks of shape \(72, 96\), got \(1, 1\)"):
@@ -52,7 +53,7 @@ def test_lift_mask_size_mismatch_raises(room: CornerRoom) -> None:
 
 
 def test_lift_reads_masks_at_color_pixels(room: CornerRoom) -> None:
-    """The pixel map shifts masks by 5 px; -1 belongs to no mask."""
+    """The color pixels are shifted by 5 px, and -1 is outside of the color image."""
     frame = room[3]
     height, width = frame.camera.shape
     masks = np.zeros((2, height, width), np.bool_)

@@ -1,4 +1,4 @@
-"""Tests of the rings around masks, compared with slow references."""
+"""Tests for the rings around masks, compared with slow references."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def neighborhoods(clusters: PointClusters, frame: Frame, *ring: float, **named: 
 
 
 def random_scene(seed: int) -> tuple[np.ndarray, Frame]:
-    """Return the masks of five overlapping blobs, some at the image border, and a frame with missing depth."""
+    """Return five overlapping masks, some at the image border, and a frame with missing depth."""
     rng = np.random.default_rng(seed)
     masks = np.zeros((5, 40, 60), np.uint8)
     for mask in masks:
@@ -80,7 +80,7 @@ def test_neighborhood_thread_schedule_balances_costs():
 
 
 def test_neighborhood_excludes_structure_from_ring_and_border():
-    """Structure is treated as missing depth, except for the points of the cluster itself."""
+    """Structure is treated like missing depth, except in the cluster itself."""
     masks, frame = random_scene(0)
     structure = np.random.default_rng(1).random((40, 60)) < 0.5
     clusters = clusters_of(masks, frame)
@@ -99,7 +99,7 @@ def test_neighborhood_excludes_structure_from_ring_and_border():
 
 
 def test_depth_in_mask_equals_chamfer_distance():
-    """Inside a cluster, the distance is to the nearest outer pixel with depth; in the ring, to the cluster."""
+    """The distance in a cluster is to the nearest outer pixel with depth. In the ring, it is to the cluster."""
     for seed in range(5):
         masks, frame = random_scene(seed)
         around = neighborhoods(clusters_of(masks, frame), frame, ring_fraction=0.25, min_ring=6, max_ring=8)
@@ -147,7 +147,7 @@ def test_neighborhood_matches_back_projection_and_distances():
 
 
 def _chamfer_reference(mask: np.ndarray) -> np.ndarray:
-    """Return the 3-4 chamfer distance (H, W) from a mask, in thirds of a pixel, by relaxation until convergence."""
+    """Return the 3-4 chamfer distance (H, W) from a mask, in thirds of a pixel."""
     distance = np.where(mask, 0, 10**6)
     while True:
         padded = np.pad(distance, 1, constant_values=10**6)
@@ -167,7 +167,7 @@ def test_depth_in_mask_ignores_pixels_without_depth():
     mask = np.zeros((1, 40, 60), bool)
     mask[0, 10:31, 20:41] = True
     depth = np.ones((40, 60))
-    depth[20, 30] = 0  # a hole in the middle of the mask is not a border
+    depth[20, 30] = 0  # a hole in the mask is not a border
     frame = frame_of(depth)
     around = neighborhoods(clusters_of(mask, frame), frame, 0.25, 4, 12)
     inside = np.zeros((40, 60))

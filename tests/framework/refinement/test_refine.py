@@ -1,4 +1,4 @@
-"""Tests of `refine`, for all refiners: exact masks are unchanged, and invalid pixels raise."""
+"""Tests for `refine`, with all refiners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of ambient occlusion on planes, whose openness is known."""
+"""Tests for ambient occlusion on planes."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def test_openness_of_plane_is_one(angle: float) -> None:
 
 
 def test_openness_in_corner_matches_ray_casting() -> None:
-    """Two planes meet at right angles 2 m in front of the camera; a ray meets the other plane or nothing."""
+    """Two planes meet at a right angle 2 m in front of the camera."""
     depth = np.float32(2 / (1 + np.abs(Y)))
     normals = np.stack([np.zeros_like(Y), -np.sign(Y), -np.ones_like(Y)], axis=-1).astype(np.float32) / np.sqrt(2)
     found = openness(CAMERA, depth, normals)
     rng = np.random.default_rng(0)
     height, turn = np.sqrt(rng.uniform(0, 1, 20000)), rng.uniform(0, 2 * np.pi, 20000)  # cosine-weighted directions
-    towards = np.sqrt(1 - height**2) * np.cos(turn)  # component toward the other plane
+    towards = np.sqrt(1 - height**2) * np.cos(turn)  # component of the direction toward the other plane
     for row in range(TILE, CAMERA.height - TILE, 7):
-        distance = np.abs(Y[row, 0]) * depth[row, 0] * np.sqrt(2)  # m, from the edge
+        distance = np.abs(Y[row, 0]) * depth[row, 0] * np.sqrt(2)  # m, distance from the edge
         blocked = (distance < RANGE_M * towards).mean()
         assert found[row, TILE:-TILE].mean() == pytest.approx(1 - DEPTH * blocked, abs=0.03)
     assert found.min() < 0.75

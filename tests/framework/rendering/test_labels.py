@@ -1,4 +1,4 @@
-"""Tests of label placement: on large objects, next to small objects, and without overlap."""
+"""Tests for the placement of labels. Labels must be on large objects or next to small ones, without overlap."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def placed(labels: list[Label]) -> dict[str, Label]:
 def test_labels_are_on_large_and_next_to_small_objects() -> None:
     ids = np.zeros((300, 400), np.int32)
     ids[50:250, 20:220] = 1
-    ids[50:250, 20:100] = 0  # the remaining part of the table is 120 px wide; its center is at 159.5 px
+    ids[50:250, 20:100] = 0  # the free part of the table is 120 px wide and centered at 159.5 px
     ids[150:160, 300:312] = 2
     labels = placed(place_labels(ids, {1: "table", 2: "cup", 3: "not in view"}, size))
     assert set(labels) == {"table", "cup"}
@@ -40,7 +40,7 @@ def test_label_of_large_object_does_not_cover_other_objects() -> None:
     ids[100:300, 100:300] = 1
     ids[150:160, 195:205] = 2
     assert placed(place_labels(ids, {1: "dining table", 2: "cup"}, size))["dining table"].target is None
-    ids[190:210, 120:180] = 3  # the gap between 3 and 4 is 40 px wide, and the label of the table 108 px
+    ids[190:210, 120:180] = 3  # the gap between 3 and 4 is 40 px wide; the label of the table needs 108 px
     ids[190:210, 220:280] = 4
     label = placed(place_labels(ids, {1: "dining table", 2: "cup", 3: "book", 4: "tray"}, size))["dining table"]
     left, top, right, bottom = (round(x) for x in _box(label.u, label.v, *size("dining table")))

@@ -1,4 +1,4 @@
-"""Tests of the shaded view in surface and instance colors, on planes with a known image."""
+"""Tests for shaded views in surface colors and in instance colors."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ from framework.rendering.lit_view_kernels import AMBIENT, DIFFUSE, LAMP
 from framework.rendering.surface import Surface
 
 CAMERA = Camera(40, 20, 20.0, 20.0, 19.5, 9.5)
-LIGHT = AMBIENT - DIFFUSE * LAMP[2] / np.linalg.norm(LAMP)  # shading of surfaces that face the camera
+LIGHT = AMBIENT - DIFFUSE * LAMP[2] / np.linalg.norm(LAMP)  # shading of a surface that faces the camera
 
 
 def quad(left: float, right: float) -> np.ndarray:
-    """Return the corners (4, 3), m, of a rectangle 1 m in front of the camera that is taller than the image."""
+    """Return the corners (4, 3), m, of a rectangle 1 m in front of the camera.
+
+    The rectangle is taller than the image.
+    """
     return np.array([[left, -2, 1], [left, 2, 1], [right, 2, 1], [right, -2, 1]], np.float32)
 
 
 @pytest.fixture(scope="module")
 def view() -> LitView:
-    """Return a view of two rectangles, each 10 columns wide, with 10 empty columns on the left and on the right."""
+    """Return a view of two rectangles. Each is 10 columns wide, and 10 columns at both sides are empty."""
     triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
     return LitView(Surface(np.concatenate([quad(-0.5, 0), quad(0, 0.5)]), triangles), CAMERA, np.eye(4))
 
@@ -46,11 +49,11 @@ def test_lit_view_in_instances_has_colors_and_dark_borders(view: LitView) -> Non
     pale = (178 + 0.22 * 100) * LIGHT
     np.testing.assert_allclose(image[:, 11:19], np.tile(painted, (20, 8, 1)), atol=1)
     np.testing.assert_allclose(image[:, 21:29], pale, atol=1)
-    # at a border, one of the two supersampled columns of a pixel is dark
+    # at a border, one of two supersampled columns is dark
     np.testing.assert_allclose(image[:, 19], np.tile(painted * (1 + 0.45) / 2, (20, 1)), atol=1)
     np.testing.assert_allclose(image[:, 20], pale * (1 + 0.45) / 2, atol=1)
     np.testing.assert_allclose(image[:, 10], np.tile(painted * (1 + 0.45) / 2, (20, 1)), atol=1)
-    np.testing.assert_allclose(image[:, 29], pale, atol=1)  # no border where the part without an instance ends
+    np.testing.assert_allclose(image[:, 29], pale, atol=1)  # parts without an instance have no border
 
 
 def test_lit_view_is_invariant_to_world_rotation() -> None:

@@ -1,4 +1,4 @@
-"""Tests of object matching over several maps of a scene."""
+"""Tests for object matching between several maps of a scene."""
 
 from __future__ import annotations
 
@@ -21,20 +21,21 @@ def ids(*runs: tuple[int, int]) -> np.ndarray:
 
 
 def test_same_objects_is_one_to_one() -> None:
-    # 5 covers most of the bed, 6 a part of it, and 7 the chair and half of object 30; 8 is on the wall
+    # 5 covers most of the bed, 6 a part of the bed, 7 the chair and half of object 30, and 8 a part of the wall
     found = ids((0, 30), (8, 10), (5, 30), (6, 10), (7, 30), (0, 10))
-    assert same_objects(found, TRUE) == {5: 900000, 7: 20}  # IoU 30 / 40 and 20 / 30; 6 overlaps only the bed
+    assert same_objects(found, TRUE) == {5: 900000, 7: 20}  # the IoUs are 30 / 40 and 20 / 30; 6 overlaps only the bed
 
 
 def test_same_objects_maximizes_total_overlap() -> None:
     true = ids((1, 50), (2, 30))
-    found = ids((5, 20), (6, 30), (5, 30))  # 5 covers 20 of the 50 points of 1 and all of 2; 6 covers 30 points of 1
+    # 5 covers 20 of the 50 points of 1 and all points of 2; 6 covers 30 points of 1
+    found = ids((5, 20), (6, 30), (5, 30))
     assert same_objects(found, true) == {5: 2, 6: 1}
 
 
 def test_same_objects_requires_minimum_iou() -> None:
     assert same_objects(ids((0, 40), (5, 9), (0, 71)), TRUE) == {}
-    assert same_objects(ids((0, 40), (5, 10), (0, 70)), TRUE) == {5: 900000}  # the minimum is 10 / 40
+    assert same_objects(ids((0, 40), (5, 10), (0, 70)), TRUE) == {5: 900000}  # the minimum IoU is 10 / 40
 
 
 def test_same_objects_without_points_or_instances_is_empty() -> None:

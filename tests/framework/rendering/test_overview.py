@@ -1,4 +1,4 @@
-"""Tests of the overview image of a map, on surfaces with a known image."""
+"""Tests for the overview image of a map."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ def test_front_sides_depth_is_exact() -> None:
     hits = FrontSides(Surface(mesh.vertices, mesh.triangles), eye).seen_by(camera, R)
     assert hits.depth[12, 16] == pytest.approx(0.5 - -0.6, abs=1e-5)  # the side of the red box
     assert hits.nearest(mesh.instance_ids)[12, 16] == 1
-    assert hits.depth[12, 0] == pytest.approx(2.5, abs=1e-4)  # the wall behind it; depth is along z, not along the ray
+    # the wall behind the box; depth is along z, not along the ray
+    assert hits.depth[12, 0] == pytest.approx(2.5, abs=1e-4)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, eye
     pixels = project(camera, transform(inverse(T), hits.points_world.astype(np.float64)))
@@ -59,7 +60,7 @@ def test_front_sides_ignore_back_faces_of_walls_and_ceiling() -> None:
     mesh = furnished()
     camera, R = Camera(9, 9, 60.0, 60.0, 4.0, 4.0), looking(np.array([0.0, 0.1, -1.0]), np.array([0.0, 0, 1]))
     hits = FrontSides(Surface(mesh.vertices, mesh.triangles), np.array([0.0, -0.5, 5.0])).seen_by(camera, R)
-    # The floor is visible through the ceiling at 2.5 m.
+    # the floor is visible through the ceiling at 2.5 m
     np.testing.assert_allclose(hits.points_world[..., 2], 0, atol=1e-4)
 
 
@@ -67,7 +68,7 @@ def test_openness_near_objects_is_below_open_floor() -> None:
     mesh = furnished()
     camera, R = Camera(128, 128, 80.0, 80.0, 63.5, 63.5), looking(np.array([-1.0, 0, -1.0]), np.array([0.0, 0, 1]))
     hits = FrontSides(Surface(mesh.vertices, mesh.triangles), np.array([2.5, 0.0, 3.0])).seen_by(camera, R)
-    normals = np.tile(np.float32(R[2]), (128, 128, 1))  # up, in the camera frame
+    normals = np.tile(np.float32(R[2]), (128, 128, 1))  # up direction in the camera frame
     light = openness(camera, hits.depth, normals)
     x, y, z = np.moveaxis(hits.points_world, -1, 0)
     floor = hits.seen & (np.abs(z) < 1e-3)
@@ -108,7 +109,7 @@ def test_best_view_looks_down_and_shows_objects() -> None:
     mesh, poses = furnished(), walk()
     surface = Surface(mesh.vertices, mesh.triangles)
     camera, T = best_view(surface, mesh.instance_ids, poses, 200, 150)
-    assert -0.9 < T[2, 2] < -0.5  # looks obliquely downward
+    assert -0.9 < T[2, 2] < -0.5  # the camera looks down at an angle
     assert T[2, 3] > 2.5  # the camera is above the ceiling
     ids = FrontSides(surface, T[:3, 3]).seen_by(camera, T[:3, :3]).nearest(mesh.instance_ids)
     assert (ids == 1).sum() > 200

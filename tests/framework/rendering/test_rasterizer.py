@@ -1,4 +1,4 @@
-"""Tests of the rasterizer, compared with ray casting per pixel."""
+"""Tests for the rasterizer, compared with ray casting per pixel."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from framework.synthetic.ray_caster import RayCaster, image_rays, pixel_rays
 from framework.synthetic.walk import look
 
 CAMERA = Camera(96, 64, 80.0, 85.0, 47.3, 31.1)
-ASIDE = 2e-3  # px; if rays at this distance from a pixel center hit the same vertex, rounding has no effect
+ASIDE = 2e-3  # px; if rays this far from the pixel center hit the same vertex, rounding has no effect
 
 
 def drawn(vertices: np.ndarray, triangles: np.ndarray, T: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """Return the index (H, W) of the vertex nearest to the surface point at each pixel; -1 = no surface."""
+    """Return the index (H, W) of the vertex nearest to the visible surface at each pixel, -1 = no surface."""
     numbered = np.arange(1, len(vertices) + 1, dtype=np.int32)
     return Rasterizer(vertices, triangles).draw(camera, T).nearest(triangles, numbered) - 1
 
 
 def met_by_rays(caster: RayCaster, triangles: np.ndarray, T: np.ndarray, du: float, dv: float) -> np.ndarray:
-    """Return the index (H, W) of the vertex nearest to each hit of rays (du, dv) px from the pixel centers."""
+    """Return the index (H, W) of the vertex nearest to the hit of each ray. Rays are (du, dv) px from pixel centers."""
     u, v = np.arange(CAMERA.width)[None, :] + du, np.arange(CAMERA.height)[:, None] + dv
     hits = caster.cast(pixel_rays(CAMERA, T, u, v))
     weights = np.stack([1 - hits.uv.sum(axis=-1), hits.uv[..., 0], hits.uv[..., 1]], axis=-1)
@@ -43,7 +43,7 @@ def assert_equals_ray_casting(vertices: np.ndarray, triangles: np.ndarray, T: np
 
 
 def random_triangles(rng: np.random.Generator, size: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices, m, and triangles of `count` random triangles of about `size` m in a cube of 6 m."""
+    """Return the vertices, m, and triangles of `count` random triangles of about `size` m."""
     centers = rng.uniform(-3, 3, (count, 1, 3))
     vertices = (centers + rng.normal(0, size, (count, 3, 3))).reshape(-1, 3).astype(np.float32)
     return vertices, np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
@@ -52,7 +52,7 @@ def random_triangles(rng: np.random.Generator, size: float, count: int) -> tuple
 @pytest.mark.parametrize(("size", "count"), [(0.02, 40 * CHUNK + 7), (0.2, 500), (3.0, 6)])
 @pytest.mark.parametrize("seed", range(3))
 def test_rasterizer_matches_ray_casting(size: float, count: int, seed: int) -> None:
-    """Some triangles are small, and some extend from in front of the camera to behind it; poses are random."""
+    """Some triangles are small, and some extend behind the camera."""
     rng = np.random.default_rng([seed, count])
     vertices, triangles = random_triangles(rng, size, count)
     assert_equals_ray_casting(vertices, triangles, exp_se3(rng.normal(0, 1, 6)))
@@ -70,7 +70,8 @@ def test_rasterizer_depth_and_weights_match_ray_casting(size: float) -> None:
     assert same.sum() > 1000
     u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
-    points = T[:3, 3] + buffer.depth[..., None] * (rays @ T[:3, :3].T)  # the weighted mean of the corners must be equal
+    # the weighted means of the corners must be equal
+    points = T[:3, 3] + buffer.depth[..., None] * (rays @ T[:3, :3].T)
     weights = np.concatenate([1 - buffer.uv.sum(axis=-1, keepdims=True), buffer.uv], axis=-1)
     mean = np.einsum("nk,nkc->nc", weights[same], vertices[triangles[buffer.triangle[same]]].astype(float))
     np.testing.assert_allclose(mean, points[same], atol=1e-5)
@@ -81,7 +82,7 @@ def test_rasterizer_depth_and_weights_match_ray_casting(size: float) -> None:
 
 
 def test_rasterized_closed_surface_has_no_gaps() -> None:
-    """The camera is inside a triangulated ball: every pixel shows a triangle, including those on edges and corners."""
+    """The camera is inside a triangulated ball. Some pixels are on edges and corners of triangles."""
     side = 40
     theta, phi = np.meshgrid(
         np.linspace(0, np.pi, side), np.linspace(0, 2 * np.pi, side, endpoint=False), indexing="ij"
@@ -96,7 +97,7 @@ def test_rasterized_closed_surface_has_no_gaps() -> None:
 
 
 def test_rasterizer_includes_pixels_on_edges_and_corners() -> None:
-    """The rectangle from (1, 1) to (5, 4) px at 2 m has two triangles and includes its border."""
+    """The rectangle from (1, 1) to (5, 4) px consists of two triangles."""
     camera = Camera(8, 6, 4.0, 4.0, 0.0, 0.0)
     vertices = np.array([[1, 1], [5, 1], [5, 4], [1, 4]], np.float32) / 4 * 2
     vertices = np.column_stack([vertices, np.full(4, 2, np.float32)])

@@ -1,4 +1,4 @@
-"""Tests of the surface kernels, compared with slow references."""
+"""Tests for surface kernels, compared with slow references."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CENTER, R = np.array([0.1, -0.2, -4.0]), looking(np.array([0.05, 0.1, 1.0]), np.
 
 @pytest.fixture(scope="module")
 def surface() -> Surface:
-    """Return triangles that share vertices, with random orientation."""
+    """Return triangles with common vertices and random orientation."""
     rng = np.random.default_rng(0)
     return Surface(rng.uniform(-1, 1, (40, 3)).astype(np.float32), rng.integers(0, 40, (30, 3), np.int32))
 

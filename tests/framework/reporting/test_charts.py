@@ -1,4 +1,4 @@
-"""Tests of the SVG charts: content and degenerate input."""
+"""Tests for the SVG charts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def parsed(picture: str) -> ElementTree.Element:
-    """Return the XML tree of an SVG image, after checking that it has no NaN or infinite numbers."""
+    """Return the XML tree of an SVG image after checking that all numbers are finite."""
     assert "nan" not in picture
     assert "inf" not in picture
     return ElementTree.fromstring(picture)
@@ -68,7 +68,7 @@ def test_top_view_escapes_object_names() -> None:
     picture, share = top_view([PlottedPath(circle(0.1))], [], [Footprint(corners, "<cup>", "#ff0000")], UP)
     [shape] = paths(picture, "chart-object-0")
     shape = shape[:4]
-    sides = np.linalg.norm(shape - np.roll(shape, 1, axis=0), axis=1)  # rotated, so that the path is horizontal
+    sides = np.linalg.norm(shape - np.roll(shape, 1, axis=0), axis=1)  # rotated until the path is horizontal
     assert sorted(sides / sides.min()) == pytest.approx([1, 1, 2, 2], rel=0.01)
     assert picture.count("&lt;cup&gt;") == 2, "expected the name in the tooltip and in the label"
     assert share < 0.1

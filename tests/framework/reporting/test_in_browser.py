@@ -1,4 +1,4 @@
-"""Tests of the report page in a browser without network access: clicks, keys and the canvas."""
+"""Tests for the report page in a browser without network access."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Return the pages of two runs and of their comparison; one class name of the second run contains HTML."""
+    """Return the pages of two runs and of their comparison. A class name of the second run contains HTML."""
     folder = tmp_path_factory.mktemp("runs")
     first = write_run(folder / "first")
     second = Path(shutil.copytree(first, folder / "second"))
@@ -56,7 +56,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture
 def opened(browser: Any) -> Iterator[Any]:
-    """Return a function that opens pages offline; finally, check that there were no requests and no errors."""
+    """Return a function that opens a page offline. After the test, check that there were no requests and no errors."""
     contexts, faults = [], []
 
     def open_page(path: Path, **options: Any) -> Any:
@@ -80,7 +80,7 @@ def opened(browser: Any) -> Iterator[Any]:
 
 
 def canvas(page: Any) -> np.ndarray:
-    """Return the RGB image (H, W, 3) of the canvas that shows the map."""
+    """Return the RGB image (H, W, 3) of the map."""
     page.wait_for_timeout(150)  # until the next frame is rendered
     picture = page.locator("#canvas").screenshot()
     return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
@@ -167,7 +167,7 @@ def test_report_table_is_sorted_searched_and_selected_by_keys(pages: list[Path],
     chosen = rows.nth(1).get_attribute("data-id")
     assert rows.nth(1).get_attribute("aria-selected") == "true"
     assert page.locator("#panel h3").inner_text().endswith(str(chosen))
-    # wait_for_function uses eval, which the policy forbids.
+    # wait_for_function uses eval, which the policy forbids
     while page.evaluate("Boolean(window.report.viewer.flight)"):
         page.wait_for_timeout(50)
     after = page.evaluate("window.report.viewer.camera.position.toArray()")
@@ -186,7 +186,7 @@ def test_report_fits_phone_screen_and_dark_mode(pages: list[Path], opened: Any) 
     assert np.median(canvas(page)) < 120
 
 
-def test_report_hostile_class_name_is_escaped(pages: list[Path], opened: Any) -> None:
+def test_report_malicious_class_name_is_escaped(pages: list[Path], opened: Any) -> None:
     page = opened(pages[1])
     page.locator("#objects-table tbody tr").filter(has_text="<img").click()
     assert HOSTILE in page.inner_text("#panel h3")

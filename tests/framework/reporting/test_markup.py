@@ -1,4 +1,4 @@
-"""Tests of the page markup: values are escaped, and scripts are restricted."""
+"""Tests for the markup of pages. Values must be escaped, and scripts are restricted."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def hostile_page() -> str:
     return markup.page("comparison.html", HOSTILE, context, {"name": HOSTILE, "more": [1.5, None]}, ["H4sI"])
 
 
-def test_page_escapes_hostile_values() -> None:
+def test_page_escapes_malicious_values() -> None:
     page = hostile_page()
     assert page.count("<script>") == 1
     assert "<script>alert" not in page

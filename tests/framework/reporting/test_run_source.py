@@ -1,4 +1,4 @@
-"""Tests of run sources, which read the sequence of a stored run."""
+"""Tests for run sources, which read the sequence of a stored run."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def directory(mapped: Path, tmp_path: Path) -> Path:
 
 
 def change_config(directory: Path, **dataset: Any) -> None:
-    """Replace the dataset in the stored config and update the config hash."""
+    """Replace the dataset in the stored config, and update the config hash."""
     config = OmegaConf.load(directory / "config.yaml")
     config.dataset = dataset
     OmegaConf.save(config, directory / "config.yaml")

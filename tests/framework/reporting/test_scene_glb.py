@@ -1,4 +1,4 @@
-"""Tests of maps as GLB files."""
+"""Tests for maps as GLB files."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_scene_glb_has_linear_colors_and_first_seen_times() -> None:
 
 
 def test_scene_glb_is_y_up() -> None:
-    """The map's up direction becomes y, as glTF requires."""
+    """In glTF, the up direction is y."""
     up = np.array([0.6, 0.0, -0.8])
     content = scene_glb(two_squares(), np.zeros(8, np.float32), {}, up)
     scene = trimesh.load_scene(io.BytesIO(content), file_type="glb")

@@ -1,4 +1,4 @@
-"""Tests of the visibility of a map from the cameras of a trajectory."""
+"""Tests for the visibility of a map from the poses of a trajectory."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def at(x: float) -> np.ndarray:
 def test_sightings_first_seen_is_first_visible_pose() -> None:
     mesh = wall()
     found = sightings(mesh, mesh.instance_ids, np.array([at(-1.0), at(-0.2), at(0.2)]), CAMERA, {})
-    half = 2 * 100 / 150  # m, visible on each side of the optical axis
+    half = 2 * 100 / 150  # m, visible half width
     x = mesh.vertices[:, 0]
     assert found.chosen == [0, 1, 2]
     assert (found.first_seen[x < -1.0 + half - 0.05] == 0).all()
@@ -44,10 +44,10 @@ def test_sightings_first_seen_is_first_visible_pose() -> None:
     assert (np.diff(found.growth) > 0).all()
 
 
-def test_sightings_best_pose_shows_whole_object() -> None:
+def test_sightings_best_pose_shows_complete_object() -> None:
     mesh = wall()
     near = at(-1.0)
-    near[2, 3] = 1.0  # more pixels, but only 0.59 of the object
+    near[2, 3] = 1.0  # the object has more pixels, but only 0.59 of it is visible
     poses = np.array([at(-3.2), near, at(-1.4), at(0.0), at(1.7)])
     assert sightings(mesh, mesh.instance_ids, poses, CAMERA, {}).best == {3: 2, 4: 4}
 

@@ -1,4 +1,4 @@
-"""Tests of stored runs as a data frame."""
+"""Tests for stored runs as a data frame."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
     chosen = {"choice.dataset": "scenenn", "choice.fuser": "bayes", "git_commit": "abc", "git_dirty": False}
     first = {"seed": 0, "threads": 2, "dataset": {"scene": "011"}, "fuser": {"voxel_size": 1, "sides": [1, 2]}}
     second = {"row": "b", "seed": 1, "dataset": {"scene": "016"}, "fuser": {"voxel_size": 0.02, "split": True}}
-    code = {"code.fuser": "plugins.fusers.bayes 3f2a9c41d0b7"}  # not in runs of older versions
+    code = {"code.fuser": "plugins.fusers.bayes 3f2a9c41d0b7"}  # missing in runs of older versions
     write_run(tmp_path / "a", first, **chosen, **code, seed=9, frames=8, fps=20.0, **{"instances.ap50": None})
     write_run(tmp_path / "in" / "b", second, **chosen, frames=4, fps=21.5, **{"instances.ap50": 1 / 3})
     (tmp_path / "failed").mkdir()

@@ -1,4 +1,4 @@
-"""Tests of the input hash; a completed run is skipped if its config and its input hash are unchanged."""
+"""Tests for the hash of the inputs. A completed run is skipped if the hashes of its config and inputs are unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of instances.json."""
+"""Tests for instances.json."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def mapped() -> GridMap:
 
 
 def nearly_equal(found: dict[int, Instance]) -> dict[int, Instance]:
-    """Return the instances with confidences and probabilities that differ only in their last bit."""
+    """Return the instances with a change in the last bit of the confidences and probabilities."""
     confidences = {1: 1 / 3, 2: np.nextafter(1 / 3, 1)}
     even = np.float32(0.5)
     likely = np.array([np.nextafter(even, np.float32(0)), np.nextafter(even, np.float32(1))], np.float32)
@@ -141,7 +141,7 @@ def test_read_instances_invalid_content_raises_one_line_error(tmp_path: Path, co
 
 
 def test_read_instances_null_class_is_named_object(tmp_path: Path) -> None:
-    """Maps without classes write null; frame numbers may be timestamps."""
+    """Maps without classes contain null. Frame numbers can be timestamps."""
     path = tmp_path / "instances.json"
     last = 1_700_000_000_000
     entry = ENTRY | {"class": None, "class_probabilities": {}, "last_frame": last, "centroid": None}
@@ -159,7 +159,7 @@ SCHEMA = json.loads((Path(instances_file.__file__).parent / "instances.schema.js
 
 
 def test_instances_schema_accepts_written_files(tmp_path: Path, room: CornerRoom) -> None:
-    """One file is of a map with upright boxes, the other of a minimal map."""
+    """The first map has upright boxes, the second map has only the required values."""
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     mapper = Mapper("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
     for frame in room:

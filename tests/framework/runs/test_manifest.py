@@ -1,4 +1,4 @@
-"""Tests of manifest.json."""
+"""Tests for manifest.json."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ def directory(tmp_path: Path) -> Path:
     """Return a run directory with two files and a manifest."""
     (tmp_path / "config.yaml").write_text("seed: 0\n")
     (tmp_path / "metrics.json").write_text("{}\n")
-    inputs = {"detector.weights": "0f" * 32}
-    Manifest.of(tmp_path, ["config.yaml", "metrics.json", "map.npz"], RunStatus.COMPLETE, inputs).write(tmp_path)
+    manifest = Manifest(RunStatus.COMPLETE, {}, {"detector.weights": "0f" * 32}, {"seed": "0"})
+    manifest.with_files(tmp_path, ["config.yaml", "metrics.json", "map.npz"]).write(tmp_path)
     return tmp_path
 
 
 def test_manifest_round_trip_keeps_contents(directory: Path) -> None:
     found = Manifest.read(directory)
     assert (found.status, dict(found.inputs)) == (RunStatus.COMPLETE, {"detector.weights": "0f" * 32})
+    assert dict(found.parameters) == {"seed": "0"}
     assert {name: size for name, (size, _) in found.files.items()} == {"config.yaml": 8, "metrics.json": 3}
     assert found.changed_files(directory) == []
 

@@ -1,4 +1,4 @@
-"""Tests of the stored mesh of a run."""
+"""Tests for the stored mesh of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the objective that a sweeper optimizes."""
+"""Tests for the objective that a sweeper optimizes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def run(tmp_path: Path) -> Path:
     [(None, None), ("frames", 6.0), (["instances.ap50", "frames"], [0.25, 6.0]), (["frames"], [6.0])],
 )
 def test_objective_returns_chosen_metrics(run: Path, objective: Any, value: Any) -> None:
-    """A list of keys gives a list, also with one key."""
+    """The result is a list if the keys are a list, also for a single key."""
     assert objective_of(run, OmegaConf.create({"objective": objective}).objective) == value
 
 
@@ -46,13 +46,13 @@ def test_objective_without_number_raises_error(run: Path, objective: Any, messag
     assert str(error.value) == message
 
 
-def test_objective_of_run_without_truth_names_cause(run: Path) -> None:
+def test_objective_of_run_without_truth_error_names_cause(run: Path) -> None:
     (run / "metrics.json").write_text(json.dumps({"frames": 6, "instances.count": 2}))
     with pytest.raises(ConfigError, match=r"got instances\.ap50; choose a dataset with ground truth"):
         objective_of(run, "instances.ap50")
 
 
 @pytest.mark.parametrize("objective", [3, [], ["frames", 3]])
-def test_objective_keys_other_types_raise_error(objective: Any) -> None:
+def test_objective_keys_of_other_types_raise(objective: Any) -> None:
     with pytest.raises(ConfigError, match=r"objective: expected a key of metrics\.json or a list of keys, got"):
         objective_keys(objective)

@@ -1,4 +1,4 @@
-"""Tests of the version and hash of plugin code."""
+"""Tests for the version and hash of plugin code."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def config(*targets: str) -> dict[str, object]:
 def test_plugin_code_edited_package_changes_hash(folder: Path) -> None:
     both = config("mean_refiner.plugin.Mean", "median_refiner.Median")
     seen = [plugin_code(both)]
-    for name in ("plugin.py", "conf/refiner/mean.yaml", "helper.py"):
+    for name in ("plugin.py", "conf/refiner/mean.yaml", "sizes.json"):
         with (folder / "mean_refiner" / name).open("a") as file:
             file.write("# edited\n")
         seen.append(plugin_code(both))
@@ -42,6 +42,55 @@ def test_plugin_code_edited_package_changes_hash(folder: Path) -> None:
     (folder / "median_refiner.py").write_text("class Median:\n    size = 3\n")
     assert plugin_code(config("median_refiner.Median")) != single
     assert list(single) == ["code.refiner"]
+
+
+SOURCES = {
+    "__init__.py": "from .mean import Mean\nfrom my_methods.blobs import Blobs as Blobs, Other\n",
+    "mean.py": "import numpy\ndef fit():\n    from . import sizes\nclass Mean: ...\n",
+    "blobs.py": "from .shapes.round import *\nfrom ..nothing import x\nclass Blobs: ...\n",
+    "sizes.py": "SIZE = 3\n",
+    "unused.py": "",
+    "weights.bin": "3",
+    "shapes/__init__.py": "from . import square\n",
+    "shapes/round.py": "import my_methods.sizes\n",
+    "shapes/square.py": "",
+}
+
+
+@pytest.mark.parametrize(
+    ("target", "required"),
+    [
+        ("my_methods.mean.Mean", {"__init__.py", "mean.py", "sizes.py", "weights.bin"}),
+        ("my_methods.Mean", {"__init__.py", "mean.py", "sizes.py", "weights.bin"}),
+        (
+            "my_methods.Blobs",
+            {"__init__.py", "blobs.py", "sizes.py", "weights.bin", "shapes/__init__.py", "shapes/round.py"},
+        ),
+        ("my_methods.missing.Mean", set(SOURCES) - {"unused.py", "shapes/square.py"}),
+    ],
+)
+def test_plugin_code_hashes_required_files_only(
+    target: str, required: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, text in SOURCES.items():
+        (tmp_path / "my_methods" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "my_methods" / name).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.invalidate_caches()
+    before, changed = plugin_code(config(target)), set()
+    for name, text in SOURCES.items():
+        (tmp_path / "my_methods" / name).write_text(f"{text}# edited\n")
+        if plugin_code(config(target)) != before:
+            changed.add(name)
+        (tmp_path / "my_methods" / name).write_text(text)
+    assert changed == required
+
+
+def test_plugin_code_import_by_name_hashes_all_files(folder: Path) -> None:
+    (folder / "mean_refiner/plugin.py").write_text("import importlib\nX = importlib.import_module('mean_refiner.y')\n")
+    before = plugin_code(config("mean_refiner.plugin.Mean"))
+    (folder / "mean_refiner/y.py").write_text("")
+    assert plugin_code(config("mean_refiner.plugin.Mean")) != before
 
 
 def test_plugin_code_other_package_keeps_hash(folder: Path) -> None:

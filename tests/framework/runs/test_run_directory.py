@@ -1,4 +1,4 @@
-"""Tests of the run directory."""
+"""Tests for the run directory."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ Run = Callable[..., RunResult]
 
 @pytest.fixture
 def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunRecord:
-    """Begin a run directory. Its overview image is a placeholder, because other tests cover the image."""
+    """Begin a run directory. The overview image is a placeholder."""
     monkeypatch.setattr(run_directory, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
     return RunRecord.begin(tmp_path / "run", CONFIG, CHOICES)
 
@@ -209,7 +209,7 @@ def test_run_directory_removed_during_run_is_recreated(record: RunRecord, room: 
 
 
 def test_rpe_ignores_steps_over_skipped_frames(room: CornerRoom) -> None:
-    """The drift is 1 cm per frame and frame 2 is skipped; the step of 2 cm over frame 2 is not used."""
+    """The drift is 1 cm per frame. Because frame 2 is skipped, one step has a drift of 2 cm."""
     true = np.eye(4)
     tracked = []
     for position in (0, 1, 3, 4):
@@ -312,7 +312,7 @@ def test_timings_csv_matches_stage_metrics(record: RunRecord, room: CornerRoom) 
 
 
 def test_pose_source_comes_from_tracker(room: CornerRoom) -> None:
-    """The pose source does not depend on the poses, which may equal the true poses or be lost."""
+    """Tracked poses may be lost or equal to the true poses."""
     one_frame = CornerRoom(frames=1)
     given = [mapped(room), mapped(room, lost_from=1, lost_to=99), mapped(one_frame)]
     assert [run_metrics(result)["pose_source"] for result in given] == ["ground_truth"] * 3
@@ -385,7 +385,7 @@ def test_code_version_of_installed_package_is_unknown(tmp_path: Path, monkeypatc
 
 
 def read_ply(path: Path) -> InstanceMesh:
-    """Return the mesh of a PLY file, read by the element counts and types in its header."""
+    """Return the mesh of a PLY file. Counts and types are read from the header."""
     content = path.read_bytes()
     header, _, body = content.partition(b"end_header\n")
     lines = header.decode().splitlines()

@@ -1,4 +1,4 @@
-"""Tests of rows, means and paired differences, compared with manual results."""
+"""Tests for rows, means and paired differences."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_rows_split_by_parameter_independent_of_seed() -> None:
 
 
 def test_rows_without_experiment_are_named_by_choices() -> None:
-    """Parameters that only one of two refiners has do not split rows."""
+    """A parameter that only one of the refiners has does not split the rows."""
     parameters: dict[str, dict[str, Any]] = {"kmeans": {"centers": 5}, "gmm": {"steps": 8, "floor": 0.1}}
     records = [
         record({"seed": seed, "refiner": node}, refiner=name, fuser="bayes")
@@ -90,7 +90,7 @@ def test_rows_split_by_command_line_overrides() -> None:
 
 
 def test_row_names_include_undeclared_choice_differences() -> None:
-    """The rows differ in the tracker, which no row overrides, so their names include it."""
+    """The trackers differ, although no row overrides the tracker."""
     records = [
         record({"row": "a", "seed": 0}, tracker="icp", fuser="bayes"),
         record({"row": "b", "seed": 0}, tracker="given", fuser="count"),
@@ -102,7 +102,7 @@ def test_row_names_include_undeclared_choice_differences() -> None:
 
 
 def test_row_names_include_undeclared_parameter_differences() -> None:
-    """The rows differ in a parameter that no row overrides, so their names include it."""
+    """A parameter differs, although no row overrides the parameter."""
     frames = {"a": 8, "b": 16}
     records = [
         record({"row": row, "seed": 0, "dataset": {"frames": count}, "fuser": {"voxel": count, "inner": {"x": count}}})
@@ -146,7 +146,7 @@ def test_row_names_include_dataset_root_differences() -> None:
 
 
 def test_row_names_include_folder_of_datasets_that_rows_override() -> None:
-    """Rows on other data have no common variant, so that they are not compared."""
+    """Rows on different data must not be compared."""
     records = [record({"row": row, "seed": 0, "dataset": {"root": f"/{row}"}}, dataset=row) for row in "ab"]
     changes = {"a": [], "b": ["dataset=b"]}
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.root=/a", "b, dataset.root=/b"]
@@ -188,7 +188,7 @@ def test_rows_of_presets_have_distinct_names() -> None:
 
 
 def of_two_datasets() -> list[Record]:
-    """Return runs of two rows on two datasets, each with its own detector and annotation."""
+    """Return runs of two rows on two datasets. Each dataset has its own detector and annotation."""
     data = (("desk", {"root": "/d", "scene": "a"}, "net"), ("rooms", {"kind": "STUDIO"}, "simulated"))
     found = [
         record({"seed": 0, "dataset": node, "detector": {"name": net}}, dataset=name, detector=net, refiner=refiner)
@@ -199,7 +199,7 @@ def of_two_datasets() -> list[Record]:
 
 
 def test_rows_average_over_datasets() -> None:
-    """The parameters of a dataset and the detector that it sets depend on it."""
+    """The parameters and the detector of a run depend on the dataset."""
     records = of_two_datasets()
     asked = {"dataset", "refiner"}
     rows = rows_of(records, ["seed", "dataset"], asked=asked)
@@ -209,7 +209,7 @@ def test_rows_average_over_datasets() -> None:
 
 
 @pytest.mark.parametrize("asked", [None, {"dataset", "refiner", "detector"}])
-def test_rows_split_by_detector_unless_dataset_sets_it(asked: set[str] | None) -> None:
+def test_rows_of_unknown_or_swept_detectors_are_split(asked: set[str] | None) -> None:
     rows = rows_of(of_two_datasets(), ["seed", "dataset"], asked=asked)
     assert [list(row.records) for row in rows] == [[("0", "desk")]] * 2 + [[("0", "rooms")]] * 2
 

@@ -1,4 +1,4 @@
-"""Tests of stored runs: complete, damaged and missing runs."""
+"""Tests for stored runs, including damaged and missing runs."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_is_recorded_same_config_is_true(directory: Path, caplog: pytest.LogCapt
 
 
 def test_is_recorded_logs_missing_map_files(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Map files may have been removed to save disk space; the metrics remain valid."""
+    """The user may have removed the map files to save disk space. The metrics remain valid."""
     (directory / "map.npz").unlink()
     (directory / "mesh.ply").unlink()
     assert is_recorded(directory, OmegaConf.create(CONFIG))
@@ -183,7 +183,7 @@ MACHINE = {"environment.processor": "a", "environment.cpus": 4}
 
 
 def record_of(directory: Path, config: dict[str, object], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write a complete run directory of this config, measured on this machine."""
+    """Write a complete directory of a run with this config on this machine."""
     monkeypatch.setattr(stored_runs, "environment", lambda: MACHINE)
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     write(directory, config_hash=config_hash(config), inputs_sha256=inputs_sha256(config), **MACHINE)

@@ -1,4 +1,4 @@
-"""Tests of the requested runs of a sweep, read from Hydra's multirun.yaml."""
+"""Tests for the requested runs of a sweep, which are read from multirun.yaml."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of timings.csv."""
+"""Tests for timings.csv."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_timings_file_round_trip_has_nan_for_missing_stages(tmp_path: Path) -> N
     np.testing.assert_array_equal(found.milliseconds["fusion"], [20, np.nan, 0])
 
 
-def test_read_timings_old_stage_gets_current_name(tmp_path: Path) -> None:
+def test_read_timings_old_stage_name_is_converted(tmp_path: Path) -> None:
     (tmp_path / "timings.csv").write_text("frame,stage,milliseconds\n0,read,1\n0,fuse,2\n")
     assert list(read_timings(tmp_path / "timings.csv").milliseconds) == ["reading", "fusion"]
     assert current_key("stage_ms.track.p95") == "stage_ms.tracking.p95"

@@ -1,4 +1,7 @@
-"""Tests of the CPU budget, which divides the cores by the recent load of prefetching and of mapping."""
+"""Tests for the CPU budget.
+
+The cores are divided between prefetching and mapping according to the recent load of both.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from framework.runtime.cpu_budget import RECENT, CpuBudget
 
 @pytest.fixture
 def thread_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], None]]:
-    """Replace the CPU clock; return the function that advances it by a number of seconds."""
+    """Replace the CPU clock. Return a function that advances the clock by a number of seconds."""
     now = [0.0]
     monkeypatch.setattr(time, "thread_time", lambda: now[0])
 
@@ -31,7 +34,7 @@ def thread_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], N
 
 @pytest.fixture(params=[1, 2, 4])
 def sharing(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> CpuBudget:
-    """Return a budget of 1, 2 or 4 cores; Numba's thread limit is replaced by a variable, and priorities are kept."""
+    """Return a budget of 1, 2 or 4 cores. The thread limit of Numba is simulated, and priorities are not changed."""
     monkeypatch.setattr(cpu_budget, "lower_priority", Mock())
     threads = [request.param]
     monkeypatch.setattr(numba, "get_num_threads", lambda: threads[0])
@@ -40,7 +43,7 @@ def sharing(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def pass_frames(sharing: CpuBudget, passes: Callable[[float], None], ahead: float, mapping: float) -> None:
-    """Simulate frames with `ahead` s of prefetching and `mapping` s of perfectly parallel mapping."""
+    """Simulate frames with `ahead` s of prefetching and `mapping` s of mapping, which is perfectly parallel."""
     for _ in range(RECENT):
         with sharing.prefetching():
             passes(ahead)
@@ -95,7 +98,7 @@ def test_cpu_budget_is_divided_among_workers(sharing: CpuBudget, thread_time: Ca
 def test_cpu_budget_ignores_single_slow_frame(sharing: CpuBudget, thread_time: Callable[[float], None]) -> None:
     pass_frames(sharing, thread_time, ahead=1.0, mapping=1.1)
     with sharing.mapping():
-        thread_time(100.0)  # compilation of kernels
+        thread_time(100.0)  # a frame with compilation of kernels
     assert sharing.prefetch_cores() == sharing.cores // 2
 
 
@@ -123,8 +126,10 @@ def test_cpu_budget_is_thread_safe() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="priorities of threads exist only on Linux")
 @pytest.mark.parametrize(("before", "calls"), [(0, 1), (10, 0), (19, 0)])
-def test_lower_priority_never_raises_it(before: int, calls: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Raising a priority requires privileges, for example in `nice -n 19 instancemap`."""
+def test_lower_priority_changes_only_higher_priorities(
+    before: int, calls: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Raising the priority requires privileges."""
     monkeypatch.setattr(os, "getpriority", lambda *_: before)
     setpriority = Mock()
     monkeypatch.setattr(os, "setpriority", setpriority)

@@ -1,4 +1,4 @@
-"""Tests of the digests of stage results."""
+"""Tests for the digests of stage results."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def clusters(count: int) -> PointClusters:
     )
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 7, 1000])  # with and without bytes after the last 64-bit word
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 1000])  # with and without additional bytes after the last 64-bit word
 def test_digest_equal_clusters_are_equal(count: int) -> None:
     assert digest_of(clusters(count)) == digest_of(clusters(count))
 
@@ -58,7 +58,7 @@ def test_digest_other_object_raises() -> None:
 
 
 def test_digest_of_semantic_map_needs_no_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its instances are components of the mesh, which takes seconds."""
+    """Computing the instances would require the mesh, which takes seconds."""
     mesh = Mock(side_effect=AssertionError("expected no mesh"))
     monkeypatch.setattr(SemanticMap, "mesh", mesh)
     monkeypatch.setattr(SemanticMap, "statistics", property(lambda _: MapStatistics(8, 64)))

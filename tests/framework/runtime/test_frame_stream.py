@@ -1,4 +1,4 @@
-"""Tests of live videos: the newest frame is mapped, others are dropped and counted, and a stop ends the run."""
+"""Tests for live video. The newest frame is mapped, and other frames are dropped and counted."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from tests.support.scenes.corner_room import (
 )
 
 PATIENCE_S = 10.0
-SLOW_S = 0.03  # duration of a stage that is too slow for the video, s
+SLOW_S = 0.03  # s, duration of a stage that is too slow for the video
 
 
 @dataclass
 class Handed(LiveVideo):
-    """Live video whose frames are the numbers passed to `come`, which waits until the listener has received them."""
+    """Live video whose frames are numbers passed to `come`, which waits until they have been received."""
 
     def __post_init__(self) -> None:
         self.name = "handed"
@@ -54,7 +54,7 @@ class Handed(LiveVideo):
 
     def come(self, *numbers: int) -> None:
         self.coming.extend(numbers)
-        for _ in range(3):  # iterations of the listener; at least the last one begins after the numbers are added
+        for _ in range(3):  # iterations of the listener; the last one begins after the numbers were added
             while self.asked.acquire(blocking=False):
                 pass
             assert self.asked.acquire(timeout=PATIENCE_S)
@@ -158,7 +158,7 @@ def test_live_video_at_fast_rate_drops_and_counts_frames(prefetch: int, caplog: 
 
 
 def test_live_video_frames_are_not_queued() -> None:
-    """Live frames are not prefetched, because each queued frame would increase the latency."""
+    """Each queued frame would increase the latency."""
     video, waiting = LiveRoom(frames_sent=200, period_s=0.002), []
 
     @dataclass
@@ -199,7 +199,6 @@ def test_live_video_ctrl_c_ends_normally(prefetch: int) -> None:
 
 
 def test_live_video_second_ctrl_c_interrupts_frame() -> None:
-    """The frame is interrupted, so the outputs are partial."""
     video = LiveRoom(frames_sent=1000)
     result = pipeline(tracker=PressesCtrlC(at=2, times=2)).run(video)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
@@ -208,7 +207,7 @@ def test_live_video_second_ctrl_c_interrupts_frame() -> None:
 
 
 def test_live_video_ctrl_c_before_first_frame_raises() -> None:
-    """The worker waits for a first frame that never arrives."""
+    """The worker waits for the first frame, which is never sent."""
 
     @dataclass
     class Silent(LiveRoom):
@@ -233,7 +232,7 @@ def test_live_video_failure_keeps_partial_map() -> None:
 def test_live_video_without_usable_frame_raises() -> None:
     with pytest.raises(DataError, match="live_room: expected at least one frame, got none"):
         pipeline().run(LiveRoom(frames_sent=0))
-    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
+    with pytest.raises(DataError, match="expected usable frames, got none among 1"):
         pipeline().run(LiveRoom(frames_sent=1, unreadable=0))
     with pytest.raises(DataError, match="expected ground-truth poses, got none for its frames;"):
         pipeline(tracker=GivenPose()).run(Handed())
@@ -241,7 +240,7 @@ def test_live_video_without_usable_frame_raises() -> None:
 
 @PREFETCH
 def test_live_stage_exception_leaves_no_threads(prefetch: int) -> None:
-    """The worker may be waiting for a frame, and the listener for the video."""
+    """When the exception is raised, the worker can be waiting for a frame."""
     video, threads = LiveRoom(frames_sent=1000), working_threads()
     with pytest.raises(OSError, match="Input/output error"):
         pipeline(prefetch, detector=FaultyDetector(at=0)).run(video)

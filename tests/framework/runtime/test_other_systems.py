@@ -1,4 +1,4 @@
-"""Tests of commands without Python's Linux-specific and POSIX modules."""
+"""Tests for commands on systems without the Linux-specific and POSIX modules of Python."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of prefetching: order, bounds, concurrency and turns."""
+"""Tests for prefetching."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_prefetched_map_is_bounded_and_ordered() -> None:
 
 
 def test_prefetched_map_overlaps_with_consumer() -> None:
-    """Both sides wait for each other; without a worker thread they would deadlock."""
+    """Each side waits for the other, which would be a deadlock without a worker thread."""
     fusing, detected = threading.Event(), threading.Event()
 
     def detect(k: int) -> int:

@@ -1,4 +1,4 @@
-"""Tests of process settings: threads, seeds, garbage collection and caches."""
+"""Tests for process settings: threads, seeds, garbage collection and caches."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CHECKOUT = Path(__file__).resolve().parents[3]
 
 
 def test_thread_limit_applies_to_libraries_loaded_later() -> None:
-    """The setting does not import torch and applies when torch is imported later."""
+    """Torch is imported after the settings were applied. The settings themselves do not import torch."""
     code = """
 import sys
 from framework.runtime.process_settings import Settings
@@ -71,7 +71,7 @@ def test_thread_limit_is_passed_to_scipy_and_open3d(monkeypatch: pytest.MonkeyPa
     assert asked == [1, 1]
 
 
-def test_apply_seeds_torch_only_if_it_is_loaded() -> None:
+def test_apply_seeds_torch_only_if_loaded() -> None:
     code = """
 import sys
 from framework.runtime.process_settings import Settings
@@ -171,7 +171,7 @@ print(time.process_time() - done)
 
 
 def test_matrix_product_threads_do_not_spin_when_idle() -> None:
-    """Spinning threads would take 0.02 s or more of CPU time in a sleeping process."""
+    """Spinning threads use at least 0.02 s of CPU time while the process sleeps."""
     environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_THREAD_TIMEOUT"}
     line = [sys.executable, "-c", IDLE_AFTER_A_PRODUCT]
     done = subprocess.run(line, cwd=CHECKOUT, env=environment, capture_output=True, text=True, check=True)

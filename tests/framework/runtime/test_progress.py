@@ -1,4 +1,4 @@
-"""Tests of the progress display: in a terminal, without a terminal, and disabled."""
+"""Tests for the progress display, with and without a terminal."""
 
 from __future__ import annotations
 

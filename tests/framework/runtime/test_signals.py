@@ -1,4 +1,4 @@
-"""Tests of deferred signals: the first takes effect after the current step, and the second immediately."""
+"""Tests for deferred signals. The first signal takes effect after the current step, a second one immediately."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_signals_deferred_first_waits_and_second_raises(
             signal.raise_signal(number)
         assert interruption.received is not None
         assert interruption.received.number == number
-        signal.raise_signal(number)  # between two steps, a signal does not raise, so that no result is lost
+        signal.raise_signal(number)  # a signal between two steps must not raise, or the result would be lost
         with pytest.raises(Interrupted) as second, interruption.second_ends_at_once("after the outputs are written"):
             signal.raise_signal(number)
         assert second.value.number == number
@@ -45,7 +45,7 @@ def test_signals_deferred_first_waits_and_second_raises(
 
 @pytest.fixture(autouse=True)
 def default_signal_handlers() -> Iterator[None]:
-    """Reset the signal handlers that libraries of other tests, such as Ray, have set."""
+    """Restore the default signal handlers, which libraries such as Ray change in other tests."""
     before = {number: signal.getsignal(number) for number in ENDING}
     for number in ENDING:
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
@@ -65,7 +65,7 @@ def test_signals_deferred_nested_returns_outer_context() -> None:
 
 
 def test_signals_deferred_keeps_existing_handlers() -> None:
-    """Shell scripts ignore Ctrl-C in background processes; submitit handles SIGTERM in its jobs."""
+    """SIGINT is ignored in background jobs of a shell, and submitit handles SIGTERM."""
     received: list[int] = []
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, _: received.append(number))

@@ -1,4 +1,4 @@
-"""Tests of worker processes whose parent process is killed."""
+"""Tests for worker processes whose parent process has been killed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ time.sleep(100)
 
 @pytest.mark.parametrize("watched", ["watched", "unwatched"])
 def test_idle_worker_ends_with_killed_parent(watched: str) -> None:
-    """The workers of joblib itself continue to wait for jobs."""
+    """Without the watchdog, the workers of joblib would continue to wait."""
     pytest.importorskip("joblib")
     process = subprocess.Popen(
         [sys.executable, "-c", IDLE_WORKERS, watched], cwd=CHECKOUT, stdout=subprocess.PIPE, text=True

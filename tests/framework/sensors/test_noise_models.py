@@ -1,4 +1,4 @@
-"""Tests of the depth noise models against the published formulas, in double and single precision."""
+"""Tests for depth noise models, compared with the published formulas."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ from framework.sensors.noise_models_kernels import (
     noise_ratio,
 )
 
-PUBLISHED = {  # m, standard deviation at depth z (m) of a surface that faces the camera
-    SensorKind.EXACT: lambda z: 0.001,  # the minimum of all models
+PUBLISHED = {  # m, standard deviation at depth z (m) on a frontal surface
+    SensorKind.EXACT: lambda z: 0.001,  # the minimum for all models
     SensorKind.KINECT_V1: lambda z: 0.0012 + 0.0019 * (z - 0.4) ** 2,  # Nguyen et al.
     SensorKind.REALSENSE_D435: lambda z: z**2 * 0.08 / (424 * 0.05),  # Grunnet-Jepsen et al.
     SensorKind.TIME_OF_FLIGHT: lambda z: (1.5 - 0.5 * z + 0.3 * z**2) / 1000,  # Fankhauser et al.
@@ -55,7 +55,7 @@ def test_depth_noise_near_camera_is_at_least_1_mm(kind: SensorKind) -> None:
 
 
 def test_depth_noise_of_kinect_is_byte_identical() -> None:
-    """The order of operations is that of earlier versions, so that their maps are reproduced."""
+    """The operations have the same order as in earlier versions, so that maps are reproducible."""
     z = np.linspace(0.3, 9, 10_000, dtype=np.float32)
     beyond = z - np.float32(0.4)
     expected = np.float32(0.0012) + np.float32(0.0019) * beyond * beyond
@@ -65,7 +65,7 @@ def test_depth_noise_of_kinect_is_byte_identical() -> None:
 
 
 def test_depth_noise_rounding_is_independent_of_caller() -> None:
-    """Without an explicit setting, Numba would use the fast-math setting of the first calling kernel."""
+    """By default, Numba uses the fast-math setting of the first kernel that calls the function."""
 
     @njit(fastmath=True)
     def fill(z: np.ndarray, noise: DepthNoise, out: np.ndarray) -> None:

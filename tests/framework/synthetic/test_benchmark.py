@@ -1,4 +1,4 @@
-"""Tests of the ten benchmark rooms and of their layouts, without rendering."""
+"""Tests for the ten benchmark rooms and their layouts."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_cluttered_groups_place_objects_on_furniture(make, seed: int) -> None:
 
 
 def gap(piece, other) -> float:
-    """Return the distance, m, between two bounding boxes; negative = depth of their overlap."""
+    """Return the distance, m, between two bounding boxes. Overlapping boxes have a negative distance."""
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
     return float(np.maximum(low - other_high, other_low - high).max())
 
@@ -132,7 +132,7 @@ def test_cluttered_groups_place_neighbors_in_contact(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_laid_table_objects_stand_on_top_without_overlap(seed: int) -> None:
+def test_laid_table_objects_are_on_table_without_overlap(seed: int) -> None:
     table, *others = laid_table_group(np.random.default_rng(seed)).pieces
     low, high = table.bounds()
     things = [piece for piece in others if piece.class_name != "chair"]

@@ -1,4 +1,4 @@
-"""Tests of the layout: furniture does not collide and stays inside the room."""
+"""Tests for the layout of furniture."""
 
 import itertools
 

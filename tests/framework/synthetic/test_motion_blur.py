@@ -1,4 +1,4 @@
-"""Tests of motion blur: its length is the displacement of a pixel, px, and zero for a static camera."""
+"""Tests for motion blur."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ POSE = look(np.array([0.3, -0.2, 1.4]), 0.4, -0.2, 0.1)
 
 
 def moved(right=0.0, down=0.0, ahead=0.0, turn=0.0):
-    """Return POSE (4, 4) translated along the camera axes, m, then rotated by `turn` rad about its y axis."""
+    """Return POSE (4, 4) after a translation along the camera axes, m, and a rotation by `turn` rad about y."""
     T = np.eye(4)
     T[:3, 3] = right, down, ahead
     c, s = np.cos(turn), np.sin(turn)
@@ -38,7 +38,7 @@ def test_motion_blur_of_still_camera_is_identity():
 def test_motion_blur_width_equals_pixel_displacement(path):
     color = np.zeros((*CAMERA.shape, 3), np.uint8)
     color[:, 48:] = 200
-    half = path / 2 * 2.0 / CAMERA.fx  # m, at a depth of 2 m
+    half = path / 2 * 2.0 / CAMERA.fx  # m, displacement at a depth of 2 m
     row = exposed(color, np.full(CAMERA.shape, 2.0), moved(right=-half), moved(right=half))[32, :, 0].astype(float)
     between = np.flatnonzero((row > 0) & (row < 200))
     assert abs(len(between) - path) <= 1
@@ -60,7 +60,7 @@ def test_motion_blur_decreases_with_distance():
 
 
 def test_motion_blur_averages_samples_along_pixel_path():
-    """The reference projects each pixel's point into the poses at both ends of the exposure."""
+    """In the reference, each point is projected into the camera at the start and the end of the exposure."""
     rng = np.random.default_rng(1)
     color, depth = noise(), rng.uniform(0.8, 4, CAMERA.shape)
     depth[rng.random(CAMERA.shape) < 0.05] = 0

@@ -1,4 +1,4 @@
-"""Tests of the renderer's geometry, to float precision."""
+"""Tests for the renderer."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ def test_renderer_depth_of_slanted_plane_is_exact():
     expected = n @ (wall.vertices[0] - T[:3, 3]) / (ray @ n)
     assert (picture.depth > 0).all()
     np.testing.assert_allclose(picture.depth, expected, rtol=2e-6)
-    shifted = np.abs(np.diff(expected, axis=1)).min() / 2  # smallest depth change within half a pixel, m
+    shifted = np.abs(np.diff(expected, axis=1)).min() / 2  # m, smallest depth change within half a pixel
     assert shifted > 50 * np.abs(picture.depth - expected).max()
     cosine = np.abs(ray @ n) / np.linalg.norm(ray, axis=-1)
     np.testing.assert_allclose(picture.incidence, cosine, atol=1e-5)
@@ -58,7 +58,7 @@ def test_renderer_background_has_zero_depth_and_id():
     picture = renderer.render(camera, look(np.array([-3.0, 0, 0]), 0.0, 0.0, 0.0))
     assert picture.instance_ids[4, 4] == 1
     assert picture.depth[4, 4] == np.float32(2.5)
-    assert picture.depth[0, 4] == 0  # nothing above the box
+    assert picture.depth[0, 4] == 0  # nothing is above the box
     assert picture.instance_ids[0, 4] == 0
     assert picture.color[0, 4].tolist() == [0, 0, 0]
     assert picture.instance_ids[6, 0] == 0
@@ -69,10 +69,11 @@ def test_renderer_lamp_casts_shadow():
     plate = rounded_box(1.0, 1.0, 0.02, 0.004).moved(z=1.0)
     floor = panel(6.0, 6.0).turned("x", np.pi / 2).moved(y=3.0)
     renderer = Renderer(scene(floor, plate), [globe(np.array([0.0, 0.0, 2.0]), 0.05, (1, 1, 1))])
-    above = look(np.array([0.0, 0.0, 0.9]), 0.0, -np.pi / 2, 0.0)  # between plate and floor, looking down
+    # the camera is between plate and floor and looks down
+    above = look(np.array([0.0, 0.0, 0.9]), 0.0, -np.pi / 2, 0.0)
     camera = Camera(101, 101, 30.0, 30.0, 50.0, 50.0)
     light = renderer.render(camera, above).color.astype(float).mean(axis=-1)
-    # The shadow of the plate extends 1 m from the center, which is 33 px at 0.9 m.
+    # the shadow of the plate has a radius of 1 m, which is 33 px at 0.9 m
     assert light[40:61, 40:61].mean() < 0.25 * light[50, 95:].mean()
 
 
@@ -88,7 +89,7 @@ def test_tone_curve_rises_from_black_to_white():
 
 
 def furnished():
-    """Return a renderer of overlapping objects without a background; some parts contain depth steps."""
+    """Return a renderer of overlapping objects without a background. Some objects contain depth steps."""
     floor = panel(3.0, 3.0).turned("x", np.pi / 2).moved(y=1.5, z=-0.5)
     return Renderer(
         scene(floor, rounded_box(0.5, 0.6, 0.7, 0.05), rounded_box(0.3, 0.2, 1.5, 0.02).moved(x=0.6, y=0.3)),
@@ -109,7 +110,7 @@ def test_image_rays_equal_vectorized_reference():
 
 
 def light_along(renderer, rays):
-    """Return the light (N, 3) and the cosines of incidence (N,) of rays (N, 6), computed from the definitions."""
+    """Return the light (N, 3) and the cosine of incidence (N,) of each ray (N, 6)."""
     s, irradiance, hits = renderer.surfaces, renderer._lit.irradiance, renderer.caster.cast(rays)
     light, cosines = np.zeros((len(rays), 3)), np.zeros(len(rays))
     for n, f in enumerate(hits.triangle):

@@ -1,4 +1,4 @@
-"""Tests of the simulated depth sensor: noise compared with publications, quantization and dropout."""
+"""Tests for the simulated depth sensor, compared with published noise models."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def measure(depth, incidence=FRONT, noise=1.0, seed=0, max_range=8.0, kind=KINEC
 
 @pytest.mark.parametrize("z", [0.8, 1.5, 2.5, 4.0])
 def test_depth_noise_deviation_matches_nguyen_model(z):
-    # The wall extends over two depth steps, so that its position relative to the steps does not matter.
+    # the wall extends over two depth steps, so that its position relative to the steps has no effect
     depth = z + np.linspace(-1, 1, FRONT.size).reshape(FRONT.shape) * float(depth_step(np.float32(z), STEPS))
     error = (measure(depth) - depth)[measure(depth) > 0]
     expected = 0.0012 + 0.0019 * (z - 0.4) ** 2
@@ -55,7 +55,7 @@ def test_depth_of_exact_sensor_has_no_noise():
 def test_time_of_flight_depth_has_no_projector_shadow():
     depth = np.full(FRONT.shape, 3.0)
     depth[:, 150:200] = 1.0
-    left = np.s_[:, 138:148]  # in the shadow of a Kinect's projector
+    left = np.s_[:, 138:148]  # in the shadow of the projector of a Kinect
     assert not measure(depth)[left].any()
     assert measure(depth, kind=SensorKind.TIME_OF_FLIGHT)[left].all()
 
@@ -80,7 +80,7 @@ def test_depth_sensor_box_casts_projector_shadow_on_left():
     depth = np.full(FRONT.shape, 3.0)
     depth[:, 150:200] = 1.0
     missing = np.mean([measure(depth, seed=s) == 0 for s in range(20)], axis=(0, 1))
-    shadow = 262.5 * 0.075 * (1 / 1.0 - 1 / 3.0)  # px, 13.1
+    shadow = 262.5 * 0.075 * (1 / 1.0 - 1 / 3.0)  # 13.1 px
     assert (missing[150 - int(shadow) + 2 : 149] > 0.99).all()
     assert (missing[: 150 - int(shadow) - 3] < 0.01).all()
     assert (missing[203:] < 0.01).all()
@@ -125,11 +125,11 @@ def test_random_bits_are_unbiased_and_seeded():
     np.testing.assert_array_equal(bits, random_bits((100, 101, 3), np.random.default_rng(0)))
 
 
-# Kernels compared with the same arithmetic on whole images
+# Kernels compared with operations on whole images
 
 
 def jagged(seed):
-    """Return depth (H, W), m, with steps, noise and holes, and cosines (H, W) from 0 to slightly over 1."""
+    """Return depth (H, W), m, with steps, noise and holes, and the cosines of incidence (H, W)."""
     rng = np.random.default_rng(seed)
     blocks = rng.uniform(0.2, 7, (CAMERA.height // 8, CAMERA.width // 8)).astype(np.float32)
     depth = np.kron(blocks, np.ones((8, 8), np.float32))
@@ -141,7 +141,7 @@ def jagged(seed):
 
 
 def slow_measure(depth, incidence, noise, max_range, rng):
-    """Return the measured depth (H, W), m, computed by operations on whole images."""
+    """Return the measured depth (H, W), m, computed on whole images."""
     exact = np.where(depth <= max_range, depth, np.float32(0))
     disparity = np.where(depth > 0, np.float32(CAMERA.fx * 0.075) / np.maximum(depth, np.float32(0.1)), 0)
     place = np.arange(CAMERA.width, dtype=np.float32)[None, :] - disparity
@@ -202,9 +202,9 @@ def measure_unread(unread, noise=1.0, seed=0):
 
 
 def slow_loss(unread, noise, seed):
-    """Return the mask (H, W) of dropped pixels, where normalized, interpolated Gaussian noise is below a quantile."""
+    """Return the mask (H, W) of the dropped pixels. Interpolated noise is compared with the dropout rate."""
     rng = np.random.default_rng([seed])
-    random_bits((*FRONT.shape, 4), rng)  # the sensor's own dropout uses these numbers
+    random_bits((*FRONT.shape, 4), rng)  # the random numbers of the other dropout
     cell = PATCH * CAMERA.width / 640
     rows, columns = (int(side / cell) + 2 for side in FRONT.shape)
     nodes = normal_quantiles()[random_bits((rows, columns), rng) >> 4].astype(float)

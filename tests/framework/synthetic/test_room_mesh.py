@@ -1,4 +1,4 @@
-"""Tests of the tessellation of room surfaces and of their visible parts."""
+"""Tests for the tessellation of room surfaces and for their visible parts."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from framework.synthetic.walk import look
 
 GRAY = Material(Texture.PAINT, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7))
 CAMERA = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
-AHEAD = look(np.array([0.0, 0.0, 0.0]), 0.0, 0.0, 0.0)  # from the origin along +x
+AHEAD = look(np.array([0.0, 0.0, 0.0]), 0.0, 0.0, 0.0)  # the camera is at the origin and looks along +x
 
 
 def scene(*solids):
-    """Return the surfaces of solids: the first is the shell, the others are instances 1, 2, ..."""
+    """Return the surfaces of solids. The first one is the shell, and the others are instances 1, 2, ..."""
     objects = []
     for instance, solid in enumerate(solids):
         piece = Furniture("thing", "chair" if instance else None)
@@ -61,7 +61,7 @@ def test_tessellate_limits_edge_length_and_keeps_surface(longest):
 
 
 def test_tessellate_closed_body_stays_watertight():
-    """Each edge of a closed body belongs to two triangles, in opposite directions."""
+    """Each edge of a watertight mesh belongs to two triangles, in opposite directions."""
     mesh = tessellate(scene(rounded_box(0.5, 0.3, 0.2, 0.02, 3)), 0.02)
     directed = np.concatenate([mesh.triangles[:, [k, (k + 1) % 3]] for k in range(3)])
     assert len(np.unique(directed, axis=0)) == len(directed)
@@ -87,7 +87,7 @@ def test_visible_mesh_excludes_occluded_surface():
     np.testing.assert_allclose(front[:, 0], 2.0, atol=1.1e-3)
     assert np.abs(front[:, 1:]).max() == pytest.approx(0.5, abs=1e-5)
     behind = mesh.vertices[mesh.instance_ids == 0]
-    shadow = 1.0  # m; the front of the box, 0.5 m to each side at 2 m, occludes twice that at 4 m
+    shadow = 1.0  # m; the front of the box has a half width of 0.5 m at 2 m and occludes 1 m at 4 m
     assert (np.abs(behind[:, 1:]).max(axis=1) > shadow - 1e-4).all()
     spacing = 0.02
     assert (np.abs(behind[:, 1:]).max(axis=1) < shadow + spacing).any()
@@ -121,7 +121,7 @@ def test_tessellate_treats_negative_zero_as_zero():
     assert len(tessellate(replace(surfaces, vertices=signed), 0.1).vertices) == len(tessellate(surfaces, 0.1).vertices)
 
 
-def test_visible_mesh_excludes_screen_and_surface_behind_it():
+def test_visible_mesh_excludes_screen_and_occluded_surface():
     objects = []
     for instance, (side, x, dark) in enumerate(((3.0, 3.0, 0.9), (1.0, 2.998, 1.0))):
         piece = Furniture("thing", None)

@@ -1,4 +1,7 @@
-"""Tests of scenes that several processes write: resuming, and files identical to those of one process."""
+"""Tests for scenes that are written by several processes.
+
+The files must be identical to those of one process, and missing files can be written later.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of a rendered room as SceneNN files, compared with the renderer."""
+"""Tests for rendered rooms that are written as SceneNN files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of rendered rooms as sequences: exact poses, repeatable frames and hand-held motion."""
+"""Tests for rendered rooms as sequences."""
 
 import hashlib
 import os
@@ -49,7 +49,7 @@ def test_synthetic_frames_are_complete(bedroom):
 
 
 def test_synthetic_images_have_gradient_on_all_surfaces(bedroom):
-    """Photometric alignment needs texture in every part of the image, including walls and floor."""
+    """Photometric alignment requires texture in all parts of the image."""
     for k in (0, 80, 160):
         gray = bedroom[k].color.astype(float).mean(axis=2)
         tiles = gray.reshape(6, 20, 8, 20).transpose(0, 2, 1, 3).reshape(48, -1)
@@ -102,7 +102,7 @@ def test_synthetic_room_depends_on_seed_and_scene(bedroom):
 
 
 def test_synthetic_frames_agree_after_reprojection(exact):
-    """Poses and pixel convention are exact: a point has the same depth and color in both images."""
+    """Each point must have the same depth and color in both images."""
     a, b = exact[60], exact[72]
     v, u = np.nonzero(a.depth > 0)
     pixels = np.stack([u, v], axis=1).astype(np.int32)
@@ -116,10 +116,10 @@ def test_synthetic_frames_agree_after_reprojection(exact):
     same = np.all([b.truth.instance_ids[y + j, x + i] == own for i in (0, 1) for j in (0, 1)], axis=0)
     f, g = seen[:, 0] - x, seen[:, 1] - y
     weights = [((1 - f) * (1 - g), 0, 0), (f * (1 - g), 1, 0), ((1 - f) * g, 0, 1), (f * g, 1, 1)]
-    # Inverse depth is linear over the image of a plane, so its interpolation is exact on planes.
+    # on planes, interpolated inverse depth is exact
     inverse_depth = sum(w / np.maximum(b.depth[y + j, x + i], 1e-6) for w, i, j in weights)
     error = np.abs(1 / inverse_depth - z)[same]
-    visible = error < 0.05  # the other points are occluded in b
+    visible = error < 0.05  # other points are occluded in b
     assert visible.mean() > 0.9
     assert np.median(error) < 1e-5
     assert np.quantile(error[visible], 0.9) < 1e-3
@@ -139,7 +139,7 @@ def test_camera_path_has_hand_held_motion(bedroom, exact):
         assert np.rad2deg(sum(turns)) > 90
         assert position[:, 2].min() > 1.2
         assert position[:, 2].max() < 1.7
-        assert np.abs(np.diff(position, n=3, axis=0)).max() < 1e-4  # m; no jerk
+        assert np.abs(np.diff(position, n=3, axis=0)).max() < 1e-4  # m; the motion has no jerk
 
 
 def test_camera_path_keeps_distance_from_walls_and_furniture(bedroom, exact):
@@ -193,7 +193,7 @@ def test_synthetic_parameter_out_of_range_raises(values, name):
 
 
 def test_synthetic_simulated_color_delay_moves_color_and_truth():
-    """Two frames are 1/30 s apart, so with a delay of 1/30 s each frame has the color of the next frame."""
+    """The delay is the time between two frames, so each frame has the color of the next frame."""
     plain = Synthetic(seed=1, noise=0.0, **SMALL)
     late = Synthetic(seed=1, noise=0.0, simulated_color_delay=1 / 30, **SMALL)
     np.testing.assert_array_equal(late[3].depth, plain[3].depth)

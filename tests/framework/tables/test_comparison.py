@@ -1,4 +1,4 @@
-"""Tests of the content and the validation of comparison tables."""
+"""Tests for the settings of comparison tables."""
 
 from __future__ import annotations
 

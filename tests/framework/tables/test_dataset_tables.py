@@ -1,4 +1,4 @@
-"""Tests of tables of sweeps without an experiment, across datasets and detectors."""
+"""Tests for tables of sweeps over datasets and detectors, without an experiment."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def run(
     row: str | None = None,
     **more: Any,
 ) -> None:
-    """Write a run directory; the ground truth depends on the dataset and the seed."""
+    """Write a run directory. The ground truth depends on the dataset and the seed."""
     directory = root / f"dataset={dataset},detector={detector},refiner={refiner},seed={seed}"
     directory.mkdir(parents=True)
     data = {"root": f"/{dataset}", "scene": f"{dataset} 1", "seed": seed}
@@ -58,14 +58,14 @@ def run(
 
 
 def table(root: Path, task: Sequence[str] = TASK, **choice: Any) -> None:
-    """Write the sweep's config with a table."""
+    """Write the config of a sweep with a table."""
     sweep = {"hydra": {"overrides": {"task": list(task)}}} | ({"table": choice} if choice else {})
     (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(sweep)))
 
 
 @pytest.fixture
 def sweep(tmp_path: Path) -> Path:
-    """Return the folder of runs of two refiners on three datasets with two seeds; `scan` has no ground truth."""
+    """Return the folder of runs of two refiners on three datasets with two seeds. `scan` has no ground truth."""
     root = tmp_path / "sweep"
     for seed in (0, 1):
         run(root, "desk", "chain", seed, 0.5 + 0.1 * seed, **{TIME: 9.0})
@@ -128,14 +128,14 @@ def test_table_averages_over_datasets(sweep: Path) -> None:
     text = write_tables(sweep)
     first, second = grids(text)
     assert first[2] == "| refiner=chain | 4 | 0.675 ± 0.150 | ground_truth |"  # 0.5, 0.6, 0.8, 0.8
-    assert second[2] == "| refiner=identity | 2 | -0.175 ± 0.025 |"  # desk -0.15, rooms -0.2
+    assert second[2] == "| refiner=identity | 2 | -0.175 ± 0.025 |"  # the differences are -0.15 (desk) and -0.2 (rooms)
     assert "- Only runs with dataset=desk,rooms." in text
     assert "- Differences are paired by seed, dataset: mean ± standard error over dataset, after averaging" in text
     assert "Missing" not in text
 
 
 def test_table_pairs_by_key_without_common_seeds(sweep: Path) -> None:
-    """Rows with other seeds are compared by dataset, with the means over their own seeds."""
+    """Rows with different seeds are compared by dataset. The values are means over the seeds of each row."""
     for dataset, ap in (("desk", 0.2), ("rooms", 0.4)):
         for seed in (5, 6):
             run(sweep, dataset, "other", seed, ap + 0.1 * (seed - 5), **{"truth_sha256": "x"})
@@ -162,7 +162,7 @@ def test_table_pairs_by_key_without_common_seeds(sweep: Path) -> None:
 
 
 def test_table_statistics_have_units_of_pairs(sweep: Path) -> None:
-    """Rows with other seeds have columns, differences and tests by dataset."""
+    """With pairs by dataset, columns, differences and tests are by dataset."""
     run(sweep, "hall", "chain", 0, 0.7)
     for dataset, ap in (("desk", 0.2), ("rooms", 0.4), ("hall", 0.3)):
         for seed in (5, 6):
@@ -194,7 +194,7 @@ def test_table_pairs_by_seed_have_same_datasets(sweep: Path) -> None:
 
 
 def test_table_groups_have_digits_and_best_value_of_each_column(sweep: Path) -> None:
-    """Large values of one column do not remove the decimals of another. Lower times are better; ties are not bold."""
+    """The number of decimals is chosen for each column. For times, the lowest value is best."""
     for path in sweep.glob("*/metrics.json"):
         path.write_text(json.dumps(json.loads(path.read_text()) | {"map.bytes": 5e6}))
     table(sweep, group_by="dataset", columns=[AP50, TIME, "map.bytes"])
@@ -225,7 +225,7 @@ def test_table_columns_are_detectors(sweep: Path) -> None:
 
 @pytest.fixture
 def experiment(tmp_path: Path) -> Path:
-    """Return the folder of two rows of an experiment on two datasets with two detectors each."""
+    """Return the folder of an experiment with two rows on two datasets with two detectors each."""
     for dataset, ap in (("desk", 0.5), ("rooms", 0.7)):
         for detector, more in (("net", 0.0), ("other", 0.1)):
             run(tmp_path, dataset, "chain", 0, ap + more, detector, row="base")
@@ -266,7 +266,7 @@ def test_experiment_averages_over_datasets_and_detectors(experiment: Path) -> No
 
 
 def test_table_of_nested_keys_lists_no_impossible_runs(sweep: Path) -> None:
-    """A scene belongs to one dataset, so other combinations are neither missing nor expected."""
+    """Each scene belongs to one dataset. Other combinations must not be listed as missing."""
     table(sweep, average_over=["seed", "dataset.scene"], group_by="dataset", columns=[AP50])
     text = write_tables(sweep)
     assert "Missing" not in text
@@ -286,7 +286,7 @@ def test_table_notes_report_identical_runs_and_rows(sweep: Path) -> None:
 
 
 def test_table_notes_report_mixed_code_of_same_dataset(sweep: Path) -> None:
-    """Averaged options have different code; only different code of one option is mixed."""
+    """Different datasets may have different code. Only different code for the same dataset is reported."""
     for path in sweep.glob("*/metrics.json"):
         metrics = json.loads(path.read_text())
         path.write_text(json.dumps(metrics | {"code.dataset": f"reader of {metrics['choice.dataset']} 3f"}))

@@ -1,4 +1,4 @@
-"""Tests of the table of several detectors."""
+"""Tests for the table of several detectors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of experiment tables in three formats."""
+"""Tests for experiment tables in three formats."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from framework.runs.data_frame import load_runs
 from framework.runs.provenance import config_hash
 from framework.synthetic.scenenn_scene import BenchmarkSettings
 from framework.tables.experiment_tables import write_tables
+from framework.tables.table_check import changed_tables
 from tests.support.forked_commands import completed
 
 pytestmark = pytest.mark.integration
@@ -56,7 +57,7 @@ def test_write_tables_values_match_manual_result(sweep: Path) -> None:
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert lines[0] == "# ablation_x"
     assert lines[2] == "| row | runs | AP50 | refinement (ms) | poses |"
-    # 0.2, 0.4, 0.6: mean 0.4, sd 0.2; 0.5, 0.6, 1.0: mean 0.7, sd sqrt(0.14 / 2) = 0.2646
+    # identity: mean 0.4, sd 0.2; chain: mean 0.7, sd sqrt(0.14 / 2) = 0.2646
     assert "| identity | 3 | 0.400 ± 0.200 | 0.0 | ground_truth |" in lines
     assert "| chain | 3 | 0.700 ± 0.265 | 151.0 ± 1.0 | ground_truth |" in lines
     # -0.3, -0.2, -0.4: mean -0.3, standard error 0.1 / sqrt(3) = 0.0577; t = 5.2 > 4.3
@@ -75,6 +76,26 @@ def test_write_tables_values_match_manual_result(sweep: Path) -> None:
     assert "Missing" not in text
 
 
+@pytest.mark.parametrize(
+    ("name", "before", "after", "message"),
+    [
+        ("table.md", "0.700 ±", "0.900 ±", "chain: AP50: expected 0.700 ± 0.265 as in the runs, got 0.900 ± 0.265"),
+        ("table.tex", "0.700", "0.900", "chain: AP50: expected 0.700 $\\pm$ 0.265 as in the runs, got 0.900 $\\pm$"),
+        ("table.csv", ",0.6,", ",0.61,", "row=chain,seed=1: instances.ap50: expected 0.6 as in the runs, got 0.61"),
+        ("table.md", "| identity | 3 | -", "| x | 3 | -", "minus chain: expected identity as in the runs, got x"),
+        ("table.md", " poses ", " x | poses ", "expected the rows and columns of the runs' table, got others"),
+    ],
+)
+def test_changed_tables_name_edited_cell(sweep: Path, name: str, before: str, after: str, message: str) -> None:
+    write_tables(sweep)
+    assert list(changed_tables(sweep)) == []
+    content = (sweep / name).read_text()
+    content = "\n".join(" ".join(line.split()) for line in content.splitlines()) if name == "table.md" else content
+    assert before in content
+    (sweep / name).write_text(content.replace(before, after))
+    assert any(message in change for change in changed_tables(sweep)), list(changed_tables(sweep))
+
+
 def test_table_csv_is_data_frame_of_its_runs(sweep: Path) -> None:
     write_tables(sweep)
     runs = load_runs(sweep)
@@ -84,7 +105,7 @@ def test_table_csv_is_data_frame_of_its_runs(sweep: Path) -> None:
 
 
 def test_table_difference_error_is_over_scenes(tmp_path: Path) -> None:
-    """By scene the differences are 0.3 and 0.1: mean 0.2, error 0.1, for any number of seeds."""
+    """The differences are 0.3 and 0.1 in the two scenes. The error must not depend on the number of seeds."""
     table = {"average_over": ["seed", "scene"], "columns": ["instances.ap50"]}
     rows = {"chain": [], "other": ["refiner=other"]}
     (tmp_path / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": table, "rows": rows}))
@@ -93,7 +114,7 @@ def test_table_difference_error_is_over_scenes(tmp_path: Path) -> None:
             run(tmp_path, row, seed, ap, 1.0, scene=scene)
     text = write_tables(tmp_path)
     lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert "| other | 2 | +0.200 ± 0.100 |" in lines  # an error over six runs would be 0.045
+    assert "| other | 2 | +0.200 ± 0.100 |" in lines  # the error over six runs would be 0.045
     assert "paired by seed, scene: mean ± standard error over scene, after averaging" in text
 
 
@@ -105,7 +126,7 @@ def test_table_notes_list_missing_runs(sweep: Path) -> None:
     text = write_tables(sweep)
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "| identity | 3 | 0.300 ± 0.141 (2 of 3) | 0.3 ± 0.6 | ground_truth/tracked |" in lines
-    assert "| identity | 1 | -0.300 | -150.0 |" in lines  # seed 0 is the only pair, so there is no error
+    assert "| identity | 1 | -0.300 | -150.0 |" in lines  # seed 0 is the only pair, and a single pair has no error
     assert "- Missing in chain: seed=1,7." in lines
     assert "- Missing in identity: seed=2." in lines
     assert "- Incomplete: row=chain,seed=1: failed: the map is full." in lines
@@ -123,7 +144,7 @@ def test_table_notes_list_requested_runs_without_outputs(sweep: Path) -> None:
 
 
 def test_table_code_note_names_later_evaluation_commit(sweep: Path) -> None:
-    """The values of the table come from two versions of the evaluation."""
+    """One of the runs was evaluated again with a later version."""
     path = sweep / "row=chain,seed=1" / "metrics.json"
     again = {"evaluation.git_commit": "fedcba9876", "evaluation.git_dirty": True}
     path.write_text(json.dumps(json.loads(path.read_text()) | again))
@@ -190,7 +211,7 @@ RUN_TIMES = {
 
 
 def of_dataset(sweep: Path, dataset: str, annotation: str | None = None, only: str = "") -> None:
-    """Set the dataset of all runs, or only of the runs of one row."""
+    """Set the dataset of all runs, or of the runs of one row."""
     for path in sweep.glob(f"row={only}*/metrics.json"):
         expected = {"choice.dataset": dataset, "annotation_release": annotation}
         path.write_text(json.dumps(json.loads(path.read_text()) | expected))
@@ -217,7 +238,7 @@ def test_table_on_scenenn_has_published_run_times(sweep: Path, annotation: str |
     ("dataset", "annotation", "only"),
     [
         ("scenenn", BenchmarkSettings().release, ""),
-        # one row was measured on synthetic rooms, the others on real data
+        # one row is on synthetic rooms, the others are on real data
         ("scenenn", BenchmarkSettings().release, "chain"),
         ("scannet", "ScanNet v2", ""),
         ("synthetic", None, ""),
@@ -237,7 +258,7 @@ def test_table_on_other_data_has_no_published_numbers(
 
 
 def test_table_published_row_without_values_is_omitted(sweep: Path) -> None:
-    """The paper reports Hz, but neither times per stage nor lost frames."""
+    """The paper reports the frame rate, but neither stage times nor lost frames."""
     of_dataset(sweep, "scenenn")
     for columns, named in ((["stage_ms.refinement.median"], True), (["frames_lost"], False)):
         table = RUN_TIMES | {"columns": columns}
@@ -248,7 +269,7 @@ def test_table_published_row_without_values_is_omitted(sweep: Path) -> None:
 
 
 def test_table_split_row_is_compared_with_matching_baseline(tmp_path: Path) -> None:
-    """The command line splits rows by voxel size; only rows with equal voxel sizes are compared."""
+    """The command line splits the rows by voxel size. Rows are compared if their voxel sizes are equal."""
     root = tmp_path / "x"
     root.mkdir()
     (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": TABLE, "rows": ROWS})))
@@ -275,7 +296,7 @@ def test_table_unknown_metric_is_dash(sweep: Path) -> None:
 
 
 def test_table_without_experiment_has_available_columns(tmp_path: Path) -> None:
-    """Only columns with values are shown; your own recordings have no ground-truth instances."""
+    """Only columns with values are written. Recordings without annotation have no instance metrics."""
     poses = {"trajectory.ate_rmse_m": 0.012, "frames_lost": 2, "fps": 21.5}
     for name in ("a", "b"):
         run(tmp_path, name, 0, None, 1.0, **poses)
@@ -306,7 +327,7 @@ def test_table_without_experiment_has_column_for_single_value(tmp_path: Path) ->
 def test_table_without_metrics_has_all_columns(tmp_path: Path) -> None:
     run(tmp_path, "a", 0, None, 1.0, **{"stage_ms.refinement.median": None})
     text = write_tables(tmp_path)
-    assert text.splitlines()[2].count("|") == 18  # row, runs, poses, and all 14 metrics
+    assert text.splitlines()[2].count("|") == 18  # row, runs, poses and 14 metrics
     assert "Omitted" not in text
 
 

@@ -1,4 +1,4 @@
-"""Tests of table cells in Markdown and LaTeX."""
+"""Tests for table cells in Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_markdown_grid_is_padded_and_aligned() -> None:
 
 @pytest.mark.parametrize("name", ["*star", "[optional]"])
 def test_latex_grid_protects_leading_star_and_bracket(name: str) -> None:
-    """LaTeX interprets a star or bracket after a line break or a rule as its argument."""
+    """After a line break or a rule, LaTeX reads a star or bracket as an argument."""
     assert f"{{}}{name} & 1 \\\\" in latex_grid(TextTable(["row", "x"], [[name, "1"]]))
 
 

@@ -1,4 +1,4 @@
-"""Tests of the headings and directions of metrics."""
+"""Tests for the headings and directions of metrics."""
 
 from __future__ import annotations
 
@@ -43,5 +43,5 @@ def test_head_names_metric_and_unit(key: str, heading: str) -> None:
         ),
     ],
 )
-def test_direction_of_metrics(better: Direction, keys: str) -> None:
+def test_direction_of_metric_is_higher_or_lower_or_none(better: Direction, keys: str) -> None:
     assert {key: direction(key) for key in keys.split()} == dict.fromkeys(keys.split(), better)

@@ -1,4 +1,4 @@
-"""Tests of the published results."""
+"""Tests for the published results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ SEQUENCES = ("011", "016", "030", "061", "078", "086", "096", "206", "223", "255
 
 
 def test_published_ap_row_is_converted_from_percent() -> None:
-    """The publication reports these numbers in percent."""
     percent = {"011": 65.5, "016": 3.3, "030": 67.6, "061": 26.9, "078": 51.7, "086": 32.5, "096": 29.9, "223": 19.0}
     [known] = [row for row in read_published("table3").rows if row.values is not None]
     assert known.values == pytest.approx({(sequence,): value / 100 for sequence, value in percent.items()})
@@ -21,7 +20,7 @@ def test_published_ap_row_is_converted_from_percent() -> None:
     assert known.poses == "ground truth"
 
 
-def test_published_run_time_of_paper_is_known() -> None:
+def test_published_table1_contains_frame_rate_of_paper() -> None:
     [known] = [row for row in read_published("table1").rows if row.values is not None]
     assert known.values is not None
     assert (known.system, known.values["fps",], known.decimals) == ("the paper", 10.8, 1)

@@ -1,4 +1,4 @@
-"""Tests of tables over sequences (the paper's Tables 2 and 3), and of values that must not be averaged."""
+"""Tests for tables over sequences, like Tables 2 and 3 of the paper."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ BY = {
     "names": NAMES,
     "columns": [f"{AP50}.couch", f"{AP50}.tv", AP50],
 }
-FIGURES = {  # by row and scene: AP50 of seeds 0 and 1
+FIGURES = {  # AP50 of seeds 0 and 1, keyed by row and scene
     ("ours", "011"): (0.6, 0.8),
     ("ours", "016"): (0.5, 0.3),
     ("prior", "011"): (0.5, 0.7),
     ("prior", "016"): (0.6, 0.4),
     ("other", "011"): (0.2, 0.2),
-    ("other", "016"): (0.1, None),  # this run fails
+    ("other", "016"): (0.1, None),  # this run failed
 }
 
 
@@ -40,7 +40,7 @@ def experiment(root: Path, table: dict[str, Any]) -> None:
 
 
 def run(root: Path, row: str, scene: str, seed: int, tracker: str = "ground_truth", **expected: Any) -> Path:
-    """Write a run directory; keywords are values of metrics.json, or `data` and `release`."""
+    """Write a run directory. Keyword arguments are metrics, or `data` and `release`."""
     directory = root / f"dataset.scene={scene},row={row},seed={seed},tracker={tracker}{len(expected.get('data', ''))}"
     directory.mkdir()
     config = {
@@ -61,7 +61,7 @@ def run(root: Path, row: str, scene: str, seed: int, tracker: str = "ground_trut
 
 @pytest.fixture
 def sweep(tmp_path: Path) -> Path:
-    """Write the runs of three rows, two scenes and two seeds, one of them failed; return their folder."""
+    """Write the runs of three rows, two scenes and two seeds, and return their folder. One run failed."""
     root = tmp_path / "table3"
     root.mkdir()
     experiment(root, ACROSS)
@@ -110,7 +110,7 @@ all equal.
 """
 
 
-def test_sequence_columns_table_matches_golden_text(sweep: Path) -> None:
+def test_sequence_columns_table_matches_expected_text(sweep: Path) -> None:
     text = write_tables(sweep)
     [line] = [line for line in text.splitlines() if "SHA-256" in line]
     assert text.replace(line.rpartition(" ")[2], "DIGEST.") == GOLDEN
@@ -133,12 +133,12 @@ def test_sequence_columns_table_has_published_rows(sweep: Path) -> None:
     assert "- Published, Voxblox++ with Detectron2 panoptic: Han et al., ICRA 2021" in text
     assert "not looked up: the paper (DDNS 2020" in text
     assert "- Sequences without a complete run: dataset.scene=030,061,078,086,096,206,223,255." in text
-    assert "seed=0 dataset.scene=255" not in text  # listed once instead of for each row and seed
+    assert "seed=0 dataset.scene=255" not in text  # listed once, not for each row and seed
 
 
 @pytest.mark.parametrize("table", [ACROSS | {"published": "table3"}, BY | {"published": "table2"}])
 def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: dict[str, Any]) -> None:
-    """Sequences that occur only in the publication get no columns or groups."""
+    """A sequence that only the paper has gets no column or group."""
     experiment(sweep, table)
     run(sweep, "ours", "016", 2, release="synthetic 1, seed 0, 240 frames", **{AP50: 0.5})
     text = write_tables(sweep)
@@ -148,7 +148,7 @@ def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: d
 
 
 def test_table_compares_rows_of_same_pose_source(sweep: Path) -> None:
-    """A tracked row is compared and ranked only with tracked rows, because poses affect the results."""
+    """Results depend on the poses, so tracked rows are compared only with tracked rows."""
     for row, value in (("ours", 0.2), ("prior", 0.3)):
         run(sweep, row, "011", 0, tracker="icp", **{AP50: value})
     first, second = grids(write_tables(sweep))
@@ -187,7 +187,7 @@ def test_table_tracked_row_needs_tracked_baseline(sweep: Path) -> None:
 def test_table_separates_other_data_and_annotations(
     sweep: Path, changed: dict[str, Any], usual: str, other: str, annotation: str
 ) -> None:
-    """Runs on different data or with different annotations are neither averaged nor compared."""
+    """Such runs must be neither averaged nor compared."""
     for path in sweep.glob("*row=other*/metrics.json"):
         path.unlink()
     run(sweep, "ours", "078", 0, **{AP50: 0.9}, **changed)
@@ -231,7 +231,7 @@ def test_sequence_groups_table_has_expected_lines(sweep: Path) -> None:
 
 
 def test_table_bold_mean_ignores_rows_with_fewer_sequences(sweep: Path) -> None:
-    """Of the tracked rows, the one with the highest mean has only one sequence; the others have two."""
+    """The tracked row with the highest mean has only one sequence. The other tracked rows have two."""
     experiment(sweep, BY)
     for row, scene, value in (
         ("ours", "011", 0.2),
@@ -251,7 +251,7 @@ def test_table_bold_mean_ignores_rows_with_fewer_sequences(sweep: Path) -> None:
 
 @pytest.mark.parametrize("table", [ACROSS, BY])
 def test_table_bold_mean_ignores_rows_with_fewer_runs(sweep: Path, table: dict[str, Any]) -> None:
-    """A mean of fewer runs is marked with its number of runs, even if all sequences are present."""
+    """A mean over fewer runs is marked with the number of runs."""
     experiment(sweep, table)
     for path in sweep.glob("*row=other,seed=1*/metrics.json"):
         path.unlink()
@@ -269,7 +269,7 @@ def test_sequence_groups_table_has_published_rows_in_group(sweep: Path) -> None:
     first, _ = grids(write_tables(sweep))
     han = "Voxblox++ with Detectron2 panoptic (published) | ground truth"
     assert first[5] == f"| | {han} | not known | 0.952 | – | 0.655 |"
-    assert f"| 030 | {han} | not known | 0.991 | 0.000 | 0.676 |" in first  # without a run of ours
+    assert f"| 030 | {han} | not known | 0.991 | 0.000 | 0.676 |" in first  # a sequence without own runs
     assert "| Voxblox++ (published) |" not in "".join(first)
     assert not [line for line in first if line.startswith("| 206")]
 

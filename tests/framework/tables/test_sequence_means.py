@@ -1,4 +1,4 @@
-"""Tests of means over sequences and seeds, compared with manual results."""
+"""Tests for means over sequences and seeds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_mean_by_sequence_is_over_seeds() -> None:
 
 
 def test_mean_over_sequences_deviation_is_over_seed_means() -> None:
-    """Both seeds have the mean 0.55: the deviation is zero although sequences differ."""
+    """The mean of each seed is 0.55, so the deviation is zero although the sequences differ."""
     mean = mean_over_sequences(FIGURES)
     assert (mean.value, mean.count) == (pytest.approx(0.55), 2)
     assert mean.deviation == pytest.approx(0, abs=1e-12)
@@ -27,7 +27,7 @@ def test_mean_over_sequences_deviation_is_over_seed_means() -> None:
 
 def test_mean_over_sequences_weights_sequences_equally() -> None:
     mean = mean_over_sequences({run: value for run, value in FIGURES.items() if run != ("1", "b")})
-    assert mean.value == pytest.approx((0.3 + 0.9) / 2)  # not 0.5, the mean of three runs
+    assert mean.value == pytest.approx((0.3 + 0.9) / 2)  # the mean over the three runs would be 0.5
     assert math.isnan(mean.deviation)
 
 

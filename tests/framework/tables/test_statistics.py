@@ -1,4 +1,4 @@
-"""Tests of paired statistics, compared with scipy, published examples and simulations."""
+"""Tests for paired statistics, compared with SciPy, published examples and simulations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from framework.tables.statistics import (
     units_needed,
 )
 
-# Student (1908): additional hours of sleep by two drugs, ten patients; R's `sleep`
+# Student (1908): additional hours of sleep of ten patients with two drugs; data set `sleep` of R
 SLEEP = (
     [0.7, -1.6, -0.2, -1.2, -0.1, 3.4, 3.7, 0.8, 0.0, 2.0],
     [1.9, 0.8, 1.1, 0.1, -0.1, 4.4, 5.5, 1.6, 4.6, 3.4],
@@ -40,12 +40,12 @@ def text_of(comparisons: dict[tuple[str, str], Pairs], *unit_keys: str) -> str:
 
 
 def test_paired_statistics_match_published_example() -> None:
-    """R: t.test(extra ~ group, paired = TRUE) has t = -4.0621, df = 9, p = 0.002833, mean difference -1.58."""
+    """The result of R is t = -4.0621, df = 9, p = 0.002833 and a mean difference of -1.58."""
     result = PairedStatistics.of(pairs(*SLEEP))
     assert result.units == 10
     assert result.mean == pytest.approx(-1.58)
     assert result.t_p == pytest.approx(0.002833, abs=1e-6)
-    # one difference is 0 and the other nine are negative: 2 of 2^9 sign patterns are at least as extreme
+    # one difference is 0 and nine are negative: 2 of 2^9 sign patterns are at least as extreme
     assert result.wilcoxon_p == pytest.approx(2 / 2**9)
 
 
@@ -66,8 +66,8 @@ def test_paired_statistics_match_scipy() -> None:
         pairs([0.5], [0.1]),
         pairs([0.5, 0.7], [0.1, 0.1]),
         pairs([2.0, 2.0, 2.0], [0.0, 0.0, 0.0]),
-        pairs([0.7, 0.2, 1.0], [0.6, 0.1, 0.9]),  # equal except for rounding
-        pairs([0.3, 0.1 + 0.2, 0.3], [0.1 + 0.2, 0.3, 0.3]),  # 0 except for rounding
+        pairs([0.7, 0.2, 1.0], [0.6, 0.1, 0.9]),  # equal up to rounding
+        pairs([0.3, 0.1 + 0.2, 0.3], [0.1 + 0.2, 0.3, 0.3]),  # 0 up to rounding
     ],
 )
 def test_paired_statistics_without_variation_are_undefined(of_units: Pairs) -> None:
@@ -87,7 +87,7 @@ def test_paired_statistics_accept_ties(differences: list[float]) -> None:
 
 
 def test_holm_matches_published_example() -> None:
-    """Holm (1979) as in R: p.adjust(c(0.01, 0.04, 0.03, 0.005), "holm") is 0.03 0.06 0.06 0.02."""
+    """The expected values are from p.adjust of R with the method "holm"."""
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.6, 0.7]) == [1.0, 1.0]
     assert holm([0.2]) == [0.2]
@@ -96,7 +96,7 @@ def test_holm_matches_published_example() -> None:
 
 @pytest.mark.parametrize(("effect", "units"), [(0.2, 199), (0.5, 34), (-0.5, 34), (0.8, 15), (1.0, 10)])
 def test_units_needed_match_published_sizes(effect: float, units: int) -> None:
-    """G*Power 3.1, difference between two dependent means, two-sided, alpha 0.05, power 0.8."""
+    """The values are from G*Power 3.1: two dependent means, two-sided, alpha 0.05, power 0.8."""
     assert units_needed(effect) == units
 
 
@@ -115,7 +115,7 @@ def test_units_needed_accept_extreme_effects(effect: float, units: float) -> Non
 
 
 def test_bootstrap_interval_covers_true_mean() -> None:
-    """The coverage of 20 units is 92% to 95%, and that of 6 units at most 91%, as the notes state."""
+    """The documented coverage is 92% to 95% for 20 units and at most 91% for 6 units."""
     rng = np.random.default_rng(0)
 
     def coverage(units: int) -> float:
@@ -126,14 +126,14 @@ def test_bootstrap_interval_covers_true_mean() -> None:
     assert 0.78 < coverage(6) < 0.91
 
 
-def test_bootstrap_interval_is_repeatable_and_independent_of_order() -> None:
+def test_bootstrap_interval_does_not_depend_on_order() -> None:
     differences = np.random.default_rng(1).exponential(1, 15)
     given = PairedStatistics.of(of_differences(differences.tolist()))
     assert PairedStatistics.of(of_differences(differences[::-1].tolist())).interval == given.interval
 
 
 def test_bootstrap_interval_is_corrected_for_skewness() -> None:
-    """For skewed differences, both limits of BCa are above those of the percentile method."""
+    """For skewed differences, both limits must be above those of the percentile method."""
     differences = np.random.default_rng(1).exponential(1, 15)
     plain = stats.bootstrap((differences,), np.mean, method="percentile", rng=0).confidence_interval
     low, high = bootstrap_interval(differences)
@@ -145,10 +145,11 @@ def test_bootstrap_interval_of_few_units_is_undefined() -> None:
     assert all(map(math.isnan, bootstrap_interval(np.array([0.1, 0.2, 0.3, 0.4, 0.6]))))
 
 
-def test_table_statistics_correct_within_metric() -> None:
+def test_table_statistics_holm_correction_is_per_metric() -> None:
     rng = np.random.default_rng(0)
     noise = {key: of_differences(rng.normal(0.5, 0.5, 12)) for key in (("a", "ap"), ("b", "ap"), ("a", "fps"))}
-    equal = {("c", "ap"): of_differences([1.0] * 12)}  # no test, so the others are not corrected for it
+    # equal differences have no test, so the other p-values are not corrected for it
+    equal = {("c", "ap"): of_differences([1.0] * 12)}
     results = TableStatistics.of(noise | equal, ["dataset.scene"]).results
     expected = holm([results["a", "ap"].t_p, results["b", "ap"].t_p])
     assert [results["a", "ap"].t_holm, results["b", "ap"].t_holm] == expected
@@ -157,7 +158,7 @@ def test_table_statistics_correct_within_metric() -> None:
 
 
 def test_table_statistics_bound_false_rejections() -> None:
-    """Without any difference, at most 5% of the tables with four rows have a star; without correction, 14%."""
+    """All rows have equal means. At most 5% of the tables have a star, or 14% without the correction."""
     rng = np.random.default_rng(0)
     p_values = stats.ttest_1samp(rng.normal(0, 1, (2000, 4, 8)) - rng.normal(0, 1, (2000, 1, 8)), 0, axis=2).pvalue
     corrected = np.array([holm(of_table) for of_table in p_values.tolist()])

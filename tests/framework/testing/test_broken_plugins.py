@@ -1,4 +1,4 @@
-"""Tests of the contract tests, on plugins that each break one rule."""
+"""Tests for the contract tests. Each plugin violates one rule and must be detected."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.integration
 
 
 class Forgetful(SphereDetector):
-    """Detector that finds fewer objects in every call."""
+    """Detector that finds fewer objects in each call."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class Forgetful(SphereDetector):
 
 
 class Sharing(SphereDetector):
-    """Detector that declares concurrent detection, but shares the first frame between the calls of other threads."""
+    """Detector that declares concurrent detection, but uses the first frame of another thread."""
 
     concurrent = True
     shared: Frame | None = None
@@ -59,7 +59,7 @@ class Sharing(SphereDetector):
 
 
 class Peeking(SphereDetector):
-    """Detector that adds the ground truth if there is one, and otherwise finds nothing."""
+    """Detector that finds objects only in frames with ground truth."""
 
     def detect(self, frame: Frame) -> Detections:
         return Detections.none(CAMERA.shape, self.classes) if frame.truth is None else super().detect(frame)
@@ -102,7 +102,7 @@ class Selecting(ClusterRefiner):
 
 @dataclass
 class Cheating(PoseTracker):
-    """Tracker that moves a fraction of the way from the first pose to the ground-truth pose."""
+    """Tracker that moves its pose toward the ground-truth pose."""
 
     fraction: float = 1.0
 
@@ -118,7 +118,7 @@ class Cheating(PoseTracker):
 
 
 class Boasting(Cheating):
-    """Tracker that does not return the ground-truth poses that it declares."""
+    """Tracker that declares ground-truth poses, but returns other poses."""
 
     pose_source = "ground_truth"
 
@@ -133,7 +133,7 @@ class Following(PoseTracker):
 
 @dataclass
 class Erasing(PoseTracker):
-    """Tracker that removes far depth readings in place."""
+    """Tracker that removes distant depth readings in place."""
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         frame.depth[frame.depth > 2] = 0
@@ -142,7 +142,7 @@ class Erasing(PoseTracker):
 
 @dataclass
 class Writing(PoseTracker):
-    """Tracker that returns a fixed, wrong pose and, if `writes`, changes the map."""
+    """Tracker that returns a constant, wrong pose and, if `writes`, changes the map."""
 
     writes: bool = False
 
@@ -153,11 +153,11 @@ class Writing(PoseTracker):
 
 
 class Careless(GridFuser):
-    """Fuser whose map is rendered from any pose, even an invalid one."""
+    """Fuser whose map accepts any pose for rendering, even an invalid one."""
 
 
 class Relocating(GridFuser):
-    """Fuser that replaces the tracked pose by the ground-truth pose."""
+    """Fuser that replaces the tracked pose with the ground-truth pose."""
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         assert frame.T_world_camera is not None
@@ -173,7 +173,7 @@ class Smoothing(GridFuser):
 
 
 class Backwards(CornerRoom):
-    """Dataset that returns its frames in reverse order."""
+    """Dataset with frames in reverse order."""
 
     def __getitem__(self, k: int) -> Frame:
         return super().__getitem__(len(self) - 1 - k)
@@ -210,7 +210,7 @@ def test_contract_detects_broken_plugin(contract: type[Any], plugin: Callable[[]
 
 
 class Late(Viewer):
-    """Viewer that reads the map after the call and writes to the working directory."""
+    """Viewer that reads the map after the call, and writes to the working directory."""
 
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
         self.scene = scene
@@ -238,7 +238,7 @@ class Leveling(Viewer):
 
 
 class Summing(Viewer):
-    """Viewer that adds the sum to the stage times."""
+    """Viewer that adds a total to the stage times."""
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
         stage_ms["total"] = sum(stage_ms.values())  # type: ignore[index]
@@ -270,7 +270,7 @@ def test_viewer_contract_detects_broken_viewer(
 
 
 def option(folder: Path, text: str) -> OptionContract:
-    """Return the contract of a refiner option with this YAML."""
+    """Return the contract test of a refiner option with this YAML."""
     (folder / "refiner").mkdir()
     (folder / "refiner" / "own.yaml").write_text(text)
 

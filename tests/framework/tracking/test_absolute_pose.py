@@ -1,4 +1,4 @@
-"""Tests of the absolute pose: exact matches give the exact pose, and ambiguous ones give None."""
+"""Tests for the estimation of an absolute pose from feature matches."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def matches(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def test_absolute_pose_from_exact_matches_is_exact() -> None:
-    """A wrong half-pixel convention would rotate the camera by a milliradian."""
+    """An offset of half a pixel would rotate the camera by a milliradian."""
     pixels, points_world, depth = matches(100)
     found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world, depth)
     assert found is not None
@@ -47,7 +47,7 @@ def test_absolute_pose_rejects_outliers() -> None:
 
 @pytest.mark.parametrize("factor", [1, 3])
 def test_absolute_pose_error_limit_scales_with_resolution(factor: int) -> None:
-    """In an image that is enlarged by 3, pixel errors are 3 times larger."""
+    """If the image is enlarged by a factor, the pixel errors increase by this factor."""
     pixels, points_world, _ = matches(100)
     camera = Camera(
         factor * CAMERA.width, factor * CAMERA.height, factor * CAMERA.fx, factor * CAMERA.fy,
@@ -61,7 +61,7 @@ def test_absolute_pose_error_limit_scales_with_resolution(factor: int) -> None:
 
 
 def test_absolute_pose_is_deterministic_for_given_seed() -> None:
-    """The matches are so noisy that other random samples give other inliers."""
+    """The matches are so noisy that the inliers depend on the random samples."""
     rng = np.random.default_rng(2)
     pixels, points_world, _ = matches(120)
     pixels += rng.normal(0, 4, pixels.shape)

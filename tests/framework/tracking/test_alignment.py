@@ -1,4 +1,4 @@
-"""Tests of one alignment step, term by term and level by level, between two exact views of a scene."""
+"""Tests for one step of the alignment between two exact views of a scene."""
 
 import dataclasses
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def step(
 ) -> tuple[np.ndarray, NormalEquations]:
     """Return the Gauss-Newton step (6,) from T_view_camera at a pyramid level, and its normal equations.
 
-    The model is the view of the scene from T_VIEW.
+    The model is the view from T_VIEW.
     """
     model, intensities = model_of(scene)
     pyramid = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)
@@ -41,7 +41,7 @@ def step(
 
 
 def model_of(scene: Scene) -> tuple[ModelView, list[np.ndarray]]:
-    """Return the scene's planes as seen from T_VIEW, and their intensities at three levels."""
+    """Return the planes of the scene as a model view from T_VIEW, and its intensities at three levels."""
     view_frame = scene.frame(T_VIEW)
     depth = view_frame.depth
     gap = inverse(T_VIEW)[:3, :3]
@@ -57,7 +57,7 @@ def model_of(scene: Scene) -> tuple[ModelView, list[np.ndarray]]:
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_color_alignment_at_true_pose_has_zero_step(level: int) -> None:
-    """An offset of half a pixel between frame and model at a level would cause a step of several millimeters."""
+    """If a level were shifted by half a pixel, the step would be several millimeters."""
     T = pose(0.03, -0.02, 0.01, (0.01, 0.02, -0.01))
     xi, equations = step(WALL, WALL.frame(T), level, inverse(T_VIEW) @ T, COLOR)
     assert equations.matched > 0.5 * CAMERA.width * CAMERA.height / 4**level
@@ -106,7 +106,7 @@ def test_depth_alignment_step_recovers_motion_between_planes(level: int) -> None
 
 
 def test_depth_alignment_rejects_points_with_different_normals() -> None:
-    """The wall is compared with a copy rotated by 60 degrees, which is close to it near the rotation axis."""
+    """The frame shows a wall that is rotated by 60 degrees. Some of its points are close to the wall of the model."""
     n = np.array([np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)])
     turned = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.5]))])
     _, equations = step(WALL, turned.frame(T_VIEW), 0, np.eye(4), DEPTH)
@@ -117,7 +117,7 @@ def test_depth_alignment_rejects_points_with_different_normals() -> None:
 
 
 def with_noisy_normals(model: ModelView) -> ModelView:
-    """Return the model with noisy normals, as in a map of one frame at a distance of a few meters."""
+    """Return the model with noisy normals, like those of a distant surface in a map of a single frame."""
     noisy = model.normals + np.random.default_rng(0).normal(0, 0.5, model.normals.shape).astype(np.float32)
     noisy /= np.linalg.norm(noisy, axis=0)
     return model._replace(normals=np.where(model.depth > 0, noisy, 0).astype(np.float32))
@@ -125,7 +125,7 @@ def with_noisy_normals(model: ModelView) -> ModelView:
 
 @pytest.mark.parametrize("level", [1, 2])
 def test_smoothed_normals_allow_motion_along_wall(level: int) -> None:
-    """A frontal wall does not constrain motion along it; a slanted wall at the image border does."""
+    """Only the slanted wall at the image border constrains the motion along the frontal wall."""
     room = Scene(planes=[(np.array([0, 0, -1.0]), -2.0), (np.array([-0.8, 0, -0.6]), -1.95)])
     T = T_VIEW @ exp_se3(np.array([0.02, 0, 0, 0, 0, 0]))
     weights = DEPTH._replace(max_distance=np.float32(0.3), geometric_scale=np.float32(16))
@@ -162,7 +162,7 @@ BOTH = COLOR._replace(depth_weight=np.float32(1), color_weight=np.float32(0.1))
 def enlarged(
     scale: float, offset: np.ndarray, weights: Weights, linear: LinearWeights | None = None
 ) -> NormalEquations:
-    """Return the normal equations of the corner, enlarged by `scale`, at the twist `offset` (6,) from the true pose."""
+    """Return the normal equations in a scene enlarged by `scale`, at the twist `offset` (6,) from the true pose."""
     frame = CORNER.frame(T_VIEW)
     model, intensities = model_of(CORNER)
     large = model._replace(depth=np.float32(scale) * model.depth)
@@ -172,7 +172,7 @@ def enlarged(
 
 @pytest.mark.parametrize("weights", [DEPTH, COLOR, BOTH], ids=["depth", "color", "both"])
 def test_alignment_beyond_range_is_scale_invariant(weights: Weights) -> None:
-    """All depths are beyond 5 m. Powers of two scale floating-point numbers without rounding."""
+    """All depths are beyond 5 m. The scales are powers of two, which cause no rounding."""
     motion = np.array([0.4, -0.3, 0.5, 0.002, -0.003, 0.001])
     units = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
     near, far = (enlarged(scale, motion * np.where(units, scale / 16, 1), weights) for scale in (16, 64))
@@ -187,7 +187,7 @@ def test_alignment_beyond_range_is_scale_invariant(weights: Weights) -> None:
 
 
 def test_distance_gate_beyond_range_increases_with_depth() -> None:
-    """At 17 to 23 m, the Tukey gate of 0.1 m increases to more than 0.3 m. VoxelHashing's gate of 0.15 m is fixed."""
+    """The default gate increases from 0.1 m to more than 0.3 m at 17 to 23 m. The gate of VoxelHashing is constant."""
     backward = np.array([0, 0, 0.3, 0, 0, 0])
     assert enlarged(16, backward, DEPTH).matched > 1000
     assert enlarged(16, backward, DEPTH, LinearWeights(np.float32(60), np.float32(0.1))).matched == 0
@@ -217,7 +217,7 @@ MAXIMA = LinearWeights(np.float32(4.0), np.float32(0.1))
 def slow_equations(
     level: PyramidLevel, model: ModelView, intensity: np.ndarray, T: np.ndarray, weights: Weights, linear: LinearWeights
 ) -> NormalEquations:
-    """Return the equations with linear weights, computed in double precision with finite differences."""
+    """Return the equations with linear weights, computed with finite differences in double precision."""
     height, width = model.depth.shape
     v, u = np.nonzero(level.depth)
     z = level.depth[v, u].astype(np.float64)
@@ -265,7 +265,7 @@ def slow_equations(
 @pytest.mark.parametrize("level", [0, 1, 2])
 @pytest.mark.parametrize("dropped", [{}, {"color_weight": 0}, {"depth_weight": 0}], ids=["both", "depth", "color"])
 def test_linear_weights_match_slow_reference(level: int, dropped: dict[str, int]) -> None:
-    """Weights cover their whole range, and some points exceed each maximum; no projection is on a pixel border."""
+    """Some points exceed each maximum. No projection is on a pixel border."""
     weights = VOXEL_HASHING._replace(**{name: np.float32(value) for name, value in dropped.items()})
     T = exp_se3(np.array([0.011, -0.007, 0.06, 0.003, -0.005, 0.002]))
     frame = CORNER.frame(T_VIEW @ exp_se3(np.array([0.05, -0.03, 0.02, 0.02, -0.03, 0.01])))
@@ -283,7 +283,7 @@ def test_linear_weights_match_slow_reference(level: int, dropped: dict[str, int]
 
 
 def test_linear_weight_is_zero_at_maximum_depth() -> None:
-    """The wall is 1.5 m away and the pose is exact, so distances are 0 and all depths are similar."""
+    """The wall is 1.5 m away. All distances are 0, because the pose is exact."""
     frame = WALL.frame(T_VIEW)
     model, intensities = model_of(WALL)
     level = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)[0]
@@ -313,7 +313,7 @@ def test_linear_weights_require_matching_normals_for_color() -> None:
 
 @pytest.mark.parametrize("kind", SensorKind)
 def test_geometric_weight_is_inverse_variance_of_sensor(kind: SensorKind) -> None:
-    """At the true pose, each matched point with normal n adds (n / sigma)^2 to the information of a translation."""
+    """For the translation along z, a point with normal n has the information (n_z / sigma)^2."""
     frame = WALL.frame(T_VIEW)
     model, intensities = model_of(WALL)
     level = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3, kind)[0]

@@ -1,4 +1,4 @@
-"""Tests of the estimation of the delay between color and depth."""
+"""Tests for the estimation of the delay between color and depth."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PALETTE = np.array([[0, 0, 0], [60, 60, 60], [230, 230, 230], [250, 180, 180], [
 
 
 def turning(t: float) -> Float64:
-    """Return the pose of a camera that rotates back and forth about its axes, at time `t`, s."""
+    """Return the pose of a camera that rotates back and forth, at time `t`, s."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec([0.12 * np.sin(5 * t), 0.2 * np.sin(4 * t + 1), 0.05 * np.sin(3 * t)]).as_matrix()
     T[:3, 3] = [0.05 * np.sin(2 * t), 0, 0]
@@ -39,7 +39,7 @@ def turning(t: float) -> Float64:
 
 
 def delayed_frames(delay: float, count: int = 60, speed: float = 1.0) -> Iterator[tuple[Frame, Float64]]:
-    """Yield `count` frames whose color was taken `delay` s after depth, and their poses."""
+    """Yield `count` frames and their poses. Color is captured `delay` s after depth."""
     scene = Scene([WALL], SPHERES)
     for k in range(count):
         t = k / 30
@@ -62,7 +62,7 @@ def test_delay_estimator_known_delay_is_found_within_2_ms(delay: float) -> None:
 def test_delay_estimator_uses_timestamps_of_both_images() -> None:
     estimator = DelayEstimator()
     for frame, pose in delayed_frames(0.02):
-        late = 0.008 if frame.index % 2 else 0.012  # s, from the color timestamp to the depth timestamp
+        late = 0.008 if frame.index % 2 else 0.012  # s, depth timestamp minus color timestamp
         stamped = Frame(
             frame.index, frame.timestamp, frame.color, frame.depth, CAMERA,
             color_timestamp=frame.timestamp - late, depth_timestamp=frame.timestamp,
@@ -84,7 +84,7 @@ def test_delay_estimator_gap_in_time_restarts_history() -> None:
     gaps, steady = DelayEstimator(), DelayEstimator()
     for frame, pose in delayed_frames(0.02, count=30):
         steady.add(frame, pose)
-        pause = 10.0 * (frame.index // 5)  # s, before every fifth frame
+        pause = 10.0 * (frame.index // 5)  # s, gap before every fifth frame
         gaps.add(Frame(frame.index, frame.timestamp + pause, frame.color, frame.depth, CAMERA), pose)
     assert steady.estimate.frames > 0
     assert gaps.estimate == UNKNOWN
@@ -110,7 +110,7 @@ def test_regress_ignores_outliers() -> None:
 
 
 def test_regress_constant_motion_has_deviation_of_offset() -> None:
-    """A constant offset and a delay have the same effect if the camera rotates at a constant rate."""
+    """At a constant rate of rotation, a constant offset and a delay have the same effect."""
     rng = np.random.default_rng(2)
     motion = np.array([0.3, 0.0]) + rng.normal(0, 0.001, (8 * BLOCKS, 2))
     delays = 0.02 + rng.normal(0, 0.001, len(motion)) / 0.3
@@ -136,7 +136,7 @@ def test_poses_at_interpolates_and_extrapolates_constant_motion() -> None:
 def test_find_edges_returns_nearer_side_across_missing_depth() -> None:
     depth = np.full((20, 40), 2.0, np.float32)
     depth[:, :20] = 1.0
-    depth[:, 20:23] = 0  # missing between the surfaces
+    depth[:, 20:23] = 0  # depth is missing between the surfaces
     edges = np.zeros((100, 3), np.float32)
     count = find_edges(depth, edges)
     assert count > 0

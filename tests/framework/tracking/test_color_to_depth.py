@@ -1,4 +1,4 @@
-"""Tests of the registration of color to depth by the camera's motion."""
+"""Tests for the registration of color to depth, based on the motion of the camera."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCENE = Scene([(np.array([0.0, 0.0, -1.0]), -2.0)], [(np.array([0.1, 0.0, 1.3]),
 
 
 def moving(t: float) -> Float64:
-    """Return the pose of a camera with constant velocity: 0.3 m/s and 0.8 rad/s."""
+    """Return the pose of a camera with a constant velocity of 0.3 m/s and 0.8 rad/s."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec([0.3 * t, 0.7 * t, 0.2 * t]).as_matrix()
     T[:3, 3] = [0.3 * t, 0, 0]
@@ -28,14 +28,14 @@ def moving(t: float) -> Float64:
 
 
 def frame_at(t: float, delay: float, index: int = 0) -> Frame:
-    """Return a frame whose color was taken `delay` s after depth."""
+    """Return a frame whose color is captured `delay` s after depth."""
     depth, _, _ = SCENE.render(CAMERA, moving(t))
     _, color, _ = SCENE.render(CAMERA, moving(t + delay))
     return Frame(index, t, color, depth, CAMERA)
 
 
 def error(frame: Frame, expected: np.ndarray) -> float:
-    """Return the mean color difference, in gray levels, excluding the border, where color is missing."""
+    """Return the mean color difference, gray levels. The border is excluded, because color is missing there."""
     inner = np.s_[12:-12, 12:-12]
     return float(np.abs(frame.color[inner].astype(float) - expected[inner]).mean())
 
@@ -76,7 +76,7 @@ def test_color_to_depth_pixels_refer_to_color_image() -> None:
 
 
 def test_color_to_depth_timestamps_add_to_delay() -> None:
-    """Color is taken 12 ms after depth: its timestamp is 8 ms before that of depth, and the delay is 20 ms."""
+    """Color is captured 12 ms after depth: the timestamps differ by -8 ms, and the delay is 20 ms."""
     registration = ColorToDepth(0.02)
     for k in range(3):
         frame = replace(frame_at(k / 30, 0.012, k), color_timestamp=k / 30 - 0.008, depth_timestamp=k / 30)
@@ -123,7 +123,7 @@ def test_color_to_depth_estimated_delay_is_used_and_logged(caplog: pytest.LogCap
             displaced.append(registration.displaced_before)
     assert registration.delay == pytest.approx(0.03, abs=0.002)
     assert found.color_pixels is not None
-    assert sum(displaced) == 1  # true only at the first use of the estimate
+    assert sum(displaced) == 1  # True only when the estimate is used for the first time
     assert len(caplog.messages) == 1
     assert "ms after depth at equal timestamps" in caplog.messages[0]
 
@@ -181,9 +181,9 @@ def test_registration_equals_reference() -> None:
 
 
 def test_predicted_color_damps_pose_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pose error displaces the next color image, and thus the next pose. The errors must not grow."""
+    """A pose error displaces the next color image, which causes another pose error. The errors must not increase."""
     registration = ColorToDepth(0.04)
-    errors = [0.0, 0.002]  # m, along x of the camera
+    errors = [0.0, 0.002]  # m, along the x axis of the camera
     for k in range(30):
         frame = frame_at(k / 30, 0.04, k)
         if k == len(errors):

@@ -1,4 +1,4 @@
-"""Tests of the depth scale: limits that increase with depth, and scale-invariant measures."""
+"""Tests for the depth scale, by which limits increase with depth."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_depth_scale_divides_translation_by_growth() -> None:
 
 
 def test_information_without_units_is_scale_invariant() -> None:
-    """The derivative of a pixel with respect to a translation is inversely proportional to the depth."""
+    """The derivatives of a pixel with respect to translation are proportional to the inverse depth."""
     rng = np.random.default_rng(0)
     J = rng.normal(size=(20, 6))
     far = np.concatenate([J[:, :3] / 7, J[:, 3:]], axis=1)

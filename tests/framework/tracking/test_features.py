@@ -1,4 +1,4 @@
-"""Tests of features: subpixel positions, the depth of their surface, and matching compared with a reference."""
+"""Tests for image features."""
 
 from __future__ import annotations
 
@@ -67,10 +67,10 @@ def test_features_of_blank_image_are_empty() -> None:
 
 def test_surface_depth_is_zero_at_edges_and_holes() -> None:
     depth = np.full((40, 60), 2.0, np.float32)
-    depth[:, 30:] = 1.0  # a step
+    depth[:, 30:] = 1.0  # a depth step
     depth[20:, :10] = 0  # a hole
-    depth[5, 45] = 0  # one reading missing
-    depth += np.where(depth > 0, 0.002 * np.arange(60, dtype=np.float32), 0)  # slanted
+    depth[5, 45] = 0  # a missing reading
+    depth += np.where(depth > 0, 0.002 * np.arange(60, dtype=np.float32), 0)  # a slanted surface
     pixels = np.array([[20, 10], [28, 10], [31.4, 10], [33, 10], [3, 30], [45, 5], [0, 0]], np.float32)
     expected = [2.04, 0, 0, 1.066, 0, 1.09, 2.0]
     np.testing.assert_allclose(surface_depth(depth, pixels), expected, atol=0.0011)

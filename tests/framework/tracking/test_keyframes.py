@@ -1,4 +1,4 @@
-"""Tests of keyframes in a textured room with known poses, and on real video."""
+"""Tests for keyframes, in a textured room with known poses and on real video."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def slowed(keyframes: Keyframes, seconds: float) -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, 0.05])
 def test_keyframes_are_independent_of_extraction_time(seconds: float) -> None:
-    """The camera moves in steps of different sizes, half of the frames are black, and old keyframes are removed."""
+    """The steps of the camera have different sizes, some frames are black, and old keyframes are removed."""
     rng = np.random.default_rng(3)
     at_once, later = (Keyframes(max_keyframes=4, min_distance=0.2) for _ in range(2))
     slowed(later, seconds)
@@ -230,7 +230,7 @@ def test_keyframes_parameter_out_of_range_raises(bound: dict[str, float]) -> Non
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="requires ../shared/data")
-def test_relocalize_real_video_succeeds_only_in_known_scene() -> None:
+def test_relocalize_in_real_video_requires_known_scene() -> None:
     kitchen = RgbdFolder(SHARED / "redkitchen")
     keyframes = Keyframes()
     for k in range(0, 150, 10):

@@ -1,4 +1,4 @@
-"""Tests of the image pyramid."""
+"""Tests for the image pyramid."""
 
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -25,7 +25,7 @@ def test_pyramid_depth_does_not_mix_surfaces_or_holes() -> None:
 
 
 def test_pyramid_pixel_center_is_mean_of_four_pixels() -> None:
-    camera = Camera(9, 7, 8.0, 8.5, 3.7, 3.1)  # odd: the last row and column are dropped
+    camera = Camera(9, 7, 8.0, 8.5, 3.7, 3.1)  # with an odd size, the last row and column are dropped
     depth = np.ones(camera.shape, np.float32)
     color = np.zeros((*camera.shape, 3), np.uint8)
     _, half, quarter = build_pyramid(camera, depth, color, 1.0, 3)
@@ -51,12 +51,13 @@ def test_model_intensities_close_single_pixel_holes() -> None:
     view = SimpleNamespace(color=np.repeat(gray[..., None], 3, axis=2), depth=(gray > 0).astype(np.float32))
     full, half, quarter = model_intensities(view, 3)
     np.testing.assert_allclose(full, np.where(gray > 0, gray / 255, -1), atol=1e-6)
-    np.testing.assert_allclose(half, [[25 / 255, 40 / 255], [-1, -1]], atol=1e-6)  # a single mapped pixel is not enough
+    # a single mapped pixel is not sufficient
+    np.testing.assert_allclose(half, [[25 / 255, 40 / 255], [-1, -1]], atol=1e-6)
     np.testing.assert_allclose(quarter, [[32.5 / 255]], atol=1e-6)
 
 
 def slope(step: float, nearest: float) -> np.ndarray:
-    """Return depth (120, 160), m, from `nearest` to 4 m, rounded down to multiples of `step`; 0 = not rounded."""
+    """Return depth (120, 160), m, from `nearest` to 4 m, rounded down to multiples of `step` unless `step` is 0."""
     depth = np.broadcast_to(np.linspace(nearest, 4, 160), (120, 160)) + np.linspace(0, 0.02, 120)[:, None]
     return (np.floor(depth / step) * step if step else depth).astype(np.float32)
 
@@ -64,7 +65,7 @@ def slope(step: float, nearest: float) -> np.ndarray:
 @pytest.mark.parametrize("nearest", [0.6, 1.0, 2.0])
 def test_is_coarse_detects_eight_bit_depth(nearest: float) -> None:
     assert is_coarse(slope(0.0392, nearest), otherwise=False)
-    disparity = 8 * 580 * 0.075 / slope(0, nearest)  # of a Kinect, in quantization steps of 1/8 px
+    disparity = 8 * 580 * 0.075 / slope(0, nearest)  # depth of a Kinect, in disparity steps of 1/8 px
     kinect = (8 * 580 * 0.075 / np.rint(disparity)).astype(np.float32)
     for fine in (slope(0.001, nearest), slope(0, nearest), kinect):
         assert not is_coarse(fine, otherwise=True)
@@ -86,7 +87,7 @@ def test_is_coarse_compares_steps_with_sensor_noise() -> None:
 @pytest.mark.parametrize(("missing", "expected"), [(0.05, False), (0.3, True), (0.9, True)])
 def test_is_scattered_detects_single_missing_pixels(missing: float, expected: bool) -> None:
     depth = np.ones((120, 160), np.float32)
-    depth[:, :60] = 0  # a hole is not scattered
+    depth[:, :60] = 0  # a single large hole
     assert not is_scattered(depth)
     depth[np.random.default_rng(0).random(depth.shape) < missing] = 0
     assert is_scattered(depth) == expected

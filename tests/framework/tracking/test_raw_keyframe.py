@@ -1,4 +1,4 @@
-"""Tests of the raw keyframe as an alignment model, on exact views of a scene."""
+"""Tests for the raw keyframe as a model for alignment."""
 
 from __future__ import annotations
 

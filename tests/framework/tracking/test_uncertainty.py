@@ -1,4 +1,4 @@
-"""Tests of pose covariances from normal equations with known noise."""
+"""Tests for pose covariances that are computed from normal equations."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_covariance_depends_on_residuals_not_assumed_noise(noise: float) -> None
 
 
 def test_covariance_of_terms_matches_simulated_estimates() -> None:
-    """The color noise is 3 times the assumed noise, and the geometric noise is half of it; all weights are 1."""
+    """The actual noise is 3 times the assumed noise for color, and half of it for depth."""
     rng = np.random.default_rng(1)
     J, J_color = rng.normal(size=(60, 6)), rng.normal(size=(60, 6))
     both = np.concatenate([J, J_color])
@@ -43,7 +43,7 @@ def test_covariance_of_terms_matches_simulated_estimates() -> None:
 
 
 def test_covariance_is_in_camera_frame() -> None:
-    """exp(xi) T_view_camera = T_view_camera exp(Ad xi), where Ad is the adjoint of T_camera_view."""
+    """A twist in the view frame is transformed to the camera frame by the adjoint of T_camera_view."""
     J = np.random.default_rng(2).normal(size=(40, 6))
     T_view_camera = exp_se3(np.array([0.3, -0.2, 0.5, 0.2, 0.4, -0.3]))
     Ad = adjoint(inverse(T_view_camera))

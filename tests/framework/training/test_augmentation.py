@@ -1,4 +1,4 @@
-"""Tests of the augmentation of images and masks."""
+"""Tests for the augmentation of images and masks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from framework.training.room_pictures import Example
 
 
 def example() -> Example:
-    """Return an image of a bright rectangle on a dark background, and the mask of the rectangle."""
+    """Return an image with a bright rectangle on a dark background, and the mask of the rectangle."""
     mask = np.zeros((1, 60, 80), np.bool_)
     mask[0, 20:45, 10:40] = True
     return Example(np.where(mask[0][..., None], 200, 10).astype(np.uint8).repeat(3, axis=-1), mask, ("chair",))

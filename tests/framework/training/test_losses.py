@@ -1,4 +1,4 @@
-"""Tests of training targets, compared with hand-computed results and with inverse functions."""
+"""Tests for training targets and losses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the images of one rendered room: seeds, classes and the round trip of masks."""
+"""Tests for the training images of one rendered room."""
 
 from __future__ import annotations
 

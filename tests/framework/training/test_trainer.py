@@ -1,4 +1,4 @@
-"""Tests of training with a tiny network; a resumed run equals an uninterrupted one."""
+"""Tests for training with a tiny network."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_trainer_loss_depends_on_seed(pictures: RoomPictures, tmp_path: Path) ->
 
 def test_trainer_unknown_picture_classes_raise(pictures: RoomPictures, tmp_path: Path) -> None:
     only_chairs = MaskRCNN(Architecture(**{**vars(TINY), "classes": ("chair",)}))
-    with pytest.raises(DataError, match=r"pictures\.folder: expected only classes of the network in .*, got bed"):
+    with pytest.raises(DataError, match=r"pictures\.folder: expected rendered scenes with only .*, got bed"):
         Trainer(only_chairs, pictures, SHORT, tmp_path, "cpu").run()
 
 

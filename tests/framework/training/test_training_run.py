@@ -1,4 +1,4 @@
-"""Tests of the command `train-detector`, from its config to a usable network."""
+"""Tests for the command `train-detector`."""
 
 from __future__ import annotations
 

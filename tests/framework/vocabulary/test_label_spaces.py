@@ -1,4 +1,4 @@
-"""Tests of the label spaces: completeness, consistency, and exact conversion."""
+"""Tests for the label spaces and their conversion to COCO."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Tests of parsed text queries and of color names."""
+"""Tests for parsed text queries and for color names."""
 
 from __future__ import annotations
 

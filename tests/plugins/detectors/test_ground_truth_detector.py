@@ -1,4 +1,4 @@
-"""Tests of detector=ground_truth and detector=none."""
+"""Tests for detector=ground_truth and detector=none."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_ground_truth_masks_of_known_classes_are_exact():
     detections = GroundTruthDetector(min_pixels=10).detect(
         frame_with(FrameTruth(ids, {8: "chair", 3: "tv", 1000: None, 4: "cup"}))
     )
-    assert len(detections) == 2  # 1000 has no class, 4 is too small
+    assert len(detections) == 2  # 1000 has no class, and 4 is too small
     np.testing.assert_array_equal(detections.masks[0], ids == 8)
     np.testing.assert_array_equal(detections.masks[1], ids == 3)
     np.testing.assert_array_equal(detections.boxes, [[3, 2, 22, 11], [5, 15, 14, 24]])

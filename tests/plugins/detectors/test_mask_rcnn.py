@@ -1,4 +1,4 @@
-"""Tests of detector=mask_rcnn with random tiny networks, and with one that detects a known object."""
+"""Tests for detector=mask_rcnn, with random tiny networks and with a network that detects a known object."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,7 @@ def detector(path):
 
 
 def test_mask_rcnn_class_row_excludes_background(path):
-    """Without suppression across classes, each detection is one label of a proposal with its softmax scores."""
+    """Without suppression, each detection is a label of a proposal and has the softmax score of the label."""
     detector, frame = MaskRCNNDetector(weights=path, device="cpu", agnostic_nms_iou=1.0), noise(0)
     seen = []
     classify = detector._network.classify
@@ -113,7 +113,7 @@ def test_mask_rcnn_sides_default_to_network_settings(path):
 
 
 def known_object(folder, monkeypatch, extent, resized):
-    """Return a detector that resizes images to a short side of `resized` px and detects one chair.
+    """Return a detector that resizes the short side of images to `resized` px and detects one chair.
 
     `extent` is the box x1 y1 x2 y2 of the chair, px, in an image of 160x120 px.
     """
@@ -132,7 +132,7 @@ def known_object(folder, monkeypatch, extent, resized):
 
 @pytest.mark.parametrize("resized", [60, 96, 120, 300])
 def test_mask_rcnn_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch, resized):
-    """Pixels u = 20..59, v = 30..89 have the borders 20..60, 30..90 at every scale."""
+    """The borders of the pixels u = 20 to 59 and v = 30 to 89 are at 20, 60, 30 and 90."""
     found = known_object(tmp_path, monkeypatch, (20, 30, 60, 90), resized).detect(noise(6))
     assert len(found) == 1
     expected = np.zeros((120, 160), bool)
@@ -144,11 +144,11 @@ def test_mask_rcnn_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch,
 
 @pytest.mark.parametrize("short_side", [32, 40, 80])
 def test_mask_rcnn_resize_keeps_ramp_position(path, short_side):
-    """The value of pixel u is 5 u; pixel u' of the resized image shows u = (u' + 0.5) / scale - 0.5."""
+    """The value of the ramp at u is 5 u."""
     ramp = np.repeat(np.tile(5 * np.arange(50, dtype=np.uint8), (40, 1))[..., None], 3, axis=2)
     image = MaskRCNNDetector(weights=path, device="cpu", short_side=short_side, long_side=400)._resize(picture(ramp))
     places = (np.arange(image.shape[3]) + 0.5) * 40 / short_side - 0.5
-    # Values are rounded to integers.
+    # pixel u' of the resized image shows u = (u' + 0.5) / scale - 0.5; values are rounded to integers
     np.testing.assert_allclose(image[0, 0, 5, 2:-2].numpy(), 5 * places[2:-2], atol=0.51)
 
 

@@ -1,4 +1,4 @@
-"""Tests of the included network, on rooms that were not used in training."""
+"""Tests for the included network, on rooms that were not used for training."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.support import registered
 
 pytestmark = pytest.mark.integration
 
-ROOMS = 2_000_000  # seed; its rooms are neither training rooms nor held-out rooms
+ROOMS = 2_000_000  # seed of rooms that are neither training nor held-out rooms
 MAX_BYTES = 20 << 20
 
 
@@ -40,7 +40,7 @@ def test_bundled_network_is_small_and_has_model_card(detector: MaskRCNNDetector)
 
 @pytest.mark.acceptance
 def test_bundled_network_detects_objects_in_unseen_rooms(detector: MaskRCNNDetector, tmp_path: Path) -> None:
-    """There are few images, so the bound is loose; the model card has the full results."""
+    """The bound is low, because there are few images. The complete results are in the model card."""
     render_rooms(tmp_path, ROOMS, 2, 10, 1)
     pictures = RoomPictures(tmp_path, ROOMS, 2)
     found = []

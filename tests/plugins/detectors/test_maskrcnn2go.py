@@ -1,4 +1,4 @@
-"""Tests of Mask R-CNN 2Go: the published network on real images, in 8-bit integers and in float."""
+"""Tests for the published Mask R-CNN 2Go on real images, in 8-bit integers and in float."""
 
 import json
 from pathlib import Path
@@ -69,7 +69,6 @@ def test_maskrcnn2go_detects_expected_objects_in_real_images(detector, scene, in
 
 
 def test_maskrcnn2go_mask_of_bed_overlaps_ground_truth(detector):
-    """Confident detections of beds overlap the ground-truth beds of Replica."""
     root = SHARED / "data" / "replica_floor2"
     if not root.is_dir():
         pytest.skip(f"{root} does not exist")
@@ -82,11 +81,11 @@ def test_maskrcnn2go_mask_of_bed_overlaps_ground_truth(detector):
             if score > 0.7 and COCO[row.argmax()] == "bed":
                 ious.append(max((mask & (ids == i)).sum() / (mask | (ids == i)).sum() for i in beds))
     assert len(ious) >= 5
-    assert np.median(ious) > 0.7  # pillows have their own labels and are not part of the bed
+    assert np.median(ious) > 0.7  # pillows have separate labels and are not part of the bed
 
 
 def test_maskrcnn2go_mask_grids_match_full_graph():
-    """`_mask_grids` computes one class per detection; the full graph computes all 81."""
+    """The complete graph computes a mask for all 81 classes instead of one class per detection."""
     detector = MaskRCNN2Go(device="cpu", int8=False)
     graph, tensors, _ = _read_network(WEIGHTS)
     whole = network_between(graph, tensors, ("_[mask]_pool5_int8",), ("mask_fcn_logits_up_int8",))
@@ -99,7 +98,7 @@ def test_maskrcnn2go_mask_grids_match_full_graph():
 
 @in_integers
 def test_maskrcnn2go_int8_detections_agree_with_float():
-    """Each confident float detection in real images has a similar int8 mask of the same class."""
+    """For each confident float detection, the best int8 mask of the same class is compared."""
     integers, real = MaskRCNN2Go(device="cpu"), MaskRCNN2Go(device="cpu", int8=False)
     agreements = []
     for scene, index in (("redkitchen", 0), ("redkitchen", 290), ("mit76", 0), ("replica_floor2", 40)):

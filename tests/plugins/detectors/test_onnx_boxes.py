@@ -1,4 +1,4 @@
-"""Tests of box detectors from ONNX files: networks with known outputs, and YOLOX-nano on real images."""
+"""Tests for box detectors in ONNX files, with known outputs and with YOLOX-nano on real images."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,13 +19,13 @@ from tests.support.networks.tiny_networks import constant_network
 
 WEIGHTS = Path("weights") / "yolox_nano" / "yolox_nano.onnx"
 
-# A cup in front of a wall; the network's input has half the size of the image, and the box of the cup is known.
+# a cup in front of a wall; the input of the network has half the size of the image
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 CUP = np.zeros((120, 160), np.bool_)
 CUP[30:70, 40:60] = True
-BOX = np.array([19.0, 14.0, 31.0, 36.0])  # x1 y1 x2 y2 in the input: the cup with a margin of two image pixels
+BOX = np.array([19.0, 14.0, 31.0, 36.0])  # x1 y1 x2 y2 in the input: the cup and a margin of two image pixels
 SHAPE = (60, 80)
-LABELS = ("chair", "cup", "wall")  # nyu40 has the class wall, which is not an object
+LABELS = ("chair", "cup", "wall")  # nyu40 has the class wall, which is no object
 
 
 def frame(index=0):
@@ -38,7 +38,7 @@ def center_size(box):
 
 
 def outputs_of(layout):
-    """Return the network outputs for a cup (0.6 cup, 0.2 chair), a wall and a weak candidate."""
+    """Return the network outputs for a cup (scores 0.6 cup, 0.2 chair), a wall and a weak candidate."""
     boxes = np.array([BOX, BOX + 20, BOX - 10])
     scores = np.array([[0.2, 0.6, 0.0], [0.1, 0.1, 0.9], [0.01, 0.02, 0.0]])
     rows = np.array([center_size(box) for box in boxes])
@@ -62,12 +62,12 @@ def outputs_of(layout):
     return {"boxes": boxes, "labels": np.array([2, 3, 2]), "scores": np.array([0.6, 0.9, 0.02])}
 
 
-EXPECTED = {  # score, and distribution over chair and cup
+EXPECTED = {  # score, and probabilities of chair and cup
     OutputLayout.yolo: (0.6, [0.25, 0.75]),
     OutputLayout.yolo_objectness: (0.5, [2 / 7, 5 / 7]),
     OutputLayout.yolox: (0.6, [0.25, 0.75]),
     OutputLayout.ssd_unit: (0.6, [0.25, 0.75]),
-    OutputLayout.ssd_tensorflow: (0.6, [0.25, 0.75]),  # from 0.2 0.6 0.2, without the wall
+    OutputLayout.ssd_tensorflow: (0.6, [0.25, 0.75]),  # 0.2 0.6 0.2 without the wall
     OutputLayout.ssd_torchvision: (0.6, [0.25, 0.75]),
 }
 
@@ -82,7 +82,7 @@ def tiny(folder, layout, **parameters):
 @pytest.mark.parametrize("layout", OutputLayout)
 def test_onnx_boxes_known_network_detects_cup_in_each_layout(tmp_path, layout):
     detector = tiny(tmp_path, layout)
-    assert detector.classes == ("cup", "chair")  # COCO's order
+    assert detector.classes == ("cup", "chair")  # order of COCO
     found = detector.detect(frame())
     score, (chair, cup) = EXPECTED[layout]
     np.testing.assert_array_equal(found.masks, CUP[None])
@@ -93,7 +93,7 @@ def test_onnx_boxes_known_network_detects_cup_in_each_layout(tmp_path, layout):
 
 @pytest.mark.parametrize("placement", Placement)
 def test_onnx_boxes_image_placement_is_inverted(tmp_path, placement):
-    """The input is taller than the image; the position of the cup in it depends on the placement."""
+    """The position of the image in the taller input depends on the placement."""
     top, scale = {Placement.top_left: (0, 0.5), Placement.center: (20, 0.5), Placement.stretch: (0, 5 / 6)}[placement]
     box = np.array([BOX[0], BOX[1] / 0.5 * scale + top, BOX[2], BOX[3] / 0.5 * scale + top])
     weights = constant_network(
@@ -110,7 +110,7 @@ def test_onnx_boxes_image_placement_is_inverted(tmp_path, placement):
         device="cpu",
         min_readings=1.0,
     )
-    # at constant depth, all pixels in the box are foreground, so the mask is the box
+    # at constant depth, the mask is the whole box
     flat = replace(frame(), depth=np.ones((120, 160), np.float32))
     (mask,) = detector.detect(flat).masks
     expected = np.zeros_like(mask)
@@ -230,6 +230,6 @@ def test_onnx_boxes_config_defaults_fit_yolox_nano(shared, nano):
     np.testing.assert_array_equal(found.scores, nano.detect(shared_frame(shared, "redkitchen", 0)).scores)
 
 
-def test_onnx_boxes_missing_weights_parameter_raises_with_url():
+def test_onnx_boxes_missing_weights_parameter_error_has_url():
     with pytest.raises(ConfigError, match=r"got none; set detector\.weights=\.\.\.; yolox_nano\.onnx .* https://"):
         registered.built("detector", "onnx_boxes")

@@ -1,4 +1,4 @@
-"""Tests of YOLO-style segmentation networks with known boxes, scores and masks."""
+"""Tests for YOLO segmentation networks with known boxes, scores and masks."""
 
 import cv2
 import numpy as np
@@ -16,8 +16,8 @@ from tests.support.recordings.rewritten_exports import LAYOUTS, rewritten
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 V, U = np.indices((120, 160))
 LABELS = ("chair", "cup", "wall")
-SIZE = 80  # px, side of the input; the image is scaled by 1/2 and is 10 px from the top
-CELL = 2  # px of the input
+SIZE = 80  # px, side of the input; the image is scaled by 1/2 and placed 10 px from the top
+CELL = 2  # px in the input
 
 
 def frame():
@@ -25,7 +25,7 @@ def frame():
 
 
 def outputs(objectness=False, transposed=False):
-    """Return the outputs for a cup in the left half of its box and a chair in the lower half of its box.
+    """Return the network outputs for a cup in the left half of its box and a chair in the lower half of its box.
 
     The prototypes are linear in the pixel coordinates.
     """
@@ -60,12 +60,12 @@ class TestContract(DetectorContract):
 
 
 @pytest.mark.parametrize(("objectness", "transposed"), [(False, False), (True, True)])
-def test_onnx_segmentation_known_network_gives_expected_output(tmp_path, objectness, transposed):
+def test_onnx_segmentation_known_network_matches_expected_output(tmp_path, objectness, transposed):
     check_cup_and_chair(tiny(tmp_path, objectness, transposed).detect(frame()))
 
 
 def check_cup_and_chair(found):
-    # The center of image pixel u is at (u + 0.5) / 2 in the input, and at (u + 0.5) / 4 - 0.5 in cells.
+    # the center of image pixel u is at (u + 0.5) / 2 px in the input and at (u + 0.5) / 4 - 0.5 in cells
     cup = ((U + 0.5) / 4 - 0.5 < 10.4) & (U >= 10) & (U < 70) & (V >= 20) & (V < 60)
     chair = (((V + 0.5) / 2 + 10) / 2 - 0.5 > 25.4) & (U >= 100) & (U < 140) & (V >= 60) & (V < 100)
     np.testing.assert_array_equal(found.masks, [cup, chair])
@@ -92,7 +92,7 @@ def test_onnx_segmentation_tflite_file_error_names_converter(tmp_path):
 
 
 def suppressed(folder, **parameters):
-    """Return a detector with the same candidates in the layout of networks that suppress duplicates: one class each."""
+    """Return a detector with the same candidates, in the layout of networks that suppress duplicates."""
     table, prototypes = outputs(transposed=True).values()
     (folder / "labels.txt").write_text("\n".join(LABELS))
     center, size, scores = table[0, :, :2], table[0, :, 2:4], table[0, :, 4:7]
@@ -104,7 +104,7 @@ def suppressed(folder, **parameters):
 
 @pytest.mark.parametrize(("spread", "expected"), [(1.0, [0.6, 0.5]), (0.5, [0.8, 0.7]), (0.0, [1.0, 1.0])])
 def test_onnx_segmentation_single_class_spreads_remaining_mass(tmp_path, spread, expected, caplog):
-    """With spread 1, a score of 0.4 gives probability 0.5, so that the label remains the best of two classes."""
+    """The probability is at least 0.5 with spread 1, so that the label remains the best of two classes."""
     with caplog.at_level("INFO"):
         found = suppressed(tmp_path, class_spread=spread).detect(frame())
     assert "n.onnx reports one class per detection" in caplog.text
@@ -173,7 +173,7 @@ IMAGES = ("mit76/color/000000.jpg", "redkitchen/color/000240.jpg", "replica_floo
 
 @pytest.fixture(scope="module")
 def yolo(shared):
-    """Return the path of YOLO11n-seg in the layout of its exporter."""
+    """Return the path of YOLO11n-seg in the original layout."""
     path = shared / "weights" / "yolo11n_seg" / "yolo11n_seg.onnx"
     if not path.is_file():
         pytest.skip(f"{path} does not exist")
@@ -206,7 +206,8 @@ def test_onnx_segmentation_yolo_agrees_in_all_layouts(tmp_path, yolo, photograph
         )
         both = (found.masks & wanted.masks).sum(axis=(1, 2)) / (found.masks | wanted.masks).sum(axis=(1, 2))
         assert both.min() > 0.995
-        if detector._layout.suppressed:  # the label has the score, the other classes share the rest
+        # the score is the probability of the label; the other classes have equal probabilities
+        if detector._layout.suppressed:
             best = np.maximum(found.scores, 1 / len(found.classes))
             np.testing.assert_allclose(found.class_probabilities.max(axis=1), best, rtol=1e-5)
             np.testing.assert_allclose(found.class_probabilities.min(axis=1), (1 - best) / 79, atol=1e-6)

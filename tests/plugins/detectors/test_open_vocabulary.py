@@ -1,4 +1,4 @@
-"""Tests of text-prompted detection: boxes and masks of fake networks are mapped to pixels for any image shape."""
+"""Tests for text-prompted detection with fake networks."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def picture(shape: tuple[int, int]) -> Frame:
 
 
 class FixedBoxes:
-    """Replacement for OWLv2 that returns given boxes, px, with given probabilities of the queries."""
+    """Replacement for OWLv2 that returns given boxes, px, and probabilities of the queries."""
 
     dtype = torch.float32
 
     def __init__(self, shape: tuple[int, int], boxes: list[list[float]], probabilities: list[list[float]]) -> None:
-        # fractions of the padded square, with the image at its upper left
+        # fractions of the padded square, with the image in the upper left corner
         shares = (torch.tensor(boxes) + 0.5) / max(shape)
         centers = (shares[:, :2] + shares[:, 2:]) / 2
         self.boxes = torch.cat([centers, shares[:, 2:] - shares[:, :2]], dim=1)[None]
@@ -59,7 +59,7 @@ class FixedBoxes:
 
 
 class BoxFiller:
-    """Replacement for SAM that fills the prompted box."""
+    """Replacement for SAM whose mask is the prompted box."""
 
     dtype = torch.float32
 
@@ -193,7 +193,7 @@ def test_open_vocabulary_unsupported_model_type_raises(owlv2: Path, tmp_path: Pa
 
 
 def test_open_vocabulary_tokenizer_loads_from_vocab_and_merges(tmp_path: Path) -> None:
-    """google/owlv2-base-patch16-ensemble has vocab.json and merges.txt, but no tokenizer.json."""
+    """google/owlv2-base-patch16-ensemble has no tokenizer.json."""
     (write_owlv2(tmp_path) / "tokenizer.json").unlink()
     letters = sorted(set("aphotofcuprbe"))
     words = ["!", *letters, *(f"{letter}</w>" for letter in letters), "<|startoftext|>", "<|endoftext|>"]

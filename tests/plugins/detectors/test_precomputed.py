@@ -1,4 +1,4 @@
-"""Tests of precomputed detections: all formats of COCO results, mask folders, and rejected files."""
+"""Tests for precomputed detections in files of COCO results and in folders of masks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 CAMERA = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
 MASK = np.zeros(CAMERA.shape, np.bool_)
 MASK[1:4, 2:7] = True  # rows 1 to 3, columns 2 to 6
-RUN_LENGTHS = [13, 3, 3, 3, 3, 3, 3, 3, 3, 3, 8]  # column by column
+RUN_LENGTHS = [13, 3, 3, 3, 3, 3, 3, 3, 3, 3, 8]  # run lengths, column by column
 PACKED = coco.encode(np.asfortranarray(MASK.view(np.uint8)))["counts"].decode()
 CHAIR = COCO.index("chair")
 
@@ -36,7 +36,7 @@ def frame(index: int = 0, camera: Camera = CAMERA) -> Frame:
 
 
 def entry(**changes: Any) -> dict[str, Any]:
-    """Return one result; a value of None removes the key."""
+    """Return one result of a detection file. A value of None removes a key."""
     segmentation = {"size": [6, 8], "counts": PACKED}
     result = {"image_id": 0, "category_name": "chair", "segmentation": segmentation, "score": 0.6} | changes
     return {key: value for key, value in result.items() if value is not None}
@@ -57,15 +57,15 @@ def detected(folder: Path, *entries: Any, **parameters: Any) -> Detections:
     [
         {"size": [6, 8], "counts": PACKED},
         {"size": [6, 8], "counts": RUN_LENGTHS},
-        [[2, 1, 7, 1, 7, 4, 2, 4]],  # pixel borders, measured from the image corner
-        [[2, 1, 7, 1, 7, 3, 2, 3], [2, 3, 7, 3, 7, 4, 2, 4]],  # two parts
+        [[2, 1, 7, 1, 7, 4, 2, 4]],  # pixel borders, relative to the image corner
+        [[2, 1, 7, 1, 7, 3, 2, 3], [2, 3, 7, 3, 7, 4, 2, 4]],  # a polygon of two parts
     ],
     ids=["packed", "list", "polygon", "polygons"],
 )
 def test_precomputed_all_segmentation_formats_are_read(tmp_path: Path, segmentation: Any) -> None:
     found = detected(tmp_path, entry(segmentation=segmentation))
     np.testing.assert_array_equal(found.masks, MASK[None])
-    np.testing.assert_array_equal(found.boxes, [[2, 1, 6, 3]])  # without a bbox, the box of the mask
+    np.testing.assert_array_equal(found.boxes, [[2, 1, 6, 3]])  # without a bbox, the box of the mask is used
 
 
 @pytest.mark.parametrize("image_id", [12, "000012", "12", "color/000012.png", "frame/000012.color.png"[6:12]])
@@ -87,7 +87,7 @@ def test_precomputed_label_and_score_give_class_distribution(tmp_path: Path) -> 
 def test_precomputed_class_spread_sets_other_probabilities(
     tmp_path: Path, spread: float, score: float, own: float
 ) -> None:
-    """The label always remains the most likely class."""
+    """The label must remain the most likely class."""
     [row] = detected(tmp_path, entry(score=score), class_spread=spread).class_probabilities
     assert row[CHAIR] == pytest.approx(own)
     np.testing.assert_allclose(np.delete(row, CHAIR), (1 - own) / 79, rtol=1e-5, atol=1e-9)
@@ -113,7 +113,7 @@ def test_precomputed_partial_distribution_is_normalized(tmp_path: Path) -> None:
     ("ids", "labels", "category_id", "name"),
     [
         (CategoryIds.COCO_91, "coco", 1, "person"),
-        (CategoryIds.COCO_91, "coco", 62, "chair"),  # as in instances_val2017.json
+        (CategoryIds.COCO_91, "coco", 62, "chair"),  # like in instances_val2017.json
         (CategoryIds.COCO_91, "coco", 90, "toothbrush"),
         (CategoryIds.FROM_ONE, "coco", 57, "chair"),
         (CategoryIds.FROM_ZERO, "coco", 56, "chair"),
@@ -131,7 +131,7 @@ def test_precomputed_category_id_maps_to_label(
 def test_precomputed_foreign_labels_map_to_coco_or_are_dropped(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A wall is not an object: it is dropped and logged."""
+    """Detections of a wall are dropped and logged, because a wall is not an object."""
     entries = [entry(category_name="sofa", score=0.9), entry(category_name="wall", score=0.8)]
     with caplog.at_level(logging.INFO):
         found = detected(tmp_path, *entries, label_space="nyu40")
@@ -148,7 +148,7 @@ def test_precomputed_sorts_and_filters_detections_by_score(tmp_path: Path) -> No
     np.testing.assert_array_equal(found.boxes[:, 2] - found.boxes[:, 0], 1)
 
 
-# Output of framework.commands.running.detect
+# Output of the command `detect`
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_precomputed_detection_file_round_trip_is_exact(tmp_path: Path, detector
 
 
 def write_folder(folder: Path, ids: np.ndarray | None = None, listed: Any = None, name: str = "000003") -> Path:
-    """Write instance 7 as a chair over MASK, 300 as a tv in the corner, and an unlisted instance 9."""
+    """Write masks of a chair (7), a tv in the corner (300) and an instance that is not listed (9)."""
     image = np.where(MASK, 7, 0).astype(np.uint16)
     image[0, 0], image[5, 7] = 300, 9
     cv2.imwrite(str(folder / f"{name}.png"), image if ids is None else ids)

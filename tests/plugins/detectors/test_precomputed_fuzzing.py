@@ -1,6 +1,8 @@
-"""Fuzz tests of detection files: a file is used, or raises a one-line error.
+"""Fuzz tests for detection files. A file must be usable or raise a one-line error.
 
-`INSTANCEMAP_FUZZ=2000 pytest tests/plugins/detectors/test_precomputed_fuzzing.py` tries 2000 cases per format.
+The following command tries 2000 cases per format:
+
+    INSTANCEMAP_FUZZ=2000 pytest tests/plugins/detectors/test_precomputed_fuzzing.py
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ def use(path: Path) -> None:
 
 
 def use_folder(description: Path) -> None:
-    """Read the folder; errors name the file or the folder."""
+    """Read the folder. An error must name the file or the folder."""
     try:
         use(description.parent)
     except DataError as error:

@@ -1,4 +1,4 @@
-"""Tests of the simulated detector: without errors it is the ground truth; each error has its configured statistics."""
+"""Tests for the simulated detector and the statistics of its errors."""
 
 from dataclasses import replace
 
@@ -38,9 +38,9 @@ PERFECT = SimulatedDetector(
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 IDS = np.zeros((120, 160), np.int32)
 IDS[20:60, 20:60] = 5  # a chair
-IDS[20:60, 60:100] = 6  # a couch that touches it
+IDS[20:60, 60:100] = 6  # a couch that touches the chair
 IDS[70:90, 40:60] = 9  # a small cup
-IDS[80:120, 100:160] = 12  # a bed cut by the image corner
+IDS[80:120, 100:160] = 12  # a bed at the image corner
 IDS[0:10, 0:10] = 30  # an object without a class
 TRUTH = FrameTruth(IDS, {5: "chair", 6: "couch", 9: "cup", 12: "bed", 30: None})
 
@@ -90,7 +90,7 @@ def test_simulated_results_depend_on_seed_and_frame_not_order():
 
 
 def test_simulated_error_types_have_independent_random_streams():
-    """A higher miss rate only removes detections; the others are identical."""
+    """With a higher miss rate, the remaining detections are unchanged."""
     few = SimulatedDetector(miss_rate=0.0, false_positives=0, merge_rate=0)
     many = replace(few, miss_rate=0.5)
     for index in range(20):
@@ -156,7 +156,7 @@ def test_simulated_shift_and_border_noise_have_given_deviation():
     assert fields.mean() == pytest.approx(0, abs=0.05)
     assert fields.std(axis=0) == pytest.approx(1, abs=0.3)
     assert fields.std() == pytest.approx(1, abs=0.05)
-    # Blurring with sigma = scale gives a correlation of exp(-d^2 / (4 scale^2)) at distance d.
+    # after blurring with sigma = scale, the correlation at distance d is exp(-d^2 / (4 scale^2))
     for distance in (1, 12, 24):
         correlation = np.mean(fields[:, :, distance:] * fields[:, :, :-distance]) / fields.var()
         assert correlation == pytest.approx(np.exp(-((distance / 24) ** 2)), abs=0.08)
@@ -178,7 +178,7 @@ def test_simulated_coarse_mask_grid_keeps_square_and_blurs_comb():
     assert np.mean(mask != (comb == 5)) > 0.2
 
 
-def test_confusion_kernel_is_normalized_and_favors_similar_classes():
+def test_confusion_kernel_is_larger_for_similar_classes():
     kernel = confusion_kernel(COCO, 0.25)
     np.testing.assert_allclose(kernel.sum(axis=1), 1)
     np.testing.assert_allclose(np.diag(kernel), 0.75)
@@ -189,7 +189,7 @@ def test_confusion_kernel_is_normalized_and_favors_similar_classes():
 
 
 def distributions(detector, frames):
-    """Return the class distributions (frames, classes) of the couch, found by its position."""
+    """Return the class distributions (frames, classes) of the couch, which is identified by its position."""
     rows = []
     for k in range(frames):
         detections = detector.detect(frame(k))
@@ -255,7 +255,7 @@ def test_simulated_attached_neighbor_is_same_in_all_frames():
         taken.append(masks[0][30, 70])
     assert np.mean(taken) == pytest.approx(0.3, abs=0.09)
     large = THING.copy()
-    large[20:120, 60:160] = 31  # more than twice as large as the chair
+    large[20:120, 60:160] = 31  # an object of more than twice the size of the chair
     alone = replace(PERFECT, attach_rate=1.0).detect(replace(frame(), truth=FrameTruth(large, ROOM.class_names)))
     np.testing.assert_array_equal(alone.masks[0], large == 5)
 
@@ -286,7 +286,7 @@ def test_simulated_miss_spread_varies_miss_rate_between_objects():
     assert even.mean() == pytest.approx(0.5, abs=0.05)
     assert uneven.mean() == pytest.approx(0.5, abs=0.13)
     assert ((even > 0.1) & (even < 0.9)).all()
-    # 27 % of a normal distribution with deviation 2 is outside +-2.2, where the rates are below 10 % or above 90 %
+    # rates below 10 % or above 90 % correspond to logits outside +-2.2: 27 % of a normal distribution with deviation 2
     assert ((uneven < 0.1) | (uneven > 0.9)).mean() == pytest.approx(0.27, abs=0.15)
 
 
@@ -344,7 +344,7 @@ def test_simulated_ellipse_matches_reference(place):
     v, u = np.ogrid[:120, :160]
     for seed, (a, b) in enumerate(((12.0, 80.0), (40.5, 13.0), (79.0, 80.0))):
         wobble = smooth_field(np.random.default_rng(seed), (120, 160), 12.0) * np.float32(0.4)
-        for field in (wobble, wobble + np.float32(3)):  # the latter gives an empty ellipse
+        for field in (wobble, wobble + np.float32(3)):  # the second size gives an empty ellipse
             expected = np.hypot((u - x) / a, (v - y) / b) + field < 1
             np.testing.assert_array_equal(ellipse(x, y, a, b, field), expected)
 

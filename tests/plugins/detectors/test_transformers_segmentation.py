@@ -1,4 +1,4 @@
-"""Tests of the transformers detector on random tiny networks of each family, compared with reference decoders."""
+"""Tests for the transformers detector, with a random tiny network of each family and reference decoders."""
 
 import json
 import math
@@ -29,7 +29,7 @@ from tests.support.networks.tiny_transformers import FIXED, LABELS, MODELS, writ
 transformers = pytest.importorskip("transformers")
 
 CLASSES = ("chair", "couch", "tv")
-MEANING = {0: 0, 2: 1, 3: 0, 4: 2}  # label -> index in CLASSES
+MEANING = {0: 0, 2: 1, 3: 0, 4: 2}  # index in CLASSES of each label
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
 
@@ -71,7 +71,7 @@ def test_transformers_tiny_networks_return_detections(detector):
 
 
 def slow_decoding(detector, kind, image, threshold):
-    """Return (score, mask, class distribution) of each query, the best first, before suppression."""
+    """Return the score, mask and class distribution of each query before suppression, the best one first."""
     pixels, (down, right) = detector._preprocessing(image.color, torch.device("cpu"))
     output = detector._network(pixel_values=pixels)
     instance = "masks_queries_logits" not in output
@@ -113,15 +113,15 @@ def test_transformers_decoding_matches_reference(folders, kind):
     assert len(expected) > 1
     np.testing.assert_allclose(found.scores, [score for score, _, _ in expected], rtol=1e-4)
     np.testing.assert_allclose(found.class_probabilities, [row for _, _, row in expected], atol=1e-5)
-    if kind != "rf_detr":  # the reference decodes at the network's size, which differs for rf_detr
+    if kind != "rf_detr":  # the reference decodes at the size of the network, which differs for rf_detr
         assert np.mean(found.masks == np.array([mask for _, mask, _ in expected])) > 0.999
 
 
 def test_transformers_decoding_agrees_with_mask2former(folders):
-    """The best label of each query has the same mask and score."""
+    """The masks and scores of the best label of each query are compared."""
     from transformers import Mask2FormerImageProcessorPil
 
-    camera = Camera(384, 384, 300.0, 300.0, 191.5, 191.5)  # the size at which Mask2Former always decodes
+    camera = Camera(384, 384, 300.0, 300.0, 191.5, 191.5)  # the size at which Mask2Former decodes
     image = frame(2, camera)
     folder = folders["mask2former"]
     detector = built(folder, score_threshold=0.05, agnostic_nms_iou=1.0, short_side=384, long_side=384)
@@ -149,7 +149,7 @@ def test_transformers_decoding_agrees_with_mask2former(folders):
 def test_transformers_decoding_matches_eomt_processor(folders):
     from transformers import EomtImageProcessorPil
 
-    image = frame(3, CAMERA)  # 48 rows are padded to 64 at the bottom
+    image = frame(3, CAMERA)  # 48 rows are padded at the bottom to 64 rows
     detector = built(folders["eomt"], score_threshold=0.03, agnostic_nms_iou=1.0)
     processor = EomtImageProcessorPil(size={"shortest_edge": 64, "longest_edge": 64}, do_pad=True)
     with torch.inference_mode():
@@ -181,14 +181,14 @@ def test_transformers_decoding_matches_eomt_processor(folders):
     ],
 )
 def test_transformers_preprocessing_agrees_with_library(name, numbers, shape):
-    # Bicubic resampling of these values stays within 0 to 255.
+    # bicubic resampling of these values stays within 0 to 255
     color = np.random.default_rng(0).integers(64, 192, (*shape, 3), np.uint8)
     processor = getattr(transformers, name)(**numbers)
     expected = processor(images=color, return_tensors="pt")["pixel_values"][0].numpy()
     content = {"image_processor_type": name, **numbers}
     pixels, _ = Preprocessing.parse(content, "here")(color, torch.device("cpu"))
     assert pixels.shape[1:] == expected.shape
-    # the library quantizes to 8 bits after resizing
+    # the library rounds to 8 bits after resizing
     np.testing.assert_allclose(pixels[0].numpy(), expected, atol=2 / 255 / 0.2)
     assert np.abs(pixels[0].numpy() - expected).mean() < 0.6 / 255 / 0.2
 
@@ -277,7 +277,7 @@ def one_line(caught):
 
 
 @pytest.mark.parametrize("variable", ["HF_HUB_OFFLINE", "INSTANCEMAP_OFFLINE"])
-def test_transformers_missing_model_offline_raises_with_advice(monkeypatch, variable):
+def test_transformers_missing_model_offline_error_has_fix(monkeypatch, variable):
     monkeypatch.delenv("INSTANCEMAP_OFFLINE", raising=False)
     monkeypatch.setenv(variable, "1")
     with pytest.raises(
@@ -289,7 +289,7 @@ def test_transformers_missing_model_offline_raises_with_advice(monkeypatch, vari
 
 
 def coco_rf_detr(folder, names):
-    """Return a tiny RF-DETR-Seg with a COCO head, whose config names the classes `names`."""
+    """Return a tiny RF-DETR-Seg with a COCO head. The config contains the class names `names`."""
     write_network(folder, "rf_detr", names)
     return built(folder, score_threshold=0.02, agnostic_nms_iou=1.0)
 
@@ -299,7 +299,7 @@ IN_A_ROW = {**dict(enumerate(COCO)), **dict.fromkeys(range(80, 91), "N/A")}
 
 @pytest.mark.parametrize("names", [dict(enumerate(COCO_BY_ID)), {k: f"LABEL_{k}" for k in range(91)}, IN_A_ROW])
 def test_transformers_rf_detr_uses_coco_91_ids(tmp_path, names):
-    """As in a test of transformers, class 17 is the cat and class 75 the remote."""
+    """For example, class 17 is cat and class 75 is remote."""
     detector = coco_rf_detr(tmp_path, names)
     assert detector.classes == COCO
     labels = Checkpoint(str(tmp_path), "main").labels
@@ -344,7 +344,7 @@ def test_transformers_missing_package_error_names_extra(monkeypatch):
 
 @pytest.fixture
 def copy(folders, tmp_path):
-    """Return a copy of the mask2former folder, and a function that changes its JSON files."""
+    """Return a copy of the mask2former folder and a function that changes its JSON files."""
     for file in folders["mask2former"].iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
 

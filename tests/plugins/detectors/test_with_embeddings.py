@@ -1,4 +1,4 @@
-"""Tests of detections with embeddings of random CLIP and SigLIP models, compared with transformers."""
+"""Tests for detections with embeddings. The models are random CLIP and SigLIP models."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def siglip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Blocks(Detector):
-    """Detector of three squares of 40x40, 30x30 and 10x10 px."""
+    """Detector of three squares with sides of 40, 30 and 10 px."""
 
     classes = ("chair", "bed")
 
@@ -99,7 +99,7 @@ def test_with_embeddings_frame_interval_sets_embedded_frames(siglip: Path) -> No
 
 
 def test_with_embeddings_contrast_controls_background(siglip: Path) -> None:
-    """With contrast 0, only the object affects the embedding; with contrast 1, the background affects it, too."""
+    """With contrast 1, the background affects the embedding. With contrast 0, only the object does."""
     plain, other = picture(), picture()
     inside = Blocks().detect(plain).masks[0]
     other.color[~inside] = 255 - other.color[~inside]

@@ -1,4 +1,4 @@
-"""Tests of association and of the instance table in all fusers that use them, on spheres with exact masks."""
+"""Tests for association and the instance table in all fusers that use them."""
 
 import dataclasses
 from collections.abc import Callable
@@ -56,9 +56,9 @@ def test_fuser_weak_detection_creates_no_instance(new_fuser: NewFuser, frames: l
     ("parameters", "updates"),
     [
         ({}, True),
-        ({"overlap_rule": OverlapRule.IOU}, False),  # the IoU of a part is small
+        ({"overlap_rule": OverlapRule.IOU}, False),  # the IoU of a part is low
         ({"min_class_agreement": 0.9}, True),
-        ({"min_class_agreement": 1.0}, False),  # the class floor prevents complete agreement
+        ({"min_class_agreement": 1.0}, False),  # the floor of the class probabilities prevents complete agreement
     ],
 )
 def test_fuser_match_requires_overlap_and_class_agreement(
@@ -73,8 +73,8 @@ def test_fuser_match_requires_overlap_and_class_agreement(
     assert (len(fuser.scene.table.records) == 1) == updates
 
 
-def test_fuser_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
-    """A detector splits an object at first and detects it as a whole later."""
+def test_fuser_split_instance_is_merged_by_complete_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    """First, the object is detected in two parts, and later as a whole."""
     fuser = new_fuser()
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
@@ -91,12 +91,12 @@ def test_fuser_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frame
 
 @pytest.mark.parametrize(
     ("fuser_class", "merge_frames"),
-    [(BayesianTsdf, 3), (Open3DVoxelBlockGrid, 1)],  # unweighted votes relabel voxels sooner
+    [(BayesianTsdf, 3), (Open3DVoxelBlockGrid, 1)],  # with unweighted votes, voxels are relabeled earlier
 )
 def test_fuser_merges_instances_covered_by_one_cluster(
     fuser_class: type[MapFuser], merge_frames: int, frames: list[Frame]
 ) -> None:
-    """The detections of the whole object have low scores and would relabel the voxels of the other half slowly."""
+    """The scores of the complete masks are so low that the voxels are relabeled slowly."""
     fuser = assemble(fuser_class, voxel_size=0.02, max_depth=4.0, merge_overlap=0.5, merge_frames=merge_frames)
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
@@ -126,7 +126,7 @@ def test_fuser_merges_instances_covered_by_one_cluster(
 def test_fuser_merges_supported_object_only_if_classes_agree(
     merge_agreement: float, agrees: bool, merged: bool, frames: list[Frame]
 ) -> None:
-    """The mask of the table also covers the object on it; a part of the table is merged."""
+    """The mask of the table also covers the object on the table."""
     fuser = assemble(
         BayesianTsdf,
         voxel_size=0.02,
@@ -189,7 +189,7 @@ def test_fuser_different_label_space_raises(new_fuser: NewFuser, frames: list[Fr
         fuser.fuse(frames[1], Pose(np.eye(4)), clusters)
 
 
-def test_fuser_empty_scene_leaves_map_unchanged(new_fuser: NewFuser) -> None:
+def test_fuser_empty_frame_keeps_map_unchanged(new_fuser: NewFuser) -> None:
     fuser = new_fuser()
     frame = Scene().frame(np.eye(4))
     fuse_masks(fuser, frame, [np.ones(CAMERA.shape, np.bool_)], [0.9])
@@ -198,7 +198,7 @@ def test_fuser_empty_scene_leaves_map_unchanged(new_fuser: NewFuser) -> None:
 
 
 def test_fuser_instance_with_few_visible_pixels_is_not_counted(new_fuser: NewFuser, frames: list[Frame]) -> None:
-    """Frames that show only a small part of an instance do not decrease its confidence."""
+    """If only a small part of the instance is visible, its confidence must not decrease."""
     fuser = new_fuser(create_points=50)
     mask = masks_of(frames[0])[0]
     fuse_masks(fuser, frames[0], [mask], [0.9])
@@ -259,9 +259,9 @@ def test_fuser_floored_distribution_is_positive_and_normalized() -> None:
 def test_fuser_supported_object_keeps_voxels_under_larger_mask(
     support_overlap: float, same_class: bool, keeps: bool, frames: list[Frame]
 ) -> None:
-    """The object is confirmed; later only the desk is detected, with a mask that covers the object.
+    """The object is confirmed. After that, only the desk is detected, and the mask of the desk covers the object.
 
-    An object of the same class is a part of the desk and is merged.
+    An object of the same class is part of the desk and is merged.
     """
     fuser = assemble(
         BayesianTsdf,

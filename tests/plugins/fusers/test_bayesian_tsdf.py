@@ -1,4 +1,4 @@
-"""Tests of fuser=bayesian_tsdf: map limits, evidence rows, and independence of the thread count."""
+"""Tests for fuser=bayesian_tsdf."""
 
 import dataclasses
 
@@ -72,14 +72,14 @@ def test_bayesian_tsdf_only_created_instances_allocate_rows(frames: list[Frame])
 def test_bayesian_tsdf_small_object_keeps_voxels_by_area_ratio(
     frames: list[Frame], on_top: float, of_the_book: bool
 ) -> None:
-    """The book is missed in half of the frames, and the mask of the couch always covers it."""
+    """The book is detected in every other frame. The mask of the couch always covers the book."""
     fuser = new_fuser(occlusion_area_ratio=on_top)
     couch = masks_of(frames[0])[0]
     v, u = np.nonzero(couch)
     rows, columns = np.ogrid[: couch.shape[0], : couch.shape[1]]
     side = np.sqrt(len(u)) / 4
     book = couch & (np.abs(rows - np.median(v)) < side / 2) & (np.abs(columns - np.median(u)) < side / 2)
-    fuse_masks(fuser, frames[0], [couch & ~book, book], [0.9, 0.4])  # creates an instance, which later masks match
+    fuse_masks(fuser, frames[0], [couch & ~book, book], [0.9, 0.4])  # creates the instances that later masks match
     for k in range(1, 9):
         frame = dataclasses.replace(frames[0], index=k)
         fuse_masks(fuser, frame, [couch, book] if k % 2 else [couch], [0.6, 0.5][: 1 + k % 2])

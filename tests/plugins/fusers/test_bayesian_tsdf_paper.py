@@ -1,4 +1,4 @@
-"""Tests of the fuser of preset=paper, compared with slow float64 references."""
+"""Tests for the fuser of preset=paper, compared with slow references in float64."""
 
 import dataclasses
 from pathlib import Path
@@ -24,7 +24,7 @@ PROBABILITIES = [(0.8, 0.2), (0.35, 0.65), (0.5, 0.5)]
 
 
 def paper_fuser(*overrides: str) -> BayesianTsdf:
-    """Return fuser=bayesian_tsdf_paper with a voxel size for the small camera."""
+    """Return fuser=bayesian_tsdf_paper with a voxel size for the small test camera."""
     fuser = built("fuser", "bayesian_tsdf_paper", f"fuser.voxel_size={VOXEL}", "fuser.max_depth=4", *overrides)
     assert isinstance(fuser, BayesianTsdf)
     return fuser
@@ -39,7 +39,7 @@ def frames() -> list[Frame]:
 
 
 def slow_matches(fuser: BayesianTsdf, frame: Frame, clusters: PointClusters) -> list[int]:
-    """Return the instance of each cluster, 0 = new or none, by comparing whole masks with the ray-cast view."""
+    """Return the instance of each cluster, 0 = new or none. Complete masks are compared with the ray-cast view."""
     assert frame.T_world_camera is not None
     seen = fuser.scene.render(frame.camera, frame.T_world_camera).instance_ids
     ids = sorted(set(np.unique(seen).tolist()) - {0})
@@ -78,8 +78,8 @@ def test_paper_fuser_association_agrees_with_slow_reference(frames: list[Frame])
 
 
 @pytest.mark.parametrize(("source", "found"), [("RAYCAST", True), ("SURFACE_LOOKUP", False)])
-def test_paper_fuser_new_surface_votes_for_instance_behind(source: str, found: bool) -> None:
-    """A new sphere occludes the mapped sphere, so its depth is less than that of the mapped surface."""
+def test_paper_fuser_new_surface_votes_for_occluded_instance(source: str, found: bool) -> None:
+    """A new sphere appears in front of the mapped sphere."""
     behind, front = (Scene([(np.array([0.0, 0.0, -1.0]), -2.5)], [(np.array([0.0, 0.0, z]), 0.35)]) for z in (2.0, 1.6))
     fuser = paper_fuser(f"fuser.association={source}")
     fuse_masks(fuser, behind.frame(pose(), 0), masks_of(behind.frame(pose(), 0)), [0.9])
@@ -93,7 +93,7 @@ def test_paper_fuser_new_surface_votes_for_instance_behind(source: str, found: b
 
 @dataclasses.dataclass
 class RecordedMatches:
-    """Points and matches of every frame that a fuser has fused."""
+    """Points and matches of all frames that a fuser has fused."""
 
     points: list[PixelLists]
     matches: list[Matches]
@@ -113,7 +113,7 @@ def recorded(fuser: BayesianTsdf, monkeypatch: pytest.MonkeyPatch) -> RecordedMa
 
 
 def labeled_voxels(scene: InstanceMap) -> tuple[Int32, Float64]:
-    """Return the indices (L,) of the labeled voxels and their positions (L, 3), m."""
+    """Return the indices (L,) and the positions (L, 3), m, of the labeled voxels."""
     grid, labels = scene.volume.voxels.grid, scene.labels
     blocks = np.flatnonzero(grid.label_row[: scene.volume.voxels.block_count] >= 0)
     labeled = labels.evidence.labeled[grid.label_row[blocks]]
@@ -125,9 +125,9 @@ def labeled_voxels(scene: InstanceMap) -> tuple[Int32, Float64]:
 def slow_distributions(
     fuser: BayesianTsdf, frame: Frame, position: Float64, masks: list[list[Bool]], matches: list[Matches]
 ) -> tuple[Float64, Float64] | None:
-    """Return the class and instance distributions of a voxel, by eqs. (6) to (8) in float64; instance 0 = none.
+    """Return the class and instance distributions of a voxel by eqs. (6) to (8), where instance 0 = none.
 
-    Return None if rounding determines which pixel sees the voxel, or that the voxel is near the surface.
+    The result is None if it depends on rounding.
     """
     assert frame.T_world_camera is not None
     x, y, z = (inverse(frame.T_world_camera) @ [*position, 1.0])[:3]
@@ -166,7 +166,8 @@ def test_paper_fuser_recursions_agree_with_slow_reference(
     found, frame, seen = recorded(fuser, monkeypatch), frames[0], []
     for k in range(4):
         whole = masks_of(frame)
-        masks = [whole[0] | whole[1], np.roll(whole[1], k, axis=0), whole[2]]  # two overlap; the last one is too weak
+        # two masks overlap, and the score of the last one is too low
+        masks = [whole[0] | whole[1], np.roll(whole[1], k, axis=0), whole[2]]
         seen.append(masks)
         fuse_masks(fuser, dataclasses.replace(frame, index=k), masks, SCORES, PROBABILITIES)
     assert any((matches.instance_ids == 0).any() for matches in found.matches), "expected an unmatched mask"
@@ -261,7 +262,7 @@ def test_paper_fuser_unmatched_masks_update_classes_only_if_set(frames: list[Fra
 
 
 def test_paper_fuser_pixels_of_all_masks_are_listed(frames: list[Frame]) -> None:
-    """In the paper, every mask is a separate update, so all overlapping masks count."""
+    """In the paper, each mask is a separate update."""
     fuser = paper_fuser()
     whole, small = masks_of(frames[0])[0], masks_of(frames[0])[0].copy()
     small[:, : int(np.median(np.nonzero(whole)[1]))] = False

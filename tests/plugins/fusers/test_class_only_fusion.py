@@ -1,4 +1,4 @@
-"""Tests of class-only fusion on analytic scenes, compared with a float64 recursion per voxel."""
+"""Tests for class-only fusion, compared with a recursion per voxel in float64."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def new_fuser(**parameters: object) -> ClassOnlyFusion:
 
 
 def mapped_boxes(boxes: list[box_scene.Box], class_ids: list[int]) -> SemanticMap:
-    """Map boxes on the floor from all views with their true masks.
+    """Map boxes on the floor from all views with true masks.
 
-    A box side with few visible pixels is a separate component, which `min_area` excludes.
+    A side of a box with few visible pixels is a separate component, which `min_area` excludes.
     """
     scene, fuser = BoxScene([[box] for box in boxes]), new_fuser(min_area=0.03)
     for k, T in enumerate(VIEWS):
@@ -54,7 +54,10 @@ def frames() -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def mapped(frames: list[Frame]) -> SemanticMap:
-    """Map three spheres: the first is detected in all frames, the second in three, the third in none."""
+    """Map three spheres.
+
+    The first one is detected in all frames, the second one in three, and the third one in none.
+    """
     fuser = new_fuser()
     for k, frame in enumerate(frames):
         found = 1 + (k in SECOND_FOUND)
@@ -101,7 +104,7 @@ def test_class_only_single_false_detection_is_removed(frames: list[Frame], when:
     assert (class_ids >= 0).sum() < 0.01 * masks_of(frames[5])[0].sum(), "expected only points at the silhouette"
 
 
-def test_class_only_missed_1_ignores_unmasked_frames(frames: list[Frame]) -> None:
+def test_class_only_missed_of_one_ignores_unmasked_frames(frames: list[Frame]) -> None:
     fuser = new_fuser(missed=1.0)
     for k, frame in enumerate(frames):
         found = [masks_of(frame)[0]] if k == 0 else []
@@ -123,7 +126,7 @@ def test_class_only_instance_below_min_area_is_excluded(frames: list[Frame]) -> 
 
 
 def test_class_only_voxel_evidence_matches_reference(mapped: SemanticMap, frames: list[Frame]) -> None:
-    """The reference is eq. (7) over the classes and the background, with the voxel projected into each frame."""
+    """The reference is eq. (7) over the classes and the background, for each frame in which the voxel is visible."""
     grid, evidence, fuser = mapped.volume.voxels.grid, mapped.labels.evidence, new_fuser()
     rows = np.flatnonzero(grid.label_row[: mapped.volume.voxels.block_count] >= 0)
     rng = np.random.default_rng(0)
@@ -206,7 +209,7 @@ def test_class_only_detected_spheres_are_instances(mapped: SemanticMap) -> None:
 
 
 def test_class_only_score_is_probability_of_best_class(frames: list[Frame]) -> None:
-    """The best class has probability 0.7. The background has more than 1/2 for score 0.33, and 1/7 for score 0.6."""
+    """The probability of the best class is 0.7, so the background wins with score 0.33 but not with 0.6."""
     for score, label in ((0.33, -1), (0.6, 0)):
         fuser = new_fuser()
         fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [score])
@@ -251,7 +254,7 @@ def test_class_only_loaded_map_can_be_extended(frames: list[Frame], tmp_path: Pa
         if k == 2:
             resumed.scene.save(tmp_path / "map.npz")
             resumed.scene = SemanticMap.load(tmp_path / "map.npz")
-            resumed.scene.volume.integrator.frames = k  # the rounding of averages depends on it
+            resumed.scene.volume.integrator.frames = k  # the rounding of averages depends on the frame number
         for fuser in (whole, resumed):
             fuse_masks(fuser, frame, masks_of(frame), [0.6, 0.5, 0.4])
     ours, theirs = whole.scene.labels.saved(), resumed.scene.labels.saved()
@@ -294,7 +297,7 @@ def with_smoothness(mapped: SemanticMap, tmp_path: Path, smoothness: float) -> S
 
 
 def slowly_smoothed(scene: SemanticMap, smoothness: float) -> Int32:
-    """Return the class ids (V,) after iterated conditional modes, vertex by vertex in float64."""
+    """Return the class ids (V,) after iterated conditional modes, computed vertex by vertex in float64."""
     surface, grid, evidence = scene.volume.surface(), scene.volume.voxels.grid, scene.labels.evidence
     class_ids = scene.mesh().class_ids.tolist()
     neighbors: list[set[int]] = [set() for _ in class_ids]

@@ -1,4 +1,4 @@
-"""Tests of the label rules of the fusers on three detections of one object."""
+"""Tests for the label rules of the fusers, with three detections of one object."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_fuser_class_probabilities_match_label_rule(
     [instance] = fuser.scene.instances().values()
     assert np.allclose(instance.class_probabilities, expected, atol=1e-5)
     assert (instance.first_frame, instance.last_frame) == (0, 2)
-    # the voxels agree with the table, although each is visible in only some of the frames
+    # voxels and table agree, although each voxel is visible in only some of the frames
     view = fuser.scene.render(CAMERA, walk(3)[1])
     classes = view.class_ids[view.instance_ids == instance.id]
     assert np.bincount(classes).argmax() == np.argmax(expected)

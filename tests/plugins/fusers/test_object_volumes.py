@@ -1,4 +1,4 @@
-"""Tests of the baseline with one volume per object, on boxes with exact depth and masks."""
+"""Tests for the baseline with one volume per object."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def new_fuser(**parameters: object) -> ObjectVolumes:
 
 
 def pan(width: float) -> list[Frame]:
-    """Return ten views of both boxes from a camera that moves by `width` m."""
+    """Return ten views of both boxes. The camera moves by `width` m."""
     places = np.linspace(-width / 2, width / 2, 10)
     return [BOXES.frame(look_from(x, -1.4, 1.5, (0.0, 0.6, 0.2)), k) for k, x in enumerate(places)]
 
@@ -80,8 +80,8 @@ def test_object_volumes_each_box_is_one_instance(mapped: ObjectVolumes) -> None:
         assert (owners == key).sum() > 300
 
 
-def test_object_volumes_label_whole_object_surface(mapped: ObjectVolumes) -> None:
-    """Without labels on the background, the vertex nearest to half of the true points would be unlabeled."""
+def test_object_volumes_label_complete_object_surface(mapped: ObjectVolumes) -> None:
+    """The surface of the background also needs labels, because half of the true points are nearest to its vertices."""
     mesh = mapped.scene.mesh()
     owners = BOXES.owners(mesh.vertices.astype(np.float64), VOXEL / 4)
     for key in (1, 2):
@@ -101,20 +101,20 @@ def test_object_volumes_statistics_include_all_volumes(mapped: ObjectVolumes) ->
     scene = mapped.scene
     objects = sum(volume.block_count for volume in scene.volumes.values())
     assert scene.statistics.voxels == 512 * (scene.background.voxels.block_count + objects)
-    per_object_voxel = 8 + 4  # bytes per voxel: grid and two counts
+    per_object_voxel = 8 + 4  # bytes per voxel for the grid and two counts
     assert scene.statistics.bytes > 8 * 512 * scene.background.voxels.block_count + per_object_voxel * 512 * objects
     assert 0 < objects < scene.background.voxels.block_count
 
 
 def room_fraction(fuser: ObjectVolumes) -> float:
-    """Return the fraction of the first object's vertices that are within a voxel of the room, but not of a box."""
+    """Return the fraction of the first object's vertices that lie on the surface of the room."""
     mesh = fuser.scene.mesh()
     points = mesh.vertices[mesh.instance_ids == 1].astype(np.float64)
     return float((BOXES.owners(points, VOXEL) == 0).mean())
 
 
-def test_object_volumes_remove_single_but_not_constant_bleed() -> None:
-    """The camera moves only a little, so with constant bleed, the mask always covers the same voxels."""
+def test_object_volumes_remove_only_temporary_mask_bleed() -> None:
+    """With constant bleed and little camera motion, the mask covers the same voxels in all frames."""
     once, always = new_fuser(), new_fuser()
     for k, frame in enumerate(pan(0.1)):
         mask = masks_of(frame)[0]
@@ -125,7 +125,7 @@ def test_object_volumes_remove_single_but_not_constant_bleed() -> None:
 
 
 def test_object_volumes_remove_bled_voxels_after_unmasked_view(frames: list[Frame]) -> None:
-    """The foreground distribution is Beta(2, 1), then Beta(2, 2), whose mean is not above 1/2."""
+    """After two frames, the foreground probability is Beta(2, 2) with mean 1/2, which is not sufficient."""
     frame, fuser = frames[0], new_fuser(min_observations=1)
     mask = masks_of(frame)[0]
     fuse(fuser, frame, [bled(mask, 12)])
@@ -147,7 +147,7 @@ def test_object_volumes_change_only_when_detected(frames: list[Frame]) -> None:
 
 
 def part_of(mask: np.ndarray, share: float) -> np.ndarray:
-    """Return the first `share` of a mask's pixels, row by row."""
+    """Return the first pixels of a mask, row by row. `share` is their fraction."""
     v, u = np.nonzero(mask)
     part = np.zeros_like(mask)
     part[v[: round(share * len(v))], u[: round(share * len(v))]] = True
@@ -160,7 +160,7 @@ def part_of(mask: np.ndarray, share: float) -> np.ndarray:
         ({}, 0.25, 0, True),  # IoU 0.25 > 0.2
         ({}, 0.15, 0, False),
         ({}, 0.25, 1, True),
-        (MASK_FUSION, 0.15, 0, True),  # all of the detection lies on the object
+        (MASK_FUSION, 0.15, 0, True),  # the whole detection is on the object
         (MASK_FUSION, 0.15, 1, False),  # of another class
     ],
 )
@@ -229,7 +229,7 @@ def test_object_volumes_probabilities_are_mean_of_detections(frames: list[Frame]
 
 
 def test_object_volumes_unconfirmed_object_in_view_is_removed(frames: list[Frame]) -> None:
-    """After 1 detection and n misses, the probability of existence is 2 / (3 + n), below 0.1 for n >= 18."""
+    """After one detection and n misses, the probability of existence is 2 / (3 + n). At n = 18, it is below 0.1."""
     frame, fuser = frames[0], new_fuser(min_observations=1)
     wall = np.zeros(CAMERA.shape, np.bool_)
     wall[10:50, 100:180] = True
@@ -276,7 +276,7 @@ def test_object_volumes_incremental_mesh_equals_loaded_mesh(frames: list[Frame],
 
 
 def test_object_volumes_keep_surfaces_of_overlapping_objects(frames: list[Frame]) -> None:
-    """The first mask covers the whole object, and the second mask a small part, which the IoU rule does not match."""
+    """The second mask covers a small part of the first object, so that its IoU is too low for a match."""
     fuser = new_fuser(min_observations=1)
     whole = masks_of(frames[0])[0]
     for k, mask in enumerate([whole, part_of(whole, 0.15)]):

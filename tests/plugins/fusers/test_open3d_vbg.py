@@ -1,4 +1,4 @@
-"""Tests of Open3D's voxel blocks as a fuser: votes, surfaces and storage, on exact scenes."""
+"""Tests for fuser=open3d_vbg, which uses the voxel block grid of Open3D."""
 
 import dataclasses
 from pathlib import Path
@@ -60,7 +60,7 @@ def one_view(**changes: float) -> tuple[Open3DMap, Frame]:
 
 
 def majority(votes: list[int]) -> tuple[int, int]:
-    """Return the candidate and the counter of the Boyer-Moore majority vote."""
+    """Return the candidate and the counter of the majority vote by Boyer and Moore."""
     candidate = count = 0
     for vote in votes:
         if vote == candidate:
@@ -85,7 +85,7 @@ def test_open3d_vbg_voxel_votes_match_boyer_moore(votes: list[int]) -> None:
 
 
 def voxel_centers(scene: Open3DMap) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices (N,) and positions (N, 3), m, of all voxels, computed block by block."""
+    """Return the indices (N,) and positions (N, 3), m, of all voxels."""
     r, size = scene.grid.settings.block_resolution, scene.grid.settings.voxel_size
     hashmap = scene.grid.blocks.hashmap()
     z, y, x = np.mgrid[:r, :r, :r].reshape(3, -1)
@@ -135,7 +135,10 @@ def test_open3d_vbg_shared_pixels_vote_for_higher_score(frames: list[Frame], sco
 
 @pytest.mark.parametrize("rotvec", [(0.0, 0.0, 0.0), (0.1, 0.5, 0.0), (-0.2, -0.4, 0.3)])
 def test_open3d_vbg_rendered_surface_is_accurate(rotvec: tuple[float, float, float]) -> None:
-    """Open3D's rays end 12 mm too far, and its depth lookup is off by half a pixel; both are corrected."""
+    """The rays of Open3D end 12 mm too far, and depth is read with an offset of half a pixel.
+
+    Both must be corrected.
+    """
     scene, T = Open3DMap(SETTINGS, CONFIRMATION), pose(rotvec=rotvec)
     walls = Scene(planes=[(np.array([-0.3, 0.1, -1.0]) / np.sqrt(1.1), -1.777)], spheres=room().spheres)
     for _ in range(3):
@@ -150,7 +153,7 @@ def test_open3d_vbg_rendered_surface_is_accurate(rotvec: tuple[float, float, flo
     assert np.median(np.abs(error)) < 0.002
     assert np.median(np.abs(view.color[wall].astype(int) - color[wall])) <= 3
     normal = view.normals_world[wall] @ walls.planes[0][0]
-    assert np.median(normal) > 0.95  # one view and nearest-neighbor depth: the field has steps
+    assert np.median(normal) > 0.95  # with one view and nearest-neighbor depth, the field has steps
     assert np.quantile(normal, 0.1) > 0.8
     near = scene.render_near(CAMERA, elsewhere, depth)
     assert np.array_equal(near.depth, view.depth)
@@ -162,7 +165,7 @@ def test_open3d_vbg_mesh_is_accurate_and_repeatable(mapped: Open3DMap, frames: l
     assert np.median(distance) < 0.1 * 0.02
     assert np.quantile(distance, 0.95) < 0.5 * 0.02
     a, b, c = (mesh.vertices[mesh.triangles[:, i]].astype(np.float64) for i in range(3))
-    towards = np.einsum("ij,ij->i", np.cross(b - a, c - a), -a)  # the camera stayed near the origin
+    towards = np.einsum("ij,ij->i", np.cross(b - a, c - a), -a)  # the camera is near the origin
     assert (towards > 0).mean() > 0.98
     again = Open3DMap(mapped.grid.settings, CONFIRMATION)
     for frame in frames:
@@ -189,7 +192,7 @@ def test_open3d_vbg_min_weight_applies_after_first_frames() -> None:
 
 
 def test_open3d_vbg_low_resolution_image_leaves_no_holes() -> None:
-    """Open3D allocates blocks only at every 4th pixel, which are 12 cm apart here; blocks are 8 cm wide."""
+    """Open3D allocates blocks only at every 4th pixel. Here, 4 pixels are 12 cm, but blocks are 8 cm wide."""
     coarse = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
     scene = Open3DMap(dataclasses.replace(SETTINGS, voxel_size=0.01), CONFIRMATION)
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.2)])
@@ -199,7 +202,7 @@ def test_open3d_vbg_low_resolution_image_leaves_no_holes() -> None:
 
 
 def test_open3d_vbg_close_view_is_complete_without_output(mapped: Open3DMap, capfd: pytest.CaptureFixture[str]) -> None:
-    """Open3D sizes its range map for the first view; in a larger view it would print a warning and leave holes."""
+    """Open3D allocates its range map for the first view. In a larger view, it prints a warning and leaves holes."""
     scene = Open3DMap(mapped.grid.settings, CONFIRMATION)
     for T in walk(3):
         scene.integrate(room().frame(T), T)
@@ -301,7 +304,7 @@ def test_open3d_vbg_full_map_error_keeps_content(frames: list[Frame], monkeypatc
     assert fuser.scene.statistics.voxels == budget * 512
     assert fuser.scene.grid.blocks.hashmap().capacity() <= budget
     assert np.array_equal(fuser.scene.mesh().vertices, before.vertices)
-    fuse_masks(fuser, frames[0], [], [])  # existing blocks can still be fused
+    fuse_masks(fuser, frames[0], [], [])  # frames in existing blocks can still be fused
 
 
 def test_open3d_vbg_statistics_count_blocks_in_use(mapped: Open3DMap) -> None:
@@ -358,7 +361,7 @@ def test_open3d_vbg_empty_map_round_trip_is_exact(tmp_path: Path) -> None:
 
 
 def test_open3d_vbg_single_depth_reading_is_mapped(frames: list[Frame]) -> None:
-    """The pixel is between the pixels that Open3D samples; without a sample, Open3D would raise an error."""
+    """Open3D samples only some pixels, and raises an error if none of them has depth."""
     depth = np.zeros_like(frames[0].depth)
     depth[61, 83] = 1.5
     fuser = new_fuser()

@@ -1,4 +1,4 @@
-"""Tests of chained refiners, as composed by Hydra."""
+"""Tests for chained refiners, as composed by Hydra."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support import registered
 
 
 class Halving(LargestComponent):
-    """Refiner that keeps every other point, so its result depends on its input."""
+    """Refiner that keeps every other point. The result depends on the order of the refiners."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return PointClusters(
@@ -99,6 +99,6 @@ def test_chain_error_names_link(overrides: list[str], message: str) -> None:
         registered.built("refiner", "chain", *overrides)
 
 
-def test_chain_without_links_raises_with_advice() -> None:
+def test_chain_without_links_error_names_identity() -> None:
     with pytest.raises(ConfigError, match="refiner=identity"):
         Chain({})

@@ -1,4 +1,7 @@
-"""Tests of connected components: parts beyond a depth step are removed, parts split by an occluder are kept."""
+"""Tests for refiner=connected.
+
+Parts behind a depth step are removed. Parts that are separated by an occluder are kept.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ def frame_of(depth: Float32, camera: Camera = CAMERA) -> Frame:
 
 
 def kept(refiner: Connected | LargestComponent, mask: Bool, depth: Float32) -> Bool:
-    """Return the kept pixels (H, W) of the mask."""
+    """Return the pixels (H, W) of the mask that are kept."""
     frame = frame_of(depth)
     after = refiner.refine(clusters_of([mask], frame), frame)
     image = np.zeros(mask.shape, np.bool_)
@@ -37,7 +40,7 @@ def kept(refiner: Connected | LargestComponent, mask: Bool, depth: Float32) -> B
 
 
 def test_connected_occluder_does_not_split_object() -> None:
-    """A couch at 3 m is behind a pole at 2 m that the mask excludes; LargestComponent drops the smaller half."""
+    """A pole at 2 m, which is not in the mask, divides a couch at 3 m. LargestComponent removes the smaller half."""
     pole = (U >= 20) & (U < 24)
     depth = np.where(pole, 2.0, 3.0)
     assert (kept(Connected(), ~pole, depth) == ~pole).all()
@@ -46,7 +49,7 @@ def test_connected_occluder_does_not_split_object() -> None:
 
 @pytest.mark.parametrize("neighbor_depth", [4.5, 1.5])
 def test_connected_object_ends_at_depth_step(neighbor_depth: float) -> None:
-    """The mask includes a wall behind the object or a table in front of it."""
+    """The mask covers a wall behind the object or a table in front of the object."""
     depth = np.where(U < 6, neighbor_depth, 3.0)
     assert (kept(Connected(), np.ones(depth.shape, np.bool_), depth) == (U >= 6)).all()
 
@@ -63,7 +66,7 @@ def test_connected_removes_background_between_slats() -> None:
 
 
 def test_connected_keeps_slanted_surface_behind_occluder() -> None:
-    """The depth slope is 0.8 m per m, so the depth on both sides of the pole differs as at a step."""
+    """The depth slope is 0.8 m per m, so the depth on both sides of the pole differs like at a step."""
     x = (U - CAMERA.cx) / CAMERA.fx
     slanted = 2.0 / (1 - 0.8 * x)  # z = 2 + 0.8 x z
     pole = (U >= 20) & (U < 30)
@@ -73,7 +76,7 @@ def test_connected_keeps_slanted_surface_behind_occluder() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_connected_refiner_matches_reference(seed: int) -> None:
-    """The clusters are so small that every point is a sample."""
+    """All points are samples, because the clusters are small."""
     rng = np.random.default_rng(seed)
     camera = Camera(16, 12, 20.0, 20.0, 7.5, 5.5)
     coarse = rng.choice([1.0, 1.05, 1.3, 2.0], (3, 4))

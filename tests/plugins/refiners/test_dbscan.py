@@ -1,4 +1,4 @@
-"""Tests of refiner=dbscan, density-based clustering."""
+"""Tests for refiner=dbscan."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FRAME = Frame(0, 0.0, np.zeros((60, 90, 3), np.uint8), np.full((60, 90), 2.0, np
 
 
 def clusters_of(*sets: np.ndarray) -> PointClusters:
-    """Return the point sets as clusters, with their points at consecutive pixels of a 90x60 image."""
+    """Return the point sets as clusters, at consecutive pixels of a 90x60 image."""
     points = np.concatenate([np.zeros((0, 3)), *sets]).astype(np.float32)
     ones = np.ones(len(sets), np.float32)
     at = np.concatenate([np.arange(0), *(np.arange(len(s)) for s in sets)])
@@ -29,7 +29,7 @@ def clusters_of(*sets: np.ndarray) -> PointClusters:
 
 
 def blobs(seed: int, count: int = 1500) -> np.ndarray:
-    """Return the points of four balls of different density that nearly touch, with noise, far from the origin."""
+    """Return noisy points of four balls of different density, which almost touch and are far from the origin."""
     rng = np.random.default_rng(seed)
     centers = rng.uniform(-0.4, 0.4, (4, 3))
     sigmas = rng.uniform(0.02, 0.08, 4)
@@ -41,7 +41,7 @@ def blobs(seed: int, count: int = 1500) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_dbscan_keeps_largest_component_with_border(seed):
-    """The reference is the largest cluster of core points of scikit-learn, with all points within eps of them."""
+    """The reference is the largest cluster of scikit-learn's core points and all points within eps of these."""
     eps, min_points, points = 0.04, 12, blobs(seed)
     reference = DBSCAN(eps=eps, min_samples=min_points).fit(points)
     core = reference.core_sample_indices_
@@ -55,7 +55,7 @@ def test_dbscan_keeps_largest_component_with_border(seed):
 
 
 def test_dbscan_eps_increases_with_depth():
-    """The points are 5 cm apart on a line at a depth of 2 m, except for one gap of 11 cm."""
+    """The points are on a line at a depth of 2 m. Their distance is 5 cm, except for one gap of 11 cm."""
     line = np.stack([np.arange(20) * 0.05, np.zeros(20), np.full(20, 2.0)], axis=1)
     line[12:, 0] += 0.06
     for slope, kept in ((0.01, 12), (0.05, 20)):
@@ -64,7 +64,7 @@ def test_dbscan_eps_increases_with_depth():
 
 
 def test_dbscan_skipped_points_join_nearby_samples():
-    """Of two plates, the larger is kept; with a stride, skipped pixels are assigned like nearby samples."""
+    """The larger of two plates is kept, whatever the stride."""
     v, u = np.mgrid[:60, :90]
     plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.3)], axis=-1).reshape(-1, 3)
     clusters = clusters_of(plates)
@@ -75,10 +75,10 @@ def test_dbscan_skipped_points_join_nearby_samples():
 
 
 def test_dbscan_weights_sampled_points_for_skipped_points():
-    """Of the 5400 points of a plate, at most 600 are sampled: every third row and column, with weight 9."""
+    """At most 600 of 5400 points are sampled: every third row and column, with weight 9."""
     v, u = np.mgrid[:60, :90]
     plate = np.stack([u * 0.01, v * 0.01, 0 * u + 2.0], axis=-1).reshape(-1, 3)
-    plate[-90:, 1] += 0.5  # the last row is removed: it contains no sample
+    plate[-90:, 1] += 0.5  # the last row contains no sample and is removed
     for eps, min_points, kept in ((0.035, 9 * 3, 59 * 90), (0.035, 9 * 5 + 1, 60 * 90)):
         refiner = Dbscan(eps=eps, eps_per_depth=0.0, min_points=min_points, stride=1, max_points=600)
         assert len(refiner.refine(clusters_of(plate), FRAME).pixels) == kept, (

@@ -1,4 +1,4 @@
-"""Tests of masks that claim convex segments: a box on a table under small, bleeding and overlapping masks."""
+"""Tests for refiner=geometric, with a box on a table under small, bleeding and overlapping masks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ POSE = Pose(exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1])))
 
 
 def table() -> tuple[np.ndarray, np.ndarray]:
-    """Return depth (H, W), m, and ids (H, W): 1 = box with its front 1.2 m away, 0 = table and wall at 2 m."""
+    """Return depth (H, W), m, and ids (H, W). The box is 1; the table and the wall at 2 m are 0."""
     v, u = np.mgrid[:240, :320]
     x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
     depth = np.minimum(2.0, 0.7 / np.maximum(y, 1e-9))
@@ -58,7 +58,7 @@ def shifted(mask: np.ndarray, dv: int, du: int) -> np.ndarray:
 
 
 def test_geometric_corrects_shifted_mask_to_box():
-    """The mask is 8 px too far right; the table is removed, and the left border of the box is added."""
+    """The mask is shifted to the right by 8 px, so it includes the table and lacks a part of the box."""
     depth, ids = table()
     frame = frame_of(depth)
     mask = shifted(ids == 1, 0, 8)
@@ -85,11 +85,11 @@ def test_geometric_without_growth_only_shrinks():
     np.testing.assert_array_equal(shrunk, grown & mask)
 
 
-def test_geometric_segment_goes_to_mask_of_largest_coverage():
+def test_geometric_segment_is_assigned_to_best_covering_mask():
     depth, ids = table()
     frame = frame_of(depth)
     u = np.arange(320)[None]
-    more, less = (ids == 1) & (u < 168), (ids == 1) & (u >= 160)  # 59 and 50 % of the box, overlapping
+    more, less = (ids == 1) & (u < 168), (ids == 1) & (u >= 160)  # overlapping masks that cover 59 and 50 % of the box
     refined = Geometric(min_overlap=0.5).refine(lifted(np.stack([less, more, np.zeros_like(more)]), frame), frame)
     assert len(refined) == 3
     assert set(refined.cluster.tolist()) == {1}
@@ -99,7 +99,7 @@ def test_geometric_segment_goes_to_mask_of_largest_coverage():
 
 
 @pytest.mark.parametrize(("min_overlap", "claimed"), [(0.4, True), (0.6, False)])
-def test_geometric_does_not_claim_segment_below_min_overlap(min_overlap, claimed):
+def test_geometric_segment_below_min_overlap_is_not_assigned(min_overlap, claimed):
     depth, ids = table()
     frame = frame_of(depth)
     half = (ids == 1) & (np.arange(320)[None] < 160)
@@ -120,7 +120,7 @@ def test_geometric_keeps_unassigned_points():
 
 
 def test_geometric_collinear_points_are_not_extended():
-    """A mask of one column in a narrow segment has collinear points, which are unchanged."""
+    """A mask of one column has collinear points, which do not determine the camera pose."""
     depth = np.zeros(CAMERA.shape, np.float32)
     depth[40:80, 60:62] = 1.0
     frame = frame_of(depth)

@@ -1,4 +1,4 @@
-"""Tests of the mixture tree over all masks of a frame, compared with a slow float64 reference."""
+"""Tests for refiner=gmm_frame, compared with a slow reference in float64."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CLASSES = ("chair", "bed")
 
 
 def clusters_of(points: Float32, masks: Int32, scores: tuple[float, ...], pixels: Int32 | None = None) -> PointClusters:
-    """Return the clusters of points; without `pixels`, each point has its own pixel."""
+    """Return the points as clusters. By default, all pixels are different."""
     n = np.arange(len(points))
     return PointClusters(
         points_world=points,
@@ -32,7 +32,7 @@ def clusters_of(points: Float32, masks: Int32, scores: tuple[float, ...], pixels
 
 
 def three_objects(seed: int, bleed: float = 0.15) -> tuple[Float32, Int32, Int32]:
-    """Return the points (S, 3), m, of three curved objects, their masks (S,), some wrong, and the true objects (S,)."""
+    """Return the points (S, 3), m, of three curved objects, their masks (S,) with errors, and the true objects (S,)."""
     rng = np.random.default_rng(seed)
     centers = np.array([[0.0, 0.0, 2.0], [0.5, 0.1, 2.2], [0.1, 0.6, 1.7]])
     truth = np.sort(rng.integers(0, 3, 900))
@@ -43,7 +43,7 @@ def three_objects(seed: int, bleed: float = 0.15) -> tuple[Float32, Int32, Int32
     return (centers[truth] + spread)[order].astype(np.float32), masks[order].astype(np.int32), truth[order]
 
 
-# The reference
+# Reference
 
 
 @dataclasses.dataclass
@@ -63,7 +63,7 @@ def floored(Sigma: Float64, floor: float) -> Float64:
 
 
 def m_step(points: Float64, gamma: Float64, masks: list[int], floor: float) -> list[Gaussian]:
-    """Return the Gaussians by eqs. (3) and (4)."""
+    """Return the Gaussians of the M-step, eqs. (3) and (4)."""
     found = []
     for k, mask in enumerate(masks):
         N_k = gamma[:, k].sum()
@@ -76,7 +76,7 @@ def m_step(points: Float64, gamma: Float64, masks: list[int], floor: float) -> l
 
 
 def em(points: Float64, gaussians: list[Gaussian], refiner: GmmFrame) -> list[Gaussian]:
-    """Return the Gaussians after EM, eqs. (2) to (4)."""
+    """Return the Gaussians of the EM algorithm, eqs. (2) to (4)."""
     previous = -np.inf
     for _ in range(refiner.max_iterations):
         logs = np.stack([gaussian.log_density(points) for gaussian in gaussians], axis=1)
@@ -90,9 +90,9 @@ def em(points: Float64, gaussians: list[Gaussian], refiner: GmmFrame) -> list[Ga
 
 
 def split(node: Gaussian, points: Float64, refiner: GmmFrame) -> list[Gaussian]:
-    """Return the children of a node, or the node itself if it has too few points.
+    """Return the children of a node, or only the node if it has too few points.
 
-    The weights of the children sum to the weight of the node.
+    The sum of the children's weights is the weight of the node.
     """
     if len(points) < 32:
         return [node]
@@ -108,7 +108,7 @@ def split(node: Gaussian, points: Float64, refiner: GmmFrame) -> list[Gaussian]:
 
 
 def slow_masks(refiner: GmmFrame, points: Float32, masks: Int32, count: int) -> Int32:
-    """Return the index (S,) of the mask whose tree contains the most probable leaf of each point."""
+    """Return the mask (S,) of the most probable leaf of each point."""
     x = points.astype(np.float64)
     first = m_step(x, np.eye(count)[masks], list(range(count)), refiner.std_floor**2)
     leaves = em(x, first, refiner)
@@ -130,7 +130,7 @@ def test_gmm_frame_point_assignment_matches_reference(levels: int, children: int
     found = np.empty(len(points), np.int32)
     found[refined.pixels[:, 0] + 80 * refined.pixels[:, 1]] = refined.cluster
     assert len(refined.cluster) == len(points)
-    assert (found != expected).mean() < 0.005  # ties may differ in single precision
+    assert (found != expected).mean() < 0.005  # ties can be resolved differently in single precision
     assert (found == truth).mean() > 0.93 > (masks == truth).mean()
     assert (np.diff(refined.cluster) >= 0).all()
 
@@ -150,11 +150,11 @@ def test_gmm_frame_foreign_points_are_moved_dropped_or_kept(treatment: ForeignPo
     np.testing.assert_allclose(sizes, by_treatment[treatment], atol=4)
 
 
-def test_gmm_frame_pixel_in_several_masks_goes_to_best_score() -> None:
+def test_gmm_frame_shared_pixel_is_assigned_by_mask_score() -> None:
     points, masks, _ = three_objects(3, bleed=0.0)
     n = np.arange(len(points))
     pixels = np.stack([n % 80, n // 80], axis=1).astype(np.int32)
-    again = np.flatnonzero(masks == 1)  # mask 2 covers mask 1 and has a higher score
+    again = np.flatnonzero(masks == 1)  # mask 2 covers mask 1 and has the higher score
     clusters = clusters_of(
         np.concatenate([points, points[again]]),
         np.concatenate([masks, np.full(len(again), 2, np.int32)]),
@@ -178,7 +178,7 @@ def test_gmm_frame_small_cluster_is_dropped() -> None:
         assert len(refined) == 3, "expected one cluster per detection"
 
 
-def test_gmm_frame_k_means_start_differs_but_finds_objects() -> None:
+def test_gmm_frame_k_means_start_finds_objects() -> None:
     points, masks, truth = three_objects(5)
     clusters = clusters_of(points, masks, (0.9, 0.8, 0.7))
     by_masks, by_k_means = (

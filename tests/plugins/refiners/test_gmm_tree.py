@@ -1,4 +1,4 @@
-"""Tests of the mixture tree: a box on a floor in front of a wall, under a bleeding mask."""
+"""Tests for refiner=gmm_tree, with a box on a floor in front of a wall under a bleeding mask."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 
 
 def room() -> tuple[np.ndarray, np.ndarray]:
-    """Return noisy depth (H, W), m, and ids (H, W): 1 = front of a 0.5 m box at 2 m, 2 = its top, 16 px high.
+    """Return noisy depth (H, W), m, and ids (H, W).
 
-    The box is on a floor in front of a wall at 3 m; both have id 0.
+    The front (1) and the top (2) of the box are at 2 m. The floor and the wall at 3 m are 0.
     """
     v, u = np.mgrid[:240, :320]
     ray_x, ray_y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
@@ -76,7 +76,7 @@ def test_gmm_tree_removes_mask_bleed(px, levels):
 
 
 def test_gmm_tree_mask_log_odds_decide_in_one_plane():
-    """Object and wall are in one plane, so only the log-odds of the mask are informative."""
+    """Object and wall are in one plane, so the points do not distinguish them."""
     depth = np.full(CAMERA.shape, 2.0, np.float32)
     frame = frame_of(depth)
     mask = np.zeros((1, *CAMERA.shape), bool)

@@ -1,4 +1,4 @@
-"""Tests of plane removal: floors and walls are removed from clusters, and flat parts of objects are kept."""
+"""Tests for refiner=plane_removal. Floors and walls are removed, and flat parts of objects are kept."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from plugins.refiners.plane_removal import PlaneRemoval
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 T_WORLD_CAMERA = exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1]))  # no world axis is vertical
 ROOM = (-2.5, -1.5, -2.0), (2.5, 1.2, 4.0)  # m; y points down, and the floor is 1.2 m below the camera
-BOX = (-0.25, 0.7, 2.9), (0.25, 1.2, 3.3)  # m, on the floor
+BOX = (-0.25, 0.7, 2.9), (0.25, 1.2, 3.3)  # m, box on the floor
 PITCH = 0.3  # rad, by which the camera looks down
 
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 def scene(*boxes: Corners, pitch: float = PITCH, noise: float = 0.0) -> tuple[Frame, np.ndarray]:
-    """Return a frame of the room with boxes, and the ids (H, W): 0 = room, k = k-th box.
+    """Return a frame of the room with boxes, and the ids (H, W), where 0 is the room and k is the k-th box.
 
     The standard deviation of depth is `noise` times the squared depth, m.
     """
@@ -63,7 +63,7 @@ def bleeding(mask: np.ndarray, px: int = 8) -> np.ndarray:
 
 
 def masks_of(clusters: PointClusters) -> np.ndarray:
-    """Return the masks (N, H, W) of the remaining pixels of each cluster."""
+    """Return the masks (N, H, W) of the remaining points of each cluster."""
     masks = np.zeros((len(clusters), *CAMERA.shape), bool)
     masks[clusters.cluster, clusters.pixels[:, 1], clusters.pixels[:, 0]] = True
     return masks
@@ -85,7 +85,7 @@ def test_structure_mask_marks_floor_and_walls():
 
 
 def test_plane_removal_sensor_noise_widens_plane_distance():
-    """With Kinect noise at 3 m, 99 % of floor and wall are removed, and the box is kept above 6 cm."""
+    """With Kinect noise at 3 m, at least 99 % of floor and wall are removed. The box is kept above 6 cm."""
     frame, ids = scene(BOX, noise=0.002)
     bled = bleeding(ids == 1)
     [left] = masks_of(PlaneRemoval().refine(lifted(frame, bled), frame))
@@ -95,7 +95,7 @@ def test_plane_removal_sensor_noise_widens_plane_distance():
 
 @pytest.mark.parametrize(("sensor", "found"), [(SensorKind.KINECT_V1, False), (SensorKind.REALSENSE_D435, True)])
 def test_plane_removal_limit_depends_on_sensor_noise(sensor, found):
-    """The noise is that of a RealSense D435, about twice that of a Kinect."""
+    """The noise is that of a RealSense D435, i.e. twice the noise of a Kinect."""
     frame = replace(scene(BOX, noise=0.0038)[0], sensor=sensor)
     planes = PlaneRemoval(plane_distance=0.0).structure(frame)
     assert (planes.fractions.sum() > 0.8) == found
@@ -107,17 +107,17 @@ def test_plane_removal_limit_of_exact_sensor_allows_uneven_walls():
 
 
 def test_plane_removal_keeps_table_top():
-    """The table fills the lower half of the image; its top occludes the floor and the room."""
+    """The table fills the lower half of the image."""
     table = (-1.2, 0.45, 0.9), (1.2, 0.5, 2.2)
     frame, ids = scene(table, BOX)
     top = PlaneRemoval(min_area=0.1)
-    for mask in (ids == 1, (ids == 1) & (np.arange(320) < 160)):  # the whole top, or a half of it
+    for mask in (ids == 1, (ids == 1) & (np.arange(320) < 160)):  # the whole table top, or one half
         [left] = masks_of(top.refine(lifted(frame, bleeding(mask, 4)), frame))
         np.testing.assert_array_equal(left, bleeding(mask, 4) & (ids > 0))
 
 
 def test_plane_removal_keeps_plane_with_most_cluster_points():
-    """The table top fills the view, so only its fraction of the cluster is informative."""
+    """The table top fills the view and cannot be distinguished from a floor by its size."""
     frame, ids = scene(((-9.0, 0.5, -9.0), (9.0, 0.6, 9.0)), ((-0.1, 0.3, 0.4), (0.1, 0.5, 0.6)), pitch=0.9)
     assert (ids > 0).all()
     refined = PlaneRemoval(min_area=0.3).refine(lifted(frame, ids == 1, bleeding(ids == 2)), frame)
@@ -136,7 +136,7 @@ def test_plane_removal_keeps_plane_with_most_cluster_points():
 
 @pytest.mark.parametrize(("share", "unchanged"), [(0.4, False), (0.6, True)])
 def test_plane_removal_cluster_fraction_counts_all_parts(share, unchanged):
-    """The wall is visible between posts. The mask covers the top `share` of the image, split among threads."""
+    """The wall is visible between posts. The mask covers the top of the image, and threads process parts of it."""
     post = np.arange(320) // 32 % 2 == 1
     depth = np.where(post, 1.5, 2.0) * np.ones(CAMERA.shape)
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth.astype(np.float32), CAMERA)
@@ -147,7 +147,7 @@ def test_plane_removal_cluster_fraction_counts_all_parts(share, unchanged):
 
 
 def test_plane_removal_keeps_screen_in_front_of_wall():
-    """The screen of 1.2 m x 0.7 m is 8 cm in front of the wall, without and with depth noise."""
+    """The screen is 8 cm in front of the wall."""
     screen = (-0.6, -0.4, 3.85), (0.6, 0.3, 3.92)
     for noise, kept, dropped in ((0.0, 1.0, 1.0), (0.001, 0.99, 0.99)):
         frame, ids = scene(screen, pitch=0.0, noise=noise)
@@ -159,7 +159,7 @@ def test_plane_removal_keeps_screen_in_front_of_wall():
 
 
 def test_plane_removal_wall_with_small_opening_is_structure():
-    """A wall with an opening of 1/20 of its width is structure; with 1/3, it could be the side of a cupboard."""
+    """An opening of 1/20 of the width is a door. With an opening of 1/3, the wall could be the side of a cupboard."""
     for width, dropped in ((12, True), (100, False)):
         frame, _ = scene(BOX)
         depth = frame.depth.copy()
@@ -172,7 +172,7 @@ def test_plane_removal_wall_with_small_opening_is_structure():
 
 
 def test_plane_removal_max_tilt_limits_removal_to_floor():
-    """With a maximum tilt of 60 degrees, the wall is not structure, and the floor is."""
+    """The wall is tilted by more than 60 degrees, and the floor is not."""
     frame, ids = scene(BOX)
     mask = np.ones(CAMERA.shape, bool)
     refiner = PlaneRemoval(plane_distance=0.02, max_tilt=60.0, max_cluster_fraction=1.0 - 1e-9)
@@ -197,7 +197,6 @@ def test_plane_removal_without_planes_changes_nothing():
 
 
 def test_plane_removal_small_plane_is_not_structure():
-    """All planes are below the minimum area or the minimum fraction of the frame."""
     frame, ids = scene(BOX)
     clusters = lifted(frame, bleeding(ids == 1))
     for strict in (PlaneRemoval(min_area=100.0), PlaneRemoval(min_frame_fraction=0.9)):

@@ -1,4 +1,4 @@
-"""Tests of rank-order clustering."""
+"""Tests for refiner=rank_order."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FRAME = Frame(0, 0.0, np.zeros((60, 90, 3), np.uint8), np.full((60, 90), 2.0, np
 
 
 def clusters_of(*sets: np.ndarray) -> PointClusters:
-    """Return the point sets as clusters, with their points at consecutive pixels of a 90x60 image."""
+    """Return the point sets as clusters, at consecutive pixels of a 90x60 image."""
     points = np.concatenate([np.zeros((0, 3)), *sets]).astype(np.float32)
     ones = np.ones(len(sets), np.float32)
     at = np.concatenate([np.arange(0), *(np.arange(len(s)) for s in sets)])
@@ -49,7 +49,7 @@ def test_rank_order_separated_blobs_split_at_any_scale(scale):
 
 
 def test_rank_order_skipped_points_join_nearest_sample():
-    """Of the 5400 points of two plates, at most 200 are sampled, one per pixel block; others join the nearest one."""
+    """At most 200 of 5400 points are sampled, one in each block of pixels."""
     v, u = np.mgrid[:60, :90]
     rng = np.random.default_rng(0)
     plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.5)], axis=-1).reshape(-1, 3)
@@ -57,7 +57,7 @@ def test_rank_order_skipped_points_join_nearest_sample():
     refined = RankOrder(threshold=2.0, max_points=200).refine(clusters_of(plates), FRAME)
     np.testing.assert_array_equal(refined.pixels[:, 0] < 50, True)
     assert len(refined.pixels) == 60 * 50
-    side = 6  # px, of the blocks: 10 x 15 samples; blocks of 5 px would give 12 x 18 > 200
+    side = 6  # px; 10 x 15 blocks; blocks of 5 px would be 12 x 18 > 200
     first = np.flatnonzero((u.ravel() % side == 0) & (v.ravel() % side == 0))
     groups = rank_order_groups(plates[first].astype(np.float32), 16, 0.6)
     nearest = cdist(plates.astype(np.float32).astype(np.float64), plates[first].astype(np.float32)).argmin(axis=1)
@@ -114,14 +114,17 @@ def test_rank_order_invalid_parameter_raises(parameters, message):
 
 
 def neighbor_order(points: np.ndarray) -> list[list[int]]:
-    """Return all points sorted by distance from each point; the point itself is first, ties by index."""
+    """Return the points sorted by their distance from each point, beginning with the point itself.
+
+    Ties are by index.
+    """
     distances = ((points[:, None].astype(np.float64) - points[None]) ** 2).sum(axis=-1)
     np.fill_diagonal(distances, -1)
     return [sorted(range(len(points)), key=lambda b, row=row: (row[b], b)) for row in distances]
 
 
 def slow_groups(points: np.ndarray, k: int, threshold: float) -> np.ndarray:
-    """Return the groups (N,), computed from the definition."""
+    """Return the groups (N,) by the definition of rank-order clustering."""
     order = neighbor_order(points)
     n = len(points)
 
@@ -149,6 +152,6 @@ def test_rank_order_groups_match_reference(points, k, threshold):
 
 
 def test_rank_order_reference_splits_test_data():
-    """The comparison with the reference is meaningful only for several groups of several points."""
+    """In the comparison with the reference, there must be several groups of several points."""
     for points, k in ((blobs(0, 70), 6), (blobs(1, 50), 9), (blobs(2, 60), 3)):
         assert 1 < len(np.unique(slow_groups(points, k, 0.5))) < len(points) // 2

@@ -1,4 +1,4 @@
-"""Tests of the shrinking refiners: a box on a floor in front of a wall, under a bleeding mask."""
+"""Tests for refiners that only remove points, with a box on a floor under a bleeding mask."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ T_WORLD_CAMERA = exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1]))
 
 
 def room(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return noisy depth (H, W), m, and ids (H, W): 0 = wall at 3 m and floor, 1 = box of 0.5 m, 2 = pole.
+    """Return noisy depth (H, W), m, and ids (H, W).
 
-    The front of the box is 2 m away; the pole is in front of its left edge at 1.2 m.
+    The wall at 3 m and the floor are 0, the box is 1, and the pole is 2. The front of the box is at 2 m, and the pole
+    at 1.2 m occludes its left edge.
     """
     v, u = np.mgrid[:240, :320]
     ray_x, ray_y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
@@ -67,20 +68,20 @@ def bleeding(mask: np.ndarray, px: int) -> np.ndarray:
 
 
 def recall_and_rejection(refined: PointClusters, before: PointClusters, ids: np.ndarray) -> tuple[float, float]:
-    """Return the kept fraction of the box points and the dropped fraction of the other points of cluster 0."""
+    """Return the kept fraction of the box and the removed fraction of the other points of cluster 0."""
     right, was_right = (ids[c.pixels[c.cluster == 0, 1], c.pixels[c.cluster == 0, 0]] == 1 for c in (refined, before))
     return right.sum() / was_right.sum(), 1 - (~right).sum() / (~was_right).sum()
 
 
 @pytest.mark.parametrize("px", [4, 6, 8])
 def test_gmm_em_removes_mask_bleed(px):
-    """Pole, floor and wall are dropped, and both faces of the box are kept."""
+    """The removed points are on the pole, the floor and the wall. Two faces of the box are kept."""
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids == 1, px)[None], frame)
     recall, rejection = recall_and_rejection(GmmEm().refine(before, frame), before, ids)
     assert recall > 0.97
-    assert rejection > (0.95 if px < 6 else 0.88)  # masks are trusted up to `expected_bleed`, 4.8 px
+    assert rejection > (0.95 if px < 6 else 0.88)  # `expected_bleed` is 4.8 px
     doubting = GmmEm(object_components=2, mask_log_odds=2.0, expected_bleed=0.5).refine(before, frame)
     doubting_recall, doubting_rejection = recall_and_rejection(doubting, before, ids)
     assert doubting_recall > 0.97
@@ -176,7 +177,7 @@ def test_shrinking_refiner_keeps_unassigned_points():
 
 
 def test_largest_component_keeps_larger_of_two_pieces():
-    """Two components are at 1 m and 1.2 m; the allowed gap at 1 m is 0.05 m."""
+    """The pieces are at 1 m and 1.2 m. The maximum gap at 1 m is 0.05 m, or 0.23 m with the larger slope."""
     camera = Camera(40, 20, 50.0, 50.0, 19.5, 9.5)
     depth = np.full((20, 40), 1.0, np.float32)
     depth[:, 25:] = 1.2
@@ -218,7 +219,7 @@ def test_largest_component_agrees_with_scipy():
 @pytest.mark.parametrize("reach", [1, 2, 3])
 @pytest.mark.parametrize("density", [0.05, 0.3, 0.9])
 def test_largest_component_matches_reference(reach, density):
-    """The reference is a graph over noisy depth with edges between points that are close in image and depth."""
+    """In the reference graph, points are connected if they are close in the image and in depth."""
     from scipy.sparse.csgraph import connected_components
 
     camera = Camera(37, 23, 50.0, 50.0, 18.0, 11.0)
@@ -232,7 +233,7 @@ def test_largest_component_matches_reference(reach, density):
         near = np.maximum(np.abs(u - u[:, None]), np.abs(v - v[:, None])) <= reach
         near &= np.abs(z - z[:, None]) < 0.03 + 0.02 * np.minimum(z, z[:, None])
         _, piece = connected_components(near, directed=False)
-        largest = np.bincount(piece).argmax()  # pieces are numbered in the order of their first points
+        largest = np.bincount(piece).argmax()  # pieces are in the order of their first points
         refined = LargestComponent(connection_radius=reach).refine(before, frame)
         np.testing.assert_array_equal(refined.pixels, before.pixels[piece == largest])
 
@@ -253,7 +254,7 @@ def test_shrinking_refiner_invalid_parameter_raises(make, parameters, message):
 
 
 def slow_posterior(points: np.ndarray, iterations: int, std_floor: float, outliers: float) -> np.ndarray:
-    """Return the posterior (P,) of one Gaussian against a uniform density, after EM in float64 from all points."""
+    """Return the posterior (P,) of a Gaussian against a uniform density, by EM in float64."""
     x = points.astype(np.float64)
     density = 1 / np.prod(np.maximum(x.max(axis=0) - x.min(axis=0), 4 * std_floor))
     weight, responsibilities, uniform = 0.0, np.full(len(x), 1 - outliers), outliers

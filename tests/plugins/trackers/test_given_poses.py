@@ -1,4 +1,7 @@
-"""Tests of trackers with given poses: frames without a pose are skipped, counted and logged in one line."""
+"""Tests for trackers with given poses.
+
+Frames without a pose are skipped, counted and logged in one line.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +75,7 @@ def test_given_poses_skip_frames_without_pose_with_one_warning(
 def test_given_poses_unreadable_frame_is_logged_separately(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Unreadable frames are logged one by one up to a limit; frames without poses do not count toward it."""
+    """Unreadable frames are logged one by one, up to a limit. Frames without a pose do not count toward the limit."""
     caplog.set_level("WARNING")
     late = 30
     room = CornerRoom(frames=late + 2, unposed=tuple(range(late)), unreadable=late)
@@ -89,7 +92,7 @@ def test_given_poses_unreadable_frame_is_logged_separately(
 
 
 def test_given_poses_error_uses_only_frames_with_true_pose(tmp_path: Path) -> None:
-    """The given poses of frames without a true pose are wrong and must not change ATE or RPE."""
+    """In frames without a true pose, the given poses are wrong, which must not affect the errors."""
     poses = [np.linalg.inv(pose_at(9 * k)) if k in GAP else pose_at(k) for k in range(FRAMES)]
     write_tum(tmp_path / "poses.txt", [k / 30 for k in range(FRAMES)], poses)
     tracker = TrajectoryFile(tmp_path / "poses.txt")

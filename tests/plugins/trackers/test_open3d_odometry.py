@@ -1,4 +1,4 @@
-"""Tests of Open3D's odometry as a tracker: known motion, and uninformative frames."""
+"""Tests for the odometry of Open3D as a tracker."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.scenes.papered_room import CAMERA, papered_frame
 LOOKING_INTO_A_CORNER = exp_se3(np.array([0, 0, 0, 0.5, 0.6, 0]))
 BEST = [
     ({}, 0.01),
-    # with color, Open3D drifts by a third of the motion even on exact images
+    # with color, Open3D drifts by a third of the motion, even on exact images
     ({"method": Method.HYBRID, "reference": Reference.PREVIOUS_FRAME}, 0.05),
     ({"method": Method.INTENSITY, "reference": Reference.PREVIOUS_FRAME}, 0.05),
 ]

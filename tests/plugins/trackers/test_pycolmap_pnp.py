@@ -1,4 +1,4 @@
-"""Tests of sparse tracking in a textured room with known poses, and on real video."""
+"""Tests for sparse tracking, in a textured room with known poses and on real video."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BLACK = np.zeros((*CAMERA.shape, 3), np.uint8)
 
 
 def pose_at(k: int) -> np.ndarray:
-    """Return the pose of a frame; the motion is about 2 cm and 2 degrees per frame."""
+    """Return the pose of a frame. The motion is about 2 cm and 2 degrees per frame."""
     return exp_se3(np.array([0.02, -0.005, 0.01, 0.003, 0.035, 0.002]) * k)
 
 
@@ -68,7 +68,7 @@ def test_pycolmap_pnp_relocalizes_after_uninformative_frames(frames: list[Frame]
     assert [pose.lost for pose in poses] == [False] * 17 + [True] * 4 + [False]
     assert "fewer than 20 of the frame's" in poses[17].reason
     np.testing.assert_array_equal(poses[20].T_world_camera, poses[16].T_world_camera)
-    assert_near(poses[-1], frames[1])  # not visible in the keyframes near the last pose
+    assert_near(poses[-1], frames[1])  # a view that is not in the keyframes near the last pose
 
 
 def test_pycolmap_pnp_depth_inconsistent_with_color_is_lost(frames: list[Frame]) -> None:

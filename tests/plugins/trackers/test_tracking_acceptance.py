@@ -1,6 +1,7 @@
-"""Acceptance tests of the tracker: accuracy on exact scenes, and accurate maps despite bad frames.
+"""Acceptance tests for the default tracker.
 
-Longer runs (300 real frames, 200 synthetic frames) are rows of `pytest tests/benchmarks -k slam`.
+Poses must be accurate on exact scenes, and the map must be accurate despite bad frames. Longer runs are part of the
+benchmarks: `pytest tests/benchmarks -k slam`.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from tests.support.scenes.analytic_scene import CAMERA, NOTHING, Scene, pose
 pytestmark = pytest.mark.acceptance
 
 VOXEL = 0.02  # m, for the small images of these tests
-WRONG = 0.04  # m, two voxels: a pose with a larger error must be lost
+WRONG = 0.04  # m, two voxels; a pose with a larger error must be lost
 
 
 def run(tracker: VoxelHashingIcp, frames: Iterable[Frame], voxel_size: float = VOXEL) -> tuple[list[Pose], SceneMap]:
-    """Track and fuse as the pipeline does; lost frames are not fused."""
+    """Track and fuse all frames. Lost frames are not fused, like in the pipeline."""
     fuser = assemble(BayesianTsdf, voxel_size=voxel_size)
     poses = []
     for frame in frames:
@@ -44,21 +45,21 @@ def run(tracker: VoxelHashingIcp, frames: Iterable[Frame], voxel_size: float = V
 
 
 def drift(tracked: Pose, frame: Frame) -> float:
-    """Return the distance, m, of the estimated position from the true position."""
+    """Return the distance, m, between the estimated and the true position."""
     assert frame.T_world_camera is not None
     return float(np.linalg.norm((inverse(frame.T_world_camera) @ tracked.T_world_camera)[:3, 3]))
 
 
 def drifts(poses: Sequence[Pose], frames: Sequence[Frame]) -> np.ndarray:
-    """Return the distances (n,), m, of estimated positions from true positions; NaN = lost."""
+    """Return the distances (n,), m, between estimated and true positions, NaN = lost."""
     return np.array([np.nan if p.lost else drift(p, f) for p, f in zip(poses, frames, strict=True)])
 
 
 @pytest.fixture(scope="module")
 def wall() -> list[Frame]:
-    """Return frames of a camera that moves 0.6 m along a flat, textured wall at 1.5 m, with depth noise of 2 mm.
+    """Return frames of a camera that moves 0.6 m along a flat, textured wall. The depth noise is 2 mm.
 
-    Only the texture determines this motion.
+    This motion is only determined by the texture.
     """
     scene = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     rng = np.random.default_rng(0)
@@ -80,7 +81,7 @@ def test_tracking_without_color_drifts_or_is_lost_on_flat_wall(min_information: 
 
 
 def test_tracking_drift_without_noise_is_below_one_voxel() -> None:
-    """The motion is that of the first 40 frames of a benchmark; the voxel size is 1 cm."""
+    """The frames are the first 40 frames of a benchmark, with voxels of 1 cm."""
     room = Synthetic(frames=240, stop=40, noise=0.0)
     frames = rendered_frames(room)
     poses, _ = run(VoxelHashingIcp(), frames, voxel_size=0.01)
@@ -89,7 +90,7 @@ def test_tracking_drift_without_noise_is_below_one_voxel() -> None:
 
 
 def test_tracking_with_color_is_not_less_accurate(shared_data: Path) -> None:
-    """In a real kitchen, color does not increase the trajectory error."""
+    """Color must not increase the trajectory error in a real kitchen."""
     frames = list(RgbdFolder(shared_data / "redkitchen", stop=80, stride=2))
     truth = [f.T_world_camera for f in frames]
     both, alone = (evaluate(truth, run(VoxelHashingIcp(color_weight=w), frames)[0]) for w in (0.1, 0.0))
@@ -99,7 +100,7 @@ def test_tracking_with_color_is_not_less_accurate(shared_data: Path) -> None:
 
 
 class Surface:
-    """The exact surface of a synthetic room, with the distance of a map from it."""
+    """The exact surface of a synthetic room."""
 
     def __init__(self, room: Synthetic) -> None:
         self._scene = o3d.t.geometry.RaycastingScene()
@@ -109,7 +110,7 @@ class Surface:
         )
 
     def error(self, scene: SceneMap) -> tuple[float, float]:
-        """Return the median distance of the mesh's vertices, m, and the fraction more than two voxels away."""
+        """Return the median distance of the mesh vertices, m, and the fraction of vertices that are two voxels away."""
         distance = self._scene.compute_distance(o3d.core.Tensor(scene.mesh().vertices)).numpy()
         return float(np.median(distance)), float((distance > 2 * VOXEL).mean())
 
@@ -137,7 +138,7 @@ def elsewhere() -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def clean_error(frames: list[Frame], surface: Surface) -> tuple[float, float]:
-    """Return the errors of the map without bad frames, as defined by `Surface.error`."""
+    """Return the errors of the map without bad frames, see `Surface.error`."""
     return surface.error(run(VoxelHashingIcp(), [*frames[:60], *frames[60:5:-1]])[1])
 
 
@@ -163,7 +164,7 @@ def garbage(frame: Frame) -> Frame:
 def assert_robust(
     poses: list[Pose], shown: list[Frame], error: tuple[float, float], clean: tuple[float, float]
 ) -> None:
-    """Check that wrong poses are lost, the last poses are correct, and the map is as accurate as without bad frames."""
+    """Check that wrong poses are lost, that the last poses are correct, and that the map is accurate."""
     off = drifts(poses, shown)
     worst = np.nanargmax(off)
     assert off[worst] < WRONG, f"frame {worst}: expected an error below {WRONG} m or a lost pose, got {off[worst]:.3f}"
@@ -175,7 +176,7 @@ def assert_robust(
 
 
 def there_and_back(frames: list[Frame], begin: int, bad: list[Frame], end: int) -> list[Frame]:
-    """Return `frames` with [begin, end) replaced by `bad`, then ten more frames, and then the way back to the start."""
+    """Return the frames with [begin, end) replaced with `bad`, ten more frames, and the way back to the start."""
     return [*frames[:begin], *bad, *frames[end : end + 10], *frames[end + 10 : 5 : -1]]
 
 
@@ -209,14 +210,14 @@ def test_tracking_after_cut_to_other_room_keeps_map_accurate(
 
 @pytest.mark.parametrize("missing", [3, 5, 20, 40])
 def test_tracking_after_jump_is_accurate_or_lost(missing: int, frames: list[Frame], surface, clean_error) -> None:
-    """The missing frames cause jumps of 4, 9, 30 and 58 cm, and of 2, 5, 17 and 33 degrees."""
+    """The jumps are 4, 9, 30 and 58 cm, and 2, 5, 17 and 33 degrees."""
     shown = there_and_back(frames, 25, [], 25 + missing)
     poses, scene = run(VoxelHashingIcp(), shown)
     assert_robust(poses, shown, surface.error(scene), clean_error)
 
 
 def test_tracking_after_jump_in_real_video_is_accurate_or_lost(shared_data: Path) -> None:
-    """The reference poses of the recording are accurate to one or two centimeters."""
+    """The reference poses have errors of one to two centimeters."""
     frames = list(RgbdFolder(shared_data / "redkitchen", stop=70))
     shown = [*frames[:25], *frames[45:55], *frames[55:5:-2]]
     poses, _ = run(VoxelHashingIcp(), shown)
@@ -226,7 +227,7 @@ def test_tracking_after_jump_in_real_video_is_accurate_or_lost(shared_data: Path
 
 
 def test_tracking_of_sparse_video_is_accurate() -> None:
-    """Steps alternate between 6 and 40 cm, and 3 and 22 degrees, so no motion model predicts the next step."""
+    """Steps of 6 cm and 3 degrees alternate with steps of 40 cm and 22 degrees, which a motion model cannot predict."""
     video = Synthetic(frames=240, stop=200, width=320, height=240)
     sparse = rendered_frames(video, [k for k in range(200) if k % 32 in (0, 4)])
     poses, _ = run(VoxelHashingIcp(), sparse)
@@ -241,7 +242,7 @@ BALL = (np.array([-1.2, 0.8, 2.2]), 0.25)
 
 @pytest.mark.parametrize("spheres", [[BALL], []], ids=["ball", "bare"])
 def test_tracking_of_textureless_wall_is_lost(spheres: list[tuple[np.ndarray, float]]) -> None:
-    """The camera moves from a corner, empty or with a ball, until only an untextured wall is visible, and back."""
+    """The camera moves from a corner to a wall without texture, and back."""
     corner = Scene(
         planes=[
             (np.array([0.0, 0.0, -1.0]), -2.5),

@@ -1,4 +1,4 @@
-"""Tests of tracker=voxel_hashing_icp on a scene with known motion."""
+"""Tests for tracker=voxel_hashing_icp."""
 
 import dataclasses
 import pickle
@@ -40,7 +40,7 @@ def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], Scen
 
 
 def drift(pose: Pose, frame: Frame) -> tuple[float, float]:
-    """Return the errors of the position, m, and of the rotation, rad."""
+    """Return the position error, m, and the rotation error, rad."""
     assert frame.T_world_camera is not None
     error = inverse(frame.T_world_camera) @ pose.T_world_camera
     return float(np.linalg.norm(error[:3, 3])), rotation_angle(error[:3, :3])
@@ -57,7 +57,7 @@ def test_voxel_hashing_icp_recovers_known_motion(color_weight: float) -> None:
 
 
 def test_voxel_hashing_icp_keyframe_prevents_drift_when_static(shared: Path) -> None:
-    """Structure below the voxel size biases the alignment if the keyframe is not used."""
+    """Without the keyframe, structure smaller than a voxel would bias the alignment."""
     frame = dataclasses.replace(RgbdFolder(shared / "data" / "redkitchen")[0], T_world_camera=np.eye(4))
     with_keyframe, alone = (
         run(VoxelHashingIcp(raw_keyframe=raw_keyframe), [frame] * 60)[0][-1] for raw_keyframe in (True, False)
@@ -67,7 +67,7 @@ def test_voxel_hashing_icp_keyframe_prevents_drift_when_static(shared: Path) -> 
 
 
 def test_voxel_hashing_icp_color_determines_motion_along_wall() -> None:
-    """Geometry does not determine sideways motion in front of one wall; its texture does."""
+    """In front of a single wall, only the texture determines the sideways motion."""
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     frames = [wall.frame(T, k) for k, T in enumerate(walk(20))]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
@@ -78,7 +78,7 @@ def test_voxel_hashing_icp_color_determines_motion_along_wall() -> None:
 
 
 def enlarged(frame: Frame, scale: float) -> Frame:
-    """Return the frame as seen in the scene enlarged by `scale`."""
+    """Return the frame in a scene that is enlarged by `scale`."""
     assert frame.T_world_camera is not None
     T = frame.T_world_camera.copy()
     T[:3, 3] *= scale
@@ -86,8 +86,8 @@ def enlarged(frame: Frame, scale: float) -> Frame:
 
 
 @pytest.mark.parametrize("scale", [1, 8])
-def test_voxel_hashing_icp_hall_is_tracked_as_accurately_as_room(scale: float) -> None:
-    """At scale 8, depths are 10 to 25 m and steps are 8 cm."""
+def test_voxel_hashing_icp_accuracy_is_independent_of_scale(scale: float) -> None:
+    """At scale 8, the depth is 10 to 25 m, and the steps are 8 cm."""
     frames = [enlarged(room().frame(T, k), scale) for k, T in enumerate(walk(20))]
     fuser = assemble(BayesianTsdf, voxel_size=0.02 * scale, max_depth=4.0 * scale)
     tracker = VoxelHashingIcp(finest_scale=1.0)
@@ -131,7 +131,7 @@ def test_voxel_hashing_icp_relocalizes_or_is_lost_after_jump() -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, 0.1])
 def test_voxel_hashing_icp_does_not_depend_on_feature_timing(seconds: float) -> None:
-    """Doubtful and lost frames need keyframes while the worker thread is still extracting features."""
+    """In some frames, keyframes are needed while the worker thread is still extracting features."""
     path = [exp_se3(np.array([0.03 * k - 0.3, 0, 0, 0, 0.01 * k, 0])) for k in range(24)]
     for k in (8, 16, 17):
         path[k] = path[k] @ exp_se3(np.array([0, 0, -0.4, 0, 0.3, 0]))
@@ -272,7 +272,7 @@ def test_voxel_hashing_icp_depth_out_of_range_is_lost() -> None:
 
 
 def test_voxel_hashing_icp_continues_after_object_is_removed() -> None:
-    """Without texture, no keyframe can confirm the pose; the ball covers several percent of the view."""
+    """The ball covers several percent of the view. Without texture, no keyframe can confirm the pose."""
     planes = room().planes
     with_ball, without = (Scene(planes, spheres, contrast=0.0) for spheres in ([(np.array([0, 0.1, 1.3]), 0.2)], []))
     frames = [(with_ball if k < 10 else without).frame(T, k) for k, T in enumerate(walk(30)[:16])]
@@ -308,7 +308,7 @@ ONE_STEP = {
 
 
 def test_voxel_hashing_icp_accepts_pose_after_good_final_step() -> None:
-    """Before the step, the error is 6 cm and too few points agree with the map; the step corrects most of it."""
+    """Before the final step, the error is 6 cm and few points agree with the map."""
     start = walk(1)[0]
     frames = [room().frame(T, k) for k, T in enumerate((start, start @ exp_se3(np.array([0.06, 0, 0, 0, 0, 0]))))]
     poses, _ = run(VoxelHashingIcp(**ONE_STEP), frames)
@@ -326,7 +326,7 @@ def test_voxel_hashing_icp_is_lost_after_bad_final_step(monkeypatch: pytest.Monk
 
 
 def aligned(T_world_camera: np.ndarray, agreement: float = 0.85, behind: float = 0.05) -> Alignment:
-    """Return an alignment with imperfect agreement, as caused by inexact intrinsics or a wrong pose."""
+    """Return an alignment with imperfect agreement, e.g. due to inexact intrinsics."""
     return Alignment(T_world_camera, 0.7, agreement, behind, agreement / (1 - behind), "", "85% agree")
 
 
@@ -337,7 +337,7 @@ def moved(step: float) -> np.ndarray:
 def test_voxel_hashing_icp_steady_motion_needs_less_agreement(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The camera moves 1 cm per frame, and at most 85 % of its points agree with the map."""
+    """The camera moves by 1 cm per frame. At most 85 % of the points agree with the map."""
     frames = [room().frame(walk(1)[0], k) for k in range(2 * STEADY + 6)]
     ends = iter(moved(0.01 * k) for k in range(1, len(frames)))
     tracker = VoxelHashingIcp(finest_scale=1.0, relocalize=False)
@@ -368,7 +368,7 @@ def test_voxel_hashing_icp_uses_features_until_motion_is_steady(monkeypatch: pyt
 
 
 def test_voxel_hashing_icp_features_reject_contradicting_pose(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All points agree with the map, but features give a position 30 cm away, from which the alignment diverges."""
+    """All points agree with the map, but the position from features is 30 cm away."""
     frames = [room().frame(walk(1)[0], k) for k in range(2)]
     tracker = VoxelHashingIcp(finest_scale=1.0)
     fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
@@ -381,7 +381,7 @@ def test_voxel_hashing_icp_features_reject_contradicting_pose(monkeypatch: pytes
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_voxel_hashing_icp_resumes_without_relocalization(moving: bool) -> None:
-    """Half of the view is replaced with random depth in four frames, while the camera is static or moves."""
+    """In four frames, half of the depth image is random. The camera is static or moves."""
     there = walk(30)[:14]
     frames = [room().frame(T, k) for k, T in enumerate(there)]
     hidden = [room().frame(there[7 + (k if moving else 0)], 7 + k) for k in range(4)]
@@ -399,7 +399,7 @@ LARGER = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
 
 
 def noisy(step: float, count: int) -> list[Frame]:
-    """Return frames with Kinect noise; the camera moves by `step` m and 0.3 `step` rad per frame."""
+    """Return frames with Kinect noise. The camera moves by `step` m and 0.3 `step` rad per frame."""
     rng = np.random.default_rng(0)
     frames = [room().frame(exp_se3(step * k * np.array([1, 0, 0, 0, 0.3, 0])), k, LARGER) for k in range(count)]
     return [
@@ -421,7 +421,7 @@ def test_voxel_hashing_icp_static_camera_keeps_pose() -> None:
 
 
 def test_voxel_hashing_icp_tracks_slow_motion() -> None:
-    """A step of 0.1 mm is below its uncertainty; the total motion of 6 mm is not."""
+    """Each step of 0.1 mm is below the uncertainty, but the total of 6 mm is not."""
     frames = noisy(0.0001, 60)
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     stops = sum(np.array_equal(a.T_world_camera, b.T_world_camera) for a, b in pairwise(poses))
@@ -431,7 +431,7 @@ def test_voxel_hashing_icp_tracks_slow_motion() -> None:
 
 @pytest.mark.parametrize(("step", "held"), [(0.0005, True), (0.002, False)])
 def test_voxel_hashing_icp_keeps_pose_for_small_uncertain_motion(step: float, held: bool) -> None:
-    """Along a wall with little texture, the uncertainty may exceed the motion of a moving camera."""
+    """Along a wall with little texture, the uncertainty can be larger than the motion."""
     tracker = VoxelHashingIcp()
     tracker._T_world_last = moved(1.0)
     uncertain = aligned(moved(1.0 + step))._replace(covariance=np.eye(6))
@@ -441,7 +441,7 @@ def test_voxel_hashing_icp_keeps_pose_for_small_uncertain_motion(step: float, he
 
 
 def test_voxel_hashing_icp_covariance_matches_errors() -> None:
-    """The errors relative to the previous frame are compared with their covariance."""
+    """Errors of the motion between two frames are compared with the covariance."""
     frames = noisy(0.004, 30)
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert poses[0].covariance is not None
@@ -461,7 +461,7 @@ def test_voxel_hashing_icp_linear_weights_give_no_covariance() -> None:
 
 
 def scattered(frame: Frame, missing: float) -> Frame:
-    """Return the frame without depth in randomly selected pixels."""
+    """Return the frame without depth at random pixels."""
     rng = np.random.default_rng(frame.index)
     return dataclasses.replace(frame, depth=np.where(rng.random(frame.depth.shape) < missing, 0, frame.depth))
 
@@ -481,7 +481,7 @@ def test_voxel_hashing_icp_lost_reason_names_scattered_depth() -> None:
 
 
 def coarse(frame: Frame) -> Frame:
-    """Return the frame with depth in steps of 3.92 cm, as in 8 bits over a range of 10 m."""
+    """Return the frame with depth in steps of 3.92 cm, i.e. 8 bits over a range of 10 m."""
     steps = (np.floor(frame.depth / 0.0392) + 0.5) * 0.0392
     return dataclasses.replace(frame, depth=np.where(frame.depth > 0, steps, 0).astype(np.float32))
 

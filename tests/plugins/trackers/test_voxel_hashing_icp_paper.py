@@ -1,4 +1,7 @@
-"""Tests of the tracker of preset=paper: VoxelHashing's parameters, without additional checks and relocalization."""
+"""Tests for the tracker of preset=paper.
+
+The parameters are those of VoxelHashing, without additional checks and relocalization.
+"""
 
 import dataclasses
 from typing import Any
@@ -36,7 +39,7 @@ def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> list[Pose]:
 
 
 def drift(pose: Pose, frame: Frame) -> float:
-    """Return the distance, m, of the estimated position from the true position."""
+    """Return the distance, m, between the estimated and the true position."""
     assert frame.T_world_camera is not None
     return float(np.linalg.norm(pose.T_world_camera[:3, 3] - frame.T_world_camera[:3, 3]))
 
@@ -57,7 +60,7 @@ def test_paper_tracker_recovers_known_motion() -> None:
 
 
 def test_paper_tracker_uses_published_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each level has its iterations, weights of color and depth, and gates."""
+    """Each level has separate iterations, weights and gates."""
     calls: list[tuple[int, Any, float, Any]] = []
     linearize = voxel_hashing_icp.linearize
 
@@ -70,7 +73,7 @@ def test_paper_tracker_uses_published_parameters(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(voxel_hashing_icp, "CONVERGED", 0.0)
     run(paper_tracker(), walked(2))
     widths = [width for width, *_ in calls]
-    assert [widths.count(width) for width in (40, 80, 160)] == [4, 6, 8 + 1]  # + 1 for the result
+    assert [widths.count(width) for width in (40, 80, 160)] == [4, 6, 8 + 1]  # 1 more for the result
     for width, weights, brightness, linear in calls:
         assert weights.color_weight == (0 if width == 160 else 1)
         assert weights.depth_weight == 1
@@ -106,14 +109,14 @@ def test_paper_tracker_uses_no_features(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def hidden_frames() -> list[Frame]:
-    """Return frames along a path, the last one with random depth in half of the image."""
+    """Return frames along a path. In the last frame, half of the depth image is random."""
     frames = walked(8)
     frames[-1].depth[:, :80] = np.random.default_rng(0).uniform(0.5, 4, (120, 80))
     return frames
 
 
 def test_paper_tracker_agreement_is_not_checked() -> None:
-    """Half of the points are random; only the agreement checks of the default tracker would reject them."""
+    """Half of the points are random. The checks of the default tracker would reject the pose."""
     poses = run(paper_tracker(), hidden_frames())
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], hidden_frames()[-1]) < 0.01
@@ -161,14 +164,14 @@ def test_paper_tracker_frame_after_implausible_step_is_lost() -> None:
 
 
 def test_paper_tracker_frame_of_single_wall_is_lost() -> None:
-    """The finest level uses no color, so the motion along the wall is undetermined."""
+    """Color is not used at the finest level, so the motion along the wall is undetermined."""
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     poses = run(paper_tracker(), [wall.frame(T, k) for k, T in enumerate(walk(3))])
     assert [pose.lost for pose in poses] == [False, True, True]
     assert "does not determine the motion" in poses[1].reason
 
 
-def test_paper_tracker_linear_weights_alone_have_little_effect() -> None:
+def test_paper_tracker_linear_weights_have_small_effect() -> None:
     frames = walked(12)
     tukey, linear = (
         run(VoxelHashingIcp(finest_scale=1.0, residual_weights=weights), frames) for weights in ResidualWeights

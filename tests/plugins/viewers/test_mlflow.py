@@ -1,4 +1,4 @@
-"""Tests of the logs for MLflow, which MLflow reads back."""
+"""Tests for viewer=mlflow. The logs are read with MLflow."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_mlflow_reads_complete_and_partial_runs(tmp_path: Path) -> None:
             tmp_path, "viewer=mlflow", f"fuser.capacity={capacity}", returncode=0 if status == "FINISHED" else 3
         )
         experiment = client.get_experiment_by_name("instancemap")
-        stored = client.search_runs([experiment.experiment_id])[0]  # the newest
+        stored = client.search_runs([experiment.experiment_id])[0]  # the newest run
         keys = [key for key in stored.data.metrics if key.startswith("frame/")]
         series = {
             key: [(each.step, each.value) for each in client.get_metric_history(stored.info.run_id, key)]
@@ -47,7 +47,7 @@ def test_mlflow_invalid_database_raises_error(tmp_path: Path) -> None:
 
 @pytest.mark.acceptance
 def test_mlflow_stores_parallel_runs_of_sweep(tmp_path: Path) -> None:
-    """Each worker opens the database, which does not exist before the sweep."""
+    """Each worker opens the database, which is created by the sweep."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     done = end(begin(tmp_path, *FAKES, *BY_JOBLIB, "viewer=mlflow", "seed=1,2,3", "hydra.sweep.dir=s", sweep="-m"))
     assert done.returncode == 0, done.stderr

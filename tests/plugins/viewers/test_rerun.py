@@ -1,4 +1,4 @@
-"""Tests of rerun recordings: their content, killed runs, and errors."""
+"""Tests for recordings of rerun."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def pipeline(viewer: RerunViewer, **stages: Any) -> Pipeline:
 
 
 def rows(file: Path, entity: str) -> Iterator[dict[str, Any]]:
-    """Yield the rows logged for an entity: the values by column, and the times, ns, by timeline."""
+    """Yield the rows of an entity: the values by column, and the times, ns, by timeline."""
     for chunk in RrdReader(file).stream():
         if chunk.entity_path == f"/{entity}" and not chunk.is_static:
             batch = chunk.to_record_batch()
@@ -74,7 +74,7 @@ def rows(file: Path, entity: str) -> Iterator[dict[str, Any]]:
 
 
 def fixed(file: Path) -> Path:
-    """Write the complete messages to a new file and return it; `RrdReader` rejects a truncated file."""
+    """Write the complete messages to a new file and return the file, because `RrdReader` rejects a truncated file."""
     whole = file.with_name("whole.rrd")
     rrd("merge", file, "-o", str(whole))
     return whole
@@ -82,7 +82,7 @@ def fixed(file: Path) -> Path:
 
 def rrd(command: str, file: Path, *options: str) -> None:
     line = [sys.executable, "-m", "rerun", "rrd", command, str(file), *options]
-    home = os.environ | {"HOME": str(file.parent)}  # rerun writes its settings to HOME
+    home = os.environ | {"HOME": str(file.parent)}  # rerun writes settings to HOME
     done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, env=home)
     assert done.returncode == 0, done.stderr
 
@@ -93,7 +93,7 @@ def entities(file: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the recording of six frames; frame 2 is unreadable, and frame 4 is lost."""
+    """Return the recording of six frames. Frame 2 is unreadable, and frame 4 is lost."""
     directory = tmp_path_factory.mktemp("run")
     viewer = RerunViewer(frame_interval=1, stride=1, mesh_interval=0.1, min_confidence=0.1)
     pipeline(viewer).run_to_any_end(CornerRoom(unreadable=2), directory)
@@ -101,7 +101,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def stages_timed(milliseconds: Sequence[float]) -> list[str]:
-    """Return the stages with a finite time; `milliseconds` has one value per stage of the legend."""
+    """Return the stages with a finite time. `milliseconds` has one value for each stage in the legend."""
     return [stage for stage, time in zip(STAGE_COLORS, milliseconds, strict=True) if np.isfinite(time)]
 
 
@@ -170,11 +170,11 @@ def test_rerun_camera_has_pose_and_intrinsics(recorded: Path) -> None:
     np.testing.assert_allclose(camera["Transform3D:translation"][0], pose_at(5)[:3, 3], atol=1e-6)
     assert camera["Pinhole:resolution"][0] == [CAMERA.width, CAMERA.height]
     K = np.array(camera["Pinhole:image_from_camera"][0]).reshape(3, 3).T
-    np.testing.assert_allclose(K, [[90, 0, 48], [0, 90, 36], [0, 0, 1]])  # rerun: pixel centers at half-integers
+    np.testing.assert_allclose(K, [[90, 0, 48], [0, 90, 36], [0, 0, 1]])  # in rerun, pixel centers are at half-integers
 
 
 def test_rerun_viewer_does_not_change_result(tmp_path: Path) -> None:
-    """The outputs are byte-identical with a viewer that reads the map after every frame."""
+    """The viewer reads the map after every frame."""
     maps = {}
     for name in ("none", "rerun"):
         viewer = build_viewer(name, "viewer.mesh_interval=0.1") if name == "rerun" else build_viewer(name)
@@ -193,7 +193,7 @@ def build_viewer(name: str, *overrides: str) -> Any:
 
 
 def test_rerun_recording_of_killed_run_has_last_second(tmp_path: Path) -> None:
-    """The last log time of the recording is compared with the time of the last fused frame."""
+    """The last time in the recording is compared with the time of the last fused frame."""
     endless = ("dataset.frames=100000", "dataset.slow_s=0.03", "fuser.capacity=100000", "fuser.note=note")
     line = [
         sys.executable,
@@ -223,7 +223,7 @@ def test_rerun_recording_of_killed_run_has_last_second(tmp_path: Path) -> None:
         run.communicate()
     fused_at = (tmp_path / "note").stat().st_mtime  # s, time of the last fused frame
     file = tmp_path / "run" / "recording.rrd"
-    os.truncate(file, file.stat().st_size - 1)  # as if killed during a write
+    os.truncate(file, file.stat().st_size - 1)  # simulate a kill during a write
     frames = list(rows(fixed(file), "world/camera/color"))
     assert len(frames) > 3
     last = max(row["log_time"] for row in frames) / 1e9
@@ -301,7 +301,7 @@ def test_rerun_occupied_port_raises(tmp_path: Path) -> None:
 
 
 def listening() -> set[str]:
-    """Return the addresses on which this process listens, as hexadecimal ADDRESS:PORT in the format of /proc."""
+    """Return the addresses on which this process listens, as hexadecimal ADDRESS:PORT like in /proc."""
     own = {str(file.readlink()) for file in list(Path("/proc/self/fd").iterdir()) if file.is_symlink()}
     lines = [line.split() for table in ("tcp", "tcp6") for line in Path("/proc/net", table).read_text().splitlines()]
     return {line[1] for line in lines if line[3] == "0A" and f"socket:[{line[9]}]" in own}
@@ -318,7 +318,7 @@ def test_rerun_browser_mode_listens_only_on_localhost(tmp_path: Path) -> None:
 
 
 def test_rerun_window_mode_binds_only_localhost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rerun is replaced by a program that records its arguments and listens on the port."""
+    """A program that records its arguments and listens on the port replaces rerun."""
     program, port = tmp_path / "rerun", free_port()
     program.write_text(
         f"""#!{sys.executable}
@@ -331,7 +331,7 @@ if "--port" in sys.argv:
     )
     program.chmod(0o755)
     monkeypatch.setattr(rerun_program, "program", lambda: str(program))
-    for _ in range(2):  # at the second call it is already running
+    for _ in range(2):  # at the second call, the program is already running
         rerun_program.open_window(port, "1GB")
     disabled, opened, *others = (tmp_path / "calls").read_text().splitlines()
     assert disabled == "analytics disable"
@@ -342,7 +342,7 @@ if "--port" in sys.argv:
         rerun_program.open_window(free_port(), "1GB")
 
 
-def test_rerun_browser_page_connects_only_to_own_server(tmp_path: Path) -> None:
+def test_rerun_browser_page_connects_only_to_viewer_server(tmp_path: Path) -> None:
     viewer = RerunViewer(mode=Mode.BROWSER, port=free_port(), web_port=free_port(), file="also.rrd")
     begun(viewer, tmp_path)
     with urlopen(f"http://127.0.0.1:{viewer.web_port}/?url=data", timeout=30) as page:

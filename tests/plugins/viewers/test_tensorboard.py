@@ -1,4 +1,4 @@
-"""Tests of the logs for TensorBoard, which TensorBoard reads back."""
+"""Tests for viewer=tensorboard. The logs are read with TensorBoard."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the offline logs for Weights & Biases, which are read with its record format."""
+"""Tests for viewer=wandb. The offline logs are read in the format of Weights & Biases."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ wandb = pytest.importorskip("wandb", reason="requires wandb (extra wandb)")
 
 pytestmark = pytest.mark.integration
 
-BLOCK, HEADER = 32768, 7  # size of a block and of the header of a chunk in LevelDB's log format, bytes
+BLOCK, HEADER = 32768, 7  # bytes, size of a block and of a chunk header in the log format of LevelDB
 WHOLE, FIRST, MIDDLE, LAST = 1, 2, 3, 4  # kinds of chunks
 
 
 def records(run: TrackedRun) -> Iterator[Any]:
-    """Yield the records of the offline log: a header of 7 bytes, then LevelDB's log format."""
+    """Yield the records of the offline log, which has a header of 7 bytes and then the log format of LevelDB."""
     from wandb.proto import wandb_internal_pb2
 
     [file] = (run.directory / "wandb").glob("offline-run-*/run-*.wandb")

@@ -1,4 +1,4 @@
-"""Slow reference for RoIAlign, sample by sample as in Detectron and torchvision."""
+"""Slow reference for RoIAlign, sample by sample like in Detectron and torchvision."""
 
 import math
 
@@ -19,7 +19,7 @@ def bilinear(plane, y, x):
 
 
 def roi_align_loops(plane, boxes, bins, scale, ratio, half_pixel):
-    """Return the pooled values (N, C, bins, bins) of a plane (C, H, W) in boxes (N, 4), px."""
+    """Return the pooled values (N, C, bins, bins) of boxes (N, 4), px, in a feature map (C, H, W)."""
     pooled = np.zeros((len(boxes), plane.shape[0], bins, bins))
     offset = 0.5 if half_pixel else 0.0
     for n, box in enumerate(boxes):

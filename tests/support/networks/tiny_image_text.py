@@ -1,4 +1,4 @@
-"""Tiny random CLIP and SigLIP models with a small tokenizer, which are quick to write and run."""
+"""Tiny random CLIP and SigLIP models with a small tokenizer."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TEXT = {
 
 
 def write_image_text(folder: Path, kind: str = "siglip") -> Path:
-    """Write a model with this `model_type`, its tokenizer and its preprocessing, as save_pretrained does."""
+    """Write a model of type `model_type` with its tokenizer and its preprocessing."""
     import transformers
 
     torch.manual_seed(5)
@@ -42,7 +42,7 @@ def write_image_text(folder: Path, kind: str = "siglip") -> Path:
     more = {"projection_dim": 16} if kind == "clip" else {}
     model = model_class(config_class(text_config=TEXT, vision_config=VISION, **more))
     with torch.no_grad():
-        for weights in model.parameters():  # with their initial weights, all images would have equal embeddings
+        for weights in model.parameters():  # with the initial weights, all images would have equal embeddings
             weights.add_(torch.randn_like(weights) * 0.3)
     model.save_pretrained(folder)
     write_tokenizer(folder)

@@ -1,4 +1,4 @@
-"""A tiny Mask R-CNN with random weights, which runs all operations in milliseconds."""
+"""A tiny Mask R-CNN with random weights."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TINY = Architecture(
 
 
 def tiny_network(architecture: Architecture = TINY, seed: int = 0) -> MaskRCNN:
-    """Return the network with random normalization statistics, so that every operation has an effect."""
+    """Return the network. The normalization statistics are random, so that every operation has an effect."""
     generator = torch.Generator().manual_seed(seed)
     network = MaskRCNN(architecture).eval()
     for name, tensor in network.state_dict().items():
@@ -31,13 +31,13 @@ def tiny_network(architecture: Architecture = TINY, seed: int = 0) -> MaskRCNN:
         elif tensor.ndim == 1:
             tensor.normal_(0, 0.1, generator=generator)
         elif tensor.ndim > 1:
-            gain = 0.3 if "predictor" in name else 1.0  # so that no class is certain
+            gain = 0.3 if "predictor" in name else 1.0  # no class may be certain
             tensor.normal_(0, gain / tensor[0].numel() ** 0.5, generator=generator)
     return network
 
 
 def tiny_network_file(folder: Path) -> Path:
-    """Write the network to a file in `folder`; return its path."""
+    """Write the network to a file in `folder` and return its path."""
     path = folder / "tiny_mask_rcnn.safetensors"
     save_network(tiny_network(), path, {"data": "none: the weights are random"})
     return path

@@ -1,4 +1,4 @@
-"""ONNX networks with known outputs: constants, or the image itself."""
+"""ONNX networks with known outputs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 
 def save(path: Path, nodes: list[Any], inputs: list[Any], outputs: list[Any], constants: list[Any]) -> Path:
-    """Write a network of these nodes to `path`; return the path."""
+    """Write a network of these nodes to `path` and return the path."""
     graph = helper.make_graph(nodes, "tiny", inputs, outputs, constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
     onnx.checker.check_model(model)
@@ -21,7 +21,7 @@ def save(path: Path, nodes: list[Any], inputs: list[Any], outputs: list[Any], co
 
 
 def constant_network(path: Path, shape: tuple[int | str, ...], outputs: Mapping[str, np.ndarray[Any, Any]]) -> Path:
-    """Write a network with an image input of `shape` and constant `outputs`, plus 0 times the image."""
+    """Write a network with an image input of `shape` and constant `outputs`."""
     nodes = [
         helper.make_node("ReduceMax", ["images"], ["largest"], keepdims=0),
         helper.make_node("Mul", ["largest", "zero"], ["nothing"]),

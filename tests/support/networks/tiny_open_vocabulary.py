@@ -1,4 +1,4 @@
-"""Tiny random OWLv2 and SAM models, which are quick to write and run."""
+"""Tiny random OWLv2 and SAM models."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def write_owlv2(folder: Path) -> Path:
 
 
 def write_sam(folder: Path, kind: str) -> Path:
-    """Write a SAM model if `kind` is "sam", and a SAM 2 model otherwise."""
+    """Write a SAM model if `kind` is "sam", otherwise a SAM 2 model."""
     import transformers
 
     torch.manual_seed(2)

@@ -1,4 +1,4 @@
-"""Tiny random networks of each transformers family, which are quick to write and run."""
+"""Tiny random networks of each transformers family."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ PREPROCESSING: dict[str, dict[str, Any]] = {
 
 
 def write_network(folder: Path, kind: str, labels: Mapping[int, str] | None = None) -> Path:
-    """Write a network of a family, whose classes and masks differ by query. By default, the classes are LABELS."""
+    """Write a network of a family. Each query has other classes and masks. The default classes are LABELS."""
     import transformers
 
     name, parameters = MODELS[kind]

@@ -1,4 +1,4 @@
-"""Copies of real recordings in which one convention differs from the dataset format."""
+"""Copies of real recordings in which one convention differs from the format."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def write_damaged(
     poses_late: int = 0,
     frames: int = 10_000,
 ) -> Path:
-    """Write an RGB-D folder with the images of the valid recording `sound`, and wrong poses, depth scale or delays.
+    """Write an RGB-D folder with wrong poses, depth scale or delays.
 
     Args:
         place: Folder to write.

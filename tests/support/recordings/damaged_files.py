@@ -1,4 +1,4 @@
-"""Random damage to files, for tests that a reader accepts a file or raises a one-line error."""
+"""Random damage to files, for fuzz tests of readers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from framework.errors import DataError
 
 EXAMPLES = int(os.environ.get("INSTANCEMAP_FUZZ", "60"))
-SLOWEST = 2.0  # maximum time to read a file of up to 100 KB on a busy machine, s
+SLOWEST = 2.0  # s, maximum time to read a file of up to 100 KB on a busy machine
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?")
 ODD_NUMBERS = (b"0", b"-1", b"3", b"65536", b"2147483648", b"4294967295", b"1" * 20, b"1" * 5000, b"1e400", b"-0.5")
 NO_NUMBERS = (b"nan", b"-inf", b"1_0", b"0x1p3", b"x", b"", b"\xff", b"\x00", b"1 1", b"\n")
@@ -42,7 +42,7 @@ def changed_json(draw: st.DrawFn, node: Any) -> Any:
 
 @st.composite
 def damaged(draw: st.DrawFn, content: bytes, tokens: tuple[bytes, ...]) -> bytes:
-    """Return `content` with one to four changes, as made by disks, transfers, editors and attackers."""
+    """Return `content` with one to four random changes, like those caused by disks, transfers, editors or attackers."""
     for _ in range(draw(st.integers(1, 4))):
         first = draw(st.integers(0, max(len(content) - 1, 0)))
         last = first + draw(st.integers(0, 30))
@@ -69,7 +69,7 @@ def damaged(draw: st.DrawFn, content: bytes, tokens: tuple[bytes, ...]) -> bytes
 
 
 def check(read: Callable[[Path], object], path: Path, content: bytes) -> str:
-    """Write and read the file; return the error message, or "" without an error. Fail for other outcomes."""
+    """Write and read the file. Return the error message, or "" without an error. Fail for any other outcome."""
     path.write_bytes(content)
     began = time.perf_counter()
     try:

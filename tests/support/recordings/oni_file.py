@@ -1,4 +1,4 @@
-"""A writer of OpenNI recordings (.oni): nodes, images, seek tables and an end record."""
+"""Writer for OpenNI recordings (.oni)."""
 
 import os
 import signal
@@ -25,9 +25,9 @@ def jpeg(image):
 
 
 def with_table(image):
-    """Return an image in OpenNI's 16zT encoding, without its short forms.
+    """Return an image in the 16zT encoding of OpenNI, without short forms.
 
-    The content is the table of values, the index of the first pixel, and then 0xff and the index for each other pixel.
+    The content is the table of values, the index of the first pixel, and then 0xff and an index for each other pixel.
     """
     values, places = np.unique(image, return_inverse=True)
     table = struct.pack("<H", len(values)) + values.astype("<u2").tobytes()
@@ -40,13 +40,13 @@ CODECS = {b"NONE": uncompressed, b"JPEG": jpeg, b"16zT": with_table}
 
 @dataclass
 class Node:
-    """A stream of depth images (H, W), uint16, or of color images (H, W, 3), uint8 RGB."""
+    """Stream of depth images (H, W), uint16, or of color images (H, W, 3), uint8 RGB."""
 
     type: int
     images: list[np.ndarray]
     times: list[int]  # time of each image, us
     codec: bytes = b"NONE"
-    pixel_format: int | None = None  # pixel format of OpenNI 2; None = omitted, as by OpenNI 1
+    pixel_format: int | None = None  # pixel format of OpenNI 2; None = omitted, like in OpenNI 1
     positions: list[int] = field(default_factory=list)  # byte offset of each image record, set by OniFile.write
 
 

@@ -1,4 +1,4 @@
-"""Exports of phone apps, written from known frames, for tests of the importers."""
+"""Exports of phone apps, written from known frames."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's camera axes: y up and z 
 
 @dataclass(frozen=True)
 class PhoneFrame:
-    """One frame of a phone."""
+    """Frame of a phone."""
 
     timestamp: float  # s
     camera: Camera  # camera of the color image
     color: UInt8  # (H, W, 3) RGB
     depth_mm: UInt16  # (h, w)
     confidence: UInt8  # (h, w), 0 to 2
-    T_world_camera: Float64  # (4, 4), in the camera axes of this project
+    T_world_camera: Float64  # T_world_camera (4, 4), in the camera axes of this project
 
     @property
     def T_world_arkit(self) -> Float64:
@@ -39,7 +39,7 @@ class PhoneFrame:
 
 
 def seen_by_phone(frames: Sequence[Frame], shape: tuple[int, int] = LIDAR) -> Iterator[PhoneFrame]:
-    """Yield frames with depth at the resolution of a phone, and low confidence next to depth steps."""
+    """Yield frames with the depth resolution of a phone. The confidence is low next to depth steps."""
     for frame in frames:
         assert frame.T_world_camera is not None
         v, u = (
@@ -84,7 +84,7 @@ def write_video(path: Path, colors: Sequence[UInt8]) -> None:
 
 
 def write_stray_scanner(folder: Path, frames: Sequence[PhoneFrame], own_intrinsics: bool = True) -> None:
-    """Write an export as in docs/format.md of StrayRobots/scanner and its OdometryEncoder."""
+    """Write an export of Stray Scanner, see docs/format.md and OdometryEncoder in StrayRobots/scanner."""
     folder.mkdir(parents=True)
     K = frames[0].camera.K
     (folder / "camera_matrix.csv").write_text("\n".join(numbered(row) for row in K))
@@ -93,7 +93,7 @@ def write_stray_scanner(folder: Path, frames: Sequence[PhoneFrame], own_intrinsi
     for k, frame in enumerate(frames):
         write_png(folder / f"depth/{k:06d}.png", frame.depth_mm)
         write_png(folder / f"confidence/{k:06d}.png", frame.confidence)
-        T = frame.T_world_arkit @ ARKIT_AXES  # q_WA * q_AC of the app
+        T = frame.T_world_arkit @ ARKIT_AXES  # q_WA * q_AC in the app
         pose = numbered([*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()])
         c = frame.camera
         own = f", {numbered([c.fx, c.fy, c.cx, c.cy])}, , " if own_intrinsics else ""
@@ -109,7 +109,7 @@ T_COLOR_DEPTH[:3, 3] = 0.015014, 0.000251, 0.000425
 
 
 def room_frames(count: int = 4) -> list[PhoneFrame]:
-    """Return frames of a small room with exact depth and a focal length that changes from frame to frame."""
+    """Return frames of a small room with exact depth. The focal length changes from frame to frame."""
     frames = []
     for k in range(count):
         camera = replace(ROOM, fx=ROOM.fx - 2 * k, fy=ROOM.fy - 2 * k)
@@ -126,7 +126,7 @@ def room_frames(count: int = 4) -> list[PhoneFrame]:
 def check_imported(
     folder: Path, frames: Sequence[PhoneFrame], scale: float = 1.0, least: int = 1, tells_up: bool = True
 ) -> None:
-    """Check that the imported folder matches the room: size, intrinsics, poses, up, color and depth."""
+    """Check the size, intrinsics, poses, up direction, color and depth of the imported folder."""
     sequence = RgbdFolder(folder)
     assert sequence.camera == frames[0].camera.scaled(scale)
     assert len(sequence) == len(frames)
@@ -151,7 +151,7 @@ def check_imported(
 
 
 def record3d_metadata(frames: Sequence[PhoneFrame], own_intrinsics: bool = True) -> dict[str, object]:
-    """Return the content of metadata.json, as in a real export; newer versions have per-frame intrinsics."""
+    """Return the content of metadata.json. Newer versions have separate intrinsics for each frame."""
     (dh, dw), camera = frames[0].depth_mm.shape, frames[0].camera
     poses = [[*Rotation.from_matrix(T[:3, :3]).as_quat(), *T[:3, 3]] for T in (frame.T_world_arkit for frame in frames)]
     metadata = {
@@ -196,7 +196,7 @@ def write_r3d(path: Path, frames: Sequence[PhoneFrame], confident: bool = True) 
 
 
 def write_scanner_app(folder: Path, frames: Sequence[PhoneFrame]) -> None:
-    """Write the "All Data" export of a low-resolution scan. Every frame has depth, a pose and color."""
+    """Write the "All Data" export of a low-resolution scan, in which every frame is complete."""
     for k, frame in enumerate(frames):
         write_png(folder / f"depth_{k:05d}.png", frame.depth_mm)
         write_png(folder / f"conf_{k:05d}.png", frame.confidence)
@@ -217,7 +217,7 @@ def write_scanner_app(folder: Path, frames: Sequence[PhoneFrame]) -> None:
 
 
 def write_polycam(folder: Path, frames: Sequence[PhoneFrame], prefix: str = "") -> None:
-    """Write raw data as in polyform's README; the prefix corrected_ marks optimized data."""
+    """Write raw data of Polycam, see the README of polyform. The prefix corrected_ marks optimized data."""
     keyframes = folder / "keyframes"
     (keyframes / f"{prefix}cameras").mkdir(parents=True)
     for frame in frames:

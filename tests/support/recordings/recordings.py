@@ -1,4 +1,4 @@
-"""Functions shared by the tests of several dataset readers."""
+"""Functions for the tests of dataset readers."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ def write_color(path: Path, rgb: tuple[int, int, int], shape: tuple[int, int] = 
 
 
 def write_depth(path: Path, value: int | np.ndarray, shape: tuple[int, int] = (480, 640)) -> None:
-    """Write a uint16 image of one value or of the given values (H, W)."""
+    """Write a uint16 image. `value` is a constant or an array (H, W)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), np.broadcast_to(value, shape).astype(np.uint16))
 
 
 def mapped(sequence: RGBDSequence) -> tuple[RunResult, np.ndarray]:
-    """Map all frames with ground-truth poses; return the result and the points (P, 3), m, in the world frame."""
+    """Map all frames with ground-truth poses. Return the result and the points (P, 3), m, in the world frame."""
     fuser = GridFuser()
     result = Pipeline(NoDetections(), GroundTruth(), KeepAll(), fuser, prefetch=0).run(sequence)
     return result, fuser.scene.mesh().vertices
 
 
 def opened(option: str, *overrides: str) -> RGBDSequence:
-    """Open the recording as `python -m framework dataset=OPTION ...` does."""
+    """Open the recording like `python -m framework dataset=OPTION ...`."""
     sequence: RGBDSequence = registered.built("dataset", option, *overrides)
     return sequence
 
 
 def fault_of(sequence: RGBDSequence, bad: int) -> str:
-    """Return the error of frame `bad`; the other frames must be readable."""
+    """Return the error of frame `bad` after checking that the other frames are readable."""
     for k in range(len(sequence)):
         if k != bad:
             sequence[k]

@@ -1,4 +1,4 @@
-"""Conversion of a network file to the output layouts of other exporters."""
+"""Conversion of a YOLO segmentation network to the output layouts of other exporters."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-MOST = 300  # maximum detections of networks with internal suppression
+MOST = 300  # maximum number of detections of networks with suppression
 
 
 class NetworkEditor:
-    """Editor that appends nodes to both outputs of a YOLO segmentation network; boxes are center and size, px."""
+    """Editor for the two outputs of a YOLO segmentation network, whose boxes are center and size, px."""
 
     def __init__(self, source: Path) -> None:
         self.model = onnx.load(source)
@@ -25,18 +25,18 @@ class NetworkEditor:
         self._names = 0
 
     def add(self, kind: str, *inputs: str | np.ndarray[Any, Any], outputs: int = 1, **attributes: Any) -> Any:
-        """Add a node; array inputs become constants. Return the names of its outputs."""
+        """Add a node and return the names of its outputs. Array inputs become constants."""
         names = [self._constant(one) if isinstance(one, np.ndarray) else one for one in inputs]
         made = [self._name() for _ in range(outputs)]
         self.graph.node.append(helper.make_node(kind, names, made, **attributes))
         return made[0] if outputs == 1 else made
 
     def columns_of(self, start: int, stop: int) -> str:
-        """Add a node that slices the table (1, columns, K) from `start` to `stop` - 1; return its output."""
+        """Slice the columns [start, stop) of the table (1, columns, K) and return the output."""
         return self.add("Slice", self.table, np.array([start]), np.array([stop]), np.array([1]))
 
     def save(self, path: Path) -> Path:
-        """Save the network with the current table and prototypes as outputs of dynamic shape."""
+        """Save the network. Its outputs are the current table and prototypes, with dynamic shape."""
         del self.graph.output[:]
         for name, axes in ((self.table, 3), (self.prototypes, 4)):
             shape = [f"{name}_{k}" for k in range(axes)]
@@ -81,7 +81,7 @@ def any_size(net: NetworkEditor) -> None:
 
 
 def best_rows(net: NetworkEditor) -> None:
-    """Select the cells with the best scores as detections, for networks without suppression."""
+    """Select the cells with the best scores as detections, like networks without suppression."""
     corners(net)
     scores = net.columns_of(4, net.columns - 32)
     best = net.add("ReduceMax", scores, axes=[1], keepdims=0)  # (1, K)
@@ -90,7 +90,7 @@ def best_rows(net: NetworkEditor) -> None:
 
 
 def suppressed(net: NetworkEditor) -> None:
-    """Suppress duplicates within the best class at the detector's threshold; pad with zero rows up to MOST."""
+    """Suppress duplicates by the best class of each cell, and pad the detections with zeros."""
     corners(net)
     scores = net.columns_of(4, net.columns - 32)
     best = net.add("ReduceMax", scores, axes=[1], keepdims=1)

@@ -1,4 +1,4 @@
-"""ROS bags of a small room for tests of the importer, written by rosbags."""
+"""ROS bags of a small room, written by rosbags."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ DEPTH_LATE = 0.004  # time from each color image to its depth image, s
 
 @dataclass
 class BagWriter:
-    """Collector of messages that writes them as a ROS 1 or ROS 2 bag."""
+    """Collection of messages that can be written as a ROS 1 or ROS 2 bag."""
 
     ros1: bool = False
     messages: list[tuple[float, str, str, Any]] = field(default_factory=list)  # (time in s, topic, type, message)
 
     def __post_init__(self) -> None:
         self.types = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
-        if self.ros1:  # the stores of all distributions lack tf2_msgs
+        if self.ros1:  # the type stores of all distributions lack tf2_msgs
             self.types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_MESSAGE))
 
     def made(self, name: str, **fields: Any) -> Any:
@@ -135,7 +135,7 @@ class BagWriter:
         self.add(START, topic, "geometry_msgs/msg/Transform", **self.transform(T))
 
     def add_static(self, *transforms: tuple[str, str, Float64]) -> None:
-        """Add static transforms, each given as (parent, child, T_parent_child)."""
+        """Add static transforms. Each is a tuple of parent, child and T_parent_child."""
         stamped = [
             self.made(
                 "geometry_msgs/msg/TransformStamped",
@@ -163,7 +163,10 @@ class BagWriter:
         )
 
     def write(self, path: Path) -> Path:
-        """Write a ROS 1 bag or a ROS 2 folder, with an .mcap file if `path` contains "mcap", else a .db3 file."""
+        """Write a ROS 1 bag or a ROS 2 folder.
+
+        The folder has an .mcap file if `path` contains "mcap", else a .db3 file.
+        """
         if self.ros1:
             writer: Any = Writer1(path)
             serialize: Callable[..., Any] = self.types.serialize_ros1
@@ -185,7 +188,7 @@ def time_of(k: int) -> float:
 
 
 def seen(k: int, camera: Camera = ROOM) -> tuple[np.ndarray, np.ndarray]:
-    """Return the color (H, W, 3) and exact depth (H, W), m, of frame k."""
+    """Return the color (H, W, 3) and the exact depth (H, W), m, of frame k."""
     depth, _, color, _ = look(camera, pose_at(k))
     return color, depth
 
@@ -195,7 +198,7 @@ def png(image: np.ndarray) -> bytes:
 
 
 def compressed_depth(depth: np.ndarray) -> tuple[bytes, str]:
-    """Return depth (m) as quantized inverse depth of compressed_depth_image_transport, and the format name."""
+    """Return depth (m) in the inverse depth format of compressed_depth_image_transport, and the format name."""
     a, b = 100.0 * 101.0, 1.0 - 100.0 * 101.0 / 10.0  # for a quantization of 100 and a range of 10 m
     stored = np.where(depth > 0, np.rint(a / np.where(depth > 0, depth, 1) + b), 0).astype(np.uint16)
     return struct.pack("<iff", 0, a, b) + png(stored), "32FC1; compressedDepth png"
@@ -206,7 +209,7 @@ def millimeters(depth: np.ndarray) -> np.ndarray:
 
 
 def add_camera_of_ros(bag: BagWriter, depth: str = "aligned_depth_to_color") -> None:
-    """Add topics of realsense2_camera with align_depth, with color and depth of the room."""
+    """Add the topics of realsense2_camera with align_depth."""
     for k in range(COUNT):
         color, metric = seen(k)
         bag.add_image(time_of(k), "/camera/color/image_raw", color, "rgb8", padding=16)
@@ -216,7 +219,7 @@ def add_camera_of_ros(bag: BagWriter, depth: str = "aligned_depth_to_color") -> 
 
 
 def add_realsense(bag: BagWriter, depth_camera: Camera, unit: float = 0.0001) -> None:
-    """Add topics of the RealSense recorder, with depth in `unit` (m) from the view of the depth camera."""
+    """Add the topics of the RealSense recorder. Depth is in `unit` (m) and not registered to color."""
     color_topic, depth_topic = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
     bag.add_camera(START, f"{color_topic}/info/camera_info", ROOM)
     bag.add_camera(START, f"{depth_topic}/info/camera_info", depth_camera, "Brown Conrady")

@@ -1,4 +1,4 @@
-"""ScanNet files as published: `.sens` files written field by field, and folders exported by SensReader."""
+"""ScanNet files as published, either `.sens` files or folders exported by SensReader."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ZLIB, OCCIPITAL = 1, 2
 
 @dataclass
 class Shot:
-    """The content of one frame; bytes in place of an image are written unchanged."""
+    """Content of one frame. Images given as bytes are written unchanged."""
 
     color: np.ndarray | bytes
     depth: np.ndarray | bytes
@@ -30,7 +30,7 @@ class Shot:
 
 
 def shots(count: int = 3) -> list[Shot]:
-    """Return frames with smooth colors and slanted depth; the camera moves by 5 cm per frame along x."""
+    """Return frames with smooth colors and slanted depth. The camera moves by 5 cm per frame along x."""
     u, v = np.meshgrid(np.arange(COLOR_CAMERA.width), np.arange(COLOR_CAMERA.height))
     x, y = np.meshgrid(np.arange(DEPTH_CAMERA.width), np.arange(DEPTH_CAMERA.height))
     made = []
@@ -77,7 +77,7 @@ def write_sens(path: Path, frames: list[Shot], **options: object) -> None:
 
 
 def write_exported(folder: Path, frames: list[Shot], suffix: str = ".png") -> None:
-    """Write the output of `SensReader/python/reader.py`; color is PNG by default, so that it is exact."""
+    """Write the output of `SensReader/python/reader.py`. By default, color is PNG and therefore exact."""
     for name in ("color", "depth", "pose", "intrinsic"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     for k, shot in enumerate(frames):

@@ -1,4 +1,4 @@
-"""A scene of planes and spheres with closed-form views of a pinhole camera."""
+"""Scene of planes and spheres, rendered exactly."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ NOTHING = PointClusters(  # a frame without detections
 
 @dataclass
 class Scene:
-    """Planes n . x = d (m), with n toward the camera, and spheres; the surfaces are numbered from 1."""
+    """Planes n . x = d (m), with n toward the camera, and spheres. Surfaces are numbered from 1."""
 
     planes: list[tuple[np.ndarray, float]] = field(default_factory=list)
     spheres: list[tuple[np.ndarray, float]] = field(default_factory=list)
-    contrast: float = 0.5  # of the texture, in [0, 1]
+    contrast: float = 0.5  # contrast of the texture, in [0, 1]
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return depth (H, W), m, float32; color (H, W, 3), uint8; and surface number (H, W), int32, 0 = nothing."""
+        """Return depth (H, W), m, color (H, W, 3), and the surface number (H, W), 0 = nothing."""
         v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         directions = rays @ T_world_camera[:3, :3].T
@@ -57,7 +57,7 @@ class Scene:
         return np.where(np.isfinite(depth), depth, 0).astype(np.float32), color, surface
 
     def _texture(self, points: np.ndarray) -> np.ndarray:
-        """Return a solid texture of a few wavelengths, so that all views of a point have the same color."""
+        """Return a solid texture of a few wavelengths, so that a point has the same color in all views."""
         x, y, z = (points[..., i] for i in range(3))
         waves = [
             np.sin(7 * x + 3 * y) + np.sin(11 * z - 5 * x + 1) + np.sin(17 * y + 4 * z),
@@ -69,7 +69,7 @@ class Scene:
     def frame(
         self, T_world_camera: np.ndarray, index: int = 0, camera: Camera = CAMERA, class_name: str = "chair"
     ) -> Frame:
-        """Return the scene as a frame; spheres are instances, planes are background."""
+        """Return the scene as a frame. Spheres are instances, and planes are background."""
         depth, color, surface = self.render(camera, T_world_camera)
         instance_ids = np.where(surface > len(self.planes), surface - len(self.planes), 0).astype(np.int32)
         names = dict.fromkeys(range(1, len(self.spheres) + 1), class_name)
@@ -83,7 +83,7 @@ class Scene:
 
 
 def room() -> Scene:
-    """Return a room corner with three spheres, whose geometry determines every camera motion."""
+    """Return a room corner with three spheres. All camera motions are determined by the geometry."""
     return Scene(
         planes=[
             (np.array([0.0, 0.0, -1.0]), -2.5),
@@ -108,7 +108,7 @@ def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, rotvec: tuple[float, fl
 
 
 def walk(frames: int) -> list[np.ndarray]:
-    """Return the poses of a smooth hand-held motion of about 10 mm and 0.5 degrees per frame."""
+    """Return the poses of a smooth hand-held motion with steps of about 10 mm and 0.5 degrees."""
     t = np.linspace(0, 1, frames) * frames / 60
     return [
         pose(

@@ -1,4 +1,4 @@
-"""Furniture made of boxes on a floor in front of a wall, with exact views and configurable mask errors."""
+"""Furniture made of boxes, on a floor in front of a wall. Mask errors are configurable."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1 m; z 
 
 @dataclass
 class BoxScene:
-    """Objects, each a list of boxes, numbered from 1; `room` belongs to no object."""
+    """Objects, each a list of boxes. Objects are numbered from 1, and `room` is not an object."""
 
     objects: list[list[Box]]
     room: tuple[Box, ...] = ROOM
@@ -48,13 +48,13 @@ class BoxScene:
         return Frame(index, index / 30, color, depth, CAMERA, T_world_camera, truth)
 
     def owners(self, points: np.ndarray, tolerance: float) -> np.ndarray:
-        """Return the object (P,) within `tolerance` m of each point; 0 = room, -1 = no object or several."""
+        """Return the object (P,) within `tolerance` m of each point, 0 = room, -1 = none or several."""
         near = np.stack([_distance(points, parts) <= tolerance for parts in [list(self.room), *self.objects]], axis=1)
         return np.where(near.sum(axis=1) == 1, near.argmax(axis=1), -1)
 
 
 def look_from(x: float, y: float, z: float, at: tuple[float, float, float]) -> np.ndarray:
-    """Return T_world_camera of an upright camera at (x, y, z) that looks at a point."""
+    """Return T_world_camera of an upright camera at (x, y, z) that looks at the point `at`."""
     forward = np.array(at) - (x, y, z)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 0.0, 1.0))
@@ -72,7 +72,7 @@ def bled(mask: np.ndarray, px: int) -> np.ndarray:
 
 
 def detected(masks: list[np.ndarray], class_ids: list[int]) -> Detections:
-    """Return detections with score 0.8 and probability 0.6 of their class, 0.2 of each other class."""
+    """Return detections with score 0.8. The probability of the class is 0.6, and that of the others 0.2."""
     n = len(masks)
     probabilities = np.full((n, len(CLASSES)), 0.2, np.float32)
     probabilities[np.arange(n), class_ids] = 0.6
@@ -86,7 +86,7 @@ def detected(masks: list[np.ndarray], class_ids: list[int]) -> Detections:
 
 
 def table(x: float, y: float, width: float = 1.4, depth: float = 0.8, height: float = 0.74) -> list[Box]:
-    """Return the boxes of a table at (x, y), m, with a top of 4 cm on four legs of 6 cm."""
+    """Return the boxes of a table at (x, y), m. The top is 4 cm thick, and the legs are 6 cm thick."""
     half = width / 2, depth / 2
     legs = [
         (x + i * (half[0] - 0.06) - 0.03, y + j * (half[1] - 0.06) - 0.03, 0.0,
@@ -97,7 +97,7 @@ def table(x: float, y: float, width: float = 1.4, depth: float = 0.8, height: fl
 
 
 def chair(x: float, y: float) -> list[Box]:
-    """Return the boxes of a chair at (x, y), m, with a seat of 45 cm, a back toward +y and four legs."""
+    """Return the boxes of a chair at (x, y), m. The seat is at 45 cm, and the back is toward +y."""
     legs = [(x + i * 0.19 - 0.02, y + j * 0.19 - 0.02, 0.0, x + i * 0.19 + 0.02, y + j * 0.19 + 0.02, 0.42)
             for i in (-1, 1) for j in (-1, 1)]  # fmt: skip
     return [(x - 0.225, y - 0.225, 0.42, x + 0.225, y + 0.225, 0.47),
@@ -111,13 +111,13 @@ BOX_TRIANGLES = np.array(
 
 
 def _corners(box: Box) -> np.ndarray:
-    """Return the corners (8, 3), m; x varies fastest."""
+    """Return the corners (8, 3), m. x varies fastest."""
     x, y, z = (box[0], box[3]), (box[1], box[4]), (box[2], box[5])
     return np.array([(x[i], y[j], z[k]) for k in (0, 1) for j in (0, 1) for i in (0, 1)])
 
 
 def _distance(points: np.ndarray, boxes: list[Box]) -> np.ndarray:
-    """Return the distances (P,), m, of points (P, 3) to the nearest box; 0 inside a box."""
+    """Return the distance, m, of points (P, 3) from the nearest box, 0 = inside a box."""
     distances = [
         np.linalg.norm(np.maximum(np.maximum(np.array(box[:3]) - points, points - np.array(box[3:])), 0), axis=1)
         for box in boxes

@@ -1,4 +1,4 @@
-"""A room with two boxes and an exact surface, for rendered images."""
+"""Room with two boxes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def box(
 
 
 def furnished(R: np.ndarray = Z_UP) -> InstanceMesh:
-    """Return a room of 4 x 3 x 2.5 m with a red box (1) and a blue box (2); R rotates the world frame."""
+    """Return a room of 4 x 3 x 2.5 m with a red box (1) and a blue box (2). R rotates the world frame."""
     parts = [box((0, 0, 1.25), (4, 3, 2.5), True), box((-1, 0, 0.4), (0.8,) * 3), box((1, 0.3, 0.4), (0.8,) * 3)]
     offsets = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
     ids = np.repeat([0, 1, 2], [len(vertices) for vertices, _ in parts]).astype(np.int32)
@@ -39,7 +39,7 @@ def furnished(R: np.ndarray = Z_UP) -> InstanceMesh:
 
 
 def walk(R: np.ndarray = Z_UP, n: int = 20) -> np.ndarray:
-    """Return camera poses (n, 4, 4) at eye height that look around the room and slightly down."""
+    """Return camera poses (n, 4, 4) at eye height. The camera looks around the room and slightly down."""
     poses = np.tile(np.eye(4), (n, 1, 1))
     for pose, angle in zip(poses, np.linspace(0, 2 * np.pi, n, endpoint=False), strict=True):
         pose[:3, :3] = R @ looking(np.array([np.cos(angle), np.sin(angle), -0.4]), np.array([0.0, 0, 1]))
@@ -49,7 +49,7 @@ def walk(R: np.ndarray = Z_UP, n: int = 20) -> np.ndarray:
 
 @dataclass
 class BoxesRoom(RGBDSequence):
-    """The room as a dataset without frames, with only its labeled surface."""
+    """The room as a dataset with a labeled surface, but without frames."""
 
     scene: str = "boxes"  # sequence name; "gone" cannot be read
 

@@ -1,4 +1,4 @@
-"""The room of the contract tests as videos with configurable errors, and minimal plugins that map it."""
+"""The corner room as a video with configurable errors, and minimal plugins that map the room."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class CornerRoom(RGBDSequence):
     truth: bool = True  # ground-truth poses and instances
     unposed: tuple[int, ...] = ()  # indices of the frames without a ground-truth pose
     slow_s: float = 0.0  # time to read a frame, s
-    scene: str = ""  # sequence name; all names give the same room
+    scene: str = ""  # sequence name, without effect on the room
     start: int = 0  # index of the first frame
     stop: int = -1  # index after the last frame; -1 = all frames
     stride: int = 1  # step between frames; 1 = every frame
@@ -84,7 +84,7 @@ class LiveRoom(LiveVideo):
     """The corner room as live video, with ground-truth poses."""
 
     frames_sent: int = 6  # number of frames that are sent
-    period_s: float = -1.0  # time between frames, s; -1 = each frame is sent when the previous one has been read
+    period_s: float = -1.0  # time between frames, s; -1 = a frame is sent after the previous one has been read
     unreadable: int = -1  # index of the frame that raises FrameError; -1 = none
     fails_after: int = -1  # number of frames before the source fails; -1 = never
 
@@ -119,7 +119,7 @@ class LiveRoom(LiveVideo):
 
 @dataclass
 class SphereDetector(Detector):
-    """Detector of both spheres with exact masks, which supports concurrent calls."""
+    """Detector of both spheres with exact masks. Concurrent calls are supported."""
 
     concurrent = True
     broken_at: int = -1  # index of the frame that raises FrameError; -1 = none
@@ -135,7 +135,7 @@ class SphereDetector(Detector):
 
 @dataclass
 class GivenPose(PoseTracker):
-    """Tracker that returns the ground-truth pose; the frames in [lost_from, lost_to) are lost."""
+    """Tracker that returns the ground-truth pose. Frames in [lost_from, lost_to) are lost."""
 
     pose_source = "ground_truth"
     lost_from: int = 0  # index of the first lost frame
@@ -160,7 +160,7 @@ class KeepAll(ClusterRefiner):
 
 @dataclass
 class GridMap(SceneMap):
-    """Map with a separate grid of triangles for each fused frame."""
+    """Map with a separate triangle grid for each fused frame."""
 
     vertices: list[np.ndarray] = field(default_factory=list)
     colors: list[np.ndarray] = field(default_factory=list)
@@ -175,7 +175,7 @@ class GridMap(SceneMap):
         return MapStatistics(voxels, bytes=28 * voxels)
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> View:
-        depth, normals, color, ids = look(camera, T_world_camera)  # as from a perfect map
+        depth, normals, color, ids = look(camera, T_world_camera)  # like in a perfect map
         return View(camera, T_world_camera, depth, normals.astype(np.float32), color, ids, ids - 1)
 
     def mesh(self) -> InstanceMesh:
@@ -221,12 +221,12 @@ class GridMap(SceneMap):
 
 @dataclass
 class GridFuser(MapFuser):
-    """Fuser that appends each frame; cluster k is instance k + 1."""
+    """Fuser that appends each frame to the map. Cluster k is instance k + 1."""
 
     capacity: int = 100  # maximum number of frames in the map
     slow_s: float = 0.0  # time to fuse a frame, s
     slow_save_s: float = 0.0  # time to save the map, s
-    note: str = ""  # path of a file that is written when a frame is in the map; "" = none
+    note: str = ""  # path of a file that is created after the first fused frame; "" = none
 
     def __post_init__(self) -> None:
         self.scene: GridMap = GridMap(slow_save_s=self.slow_save_s)
@@ -257,7 +257,7 @@ class GridFuser(MapFuser):
 
 
 def fault(kind: str) -> BaseException:
-    """Return an example of an exception that a stage can raise, by name."""
+    """Return the exception of this kind, as an example of a failing stage."""
     faults: dict[str, BaseException] = {
         "OSError": OSError(5, "Input/output error", "weights.bin"),
         "ValueError": ValueError("operands could not be broadcast together"),
@@ -269,7 +269,7 @@ def fault(kind: str) -> BaseException:
 
 @dataclass
 class FaultyDetector(SphereDetector):
-    """Detector that fails at one frame with an exception of `fault`, or returns masks of a wrong size."""
+    """Detector that raises an exception or returns invalid masks in one frame."""
 
     at: int = 3  # index of the frame at which the detector fails
     kind: str = "OSError"  # failure: OSError, ValueError, MemoryError, SystemExit or masks (invalid masks)

@@ -1,4 +1,4 @@
-"""A stored run of a room made of boxes: a table on the floor, a cube on the table and a picture on the wall."""
+"""Stored run of a room made of boxes: a table on the floor, a cube on the table and a picture on the wall."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ UP = np.array([0.0, 0.0, 1.0])
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # R_world_room of a world frame with y up
 Block = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1 m
 
-WALLS: list[Block] = [(0, 0, 0, 4, 3, 2.5)]  # walls, floor and ceiling, seen from inside
+WALLS: list[Block] = [(0, 0, 0, 4, 3, 2.5)]  # walls, floor and ceiling, visible from inside
 TABLE: list[Block] = [
     (0.8, 1.0, 0.7, 2.0, 1.8, 0.75),
     *((x, y, 0, x + 0.05, y + 0.05, 0.7) for x in (0.8, 1.95) for y in (1.0, 1.75)),
@@ -32,7 +32,7 @@ PICTURE: list[Block] = [(2.8, 2.95, 1.2, 3.3, 3.0, 1.6)]
 
 
 def faces(block: Block, inward: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices (V, 3), m, and outward triangles (T, 3) of a box; `inward` reverses their orientation."""
+    """Return the vertices (V, 3), m, and triangles (T, 3) of a box. The triangles face outward unless `inward`."""
     low, high = np.array(block[:3]), np.array(block[3:])
     vertices, triangles, count = [], [], 0
     for axis in range(3):
@@ -52,7 +52,7 @@ def faces(block: Block, inward: bool = False) -> tuple[np.ndarray, np.ndarray]:
 
 
 def look_about(places: Sequence[tuple[float, float, float]], n: int = 12) -> Float64:
-    """Return T_room_camera (F, 4, 4) of cameras at `places` (m), in `n` directions and at three downward angles."""
+    """Return T_room_camera (F, 4, 4) of cameras at `places` (m), in `n` directions and at three pitch angles."""
     poses = []
     for place in places:
         for angle in np.linspace(0, 2 * np.pi, n, endpoint=False):
@@ -72,7 +72,7 @@ class ExportedRoom:
         default_factory=lambda: {"dining table": TABLE, "cube": CUBE, "picture": PICTURE}
     )
     walls: list[Block] = field(default_factory=lambda: WALLS)
-    blocks: list[Block] = field(default_factory=list)  # boxes that belong to no object, seen from outside
+    blocks: list[Block] = field(default_factory=list)  # boxes that belong to no object, visible from outside
     eyes: Sequence[tuple[float, float, float]] = ((0.4, 0.4, 1.5), (3.5, 2.5, 1.5), (0.4, 2.6, 1.5), (3.5, 0.4, 1.5))
     R_world_room: Float64 = field(default_factory=lambda: np.eye(3))
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, position of the room in the world frame
@@ -84,7 +84,7 @@ class ExportedRoom:
         return T
 
     def mesh(self) -> InstanceMesh:
-        """Return the mesh in the world frame; objects are numbered from 1 in the order of `things`."""
+        """Return the mesh in the world frame. Objects are numbered from 1 in the order of `things`."""
         solid = [(k, block, False) for k, blocks in enumerate(self.things.values(), start=1) for block in blocks]
         solid += [(0, block, False) for block in self.blocks] + [(0, block, True) for block in self.walls]
         vertices, triangles, ids, count = [], [], [], 0
@@ -107,7 +107,7 @@ class ExportedRoom:
         )
 
     def write(self, run: Path, figures: bool = True) -> Path:
-        """Write a run directory; without `figures`, metrics.json lacks the up direction and the floor height."""
+        """Write a run directory. Without `figures`, metrics.json has no up direction and no floor height."""
         run.mkdir(parents=True, exist_ok=True)
         mesh, up = self.mesh(), self.R_world_room @ UP
         write_mesh(run / "mesh.ply", mesh)

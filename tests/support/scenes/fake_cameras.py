@@ -1,6 +1,6 @@
-"""Fake vendor libraries of depth cameras, with a camera in the corner room.
+"""Fake libraries of depth cameras, with a camera in the corner room.
 
-They contain only what the readers use. Names, arguments and return values are those of pyrealsense2 2.59 and of
+The fakes contain only what the readers use. Names, arguments and return values are those of pyrealsense2 2.59 and
 pyorbbecsdk2 2.1.
 """
 
@@ -22,7 +22,7 @@ DEPTH_AFTER_COLOR_US = 4000  # time from the color to the depth image, microseco
 
 @dataclass
 class FakeCamera:
-    """The connected camera and its configured errors."""
+    """Connected camera with configurable errors."""
 
     plugged_in: bool = True
     coeffs: tuple[float, ...] = (0.0,) * 5  # lens distortion: k1, k2, p1, p2, k3
@@ -32,7 +32,7 @@ class FakeCamera:
     unplugged_at: int = -1  # index of the frame at which the library raises; -1 = never
     without_depth: int = -1  # index of the frame without depth; -1 = none
     running: bool = False
-    started: list[dict[str, Any]] = field(default_factory=list)  # request of each start
+    started: list[dict[str, Any]] = field(default_factory=list)  # requested streams of each start
     registered: int = 0  # number of registered image pairs
 
     def start(self, asked: dict[str, Any]) -> None:
@@ -57,7 +57,7 @@ class FakeCamera:
 
 @dataclass
 class _Images:
-    """The frame set of both libraries."""
+    """Frame set of both libraries."""
 
     camera: FakeCamera
     k: int
@@ -81,9 +81,9 @@ class _Images:
 
 
 def _image(pixels: np.ndarray, shift: int = 0, time_us: int = 0) -> SimpleNamespace:
-    """Return an image of both libraries; `shift`, px, simulates depth that is not registered to color."""
+    """Return an image of both libraries. `shift`, px, moves depth as if it were not registered to color."""
     pixels = np.roll(pixels, shift, axis=1)
-    pixels.setflags(write=False)  # read-only, because the library owns the image
+    pixels.setflags(write=False)  # read-only like an image that the library owns
     height, width = pixels.shape[:2]
     return SimpleNamespace(
         get_data=lambda: pixels,

@@ -1,4 +1,4 @@
-"""A box-shaped room with exact geometry and a random wallpaper on every wall, for image features."""
+"""Box-shaped room with random wallpaper, for image features."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def papered_frame(T_world_camera: np.ndarray, index: int = 0, paper: int = 0, ca
 
 
 def _sampled(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return bilinear samples (P, 3). OpenCV's remap accepts at most 32767 samples per row, so rows of 256 are used."""
+    """Return bilinear samples (P, 3). The samples are in rows of 256, because OpenCV accepts at most 32767 per row."""
     pad = -len(x) % 256
     grid_x, grid_y = (np.pad(c, (0, pad)).reshape(-1, 256) for c in (x, y))
     return cv2.remap(image, grid_x, grid_y, cv2.INTER_LINEAR).reshape(-1, 3)[: len(x)]

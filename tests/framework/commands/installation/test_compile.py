@@ -1,4 +1,4 @@
-"""Tests of the command `compile` and its interruption by Ctrl-C."""
+"""Tests for the command `compile`."""
 
 from __future__ import annotations
 

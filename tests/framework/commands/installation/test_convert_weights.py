@@ -1,4 +1,4 @@
-"""Tests of the command `convert-weights`, which writes networks for detector=mask_rcnn."""
+"""Tests for the command `convert-weights`."""
 
 import hashlib
 import pickle

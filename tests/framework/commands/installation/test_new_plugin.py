@@ -1,4 +1,4 @@
-"""Tests of the command `new-plugin`. The generated repositories are installed and tested outside the checkout."""
+"""Tests for the command `new-plugin`. The generated repositories are installed and tested outside of the checkout."""
 
 from __future__ import annotations
 
@@ -40,7 +40,6 @@ def test_new_plugin_output_matches_example_plugin() -> None:
 @pytest.mark.parametrize("name", ["x", "a" * LONGEST_NAME])
 @pytest.mark.parametrize("stage", GROUPS)
 def test_new_plugin_files_pass_ruff(stage: str, name: str, tmp_path: Path) -> None:
-    """Ruff also detects undefined names and invalid Python in a template."""
     made = write_repository(stage, name, tmp_path)
     for line in (["check", "--no-cache"], ["format", "--check", "--no-cache"]):
         done = subprocess.run(
@@ -101,7 +100,8 @@ def test_new_plugin_failure_keeps_existing_files(tmp_path: Path, monkeypatch: py
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with one plugin repository per group and the virtual environment `env`.
 
-    The plugins and InstanceMap are installed in `env` from wheels. The libraries are those of the current environment.
+    The plugins and InstanceMap are installed in `env` from wheels. The dependencies are those of the current
+    environment.
     """
     folder = tmp_path_factory.mktemp("stranger")
     for stage in GROUPS.keys() - {"refiner"}:
@@ -126,7 +126,7 @@ def test_new_plugin_installed_plugins_pass_their_tests(place: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_new_plugin_and_builtin_option_share_sweep_table(place: Path) -> None:
+def test_new_plugin_and_builtin_option_are_in_one_sweep_table(place: Path) -> None:
     (place / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")
     chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"
@@ -161,7 +161,7 @@ def test_installed_package_runs_doctor_and_new_plugin(place: Path) -> None:
 
 @pytest.mark.acceptance
 def test_installed_package_maps_desk(place: Path) -> None:
-    """Run the command with its default dataset, and the Python example of the README, on a few frames each."""
+    """The command with its default dataset and the Python example of the README run on a few frames."""
     assert run_in(place, "instancemap", "--version") == f"instancemap {framework.__version__}\n"
     run_in(place, "instancemap", "dataset.stop=3", "hydra.run.dir=desk")
     assert json.loads((place / "desk" / "metrics.json").read_text())["frames"] == 3

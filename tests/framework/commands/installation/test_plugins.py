@@ -1,4 +1,4 @@
-"""Tests of the plugin listing, with a third-party package installed by pip."""
+"""Tests for the listing of plugins, with a third-party package installed by pip."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ PACKAGE = {
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return environment variables that make the installed package importable."""
+    """Return the environment variables with which the installed package can be imported."""
     import textwrap
 
     source, site = tmp_path_factory.mktemp("acme"), tmp_path_factory.mktemp("site")
@@ -216,7 +216,7 @@ def test_describe_option_accepts_every_registered_option() -> None:
 
 
 def test_plugins_listing_does_not_import_open3d(tmp_path: Path) -> None:
-    """The import takes 0.5 s and 170 MB. The default stages do not need Open3D."""
+    """Importing Open3D takes 0.5 s and 170 MB, and the default stages do not need it."""
     code = (
         "import sys; from framework.commands.installation.plugins import *; "
         "registered(*GROUPS); print('open3d' in sys.modules)"

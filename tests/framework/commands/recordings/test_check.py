@@ -1,4 +1,4 @@
-"""Tests of the command `check`: output, errors, and the correction by the suggested setting."""
+"""Tests for the command `check`."""
 
 from __future__ import annotations
 

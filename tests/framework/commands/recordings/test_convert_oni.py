@@ -1,4 +1,4 @@
-"""Tests of the command `convert-oni`: its output files, including those written before an error."""
+"""Tests for the command `convert-oni`."""
 
 import sys
 
@@ -29,7 +29,10 @@ def command(monkeypatch, *arguments):
 
 
 def deliver(monkeypatch, count, fault=None):
-    """Replace OpenNI 2, which may not be installed, with a reader of `count` frames that can raise `fault`."""
+    """Replace OpenNI 2 with a reader of `count` frames.
+
+    If `fault` is given, the reader raises it after the last frame.
+    """
 
     def read_frames(contents, scratch):
         yield from FRAMES[:count]
@@ -70,7 +73,7 @@ def test_convert_oni_writes_scene_images(tmp_path, monkeypatch, capsys, source):
     assert f"{tmp_path / '011'}: 4 frames; skipped 0 color" in capsys.readouterr().out
 
 
-def test_convert_oni_color_and_depth_keep_own_timestamps(tmp_path, monkeypatch, source):
+def test_convert_oni_color_and_depth_timestamps_are_kept(tmp_path, monkeypatch, source):
     deliver(monkeypatch, 3)
     convert_oni.convert(source, tmp_path / "011")
     assert (tmp_path / "011/timestamp.txt").read_text() == "1 7 0\n2 1007 1000\n3 2007 2000\n"

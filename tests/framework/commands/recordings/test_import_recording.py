@@ -1,4 +1,4 @@
-"""Tests of the command `import`: output, errors, and the mapping of an imported phone recording."""
+"""Tests for the command `import`."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_import_odometry_is_used_by_printed_command(
 def test_import_rotated_images_have_rotated_poses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The y axis points down in the room and up in ARKit, so the images are upside down for a phone."""
+    """The y axis points down in the room and up in ARKit, so the images of the phone are upside down."""
     frames = room_frames()
     write_stray_scanner(tmp_path / "export", frames)
     command(monkeypatch, tmp_path / "export", tmp_path / "out", "--rotate", "180", "--confidence", "0")
@@ -96,7 +96,7 @@ def test_import_existing_output_raises_before_reading(
 
 @pytest.mark.acceptance
 def test_import_phone_recording_is_mappable(shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The export of a real kitchen contains 256x192 depth, a video and ARKit poses. All frames are tracked."""
+    """The export of a real kitchen has 256x192 depth images, a video and ARKit poses. No frame may be lost."""
     kitchen = RgbdFolder(shared_data / "redkitchen", stride=3, stop=180)
     write_stray_scanner(tmp_path / "export", list(seen_by_phone(list(kitchen))))
     command(monkeypatch, tmp_path / "export", tmp_path / "out")

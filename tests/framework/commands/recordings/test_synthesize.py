@@ -1,4 +1,4 @@
-"""Tests of the command `synthesize`."""
+"""Tests for the command `synthesize`."""
 
 from __future__ import annotations
 

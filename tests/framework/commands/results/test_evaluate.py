@@ -1,4 +1,4 @@
-"""Tests of the command `evaluate` on stored runs."""
+"""Tests for the command `evaluate` on stored runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CODE = {"evaluation.git_commit": "abcdef0", "evaluation.git_dirty": False}
 
 @pytest.fixture(scope="module")
 def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the directory of a mapped run whose overview image is a placeholder."""
+    """Return the directory of a run. Its overview image is a placeholder."""
     directory = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(run_directory, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
@@ -45,14 +45,14 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stored(mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a copy of the run directory; set a known commit of the evaluation code."""
+    """Return a copy of the run directory, and set a known commit of the evaluation code."""
     monkeypatch.setattr(reevaluation, "code_version", lambda: {"git_commit": "abcdef0", "git_dirty": False})
     return Path(shutil.copytree(mapped, tmp_path / "runs" / "first"))
 
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Return a function that runs the command in this process and returns its status, stdout and stderr."""
+    """Return a function that runs the command in this process and returns the status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["evaluate", *map(str, arguments)])
@@ -120,7 +120,7 @@ def test_evaluate_tiny_difference_prints_all_digits(stored: Path, command) -> No
 
 @pytest.mark.parametrize("option", ["--allow-changed-ground-truth", "--other-truth"])
 def test_evaluate_changed_ground_truth_requires_option(stored: Path, command, option: str) -> None:
-    """In another working directory, a relative dataset.root can name a folder with other ground truth."""
+    """A relative dataset.root can refer to other ground truth if the working directory changes."""
     true = metrics_of(stored)
     write_metrics(stored, true | {"truth_sha256": "0" * 64})
     status, out, err = command(stored)
@@ -203,7 +203,7 @@ def _truncated_mesh(directory: Path) -> None:
         (lambda directory: _with_dataset(directory, colour=1), "got 'colour'"),
     ],
 )
-def test_evaluate_refuses_only_unusable_run(stored: Path, command, spoil: Callable[[Path], None], message: str) -> None:
+def test_evaluate_rejects_only_unusable_run(stored: Path, command, spoil: Callable[[Path], None], message: str) -> None:
     spoilt = Path(shutil.copytree(stored, stored.parent / "a spoilt one"))
     spoil(spoilt)
     before = {path.name: path.read_bytes() for path in spoilt.iterdir()}
@@ -217,13 +217,13 @@ def test_evaluate_refuses_only_unusable_run(stored: Path, command, spoil: Callab
     assert {path.name: path.read_bytes() for path in spoilt.iterdir()} == before
 
 
-def test_evaluate_folder_without_runs_is_refused(stored: Path, tmp_path: Path, command) -> None:
+def test_evaluate_folder_without_runs_is_rejected(stored: Path, tmp_path: Path, command) -> None:
     status, out, err = command(tmp_path / "nothing", stored)
     assert (status, out) == (1, f"{stored}: unchanged\n")
     assert err == f"refused: {tmp_path / 'nothing'}: expected a run directory or a folder of runs, got neither\n"
 
 
-def test_evaluate_runs_with_same_truth_load_it_once(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evaluate_runs_with_same_truth_load_truth_once(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(stored, stored.parent / "second")
     _with_dataset(Path(shutil.copytree(stored, stored.parent / "other")), stop=3)
     made = []
@@ -276,7 +276,6 @@ def test_evaluate_process_reports_results_and_status(mapped: Path, tmp_path: Pat
 
 
 def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
-    """Without the lock, a run could restart while its file is rewritten."""
     write_metrics(stored, metrics_of(stored) | {"instances.ap50": 0.5})
     before = (stored / "metrics.json").read_bytes()
     with locked(stored):
@@ -289,11 +288,10 @@ def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
 
 @pytest.mark.parametrize("started", [["-m", "framework"], ["-P", "-m", "framework"]])
 def test_evaluate_does_not_execute_code_in_run_directory(started: list[str], stored: Path) -> None:
-    """Modules in an untrusted run directory are not imported."""
     (stored / "brought.py").write_text(
         "print('runs')\nfrom tests.support.scenes.corner_room import CornerRoom as Brought\n"
     )
-    for name in ("numpy", "yaml", "matplotlib", "evo"):  # imported by the command itself
+    for name in ("numpy", "yaml", "matplotlib", "evo"):  # modules that the command imports
         (stored / f"{name}.py").write_text("print('runs')\n")
     _with_dataset(stored, _target_="brought.Brought")
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}

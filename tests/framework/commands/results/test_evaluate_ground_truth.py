@@ -1,4 +1,4 @@
-"""Tests of runs that are evaluated with the map of another run as ground truth."""
+"""Tests for runs that use the map of another run as ground truth."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def write_folder(root: Path) -> None:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the run `reference`, mapped with true masks and poses, and two recordings of its frames."""
+    """Return a folder with the run `reference`, made with true masks and poses, and two recordings of its frames."""
     place = tmp_path_factory.mktemp("truth")
     reported_run.write_run(place / "reference")
     for name in ("posed", "unposed"):
@@ -53,7 +53,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def mapped(directory: Path, root: Path, **changes: Any) -> dict[str, Any]:
-    """Map the recording in `root` into the run directory `directory`; return the metrics."""
+    """Map the recording in `root` into the run directory `directory` and return the metrics."""
     dataset = {"_target_": "framework.datasets.rgbd_folder.RgbdFolder", "root": str(root)}
     config = reported_run.CONFIG | {
         "dataset": dataset | changes.pop("dataset", {}),
@@ -77,7 +77,7 @@ def evaluated(directory: Path, ground_truth: Path | None) -> int:
 
 
 def tracker(made: Path) -> dict[str, str]:
-    """Return the config of a tracker that reads the poses of the reference run."""
+    """Return the config of a tracker that returns the poses of the reference run."""
     path = made / "reference" / "trajectory.txt"
     return {"_target_": "plugins.trackers.trajectory_file.TrajectoryFile", "path": str(path)}
 
@@ -106,7 +106,7 @@ def test_ground_truth_run_aligns_unposed_map(made: Path, tmp_path: Path) -> None
     write_tum(reference / "trajectory.txt", times, shift @ poses)
     named = {"ground_truth": str(reference)}
     assert mapped(tmp_path / "run", made / "unposed", dataset=named, tracker=tracker(made))["instances.ap50"] == 1.0
-    write_tum(reference / "trajectory.txt", times, poses)  # the poses no longer fit the mesh
+    write_tum(reference / "trajectory.txt", times, poses)  # the poses no longer match the mesh
     assert evaluated(tmp_path / "run", reference) == 0
     assert metrics_of(tmp_path / "run")["instances.ap50"] == 0.0
 
@@ -114,7 +114,7 @@ def test_ground_truth_run_aligns_unposed_map(made: Path, tmp_path: Path) -> None
 def test_evaluate_changes_ground_truth_of_finished_run(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Later evaluations, reports and figures use the same ground truth."""
+    """The new ground truth is stored, so later evaluations, reports and figures use it."""
     fake = {"_target_": "plugins.detectors.none.NoDetections"}
     directory = tmp_path / "run"
     assert "instances.ap50" not in mapped(directory, made / "posed", detector=fake)
@@ -148,8 +148,7 @@ def test_evaluate_unusable_ground_truth_is_one_line_error(
     assert (directory / "metrics.json").read_bytes() == before
 
 
-def test_evaluate_again_gives_identical_metrics(made: Path, tmp_path: Path) -> None:
-    """The alignment of a tracked map uses the stored poses."""
+def test_evaluate_repeated_gives_identical_metrics(made: Path, tmp_path: Path) -> None:
     reference = made / "reference"
     before = mapped(tmp_path / "run", made / "unposed", dataset={"ground_truth": str(reference)}, tracker=tracker(made))
     assert evaluated(tmp_path / "run", None) == 0

@@ -1,4 +1,4 @@
-"""Tests of the command `export`: arguments, written files and errors."""
+"""Tests for the command `export`."""
 
 from __future__ import annotations
 

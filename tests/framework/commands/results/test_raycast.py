@@ -1,4 +1,4 @@
-"""Tests of the command `raycast`."""
+"""Tests for the command `raycast`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stored(mapped: Path, tmp_path: Path) -> Path:
-    """Return the directory of a run in which tracking is lost in frame 2."""
+    """Return the directory of a run that is lost in frame 2."""
     run = Path(shutil.copytree(mapped, tmp_path / "run"))
     timestamps, poses = read_tum(run / "trajectory.txt")
     write_tum(run / "trajectory.txt", np.delete(timestamps, 2), np.delete(poses, 2, axis=0))
@@ -43,7 +43,7 @@ def stored(mapped: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Return a function that runs the command in this process and returns its status, stdout and stderr."""
+    """Return a function that runs the command in this process and returns the status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["raycast", *map(str, arguments)])
@@ -60,7 +60,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 @pytest.fixture
 def views(monkeypatch: pytest.MonkeyPatch) -> list[tuple[View, str]]:
-    """Return a list that receives each drawn view with its note."""
+    """Return a list that collects each drawn view and its note."""
     drawn: list[tuple[View, str]] = []
     write = raycast_figure.write_raycast
 

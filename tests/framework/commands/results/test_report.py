@@ -1,4 +1,4 @@
-"""Tests of the command `report`."""
+"""Tests for the command `report`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def stored(mapped: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Return a function that runs the command in this process and returns its status, stdout and stderr."""
+    """Return a function that runs the command in this process and returns the status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["report", *map(str, arguments)])
@@ -50,7 +50,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 
 def texts(page: str) -> str:
-    """Return the visible text of an HTML page, with single spaces."""
+    """Return the visible text of an HTML page with normalized white space."""
     body = page[page.index("<body>") : page.index('<script type="application/json"')]
     return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", body))
 
@@ -94,7 +94,7 @@ def test_report_without_sequence_shows_map_images(stored: Path, command, monkeyp
 
 
 def test_report_with_large_path_omits_enlarged_path(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(composition, "_added", [])  # without the sequence there is no ground-truth path
+    monkeypatch.setattr(composition, "_added", [])  # the ground-truth path requires the sequence
     monkeypatch.setattr(run_page, "SMALL_PATH", 0.0)  # every path is large enough in the top view
     assert command(stored)[0] == 0
     page = (stored / "report.html").read_text()
@@ -118,7 +118,7 @@ def test_report_invalid_unicode_names_are_escaped(stored: Path, command) -> None
 
 
 def test_report_object_without_class_is_listed(stored: Path, command) -> None:
-    """Fusers without classes write such maps."""
+    """Some fusers write maps without classes."""
     entries = json.loads((stored / "instances.json").read_text())
     entries[0] |= {"class": None, "class_probabilities": {}}
     (stored / "instances.json").write_text(json.dumps(entries))
@@ -210,7 +210,7 @@ def test_report_url_is_percent_encoded(stored: Path, command) -> None:
     assert out.endswith("my%20run%20%232%2050%25/report.html\n")
 
 
-def test_report_invalid_or_repeated_run_is_refused(stored: Path, command, tmp_path: Path) -> None:
+def test_report_invalid_or_repeated_run_is_rejected(stored: Path, command, tmp_path: Path) -> None:
     assert "expected a run directory with metrics.json or" in command(tmp_path)[2]
     assert "expected distinct runs" in command(stored, stored.parent / "." / "first")[2]
 

@@ -1,9 +1,11 @@
-"""Tests of `instancemap reproduce` and `instancemap bundle`."""
+"""Tests for the commands `reproduce` and `bundle`."""
 
 from __future__ import annotations
 
+import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -25,6 +27,7 @@ from instancemap import ClusterRefiner
 @dataclass
 class Shift(ClusterRefiner):
     distance: float = 0.0
+    weights: str = ""
 
     def refine(self, clusters, frame):
         return replace(clusters, points_world=clusters.points_world + np.float32(self.distance))
@@ -32,7 +35,7 @@ class Shift(ClusterRefiner):
 
 
 def command(folder: Path, *words: str, path: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a command of InstanceMap in `folder`; `path` is an additional import folder."""
+    """Run a command of InstanceMap in `folder`. `path` is an additional folder for imports."""
     paths = [str(CHECKOUT), *([str(path)] if path else [])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     line = [sys.executable, "-m", "framework", *words]
@@ -41,16 +44,18 @@ def command(folder: Path, *words: str, path: Path | None = None) -> subprocess.C
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with one run of the fake stages and a third-party refiner, and the package of the refiner."""
+    """Return a folder with a run of the fake stages and a third-party refiner, and the package of the refiner."""
     folder = tmp_path_factory.mktemp("runs")
     (folder / "package/shift_refiner").mkdir(parents=True)
     (folder / "package/shift_refiner/__init__.py").write_text(REFINER)
     (folder / "conf/refiner").mkdir(parents=True)
-    (folder / "conf/refiner/shift.yaml").write_text("_target_: shift_refiner.Shift\ndistance: 0.0\n")
+    (folder / "conf/refiner/shift.yaml").write_text("_target_: shift_refiner.Shift\ndistance: 0.0\nweights: ''\n")
+    (folder / "network.onnx").write_bytes(b"weights")
     conf = folder / "fake_conf"
     shutil.copytree(CHECKOUT / "tests/support/fake_conf", conf)
     shutil.copy(folder / "conf/refiner/shift.yaml", conf / "refiner")
     words = ["--config-dir", str(conf), *FAKES[2:-2], "refiner=shift", FAKES[-1], "hydra.run.dir=sweep/run"]
+    words.append(f"refiner.weights={folder / 'network.onnx'}")
     done = command(folder, *words, path=folder / "package")
     assert done.returncode == 0, done.stderr
     return folder
@@ -77,7 +82,7 @@ def test_reproduce_changed_parameter_is_named(runs: Path, run: Path) -> None:
     config.write_text(config.read_text().replace("distance: 0.0", "distance: 0.5"))
     done = reproduce(runs, run)
     assert done.returncode == 1
-    assert "config.yaml: refiner.distance: expected 0.0 (as composed by Hydra), got 0.5" in done.stdout
+    assert "config.yaml: refiner.distance: expected 0.0, got 0.5" in done.stdout
 
 
 def test_reproduce_edited_metrics_are_named(runs: Path, run: Path) -> None:
@@ -86,6 +91,26 @@ def test_reproduce_edited_metrics_are_named(runs: Path, run: Path) -> None:
     done = reproduce(runs, run, "--check-only")
     assert done.returncode == 1
     assert "metrics.json: expected the SHA-256" in done.stdout
+
+
+def test_reproduce_replaced_network_is_named(runs: Path, run: Path) -> None:
+    network = runs / "network.onnx"
+    network.write_bytes(b"other weights")
+    done = reproduce(runs, run, "--check-only")
+    network.write_bytes(b"weights")
+    assert done.returncode == 1
+    assert re.search(rf"changed: refiner.weights: expected the file with the SHA-256 .* in {network}", done.stdout)
+
+
+def test_reproduce_edited_table_reports_changed_cell(runs: Path, run: Path) -> None:
+    assert command(run.parent.parent, "tables", "sweep").returncode == 0
+    table = run.parent / "table.csv"
+    lines = table.read_text().splitlines()
+    count = dict(zip(*csv.reader(lines), strict=True))["frames"]
+    table.write_text("\n".join([lines[0], lines[1].replace(f",{count},", ",97,")]) + "\n")
+    done = command(run.parent.parent, "reproduce", "sweep/table.csv", "--check-only")
+    assert done.returncode == 1
+    assert f"table.csv: run: frames: expected {count} as in the runs, got 97" in done.stdout
 
 
 def test_reproduce_changed_plugin_names_package_frame_and_stage(runs: Path, run: Path, tmp_path: Path) -> None:
@@ -102,19 +127,19 @@ def test_reproduce_changed_plugin_names_package_frame_and_stage(runs: Path, run:
 def test_reproduce_override_of_unknown_key_raises(runs: Path, run: Path) -> None:
     done = reproduce(runs, run, "dataset.nothing=3")
     assert done.returncode == 1
-    assert "dataset.nothing=3: expected KEY=VALUE with a key of the run's config" in done.stderr
+    assert "dataset.nothing=3: expected KEY=VALUE with a key and a type of the run's config" in done.stderr
 
 
 def test_reproduce_unknown_row_lists_rows(runs: Path, run: Path) -> None:
     done = reproduce(runs, run, "--cell", "nothing")
     assert done.returncode == 1
-    assert "error: --cell: expected one of " in done.stderr
+    assert "error: --cell: expected one of the rows all runs, got 'nothing'" in done.stderr
 
 
-def test_bundle_contains_plugin_and_is_reproduced_without_package(runs: Path, run: Path, tmp_path: Path) -> None:
+def test_bundle_with_plugin_is_reproduced_without_package(runs: Path, run: Path, tmp_path: Path) -> None:
     done = command(tmp_path, "bundle", "sweep", "--out", "experiment.zip", path=runs / "package")
     assert done.returncode == 0, done.stderr
-    assert "experiment.zip: 1 runs, " in done.stdout
+    assert "experiment.zip: 1 run, " in done.stdout
     names = zipfile.ZipFile(tmp_path / "experiment.zip").namelist()
     assert {"run/metrics.json", "run/manifest.json", "plugins/shift_refiner/__init__.py"} <= set(names)
     assert "run/map.npz" not in names

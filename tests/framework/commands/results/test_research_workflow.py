@@ -1,8 +1,10 @@
-"""Test of a research workflow: own plugins, an experiment over datasets and detectors, table, figure and bundle."""
+"""Test of docs/tutorials/research_project.md: plugins, an experiment over datasets and detectors, and its bundle."""
 
 from __future__ import annotations
 
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -12,121 +14,35 @@ import pytest
 
 from instancemap import load_runs
 from tests.support import option_files
+from tests.support.doc_pages import PAGES, blocks
 from tests.support.fresh_environment import CHECKOUT, OFFLINE, PIP, build_wheels, create_environment, run_in
 from tests.support.table_text import grids
 
 pytestmark = pytest.mark.acceptance
 
-PROJECT = """
-[build-system]
-requires = ["hatchling"]
-build-backend = "hatchling.build"
-
-[project]
-name = "my-methods"
-version = "0.1"
-
-[project.entry-points."instancemap.configs"]
-my_methods = "my_methods.conf"
-
-[tool.hatch.build.targets.wheel]
-packages = ["my_methods"]
-"""
-PLUGINS = '''
-"""A detector by color, and a refiner by depth."""
-
-from dataclasses import dataclass
-
-import cv2
-import numpy as np
-from instancemap import ClusterRefiner, Detections, Detector, Frame, PointClusters, keep_points
-
-
-@dataclass
-class ColorBlobs(Detector):
-    """Detection of connected regions of saturated color."""
-
-    min_area: int = 200  # minimum area of a region, px
-
-    def __post_init__(self) -> None:
-        self.classes = ("chair", "couch")
-
-    def detect(self, frame: Frame) -> Detections:
-        saturation = cv2.cvtColor(frame.color, cv2.COLOR_RGB2HSV)[..., 1]
-        count, regions, stats, _ = cv2.connectedComponentsWithStats((saturation > 80).astype(np.uint8))
-        kept = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= self.min_area]
-        if not kept:
-            return Detections.none(frame.camera.shape, self.classes)
-        x, y, width, height = stats[kept, :4].T.astype(np.float32)
-        return Detections(
-            masks=regions == np.array(kept)[:, None, None],
-            boxes=np.stack([x, y, x + width - 1, y + height - 1], axis=1),
-            scores=np.full(len(kept), 0.6, np.float32),
-            class_probabilities=np.tile(np.float32([0.6, 0.4]), (len(kept), 1)),
-            classes=self.classes,
-        )
-
-
-@dataclass
-class NearestPoints(ClusterRefiner):
-    """Selection of the points of each cluster that are nearer than a quantile of their depths."""
-
-    quantile: float = 0.5  # quantile of the depths, in [0, 1]
-
-    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        u, v = clusters.pixels.T
-        depth = frame.depth[v, u]
-        kept = np.ones(len(depth), np.bool_)
-        for k in range(len(clusters)):
-            own = clusters.cluster == k
-            if own.any():
-                kept[own] = depth[own] <= np.quantile(depth[own], self.quantile)
-        return keep_points(clusters, kept)
-'''
-EXPERIMENT = """
-# @package _global_
-# Effect of the refiner nearest_points.
-defaults:
-  - /parts/experiment
-  - _self_
-
-rows:
-  identity: [refiner=identity]
-  mine: [refiner=nearest_points]
-
-table:
-  average_over: [seed, dataset, detector]
-  pair_by: [dataset, detector]
-  columns: [instances.count, instances.ap50, stage_ms.refinement.median]
-
-figure:
-  kind: maps
-  sequences: dataset
-"""
-DATASETS, DETECTORS, ROWS = ("desk", "my_recording", "my_room"), ("maskrcnn2go", "color_blobs"), ("identity", "mine")
-CHOSEN = (
-    "experiment=week",
-    f"dataset={','.join(DATASETS)}",
-    f"detector={','.join(DETECTORS)}",
-    *("dataset.stop=3", "tracker=ground_truth", "fuser.voxel_size=0.03", "fuser.min_observations=1"),
-)
+TUTORIAL = "docs/tutorials/research_project.md"
+EXPERIMENT = "outputs/nearest_points"
+DATASETS, DETECTORS = ("desk", "my_recording", "my_room"), ("maskrcnn2go", "saturated_regions")
+ROWS = ("identity", "nearest_points")
+SMALL = ("dataset.stop=3", "tracker=ground_truth", "fuser.voxel_size=0.03", "fuser.min_observations=1")
 
 
 def write_package(folder: Path, recording: Path) -> None:
-    """Write the source folder of a package with two plugins, two datasets and an experiment."""
-    files = {
-        "pyproject.toml": PROJECT,
-        "my_methods/__init__.py": PLUGINS,
-        "my_methods/conf/detector/color_blobs.yaml": "_target_: my_methods.ColorBlobs\nmin_area: 200 # px\n",
-        "my_methods/conf/refiner/nearest_points.yaml": "_target_: my_methods.NearestPoints\nquantile: 0.5\n",
-        "my_methods/conf/dataset/my_recording.yaml": f"defaults: [rgbd_folder, _self_]\nroot: {recording}\n",
-        "my_methods/conf/dataset/my_room.yaml": "defaults: [synthetic, _self_]\nwidth: 160\nheight: 120\nframes: 3\n",
-        "my_methods/conf/experiment/week.yaml": EXPERIMENT.lstrip(),
-    }
+    """Write the package of the tutorial, with a recording in the folder `recording`."""
+    pattern = r"`(my_methods/[\w./]+|pyproject\.toml)`[^`]*(?:`conf`[^`]*)?```\w+\n(.*?)```"
+    files = dict(re.findall(pattern, PAGES[TUTORIAL], re.DOTALL))
+    assert len(files) == 7
     for name, content in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(content)
+        path.write_text(content.replace("RECORDING", str(recording)))
+
+
+def commands() -> list[list[str]]:
+    """Return the words of the commands in the tutorial, without `instancemap`."""
+    lines = "".join(blocks("bash", TUTORIAL)).splitlines()
+    assert all(line.startswith("instancemap ") for line in lines)
+    return [shlex.split(line)[1:] for line in lines]
 
 
 def command(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
@@ -139,50 +55,51 @@ def command(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of the installed package and the outputs of its experiment."""
-    folder = tmp_path_factory.mktemp("week")
+    folder = tmp_path_factory.mktemp("project")
     (folder / "recording").mkdir()
     option_files.overrides("dataset", "rgbd_folder", folder / "recording")
     write_package(folder / "my-methods", folder / "recording")
     wheels = build_wheels(folder / "package", [folder / "my-methods"])
     subprocess.run([*PIP, "install", *OFFLINE, "--target", str(folder / "installed"), *wheels], check=True, timeout=120)
-    done = command(folder, *CHOSEN)
+    run, _, _ = commands()
+    done = command(folder, *run, *SMALL)
     assert done.returncode == 0, done.stderr[-4000:]
     return folder
 
 
 def test_workflow_data_frame_has_run_of_each_combination(folder: Path) -> None:
-    runs = load_runs(folder / "outputs" / "week")
+    runs = load_runs(folder / EXPERIMENT)
     combinations = runs[["dataset", "detector", "row"]].itertuples(index=False, name=None)
     assert sorted(combinations) == sorted((d, n, row) for d in DATASETS for n in DETECTORS for row in ROWS)
     assert (runs["frames"] == 3).all()
-    mine = runs["row"] == "mine"
-    assert runs["code.refiner"][mine].str.startswith("my_methods 0.1 ").all()
-    assert runs["code.refiner"][~mine].str.startswith("plugins.refiners.identity ").all()
+    own = runs["row"] == "nearest_points"
+    assert runs["code.refiner"][own].str.startswith("my_methods 0.1 ").all()
+    assert runs["code.refiner"][~own].str.startswith("plugins.refiners.identity ").all()
 
 
 def test_workflow_table_has_paired_differences(folder: Path) -> None:
-    text = (folder / "outputs" / "week" / "table.md").read_text()
+    text = (folder / EXPERIMENT / "table.md").read_text()
     means, differences, statistics = grids(text)
-    assert [line.split(" | ")[:2] for line in means[2:]] == [["| identity", "6"], ["| mine", "6"]]
+    assert [line.split(" | ")[:2] for line in means[2:]] == [["| identity", "6"], ["| nearest_points", "6"]]
     assert differences[0] == "| minus identity | pairs | instances | AP50 | refinement (ms) |"
     [line] = differences[2:]
-    assert line.startswith("| mine | 6 | ")
-    assert any(line.startswith("| refinement (ms) | mine | 6 | ") for line in statistics)
+    assert line.startswith("| nearest_points | 6 | ")
+    assert any(line.startswith("| refinement (ms) | nearest_points | 6 | ") for line in statistics)
     assert "- Differences are paired by dataset, detector: mean ± standard error over dataset, detector" in text
-    assert f"- Command line: {' '.join(CHOSEN[1:])}." in text
+    assert f"- Command line: {' '.join([*commands()[0][1:], *SMALL])}." in text
     assert "Missing" not in text
     assert "Incomplete" not in text
 
 
 def test_workflow_writes_figure(folder: Path) -> None:
-    outputs = folder / "outputs" / "week"
+    outputs = folder / EXPERIMENT
     assert (outputs / "figure.png").stat().st_size > 10_000
     assert (outputs / "figure.pdf").read_bytes().startswith(b"%PDF")
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="requires pdflatex")
 def test_workflow_table_compiles_in_latex(folder: Path, tmp_path: Path) -> None:
-    table = (folder / "outputs" / "week" / "table.tex").read_text()
+    table = (folder / EXPERIMENT / "table.tex").read_text()
     document = f"\\documentclass{{article}}\n\\usepackage{{booktabs}}\n\\begin{{document}}\n{table}\\end{{document}}\n"
     (tmp_path / "paper.tex").write_text(document)
     line = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
@@ -193,13 +110,43 @@ def test_workflow_table_compiles_in_latex(folder: Path, tmp_path: Path) -> None:
 
 def test_workflow_bundle_is_reproduced_in_new_environment(folder: Path, tmp_path: Path) -> None:
     """The new environment has InstanceMap, but not the package with the plugins."""
-    done = command(folder, "bundle", "outputs/week", "--out", str(tmp_path / "week.zip"))
+    _, bundle, reproduce = commands()
+    done = command(folder, *bundle)
     assert done.returncode == 0, done.stderr
-    assert "week.zip: 12 runs, " in done.stdout
+    assert "nearest_points.zip: 12 runs, " in done.stdout
+    shutil.copy(folder / "nearest_points.zip", tmp_path)
     create_environment(tmp_path)
     absent = "import importlib.util as util; print(util.find_spec('my_methods'))"
     assert run_in(tmp_path, "python", "-c", absent) == "None\n"
-    message = run_in(tmp_path, "instancemap", "reproduce", "week.zip", "--trust-code")
+    message = run_in(tmp_path, "instancemap", *reproduce)
     compared = [line for line in message.splitlines() if ": changed: " not in line]
     assert len(compared) == 12
     assert all(line.endswith(": byte-identical") for line in compared), message
+
+
+def test_workflow_edited_plugin_repeats_only_its_runs(folder: Path) -> None:
+    """The detector is in another module of the same package."""
+    source = folder / "installed/my_methods"
+    text = (source / "__init__.py").read_text()
+    split = text.index("@dataclass\nclass NearestPoints")
+    imports = text[: text.index("@dataclass")]
+    (source / "refiners.py").write_text(imports + text[split:])
+    (source / "detectors.py").write_text(text[:split])
+    (source / "__init__.py").write_text(
+        "from .detectors import SaturatedRegions\nfrom .refiners import NearestPoints\n"
+    )
+    run, _, _ = commands()
+    assert command(folder, *run, *SMALL).returncode == 0
+    before = modification_times(folder)
+    refiner = (source / "refiners.py").read_text()
+    (source / "refiners.py").write_text(refiner.replace("<= np.quantile", "< np.quantile"))
+    done = command(folder, *run, *SMALL)
+    assert done.returncode == 0, done.stderr[-4000:]
+    repeated = {name for name, time in modification_times(folder).items() if time != before[name]}
+    assert repeated == {name for name in before if "row=nearest_points" in name}
+    assert len(repeated) == 6
+
+
+def modification_times(folder: Path) -> dict[str, int]:
+    """Return the modification time of each run by the name of its directory."""
+    return {path.parent.name: path.stat().st_mtime_ns for path in (folder / EXPERIMENT).glob("*/metrics.json")}

@@ -1,4 +1,4 @@
-"""Tests of the checks before the first run of a sweep."""
+"""Tests for the checks before the first run of a sweep."""
 
 import pytest
 
@@ -52,7 +52,7 @@ def test_single_run_takes_first_value_of_each_sweep() -> None:
 
 
 def check(*overrides: str, swept: tuple[str, ...] = ()) -> None:
-    """Check the table of a sweep as `instancemap -m` does."""
+    """Check the table of a sweep like `instancemap -m`."""
     config = composed(*overrides)
     check_table(config, [*overrides, *swept], checked_rows(config.get("rows")))
 

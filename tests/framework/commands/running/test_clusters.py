@@ -1,4 +1,4 @@
-"""Tests of sweeps on clusters that preempt jobs and remove nodes. The tables of a resumed sweep are identical."""
+"""Tests for sweeps on clusters that preempt jobs or remove nodes. A resumed sweep must write identical tables."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ THREE = ("row=half", "seed=1,2,3", "dataset.slow_s=0.7", "threads=1")  # three r
 
 
 def mapping(directory: Path) -> dict[int, str]:
-    """Return the names of the active runs by the id of the process that holds the lock of the run directory."""
+    """Return the names of the active runs, keyed by the process that holds the lock of the run directory."""
     holders = {}
     for name in begun(directory):
         words = (directory / PLACE / name / ".lock_holder").read_text().split()
@@ -28,7 +28,7 @@ def mapping(directory: Path) -> dict[int, str]:
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return the tables of an uninterrupted sweep whose runs are executed one after another."""
+    """Return the tables of a sweep that was not interrupted and executed its runs one after another."""
     directory = tmp_path_factory.mktemp("undisturbed")
     done = end(begin(directory, *THREE))
     assert done.returncode == 0, done.stderr
@@ -36,14 +36,18 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def test_slurm_sweep_resumes_preempted_and_killed_jobs(tmp_path: Path, undisturbed: dict[str, str]) -> None:
-    """Use submitit's local queue, the signal that SLURM sends before it preempts a job, and SIGKILL."""
+    """One job gets the signal that SLURM sends before preemption, another one gets SIGKILL.
+
+    The queue is that of submitit.
+    """
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     arguments = ("launcher=submitit_local", *THREE)
     first = begin(tmp_path, *arguments)
     wait_until(lambda: len(mapping(tmp_path)) == 3, first)
     preempted, killed, _ = map(psutil.Process, mapping(tmp_path))
     preempted.send_signal(signal.SIGUSR2)
-    for process in (*killed.parents()[:1], killed):  # first the queue's process, which would end the job normally
+    # the process of the queue first, because it would end the job normally
+    for process in (*killed.parents()[:1], killed):
         process.kill()
     done = end(first)
     assert done.returncode == 1
@@ -61,7 +65,7 @@ def test_slurm_sweep_resumes_preempted_and_killed_jobs(tmp_path: Path, undisturb
 
 @pytest.fixture
 def ray_cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
-    """Start a Ray cluster whose head node runs no jobs."""
+    """Start a Ray cluster. Its head node runs no jobs."""
     pytest.importorskip("hydra_plugins.hydra_ray_launcher")
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))

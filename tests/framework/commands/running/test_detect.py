@@ -1,4 +1,4 @@
-"""Tests of the command `detect`."""
+"""Tests for the command `detect`."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_detect_failing_detector_leaves_no_file(tmp_path: Path) -> None:
     (tmp_path / "found.json").write_text("before")
     with pytest.raises(DataError, match="expected ground-truth instances"):
         write_detections(tmp_path / "found.json", SphereDetector(), CornerRoom(truth=False))
-    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
+    with pytest.raises(DataError, match="expected usable frames, got none among 1"):
         write_detections(tmp_path / "found.json", SphereDetector(broken_at=0), CornerRoom(frames=1))
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("found.json", "before")]
 
@@ -141,7 +141,7 @@ def test_detect_without_detections_writes_valid_file(tmp_path: Path) -> None:
 
 @dataclass
 class PartlyTrueRoom(CornerRoom):
-    """A room whose frame 2 has no pose, so that its ground-truth instances cannot be rendered."""
+    """A room in which frame 2 has no pose and therefore no ground-truth instances."""
 
     def __getitem__(self, k: int) -> Frame:
         frame = super().__getitem__(k)
@@ -151,5 +151,5 @@ class PartlyTrueRoom(CornerRoom):
 def test_detect_accepts_frame_without_rendered_truth(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_detections(tmp_path / "found.json", NoDetections(), PartlyTrueRoom())
     assert "frame skipped in the evaluation: frame 2 has no pose" in caplog.text
-    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
+    with pytest.raises(DataError, match="expected usable frames, got none among 1"):
         write_detections(tmp_path / "found.json", SphereDetector(), PartlyTrueRoom(start=2, stop=3))

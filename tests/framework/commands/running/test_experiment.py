@@ -1,4 +1,4 @@
-"""Tests of experiments and of the rows of the included experiments."""
+"""Tests for experiments and for the rows of the included experiments."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def table(directory: Path) -> dict[str, dict[str, str]]:
-    """Return the cells of the rows in table.md by name and heading."""
+    """Return the cells of table.md as {name of the row: {heading: cell}}."""
     lines = [line.strip("|").split("|") for line in (directory / "table.md").read_text().splitlines()[2:]]
     heads, _, *rows = [[cell.strip() for cell in line] for line in lines[: lines.index([""])]]
     return {row[0]: dict(zip(heads, row, strict=True)) for row in rows}
 
 
 def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
-    """The rows `all` and `half` map 8 and 4 frames, of which `seed` frames are lost. The row `broken` fails."""
+    """The row `all` maps 8 frames and `half` maps 4 frames. `seed` frames are lost in each. The row `broken` fails."""
     first = start(tmp_path)
     out = tmp_path / "outputs" / "fake_ablation"
     assert first.returncode == 1, "expected the status of failed runs, from the row `broken`"
@@ -79,7 +79,7 @@ def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
     assert json.loads(metrics["row=half,seed=3"].read_text())["choice.refiner"] == "identity"
 
     written = {name: path.stat().st_mtime_ns for name, path in metrics.items()}
-    metrics["row=half,seed=3"].unlink()  # as if the run had been killed before its last file was written
+    metrics["row=half,seed=3"].unlink()  # simulate a run that was killed before it wrote the last file
     again = start(tmp_path, "row=all,half", "table.columns=[frames]")
     assert again.returncode == 0, again.stderr
     assert again.stderr.count("skipped: the completed run in") == 3
@@ -90,7 +90,7 @@ def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
 
 
 def test_experiment_table_has_one_column_per_sequence(tmp_path: Path) -> None:
-    """Sequence names keep leading zeros. Directory names do not contain table settings."""
+    """Sequence names keep their leading zeros, and directory names do not contain settings of the table."""
     done = start(tmp_path, "experiment=fake_scenes", "table.average_over=[seed]")
     assert done.returncode == 0, done.stderr
     lines = [" ".join(line.split()) for line in done.stdout.splitlines()]
@@ -105,7 +105,7 @@ def test_experiment_table_has_one_column_per_sequence(tmp_path: Path) -> None:
 
 
 def composed(overrides: list[str], *directories: Path) -> tuple[DictConfig, Any]:
-    """Return the config of a sweep job, and its chosen option in each config group."""
+    """Return the config of a sweep job and the option that is chosen in each config group."""
     with initialize_config_dir(str(directories[0] if directories else CONF), version_base="1.3"):
         config = compose("config", overrides=overrides, return_hydra_config=True)
         HydraConfig.instance().set_config(config)
@@ -115,7 +115,7 @@ def composed(overrides: list[str], *directories: Path) -> tuple[DictConfig, Any]
         return with_row(config, own)
 
 
-def test_experiment_row_name_may_be_number() -> None:
+def test_experiment_row_name_accepts_number() -> None:
     assert OmegaConf.create("{rows: {ours: [], 2: []}, all: '${all_of:${rows}}'}").all == "ours,2"
 
 
@@ -125,7 +125,7 @@ def test_experiment_row_name_may_be_number() -> None:
     [(None, False), ("paper", False), *(pytest.param(p, True, marks=pytest.mark.acceptance) for p in [None, *PRESETS])],
 )
 def test_experiment_rows_compose_with_every_preset(experiment: str, preset: str | None, all_rows: bool) -> None:
-    """Compose rows as the command does, and build their stages. Without `all_rows`, use only the last rows."""
+    """The rows are composed and their stages are built. Without `all_rows`, only the last rows are tested."""
     hashes: dict[str, str] = {}
     asked = [f"experiment={experiment}", "seed=1", *USER_SETTINGS] + ([f"preset={preset}"] if preset else [])
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -148,7 +148,7 @@ def test_experiment_rows_compose_with_every_preset(experiment: str, preset: str 
 
 
 def build_detector(node: DictConfig) -> None:
-    """Build a detector, or check that it names its missing files in one line."""
+    """Build the detector, or check that a missing file is reported in a one-line error."""
     try:
         build(Detector, node)
     except InstanceMapError as error:
@@ -173,7 +173,7 @@ def test_sequences_choose_data_detector_and_pose_source() -> None:
 
 @pytest.mark.parametrize("sequences", sorted(path.stem for path in (CONF / "sequences").glob("*.yaml")))
 def test_sequences_with_given_poses_use_ground_truth_tracker(sequences: str) -> None:
-    """The tracker of `sequences` overrides the tracker of `preset`; the command line overrides both."""
+    """The tracker set by `sequences` overrides that of `preset`, and the command line overrides both."""
     given = sequences.endswith("_given_poses")
     own = {preset: chosen(preset=preset)["tracker"] for preset in PRESETS}
     for preset in PRESETS:
@@ -183,7 +183,7 @@ def test_sequences_with_given_poses_use_ground_truth_tracker(sequences: str) -> 
 
 
 def chosen(**choices: str) -> dict[str, str]:
-    """Return the option that Hydra chooses for each config group."""
+    """Return the option that Hydra chooses in each config group."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", [f"{group}={name}" for group, name in choices.items()], return_hydra_config=True)
     return {str(key): str(value) for key, value in config.hydra.runtime.choices.items()}
@@ -195,7 +195,7 @@ def test_preset_default_changes_nothing() -> None:
 
 @pytest.mark.parametrize("experiment", ["table1_runtime", "table2_class_ap", "table3_map", "figure3_stage_times"])
 def test_sequences_of_scenenn_select_real_data_settings(experiment: str) -> None:
-    """They use a network for real images, no rendered ground truth, the paper's sequences and a separate folder."""
+    """The detector is a network for real images. The sequences are those of the paper."""
     overrides = [f"experiment={experiment}", "sequences=scenenn", "dataset.root=DIR"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         asked = compose("config", overrides=overrides, return_hydra_config=True)

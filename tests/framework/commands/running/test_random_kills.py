@@ -1,7 +1,9 @@
-"""Tests of runs that are killed at random times.
+"""Tests for runs that are killed at random times.
 
-Each killed run leaves complete, partial or no outputs, and the next run succeeds. To test 30 kills, run
-INSTANCEMAP_KILLS=30 python -m pytest tests/framework/commands/running/test_random_kills.py
+A killed run may leave complete, partial or no outputs, and the next run must succeed. The following command tests 30
+kills:
+
+    INSTANCEMAP_KILLS=30 python -m pytest tests/framework/commands/running/test_random_kills.py
 """
 
 from __future__ import annotations
@@ -28,11 +30,11 @@ pytestmark = pytest.mark.acceptance
 
 KILLS = int(os.environ.get("INSTANCEMAP_KILLS", "6"))
 SHORT = ("dataset.frames=20", "fuser.slow_s=0.02", "fuser.slow_save_s=0.3", "fuser.note=note")
-LONGEST_WAIT_S = 1.2  # maximum wait before a kill; mapping takes about 0.5 s, saving another 0.5 s
+LONGEST_WAIT_S = 1.2  # s, maximum time before a kill; mapping and saving take about 0.5 s each
 
 
 def whole_files(place: Path) -> set[str]:
-    """Return the names of the output files in a run directory. Raise DataError for a truncated file."""
+    """Return the names of the output files in a run directory. Raise DataError if a file is truncated."""
     read = {
         "trajectory.txt": read_tum,
         "timings.csv": read_timings,

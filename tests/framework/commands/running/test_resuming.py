@@ -1,4 +1,4 @@
-"""Tests of resumed maps and of localization in a stored map."""
+"""Tests for resumed maps and for localization in a stored map."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
 
 
 def stored_files(mapper: Mapper, place: Path) -> Path:
-    """Write the map and the keyframes of a mapper to the new folder `place`; return the folder."""
+    """Write the map and the keyframes of a mapper to the new folder `place` and return the folder."""
     place.mkdir()
     mapper.scene.save(place / "map.npz")
     if keyframes := mapper.pipeline.tracker.keyframes():
@@ -54,7 +54,7 @@ def test_resumed_map_is_identical_to_single_run(tmp_path: Path, room: CornerRoom
 
 
 def test_resumed_map_continues_frame_numbers(tmp_path: Path, room: CornerRoom) -> None:
-    """Both recordings number their frames from 0. An object in both is observed in the frames of both recordings."""
+    """The frame numbers of both recordings start at 0. Both recordings show the same objects."""
     first, _ = mapped(room, *GIVEN)
     again, _ = mapped(room, *GIVEN, f"resume_from={stored_files(first, tmp_path / 'first')}")
     for key, instance in first.instances().items():
@@ -68,7 +68,7 @@ def ate_mm(recording: Recording, poses: list[Pose]) -> float:
 
 
 def check_halves(tmp_path: Path, recording: Recording) -> None:
-    """Check that mapping in two halves has an ATE at most 5 mm above that of a single run, and a similar map."""
+    """Check that mapping in two halves gives a similar map, and an ATE that is at most 5 mm larger than in one run."""
     half = len(recording) // 2
     whole, poses = mapped(recording, *TRACKED)
     first, in_first = mapped([recording[k] for k in range(half)], *TRACKED)
@@ -143,7 +143,7 @@ def test_resume_from_missing_map_raises(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def desk() -> Mapper:
-    """Return a mapper that has tracked six frames of the desk."""
+    """Return a mapper after six tracked frames of the desk."""
     return mapped([DESK[k] for k in range(0, 30, 5)], *TRACKED)[0]
 
 
@@ -192,7 +192,7 @@ def test_resumed_map_of_two_recordings_round_trips(tmp_path: Path, room: CornerR
 
 
 def test_localize_in_places_new_map_in_stored_world(tmp_path: Path) -> None:
-    """Without ground-truth poses, the second recording is tracked in the world frame of the first one."""
+    """Neither recording has ground-truth poses. The second one is tracked in the world frame of the first one."""
     unposed = [replace(DESK[k], T_world_camera=None) for k in range(40)]
     first, poses = mapped(unposed[:25], *TRACKED)
     own, in_its_world = mapped(unposed[20:], *TRACKED, f"localize_in={stored_files(first, tmp_path / 'first')}")

@@ -1,4 +1,4 @@
-"""Tests of complete, partial and failed runs, and of the run directory."""
+"""Tests for complete, partial and failed runs and their run directories."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ CAPACITY = "fuser.capacity: expected at most 1 frames, got more; increase fuser.
 
 
 def begin(directory: Path, *arguments: str, before: Callable[[], object] | None = None) -> ForkedCommand:
-    """Start a run with fake stages in `directory`; its process calls `before` first."""
+    """Start a run with fake stages in `directory`. The process calls `before` first."""
     return ForkedCommand(directory, "--config-dir", str(FAKE_CONF), *FAKES, *arguments, before=before)
 
 
 def end(process: ForkedCommand) -> tuple[int | None, str]:
-    """Wait for the process; return its exit status and stderr."""
+    """Wait for the process and return its exit status and stderr."""
     try:
         _, stderr = process.communicate(timeout=PATIENCE_S)
     except subprocess.TimeoutExpired:
@@ -58,7 +58,7 @@ def figures(directory: Path, name: str = "metrics.partial.json") -> dict[str, ob
 
 
 def limit_file_size() -> None:
-    """Limit the size of files to 64 KiB. Larger writes fail as on a full disk."""
+    """Limit the size of files to 64 KiB, so that larger writes fail like on a full disk."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))
 
 
@@ -69,7 +69,7 @@ def ignore_ctrl_c() -> None:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("background", [False, True])
 def test_run_signal_leaves_partial_outputs(tmp_path: Path, number: signal.Signals, background: bool) -> None:
-    """Runs that a script starts in the background ignore Ctrl-C."""
+    """A run in the background of a shell script ignores Ctrl-C, but other signals end the run."""
     place = tmp_path / "run"
     process = begin(tmp_path, *ENDLESS, f"hydra.run.dir={place}", before=ignore_ctrl_c if background else None)
     wait_for(tmp_path / "note", process)
@@ -102,7 +102,7 @@ def test_run_stage_error_leaves_partial_outputs(tmp_path: Path, kind: str, messa
     assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json"}
     left = figures(place)
     assert message in str(left["partial"])
-    assert left["frames"] in (3, 4)  # a detector error occurs before the frame is counted, a mask error afterwards
+    assert left["frames"] in (3, 4)  # a detector error is raised before the frame is counted, a mask error after that
     assert len((place / "trajectory.txt").read_text().splitlines()) in (3, 4)
 
 
@@ -125,7 +125,7 @@ def test_run_error_before_first_frame_leaves_no_outputs(tmp_path: Path) -> None:
 
 
 def test_run_stage_system_exit_writes_partial_outputs(tmp_path: Path) -> None:
-    """A preempted submitit job raises SystemExit."""
+    """In a preempted job, submitit raises SystemExit."""
     place = tmp_path / "run"
     status, _ = end(begin(tmp_path, "detector=faulty", "detector.kind=SystemExit", f"hydra.run.dir={place}"))
     assert status == 7
@@ -259,7 +259,7 @@ def test_run_in_locked_folder_changes_nothing(tmp_path: Path) -> None:
     assert {path for path in place.rglob("*") if path.is_file()} - set(before) == {place / ".lock_holder"}
 
 
-def test_run_with_pipe_as_log_is_refused(tmp_path: Path) -> None:
+def test_run_with_pipe_as_log_is_rejected(tmp_path: Path) -> None:
     place = tmp_path / "run"
     place.mkdir()
     os.mkfifo(place / "instancemap.log")

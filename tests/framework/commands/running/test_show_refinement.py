@@ -1,4 +1,4 @@
-"""Tests of the command `show-refinement`."""
+"""Tests for the command `show-refinement`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_show_refinement_errors_are_one_line(tmp_path: Path, overrides: list[str
 
 
 class FoundOnlyIn(SphereDetector):
-    """Detector of both spheres in one frame and of nothing in the other frames."""
+    """Detector that finds both spheres in one frame and nothing in the other frames."""
 
     def __init__(self, index: int) -> None:
         super().__init__()
@@ -83,7 +83,7 @@ def test_show_refinement_skips_unusable_frames() -> None:
     assert position == 1
     with pytest.raises(FrameError, match="truncated"):
         detected(CornerRoom(unreadable=0), SphereDetector(), 0)
-    with pytest.raises(DataError, match="expected a usable frame, got none of 1 candidates"):
+    with pytest.raises(DataError, match="expected a usable frame, got none among 1 candidates"):
         detected(CornerRoom(frames=1, unreadable=0), SphereDetector(), None)
 
 

@@ -1,4 +1,4 @@
-"""Tests of sweeps with every launcher, including sweeps that are killed and started again."""
+"""Tests for sweeps with every launcher, including sweeps that are killed and restarted."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ PLACE = Path("outputs") / "fake_ablation"
 BY_JOBLIB = ("launcher=joblib", "hydra.launcher.n_jobs=2")
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
 SLOW = "dataset.slow_s=0.1"  # so that workers are killed in the middle of a run
-SIX = ("row=half,broken", "seed=1,2,3", SLOW)  # six runs; those of the row `broken` fail
+SIX = ("row=half,broken", "seed=1,2,3", SLOW)  # six runs, of which those of the row `broken` fail
 RUNS = {f"{SLOW},row=half,seed={seed}" for seed in (1, 2, 3)}
-MEASURED = ("fps", "stage_ms.", "peak_rss_bytes")  # prefixes of the columns of table.csv that differ in each run
+MEASURED = ("fps", "stage_ms.", "peak_rss_bytes")  # column prefixes of values that differ between runs
 PATIENCE_S = 180
 
 
 def begin(directory: Path, *arguments: str, sweep: str = "experiment=fake_ablation") -> subprocess.Popen[str]:
-    """Start the fake experiment or another sweep in its own process group, as a terminal does."""
+    """Start the fake experiment or another sweep in a separate process group, like a terminal."""
     fakes = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), sweep]
     clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
     environment = clean | {
@@ -77,18 +77,18 @@ def wait_until(condition: Callable[[], object], process: subprocess.Popen[str]) 
 
 
 def recorded(directory: Path) -> dict[str, int]:
-    """Return the completion time, ns since the epoch, of each completed run by directory name."""
+    """Return the completion time of each completed run, ns since the epoch, keyed by the directory name."""
     return {path.parent.name: path.stat().st_mtime_ns for path in (directory / PLACE).glob("*/metrics.json")}
 
 
 def begun(directory: Path) -> dict[str, int]:
-    """Return the start time, ns since the epoch, of each active run by directory name."""
+    """Return the start time of each active run, ns since the epoch, keyed by the directory name."""
     began = {path.parent.name: path.stat().st_mtime_ns for path in (directory / PLACE).glob("*/config.yaml")}
     return {name: began[name] for name in set(began) - set(recorded(directory))}
 
 
 def tables(directory: Path) -> dict[str, str]:
-    """Return the contents of the tables by file name; table.csv without the columns of measured times and memory."""
+    """Return the contents of the tables. Columns of table.csv with measured times and memory are omitted."""
     texts = {name: (directory / PLACE / name).read_text() for name in ("table.md", "table.tex")}
     runs = pandas.read_csv(directory / PLACE / "table.csv")
     kept = [key for key in runs if not key.startswith(MEASURED)]
@@ -97,7 +97,7 @@ def tables(directory: Path) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
-    """Return the folder and the finished process of an uninterrupted joblib sweep; the runs of one row fail."""
+    """Return the folder and the process of a finished joblib sweep. The runs of one row fail."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     directory = tmp_path_factory.mktemp("whole")
     return directory, end(begin(directory, *BY_JOBLIB, *SIX))
@@ -124,7 +124,7 @@ def test_sweep_by_joblib_continues_after_failed_runs(
 def test_sweep_with_other_launcher_keeps_completed_runs(
     whole: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
-    directory = Path(shutil.copytree(whole[0], tmp_path / "copy"))  # the table names the other number of threads
+    directory = Path(shutil.copytree(whole[0], tmp_path / "copy"))  # the table lists the other number of threads
     before = recorded(directory)
     again = end(begin(directory, "row=half", "seed=1,2,3", SLOW, "threads=2"))
     assert again.returncode == 0, again.stderr
@@ -136,7 +136,7 @@ def test_sweep_with_other_launcher_keeps_completed_runs(
 def test_sweep_resumed_after_kill_writes_same_table(
     whole: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
-    """First one worker is killed, then the whole sweep."""
+    """A single worker is killed first, and then the whole sweep."""
     first = begin(tmp_path, *BY_JOBLIB, *SIX)
     wait_until(lambda: recorded(tmp_path) and begun(tmp_path), first)
     workers = [child for child in psutil.Process(first.pid).children() if "LokyProcess" in " ".join(child.cmdline())]
@@ -166,7 +166,7 @@ def test_sweep_resumed_after_kill_writes_same_table(
 
 
 def test_sweep_without_experiment_reports_failures(tmp_path: Path) -> None:
-    """The folder is named after the start time of the sweep, also in worker processes."""
+    """The folder is named after the start time of the sweep, also in the worker processes."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     done = end(begin(tmp_path, *FAKES, "dataset.frames=few,many", "launcher=joblib", sweep="-m"))
     assert done.returncode == 1
@@ -179,7 +179,7 @@ def test_sweep_without_experiment_reports_failures(tmp_path: Path) -> None:
 
 
 def swept(directory: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, int]]:
-    """Run a sweep without an experiment in one folder; return the process and the completion times."""
+    """Run a sweep without an experiment in `folder`, and return the process and the completion times."""
     done = end(begin(directory, *FAKES, "dataset.frames=3", "hydra.sweep.dir=s", *arguments, sweep="-m"))
     assert done.returncode == 0, done.stderr
     runs = (directory / "s").glob("*/metrics.json")
@@ -187,7 +187,7 @@ def swept(directory: Path, *arguments: str) -> tuple[subprocess.CompletedProcess
 
 
 def test_sweep_without_experiment_is_resumed(tmp_path: Path) -> None:
-    """Settings without effect on the results are not part of a directory name."""
+    """Directory names do not contain settings without effect on the results."""
     _, first = swept(tmp_path, "seed=1,2")
     assert set(first) == {"seed=1,tracker=fake", "seed=2,tracker=fake"}
     harmless = (
@@ -205,7 +205,7 @@ def test_sweep_without_experiment_is_resumed(tmp_path: Path) -> None:
 
 @pytest.mark.acceptance
 def test_sweep_over_settings_without_effect_has_separate_folders(tmp_path: Path) -> None:
-    """A sweep over settings that affect only the speed has them in its directory names, also in worker processes."""
+    """If a sweep varies such a setting, the directory names contain it, also in worker processes."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     _, first = swept(tmp_path, "threads=1,2", "prefetch=0")
     assert set(first) == {"threads=1,tracker=fake", "threads=2,tracker=fake"}
@@ -245,7 +245,7 @@ ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=10000
 def test_sweep_signal_leaves_partial_outputs_of_active_runs(
     tmp_path: Path, signal_sent: signal.Signals, all_at_once: bool, n_jobs: int, seeds: str, at_work: int
 ) -> None:
-    """A terminal sends Ctrl-C to the workers as well; `kill` signals only the main process."""
+    """Ctrl-C in a terminal also signals the workers. `kill` signals only the main process."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     by_joblib = (*BY_JOBLIB, f"hydra.launcher.n_jobs={n_jobs}")
     process = begin(tmp_path, *by_joblib, "row=all", f"seed={seeds}", *ENDLESS, "fuser.note=${seed}.note")
@@ -288,7 +288,7 @@ def test_sweep_second_signal_ends_workers_immediately(tmp_path: Path) -> None:
 
 
 def running_after(seconds: float, processes: list[psutil.Process]) -> list[psutil.Process]:
-    """Return the processes that have not ended after some seconds. Another process may read their status later."""
+    """Return the processes that are still running after some seconds, without zombies."""
     deadline = time.monotonic() + seconds
     while left := [one for one in processes if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]:
         if time.monotonic() > deadline:
@@ -299,7 +299,7 @@ def running_after(seconds: float, processes: list[psutil.Process]) -> list[psuti
 
 @pytest.mark.parametrize("signaled", [False, True])
 def test_sweep_killed_leaves_partial_outputs_only(tmp_path: Path, signaled: bool) -> None:
-    """After `kill -9` of the main process, its workers write partial outputs and exit, also without a signal."""
+    """If the main process is killed, the workers write partial outputs and exit, even if they get no signal."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     process = begin(tmp_path, *BY_JOBLIB, "row=all", "seed=1,2,3", *ENDLESS, "fuser.note=${seed}.note")
     wait_until(lambda: len(list(tmp_path.glob("*.note"))) == 2, process)
@@ -316,7 +316,7 @@ def test_sweep_killed_leaves_partial_outputs_only(tmp_path: Path, signaled: bool
 @pytest.mark.parametrize("state", ["starting", "writing"])
 @pytest.mark.acceptance
 def test_sweep_killed_leaves_no_processes(tmp_path: Path, state: str) -> None:
-    """Workers also exit if they are just being started, and if writing takes too long."""
+    """Workers also exit if they are still starting, or if they take too long to write."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     process = begin(tmp_path, *BY_JOBLIB, "row=all", "seed=1,2", "fuser.slow_save_s=100", "fuser.capacity=100000")
     root = psutil.Process(process.pid)
@@ -332,14 +332,14 @@ def test_sweep_killed_leaves_no_processes(tmp_path: Path, state: str) -> None:
 
 @pytest.mark.acceptance
 def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
-    """After `kill -9` of the main process, its workers still write partial outputs; the next sweep repeats the runs."""
+    """The workers of a killed sweep first write their partial outputs. Then the next sweep repeats the runs."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     arguments = (*BY_JOBLIB, "row=half", "dataset.slow_s=1")
     first = begin(tmp_path, *arguments)
     wait_until(lambda: len(begun(tmp_path)) == 2, first)
     workers = psutil.Process(first.pid).children(recursive=True)
     for worker in workers:
-        worker.suspend()  # until the second sweep waits, so that the result does not depend on the speed of the machine
+        worker.suspend()  # until the second sweep waits; the result then does not depend on the speed of the machine
     first.kill()
     again = begin(tmp_path, *arguments)
     logs = (tmp_path / PLACE).glob
@@ -353,7 +353,7 @@ def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
     assert done.stderr.count("mapping") == len(recorded(tmp_path)) == 2
 
 
-def test_sweep_in_locked_folder_is_refused(tmp_path: Path) -> None:
+def test_sweep_in_locked_folder_is_rejected(tmp_path: Path) -> None:
     with locked(tmp_path / PLACE):
         done = end(begin(tmp_path))
     assert (done.returncode, done.stdout) == (1, "")
@@ -409,7 +409,7 @@ def test_jobs_at_once_depends_on_threads_and_cores(monkeypatch: pytest.MonkeyPat
     ("launcher", "node"), [("joblib", "n_jobs"), ("slurm", "cpus_per_task"), ("ray", "ray.remote.num_cpus")]
 )
 def test_launcher_config_uses_job_threads(launcher: str, node: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The machine has 12 cores, and threads=0 uses all of them. A job with 0 cores would not count toward the limit."""
+    """The machine has 12 cores, and threads=0 means all cores."""
     pytest.importorskip(f"hydra_plugins.hydra_{launcher.replace('slurm', 'submitit')}_launcher")
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(12))
     for threads in (3, 0):

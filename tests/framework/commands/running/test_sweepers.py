@@ -1,4 +1,4 @@
-"""Tests of sweepers that optimize the objective of runs."""
+"""Tests for sweepers that optimize the objective of runs."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ SPACE = ["fuser.voxel_size=interval(0.005,0.05)", "refiner.x=interval(0,1)"]
 
 
 def planted(voxel_size: float, x: float) -> float:
-    """Return a smooth objective in [0, 1] with its maximum 1 at (0.02, 0.7)."""
+    """Return a smooth objective in [0, 1] with the maximum 1 at (0.02, 0.7)."""
     return float(np.exp(-(((voxel_size - 0.02) / 0.01) ** 2) - ((x - 0.7) / 0.2) ** 2))
 
 
 def launch_planted(overrides: Sequence[Sequence[str]], initial_job_idx: int) -> list[JobReturn]:
-    """Evaluate the planted objective for the overrides of each job, as a launcher of Hydra does."""
+    """Evaluate the planted objective for the overrides of each job, in place of a launcher of Hydra."""
     jobs = [dict(override.split("=") for override in job) for job in overrides]
     values = [planted(float(job["fuser.voxel_size"]), float(job["refiner.x"])) for job in jobs]
     return [JobReturn(status=JobStatus.COMPLETED, _return_value=value) for value in values]
@@ -69,7 +69,7 @@ def test_optuna_beats_random_search_in_median(tmp_path: Path) -> None:
 
 @pytest.mark.integration
 def test_optuna_optimizes_metric_of_runs(tmp_path: Path) -> None:
-    """The last sweep continues the stored study: its runs are in other folders, or are skipped."""
+    """The last sweep continues the stored study. Its runs are skipped or have new folders."""
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="requires hydra-optuna-sweeper (extra sweepers)")
     arguments = (
         "hydra/sweeper=optuna",

@@ -1,4 +1,4 @@
-"""Tests of cameras in JSON files. The tests of the dataset readers cover invalid values."""
+"""Tests for cameras in JSON files. Invalid values are covered by the tests for the dataset readers."""
 
 from __future__ import annotations
 

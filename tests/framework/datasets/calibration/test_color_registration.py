@@ -1,4 +1,4 @@
-"""Tests of color registration between two cameras at one position, on images with known values."""
+"""Tests for the registration of color images between two cameras at the same position."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DEPTH = Camera(640 // 8, 480 // 8, 577.9 / 8, 576.5 / 8, 39.6, 29.4)
 
 
 def ramp(camera: Camera) -> np.ndarray:
-    """Return an image (H, W, 3) that encodes the viewing direction of each pixel: scaled x / z and y / z."""
+    """Return an image (H, W, 3) whose colors encode the viewing direction x / z, y / z of each pixel."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     return np.stack([128 + 200 * x, 128 + 200 * y, np.full_like(x, 77)], axis=-1)
@@ -25,8 +25,8 @@ def test_color_registration_matches_viewing_direction() -> None:
     found, negative = registration.apply(image), registration.apply(255 - image)
     assert (
         np.abs(found[2:-2, 2:-2] - ramp(DEPTH)[2:-2, 2:-2]).max() < 1.2
-    )  # gray levels; a shift of one pixel changes colors by 2.8
-    both = (found + (255.0 - negative)) / 2  # OpenCV rounds halves up, which cancels here
+    )  # gray levels; a shift by one pixel changes the color by 2.8
+    both = (found + (255.0 - negative)) / 2  # OpenCV rounds 0.5 up, without effect on the difference
     assert np.abs((both - ramp(DEPTH))[2:-2, 2:-2].mean(axis=(0, 1))).max() < 0.02
 
 

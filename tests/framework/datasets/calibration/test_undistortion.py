@@ -1,4 +1,4 @@
-"""Tests of undistortion, compared with OpenCV and with the view of a pinhole camera."""
+"""Tests for undistortion, compared with OpenCV and with a pinhole camera."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_distorted_matches_opencv(intrinsics: Intrinsics) -> None:
 
 
 def recorded(camera: Camera, lens: Distortion, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return depth (H, W), m, and color (H, W, 3) as seen through the lens, by inversion of the lens model."""
+    """Return the depth (H, W), m, and color (H, W, 3) of a camera with this lens."""
     wide = Camera(3 * camera.width, 3 * camera.height, 2 * camera.fx, 2 * camera.fy, 239.5, 179.5)
     depth, color, _ = room().render(wide, T_world_camera)
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(np.float64)
@@ -52,7 +52,7 @@ def test_undistortion_view_matches_pinhole_view() -> None:
         False,
         False,
         False,
-    )  # the distorted image does not cover the border
+    )  # the border is outside of the distorted image
     edges = cv2.dilate(cv2.Laplacian(surface.astype(np.float32), cv2.CV_32F), np.ones((7, 7))) != 0
     kept = inside & ~edges & (true_depth > 0)
     undistortion = Undistortion(CAMERA, LENS)
@@ -60,7 +60,7 @@ def test_undistortion_view_matches_pinhole_view() -> None:
     after = np.abs(undistortion.smooth(color).astype(int) - true_color)[kept].mean()
     assert after < 1 < before
     off, was = (np.abs(z - true_depth)[kept] for z in (undistortion.exact(depth), depth))
-    assert np.percentile(off, 90) < np.percentile(was, 90) / 4  # the nearest pixel can be half a pixel off
+    assert np.percentile(off, 90) < np.percentile(was, 90) / 4  # the nearest pixel is up to half a pixel away
 
 
 def test_undistortion_exact_mode_does_not_mix_labels() -> None:

@@ -1,4 +1,4 @@
-"""Tests of depth cameras with fake vendor libraries."""
+"""Tests for depth cameras with fake vendor libraries."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.support.scenes.fake_cameras import (
 
 @dataclass(frozen=True)
 class Brand:
-    """A camera reader and the fake of its vendor library."""
+    """Camera reader with the fake of its vendor library."""
 
     name: str
     reader: type[RealSense] | type[Orbbec]
@@ -187,7 +187,7 @@ def test_camera_missing_depth_raises_for_its_frame_only(brand: Brand, device: Fa
 
 
 def test_orbbec_waits_for_first_depth_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first depth frame contains the depth unit."""
+    """The depth unit is only known from the first depth frame."""
     monkeypatch.setitem(sys.modules, "pyorbbecsdk", orbbec_module(FakeCamera(without_depth=0)))
     [frame] = sent(BRANDS[1].video(), 1)
     np.testing.assert_allclose(frame.depth, CornerRoom()[1].depth, atol=UNIT)

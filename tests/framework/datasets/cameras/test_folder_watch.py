@@ -1,4 +1,7 @@
-"""Tests of a watched folder: complete frames in order, and reports of all skipped files."""
+"""Tests for a watched folder.
+
+Complete frames must be read in order, and skipped files must be reported.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ ROOM = CornerRoom(frames=30)
 
 
 def encoded(k: int) -> dict[str, bytes]:
-    """Return the bytes of both files of frame k."""
+    """Return the encoded color and depth image of frame k, keyed by the file name."""
     frame = ROOM[k % len(ROOM)]
     color = cv2.imencode(".jpg", frame.color[..., ::-1])[1]
     return {
@@ -56,14 +59,14 @@ def folder(tmp_path: Path) -> Path:
 
 
 class Watched:
-    """A watched folder that is scanned on request."""
+    """Watched folder that is scanned on request."""
 
     def __init__(self, folder: Path, **parameters: Any) -> None:
         self.over = False
         self._frames = FolderWatch(folder, poll_interval=0.001, **parameters).frames()
 
     def readers(self) -> Iterator[FrameReader]:
-        """Yield the frame readers of one scan, up to the first None."""
+        """Yield the frame readers of one scan."""
         while (reader := next(self._frames, self)) is not None:
             if isinstance(reader, Watched):
                 self.over = True
@@ -71,7 +74,7 @@ class Watched:
             yield reader
 
     def look(self) -> list[int | str]:
-        """Scan the folder; return the indices of the readable frames and the error messages of the others."""
+        """Scan the folder and return the index of each readable frame and the error message of each other frame."""
         return [outcome(reader) for reader in self.readers()]
 
 
@@ -266,7 +269,7 @@ class Known(PoseTracker):
 
 
 def test_watched_folder_is_mapped_while_written(folder: Path) -> None:
-    """The writer is slow, writes its files in place, and at the end creates the file `end`."""
+    """The images are written slowly and in place. The file `end` is created at the end."""
 
     def writer() -> None:
         for k in range(len(ROOM)):

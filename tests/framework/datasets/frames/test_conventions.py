@@ -1,4 +1,4 @@
-"""Tests of configurable conventions for poses, units and image pairs that differ from the dataset format."""
+"""Tests for conventions of poses, units and image pairs that differ from the dataset format."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def test_pose_reading_recovers_original_pose(seed: int) -> None:
     np.testing.assert_allclose(PoseReading(pose_unit=0.001).pose(in_mm), T_world_camera, atol=1e-12)
     x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3]).as_quat()
     misread = T_world_camera.copy()
-    misread[:3, :3] = Rotation.from_quat((w, x, y, z)).as_matrix()  # w x y z of the file, read as x y z w
+    misread[:3, :3] = Rotation.from_quat((w, x, y, z)).as_matrix()  # the file stores w x y z, which is read as x y z w
     scalar_first = PoseReading(quaternion_order=QuaternionOrder.WXYZ)
     np.testing.assert_allclose(scalar_first.pose(misread), T_world_camera, atol=1e-12)
 
 
 def test_camera_axes_match_system_conventions() -> None:
-    """The expected values are the directions right, down and forward of the image in the axes of each system."""
+    """The expected vectors are right, down and forward of the image in the axes of each system."""
     right, below, ahead = np.eye(3)
     for axes, expected in {
         CameraAxes.OPENCV: ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -74,7 +74,7 @@ def test_conventions_invalid_parameter_raises(wrong: dict[str, float], message: 
 
 
 def images(k: int) -> StoredImages:
-    """Return 2x2 images whose pixels have the value k."""
+    """Return 2x2 images in which all pixels have the value k."""
     color, depth = np.full((2, 2, 3), k, np.uint8), np.full((2, 2), k, np.uint16)
     return StoredImages(f"color {k}", f"depth {k}", lambda: color, lambda: depth)
 

@@ -1,4 +1,4 @@
-"""Tests of frame selection: start, stop, stride and frame_fraction."""
+"""Tests for the selection of frames by start, stop, stride and frame_fraction."""
 
 import pytest
 
@@ -37,7 +37,7 @@ def test_frame_fraction_is_seeded_ordered_subset():
 
 
 def test_frame_fraction_sampling_is_uniform():
-    """Each of 20 frames is in 500 ± 80 (5 standard deviations) of 1000 subsets."""
+    """In 1000 subsets, each of the 20 frames occurs 500 ± 80 times (5 standard deviations)."""
     taken = [index for seed in range(1000) for index in choose_frames(20, 0, -1, 1, frame_fraction=0.5, seed=seed)]
     counts = [taken.count(index) for index in range(20)]
     assert min(counts) > 420

@@ -1,4 +1,4 @@
-"""Tests of ground truth that the user selects, with a labeled wall in front of a camera."""
+"""Tests for ground truth that the user selects, with a labeled wall in front of the camera."""
 
 from __future__ import annotations
 
@@ -29,9 +29,8 @@ WALL = 2.0  # z of the wall in the world frame, m
 CELL = 0.05  # distance between the vertices of the wall, m
 CHAIR, UNKNOWN = 7, 70_000  # instance ids at x < -0.3 m and at x > 0.4 m
 CLASSES = {str(CHAIR): {"name": "arm chair", "class": "chair"}, str(UNKNOWN): {"name": "thing", "class": None}}
-T_RUN_WORLD = exp_se3(
-    np.array([1.0, -2.0, 0.5, 0.3, -0.8, 0.4])
-)  # from the world frame of the recording to that of a tracked run
+# from the world frame of the recording to that of a tracked run
+T_RUN_WORLD = exp_se3(np.array([1.0, -2.0, 0.5, 0.3, -0.8, 0.4]))
 
 
 def pose(k: int) -> np.ndarray:
@@ -43,7 +42,7 @@ def label_at(x: np.ndarray) -> np.ndarray:
 
 
 def write_wall(path: Path, T: np.ndarray | None = None, **properties: np.ndarray) -> None:
-    """Write the mesh of a wall of 4 x 4 m, transformed by T (4, 4). `properties` replace its instance labels."""
+    """Write the mesh of a wall of 4 x 4 m. `properties` replace the instance labels."""
     side = np.arange(-2.0, 2.0 + CELL / 2, CELL)
     x, y = np.meshgrid(side, side)
     vertices = np.stack([x, y, np.full_like(x, WALL)], axis=-1).reshape(-1, 3).astype(np.float32)
@@ -59,7 +58,7 @@ def write_wall(path: Path, T: np.ndarray | None = None, **properties: np.ndarray
 
 
 def seen_labels(k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the labels (H, W) of the wall in frame k, and a mask (H, W) of the pixels away from label borders."""
+    """Return the labels (H, W) of the wall in frame k and a mask (H, W) without the pixels next to label borders."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(CAMERA.shape)], axis=-1)
     T = pose(k)
@@ -70,7 +69,7 @@ def seen_labels(k: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return the folder of a recording with poses and without annotation."""
+    """Return the folder of a recording that has poses but no annotation."""
     root = tmp_path / "room"
     for name in ("color", "depth"):
         (root / name).mkdir(parents=True)
@@ -94,7 +93,7 @@ def mesh(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def tracked_run(tmp_path: Path) -> Path:
-    """Return a run of the recording in its own world frame. UNKNOWN is tentative and not in instances.json."""
+    """Return a run of the recording with a separate world frame. UNKNOWN is tentative and not in instances.json."""
     run = tmp_path / "run"
     run.mkdir()
     write_wall(run / "mesh.ply", T_RUN_WORLD)
@@ -185,7 +184,7 @@ def test_named_truth_tracked_run_is_aligned_to_map(folder: Path, tracked_run: Pa
     )
     truth = video.scene_truth()
     np.testing.assert_array_equal(np.unique(truth.instance_ids), [0, CHAIR])
-    T_map_world = inverse(pose(1))  # a map that begins with frame 1
+    T_map_world = inverse(pose(1))  # the map begins with frame 1
     map_poses = np.array([T_map_world @ pose(k) for k in (1, 2, 3)])
     aligned = in_map_world(truth, np.array([1, 2, 3]) / 30, map_poses)
     wall = transform(T_map_world @ inverse(T_RUN_WORLD), read_ply(tracked_run / "mesh.ply").vertices)
@@ -194,7 +193,7 @@ def test_named_truth_tracked_run_is_aligned_to_map(folder: Path, tracked_run: Pa
 
 
 def test_named_truth_run_with_given_poses_is_not_aligned(folder: Path, tracked_run: Path) -> None:
-    """The map begins at the given pose and drifts. The drift is part of the error."""
+    """The map begins at the given pose. Its drift is part of the error."""
     (tracked_run / "metrics.json").write_text('{"pose_source": "ground_truth"}')
     times, poses = read_tum(tracked_run / "trajectory.txt")
     truth = RgbdFolder(folder, ground_truth=tracked_run).scene_truth()
@@ -263,7 +262,7 @@ def test_named_truth_rejects_directory_without_mesh(folder: Path, tmp_path: Path
 
 @pytest.mark.parametrize("name", ["redkitchen", "freiburg1_rpy"])
 def test_named_truth_masks_agree_with_annotated_images(shared_data: Path, name: str) -> None:
-    """With wrong axes, an inverted pose or other ids, less than half of the annotated pixels agree."""
+    """With wrong axes, an inverted pose or wrong ids, less than half of the annotated pixels would agree."""
     kitchen, desk = shared_data / "redkitchen", shared_data / "tum_fr1_rpy_a"
     images: list[Path] = sorted(((kitchen if name == "redkitchen" else desk / "annotation") / "instance").iterdir())
     video: Recording = RgbdFolder(kitchen, ground_truth=kitchen / "annotation" / "mesh.ply")
@@ -291,7 +290,7 @@ def test_named_truth_masks_agree_with_annotated_images(shared_data: Path, name: 
 def test_named_truth_applies_to_every_dataset(
     shared_data: Path, mesh: Path, option: str, root: str, scene: str
 ) -> None:
-    """The mesh is a wall in front of the camera of the first frame with a pose."""
+    """The mesh is a wall in front of the first frame with a pose."""
     place = (f"dataset.root={shared_data / root}", f"dataset.scene={scene}")
     first = next(frame for frame in opened(option, *place) if frame.T_world_camera is not None)
     write_wall(mesh, first.T_world_camera)

@@ -1,4 +1,4 @@
-"""Tests of voxel voting on small scenes, compared with exact results and a slow reference implementation."""
+"""Tests for ground truth that is fused from frames by voxel voting."""
 
 from collections import Counter, defaultdict
 
@@ -52,7 +52,7 @@ def test_scene_truth_matches_per_pixel_reference():
     truth = fuse_scene_truth(random_views(30, 3), {1: "chair"}, voxel)
     expected = reference(random_views(30, 3), voxel)
     assert len(truth.points_world) == len(expected)
-    # Points and dictionary keys are in the order in which their voxels are first observed.
+    # points and keys are in the order in which their voxels are first observed
     for point, instance, (best, mean) in zip(truth.points_world, truth.instance_ids, expected.values(), strict=True):
         assert instance == best
         np.testing.assert_allclose(point, mean, atol=1e-6)
@@ -63,7 +63,7 @@ def test_scene_truth_wall_gives_one_point_per_voxel():
     truth = fuse_scene_truth(
         [view(np.full(camera.shape, 2.0), np.full(camera.shape, 5), camera=camera)], {5: "tv"}, 0.05
     )
-    # Pixels are 2 cm apart. They cover 4.00 x 3.00 m around the optical axis, minus one pixel.
+    # pixels are 2 cm apart and cover 4.00 x 3.00 m around the optical axis, minus one pixel
     assert len(truth.points_world) == 80 * 60
     np.testing.assert_allclose(truth.points_world[:, 2], 2.0, atol=1e-6)
     assert (truth.instance_ids == 5).all()
@@ -84,7 +84,7 @@ def test_scene_truth_hash_table_growth_keeps_voxels_unique():
     again = fuse_scene_truth(random_views(6, 1, camera), {}, 0.001)
     np.testing.assert_array_equal(truth.points_world, again.points_world)
     keys = np.floor(truth.points_world.astype(np.float64) / 0.001).astype(int)
-    assert len(np.unique(keys, axis=0)) > 0.99 * len(keys)  # a mean may be rounded into the next voxel
+    assert len(np.unique(keys, axis=0)) > 0.99 * len(keys)  # rounding can move a mean into the next voxel
 
 
 def test_scene_truth_empty_depth_gives_no_points():

@@ -1,4 +1,4 @@
-"""Tests of ScanNet scans as `.sens` files and as exported folders."""
+"""Tests for ScanNet scans, both `.sens` files and exported folders."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def write(request: pytest.FixtureRequest) -> Writer:
 
 
 def write_labels(scene: Path) -> None:
-    """Write the mesh of a wall 2 m in front of the first camera: a chair at x < 0, and no label at x > 0.3 m."""
+    """Write the labeled mesh of a wall in front of the first camera. The part at x < 0 is a chair."""
     x, y = np.meshgrid(np.linspace(-1.5, 1.5, 31), np.linspace(-1.5, 1.5, 31))
     vertices = np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(30)[:, None] * 31 + np.arange(30)).ravel()
@@ -247,7 +247,7 @@ def test_scannet_truth_matches_labeled_mesh(tmp_path: Path, write: Writer) -> No
 
 
 def test_scannet_missing_label_table_changes_annotation_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """The label table affects the metrics of a map, so result tables must not mix runs with and without it."""
+    """Without the label table, the metrics differ. Tables must not mix such runs with others."""
     as_sens(tmp_path / SCENE, shots())
     write_labels(tmp_path / SCENE)
     (tmp_path / "scannetv2-labels.combined.tsv").unlink()
@@ -295,7 +295,7 @@ def test_scannet_incomplete_truth_files_give_no_truth(tmp_path: Path, caplog: py
 
 
 def read_all(path: Path) -> None:
-    """Read every frame of the scan; raise the error of the last invalid frame."""
+    """Read every frame of the scan and raise the error of the last invalid frame."""
     sequence = ScanNet(path.parent)
     fault = None
     for k in range(len(sequence)):
@@ -332,7 +332,7 @@ def test_scannet_fuzzed_file_is_read_or_raises_one_line_error(tmp_path: Path, na
     path = scene / name if (scene / name).exists() else tmp_path / name
     content = path.read_bytes()
     for other in (MESH,) if name.endswith(".sens") else ():
-        (scene / other).unlink()  # reading the mesh is slow; other tests cover it
+        (scene / other).unlink()  # reading the mesh is slow and tested elsewhere
     read, tokens = FUZZED[name]
 
     @settings(max_examples=EXAMPLES, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))

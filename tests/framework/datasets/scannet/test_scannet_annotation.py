@@ -1,4 +1,4 @@
-"""Tests of ScanNet's labeled mesh: instances from segments and objects, and classes from names."""
+"""Tests for the labeled mesh of ScanNet: instances from segments and objects, and classes from names."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def read(folder: Path, groups: list[dict[str, Any]], segments: list[int] | None 
 
 def test_scannet_annotation_maps_segments_to_instances(tmp_path: Path) -> None:
     mesh = read(tmp_path, [group(0, "office chair", 70, 9), group(4, "couch", 5), group(1, "wall", 3)])
-    # the wall is not an instance; the unlabeled part is an additional instance without a class
+    # the wall is not an instance; the part without labels is an instance without a class
     np.testing.assert_array_equal(mesh.instance_ids, [0, 0, 1, 1, 5, 5, 1, 1, 6, 6])
     assert mesh.class_names == {1: "chair", 5: "couch", 6: None}
     assert mesh.instance_ids.dtype == np.int32
@@ -120,14 +120,14 @@ def test_scannet_label_table_missing_names_are_listed(tmp_path: Path) -> None:
 
 
 def test_scannet_label_table_name_spellings_are_equivalent() -> None:
-    """Spaces and punctuation may be omitted."""
+    """Names may be written without spaces and punctuation."""
     meanings: dict[str, set[str | None]] = {}
     for name, meaning in MEANINGS.items():
         meanings.setdefault("".join(filter(str.isalnum, name)), set()).add(meaning)
     assert all(len(meant) == 1 for meant in meanings.values())
 
 
-def test_scannet_annotation_later_object_gets_shared_segment(tmp_path: Path) -> None:
+def test_scannet_annotation_later_object_has_shared_segment(tmp_path: Path) -> None:
     mesh = read(tmp_path, [group(0, "bed", 3, 70), group(1, "pillow", 70), group(2, "chair", 3)])
     np.testing.assert_array_equal(mesh.instance_ids[:4], [3, 3, 0, 0])
 

@@ -1,4 +1,4 @@
-"""Tests of valid and truncated `.sens` files, and of files with one invalid field."""
+"""Tests for `.sens` files, including truncated files and files with one invalid field."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.recordings.scannet_files import (
     shots,
 )
 
-SIZES = 12 + 15 + 4 * 64  # byte offset of the header fields after the name and the matrices
+SIZES = 12 + 15 + 4 * 64  # byte offset of the fields after the name and the matrices
 HEADER = SIZES + 36
 
 

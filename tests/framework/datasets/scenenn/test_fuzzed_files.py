@@ -1,6 +1,8 @@
-"""Fuzz tests of every file format: a damaged file is read, or raises a one-line error with file and position.
+"""Fuzz tests for every file format. A damaged file must be read, or raise a one-line error with file and position.
 
-`INSTANCEMAP_FUZZ=5000 pytest tests/framework/datasets/scenenn/test_fuzzed_files.py` tries 5000 cases per format.
+The following command tries 5000 cases per format:
+
+    INSTANCEMAP_FUZZ=5000 pytest tests/framework/datasets/scenenn/test_fuzzed_files.py
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests of intrinsics files in every known spelling of keys and values."""
+"""Tests for intrinsics files with different spellings of keys and values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of .oni frames: pairing of color and depth, and real playback if OpenNI 2 is installed."""
+"""Tests for the frames of .oni files. If OpenNI 2 is installed, files are also played back."""
 
 import ctypes
 import signal
@@ -129,7 +129,7 @@ def times_of(frames):
 
 
 def play_back(color_times, depth_times):
-    """Pair frames as SceneNN's PlaybackSync does: advance the earlier stream until both times are close."""
+    """Pair frames like SceneNN's PlaybackSync, which advances the earlier stream until both times are close."""
     paired, color_reader, depth_reader = [], iter(color_times), iter(depth_times)
     try:
         while True:

@@ -1,4 +1,4 @@
-"""Tests of the records of .oni files, including truncated files."""
+"""Tests for the records of .oni files, including truncated files."""
 
 import os
 import struct

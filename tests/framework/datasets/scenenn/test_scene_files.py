@@ -1,4 +1,4 @@
-"""Tests of trajectory.log: the published format, lost and truncated frames, and errors with line numbers."""
+"""Tests for trajectory.log, including lost frames, truncated files and files with errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of SceneNN folders in the documented layout, and of folders with missing or invalid files."""
+"""Tests for SceneNN folders, including folders with missing or invalid files."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ WALL = 2.0  # distance of the mesh from the first camera, m
 
 
 def labels() -> list[Annotated]:
-    """Return the labels, unsorted as in the dataset."""
+    """Return the labels in random order, like in the dataset."""
     named = ((CHAIR, "chair1", "chair"), (NAMELESS, "thing", ""), (CABINET, "cabinet", "cabinet"), (SOFA, "s", "Sofa"))
     return [Annotated(i, text, nyu, (10, 20, 30), None, None) for i, text, nyu in named]
 
 
 def striped_wall() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the vertices (V, 3), m, triangles (T, 3) and labels (V,) of a wall of vertical stripes.
+    """Return the vertices (V, 3), m, triangles (T, 3) and labels (V,) of a wall with vertical stripes.
 
-    The wall extends from x = -1 to 1 m, with a vertex every 5 cm. Each stripe is 0.25 m wide and has one label.
+    The wall extends from x = -1 to 1 m and has a vertex every 5 cm. Each stripe is 0.25 m wide and has one label.
     """
     x, y = np.meshgrid(np.arange(-20, 21) * 0.05, np.arange(-20, 21) * 0.05)
     vertices = np.stack([x, y, np.full_like(x, WALL)], axis=-1).reshape(-1, 3).astype(np.float32)
@@ -134,13 +134,14 @@ def test_scenenn_true_masks_match_mesh_at_true_pose(root: Path) -> None:
     frame = SceneNN(root, "016", frame_ground_truth=True)[1]
     assert frame.truth is not None
     u = np.arange(CAMERA.width)
-    x = (u - CAMERA.cx) / CAMERA.fx * WALL + 0.1  # on the wall, in the world frame, m
-    nearest = np.round(x / 0.05).astype(int) + 20  # column of the nearest vertex
+    x = (u - CAMERA.cx) / CAMERA.fx * WALL + 0.1  # m, x of the points on the wall in the world frame
+    nearest = np.round(x / 0.05).astype(int) + 20  # index of the nearest vertex column
     _, _, vertex_labels = striped_wall()
     row = vertex_labels.reshape(41, 41)[0]
     expected = np.where(np.abs(x) <= 1, row[np.clip(nearest, 0, 40)], 0)
     expected[expected == CABINET] = 0
-    sure = np.abs(x / 0.05 - np.floor(x / 0.05) - 0.5) > 0.01  # not midway between vertices, where rounding decides
+    # midway between two vertices, the label depends on rounding
+    sure = np.abs(x / 0.05 - np.floor(x / 0.05) - 0.5) > 0.01
     np.testing.assert_array_equal(frame.truth.instance_ids[11, sure], expected[sure])
 
 

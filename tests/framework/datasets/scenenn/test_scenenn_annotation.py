@@ -1,4 +1,4 @@
-"""Tests of NNN.xml: published attributes, missing or invalid values, and malicious files."""
+"""Tests for the annotation file NNN.xml, including missing, invalid and malicious content."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_scenenn_annotation_round_trip_preserves_labels(path):
 
 
 def test_scenenn_annotation_box_is_rotated_by_quaternion(path):
-    """After a rotation of 90 degrees about z, the x axis of the box is the y axis of the world frame."""
+    """The quaternion is a rotation by 90 degrees about z, which maps x to y."""
     half = np.sqrt(0.5)
     box = read_label(path, f'id="1" obbox="1 2 3 4 5 6 0 0 {half} {half}"').obb
     np.testing.assert_allclose(box.rotation @ [1, 0, 0], [0, 1, 0], atol=1e-15)
@@ -141,7 +141,7 @@ BOMB = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10 if k else "ha"}">' for k in 
         '<!DOCTYPE l [<!ENTITY a11 SYSTEM "file:///etc/passwd">]>',
         '<!DOCTYPE l [<!ENTITY % a11 SYSTEM "http://127.0.0.1/a.dtd"> %a11;]>',
         '<!DOCTYPE l SYSTEM "file:///etc/passwd">',
-        f'<!DOCTYPE l [<!ATTLIST label text CDATA "{"x" * 100000}">]>',  # each label would contain this value
+        f'<!DOCTYPE l [<!ATTLIST label text CDATA "{"x" * 100000}">]>',  # each label would have this value
     ],
 )
 def test_scenenn_annotation_entities_and_doctypes_raise(path, prologue):

@@ -1,4 +1,4 @@
-"""Tests of models by hub id, with a local hub server."""
+"""Tests for models that are selected by hub id, with a local server."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ FILES = {
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch):
-    """Serve the model somebody/something as huggingface.co does, and record the requests."""
+    """Serve the model somebody/something like huggingface.co, and record the requests."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_HEAD(self):
@@ -80,7 +80,7 @@ def digest(content):
 
 
 def listing(files):
-    """Return the hub's information about a model with these files; only large files have a SHA-256."""
+    """Return the description of a model with these files. Only large files have a SHA-256."""
     siblings = []
     for name, content in files.items():
         large = (
@@ -119,7 +119,7 @@ def test_hub_model_sharded_weights_download_missing_shard(hub):
     hub.files["model.safetensors.index.json"] = json.dumps({"weight_map": names}).encode()
     folder = find_model("somebody/something", "main")
     assert {file.name for file in folder.iterdir()} == {*hub.files} - {"README.md"}
-    (folder / "model-00002-of-00002.safetensors").resolve().unlink()  # as after an interrupted download
+    (folder / "model-00002-of-00002.safetensors").resolve().unlink()  # like after an interrupted download
     hub.sent.clear()
     assert find_model("somebody/something", "main") == folder
     assert hub.sent == ["model-00002-of-00002.safetensors"]

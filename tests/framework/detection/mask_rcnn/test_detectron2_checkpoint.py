@@ -1,6 +1,7 @@
-"""Tests of detectron2 checkpoints: the pickle executes no code, and the network outputs equal detectron2's.
+"""Tests for detectron2 checkpoints.
 
-The reference follows detectron2's definitions and names, in double precision and without the project's network code.
+The outputs of the network are compared with a reference in double precision. The reference follows the definitions and
+names of detectron2 and uses no code of this project. Reading a checkpoint must not execute code in the pickle.
 """
 
 import math
@@ -25,7 +26,7 @@ MEAN_BGR = (103.530, 116.280, 123.675)
 
 
 def synthetic_state(network="resnet50", classes=80):
-    """Return a checkpoint with detectron2's names and random values, as float32 arrays."""
+    """Return a checkpoint of random float32 arrays with the names of detectron2."""
     rng = np.random.default_rng(11)
     state = {"pixel_mean": np.array(MEAN_BGR).reshape(3, 1, 1), "pixel_std": np.ones((3, 1, 1))}
 
@@ -101,7 +102,7 @@ class Detectron2:
                     break
                 stride = 2 if stage > 2 and block == 0 else 1
                 shortcut = self.normalized(f"{name}.shortcut", x, stride=stride) if block == 0 else x
-                y = self.normalized(f"{name}.conv1", x, stride=stride).relu()  # STRIDE_IN_1X1
+                y = self.normalized(f"{name}.conv1", x, stride=stride).relu()  # as with STRIDE_IN_1X1
                 y = self.normalized(f"{name}.conv2", y, padding=1).relu()
                 x = (self.normalized(f"{name}.conv3", y) + shortcut).relu()
             stages[stage] = x
@@ -113,7 +114,10 @@ class Detectron2:
         return [*levels, functional.max_pool2d(levels[-1], 1, 2)]
 
     def anchors(self, pyramid):
-        """Return the anchors (A, 4), px, centered at the corners of the cells (OFFSET 0), with unrounded sizes."""
+        """Return the anchors (A, 4), px.
+
+        They are centered at the cell corners (OFFSET 0), and their sizes are not rounded.
+        """
         anchors = []
         for level, stride, side in zip(pyramid, (4, 8, 16, 32, 64), (32, 64, 128, 256, 512), strict=True):
             for y in range(level.shape[2]):
@@ -125,7 +129,7 @@ class Detectron2:
         return np.array(anchors)
 
     def proposals(self, pyramid):
-        """Return the scores (A,) and boxes (A, 4), px, of all anchors, before the selection."""
+        """Return the scores (A,) and boxes (A, 4), px, of all anchors before the selection."""
         scores, deltas = [], []
         for level in pyramid:
             x = self.layer("proposal_generator.rpn_head.conv", level, padding=1).relu()
@@ -143,7 +147,7 @@ class Detectron2:
         return torch.from_numpy(np.concatenate(rows))
 
     def boxes(self, pyramid, boxes):
-        """Return the class probabilities (N, K + 1), background last, and the boxes (N, K, 4), px."""
+        """Return the class probabilities (N, K + 1), with the background last, and the boxes (N, K, 4), px."""
         x = self.pooled(pyramid, boxes, 7).flatten(1)
         x = self.layer("roi_heads.box_head.fc1", x, functional.linear).relu()
         x = self.layer("roi_heads.box_head.fc2", x, functional.linear).relu()
@@ -164,7 +168,7 @@ class Detectron2:
 
 
 def moved(boxes, deltas, weights):
-    """Return the boxes (N, 4), px, moved by `deltas` (N, 4), as Box2BoxTransform.apply_deltas does."""
+    """Return the boxes (N, 4), px, moved by `deltas` (N, 4) like in Box2BoxTransform.apply_deltas."""
     widths, heights = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
     x, y = boxes[:, 0] + 0.5 * widths, boxes[:, 1] + 0.5 * heights
     dx, dy, dw, dh = (deltas[:, k] / weights[k] for k in range(4))
@@ -226,7 +230,7 @@ def test_detectron2_unsupported_networks_raise():
     state = as_tensors(synthetic_state())
     with pytest.raises(
         DataError,
-        match=r"^here: pixel_std: expected .*, as in networks initialized from MSRA, got \[57\.375, 57\.12, 58\.395\]",
+        match=r"^here: pixel_std: expected .*, as in networks .*, got \[57\.375, 57\.12, 58\.395\]",
     ):
         from_detectron2(state | {"pixel_std": torch.tensor([57.375, 57.12, 58.395])}, "here")
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""Tests of fused normalization, pyramid anchors, and the selection of the best anchors."""
+"""Tests for fused batch normalization, anchors, and the selection of the best anchors."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_network_with_fused_batch_norms_matches_original():
 
 
 @pytest.mark.parametrize("count", [1, 40, 99, 100, 200])
-@pytest.mark.parametrize("decimals", [0, 6])  # 0: many equal scores
+@pytest.mark.parametrize("decimals", [0, 6])  # with 0 digits, many scores are equal
 def test_network_best_first_equals_stable_sort(count, decimals):
     scores = np.random.default_rng(3).normal(size=100).round(decimals).astype(np.float32)
     np.testing.assert_array_equal(best_first(scores, count), np.argsort(-scores, kind="stable")[:count])

@@ -1,4 +1,4 @@
-"""Tests of network files: exact round trips, and errors for damaged files."""
+"""Tests for network files, including damaged files."""
 
 import json
 import re
@@ -13,7 +13,7 @@ from tests.support.networks.tiny_mask_rcnn import TINY, tiny_network, tiny_netwo
 
 
 def rewritten(path, tensors=None, **metadata):
-    """Rewrite the file with other tensors or metadata, as another program could; return the path."""
+    """Write the file again with other tensors or metadata, and return the path."""
     from safetensors import safe_open
 
     with safe_open(path, framework="pt") as file:

@@ -1,4 +1,4 @@
-"""Tests of downloaded weights, with a local web server."""
+"""Tests for downloaded weights, with a local web server."""
 
 import hashlib
 import threading
@@ -12,7 +12,7 @@ from framework.detection.mask_rcnn.published_weights import PUBLISHED, Published
 from framework.errors import DataError
 from framework.files.search_paths import PROJECT_ROOT
 
-CONTENT = bytes(range(256)) * 20_000  # several download blocks
+CONTENT = bytes(range(256)) * 20_000  # larger than one download block
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 
@@ -46,7 +46,7 @@ def server():
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """Set an empty cache folder and allow downloads; return the folder."""
+    """Set an empty cache folder, allow downloads and return the folder."""
     monkeypatch.setattr(published_weights.platformdirs, "user_cache_path", lambda *_, **__: tmp_path / "cache")
     monkeypatch.delenv("INSTANCEMAP_OFFLINE")
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
@@ -119,7 +119,7 @@ def test_published_network_offline_makes_no_requests(server, cache, monkeypatch)
     assert f"put it at {cache / 'network.pth'}" in fault()
     assert not server.asked
     cache.mkdir(parents=True)
-    (cache / "network.pth").write_bytes(CONTENT)  # at the path in the message
+    (cache / "network.pth").write_bytes(CONTENT)  # the error message contains this path
     assert find_network(Path("offered")).read_bytes() == CONTENT
 
 

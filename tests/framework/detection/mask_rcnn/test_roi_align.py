@@ -1,4 +1,4 @@
-"""Tests of both RoIAlign implementations, compared with the sample loops of Detectron and torchvision."""
+"""Tests for both implementations of RoIAlign, compared with the loops of Detectron and torchvision."""
 
 import math
 
@@ -13,7 +13,7 @@ from tests.support.networks.roi_align_loops import roi_align_loops
 
 @pytest.fixture(params=["products", "sums"])
 def path(request, monkeypatch):
-    """Force one of the two implementations; return its name."""
+    """Select one of the two implementations and return its name."""
     monkeypatch.setattr(module, "PRODUCT_SPEED", {"products": math.inf, "sums": 0.0}[request.param])
     other = {"products": "_sums", "sums": "_products"}[request.param]
     monkeypatch.setattr(module, other, lambda *_: pytest.fail("expected only the forced implementation"))
@@ -61,7 +61,7 @@ def test_roi_align_chunks_keep_box_order(monkeypatch):
 
 @pytest.mark.parametrize("ratio", [0, 2])
 def test_roi_align_gradient_matches_cell_contributions(path, ratio):
-    """Pooling is linear, so the gradient at a cell is the pooled sum of a map that is 1 only at this cell."""
+    """Pooling is linear. The gradient at a cell is therefore the pooled sum of a map that is 1 at this cell."""
     rng = np.random.default_rng(6)
     boxes = rng.uniform(0, 60, (4, 2))
     boxes = np.hstack([boxes, boxes + rng.uniform(4, 50, (4, 2))]).astype(np.float32)

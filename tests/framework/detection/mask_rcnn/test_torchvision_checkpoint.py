@@ -1,4 +1,4 @@
-"""Tests of torchvision checkpoints: weight names, COCO ids and, if torchvision is installed, outputs."""
+"""Tests for torchvision checkpoints. If torchvision is installed, the outputs are compared."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from framework.vocabulary.label_spaces import COCO
 from tests.support.networks.tiny_mask_rcnn import TINY, tiny_network
 
 # fmt: off
-COCO_NUMBERS = (  # ids of the 80 classes, as in COCO's annotation files
+COCO_NUMBERS = (  # ids of the 80 classes in the annotation files of COCO
     *range(1, 12), *range(13, 26), 27, 28, *range(31, 45), *range(46, 66), 67, 70, *range(72, 83), *range(84, 91),
 )
 # fmt: on
@@ -21,7 +21,7 @@ NINETY = tuple(f"category {number}" for number in range(1, 91))
 
 
 def old_name(name):
-    """Return the name that torchvision used when the checkpoint was published."""
+    """Return the name of a weight at the time when the checkpoint was published."""
     name = name.replace("rpn.head.conv.0.0.", "rpn.head.conv.")
     for k in range(4):
         name = name.replace(f"fpn.inner_blocks.{k}.0.", f"fpn.inner_blocks.{k}.")
@@ -31,7 +31,7 @@ def old_name(name):
 
 
 def published(name="resnet50", width=2):
-    """Return a network with all 91 labels, and its state_dict with torchvision's old names."""
+    """Return a network with all 91 labels and its state_dict with the old names."""
     network = tiny_network(replace(TINY, classes=NINETY, backbone=ResNetShape(name, width, norm_eps=0.0)))
     state = {old_name(k): v.clone() for k, v in network.state_dict().items() if "num_batches_tracked" not in k}
     return network, state
@@ -98,7 +98,7 @@ def test_torchvision_invalid_checkpoints_raise():
 
 
 def test_torchvision_p6_anchor_stride_is_matched():
-    """At 800 px, P5 has 25 rows and P6 has 13. The stride of P6 is then 61 px (rounded down), not 64 px."""
+    """At 800 px, P6 has 13 rows. Its stride is 800 // 13 = 61 px instead of 64 px."""
     _, state = published()
     network = from_torchvision(state, "here")
     pyramid = [
@@ -113,7 +113,7 @@ def test_torchvision_p6_anchor_stride_is_matched():
 
 
 def test_network_outputs_match_torchvision():
-    """With the same random weights, every step gives the same numbers as torchvision's model."""
+    """Each step is compared, with the same random weights."""
     try:
         import torchvision
     except (ImportError, RuntimeError) as absent:  # torchvision's extension does not load with a CPU build of torch

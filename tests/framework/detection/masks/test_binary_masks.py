@@ -1,4 +1,4 @@
-"""Tests of pasted and prototype masks, boxes and overlaps, compared with per-pixel references."""
+"""Tests for binary masks, compared with per-pixel references."""
 
 import numpy as np
 import pytest
@@ -42,11 +42,11 @@ def test_paste_masks_matches_per_pixel_interpolation(borders):
     grid = rng.uniform(0, 1, (24, 24)).astype(np.float32)
     (mask,) = paste_masks(grid[None], np.array([borders], np.float32), (40, 60), 0.5)
     expected = paste_by_pixel(grid, np.float64(np.float32(borders)), (40, 60), 0.5)
-    assert (mask != expected).sum() <= 2  # float32 and float64 can differ at the threshold
+    assert (mask != expected).sum() <= 2  # at the threshold, float32 and float64 can differ
 
 
 def test_paste_masks_full_grid_fills_box_exactly():
-    """The interpolation between a cell of 1 and the border 0 crosses 0.5 exactly at the border of the box."""
+    """The mask interpolates between 1 in the outer cells and 0 outside, and is 0.5 at the border of the box."""
     (mask,) = paste_masks(np.ones((1, 24, 24), np.float32), np.array([[9.5, 4.5, 33.5, 28.5]], np.float32), (40, 60))
     expected = np.zeros((40, 60), bool)
     expected[5:29, 10:34] = True
@@ -70,7 +70,7 @@ def test_tight_boxes_span_first_to_last_pixel():
 
 
 def test_mask_overlaps_count_shared_pixels():
-    """The masks fill the image or a rectangle, overlap in one pixel, or are empty."""
+    """Some masks fill the image or a rectangle, two share a single pixel, and one is empty."""
     rng = np.random.default_rng(6)
     masks = rng.random((12, 40, 300)) > 0.5
     for mask in masks[2:]:
@@ -129,9 +129,9 @@ def test_masks_from_prototypes_match_definition(placement, threshold):
 
 
 def test_masks_from_prototypes_keep_edge_position():
-    """A prototype that is linear in x crosses zero at u = 20.3 px, so the mask begins at pixel 21."""
+    """The prototype is linear in x and is zero at u = 20.3 px."""
     letterbox = Letterbox.fit((48, 48), (96, 96), Placement.center)
-    cell_centers = (np.arange(24) + 0.5) * 4 / 2 - 0.5  # in px of the image
+    cell_centers = (np.arange(24) + 0.5) * 4 / 2 - 0.5  # px of the image
     prototypes = np.tile((cell_centers - 20.3).astype("f4"), (1, 24, 1))
     borders = np.array([[-0.5, -0.5, 47.5, 47.5]], np.float32)
     (mask,) = masks_from_prototypes(np.ones((1, 1), "f4"), prototypes, borders, letterbox, (48, 48))

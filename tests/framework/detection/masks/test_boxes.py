@@ -1,4 +1,4 @@
-"""Tests of box arithmetic and non-maximum suppression, compared with formulas and a quadratic algorithm."""
+"""Tests for box operations and non-maximum suppression."""
 
 import math
 

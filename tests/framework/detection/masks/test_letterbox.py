@@ -1,4 +1,4 @@
-"""Tests of the letterbox transform between image and network input."""
+"""Tests for the letterbox transform from the image to the network input."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def test_letterbox_placement_sets_size_and_offsets(image, placement, resized, to
 
 @pytest.mark.parametrize("placement", Placement)
 def test_letterbox_image_borders_round_trip_exactly(placement):
-    """The image spans -0.5 to W - 0.5 px, even if its size in the input is rounded."""
+    """The borders of an image are at -0.5 and W - 0.5 px, even if the size of the resized image is rounded."""
     letterbox = Letterbox.fit((333, 217), (416, 320), placement)
     height, width = letterbox.resized
     corners = [letterbox.left, letterbox.top, letterbox.left + width, letterbox.top + height]
@@ -34,7 +34,7 @@ def test_letterbox_image_borders_round_trip_exactly(placement):
 
 @pytest.mark.parametrize("placement", Placement)
 def test_letterbox_blob_position_round_trips(placement):
-    """OpenCV's resizing and the inverse mapping agree within 0.05 px."""
+    """The center of a blob is resized by OpenCV and transformed back."""
     v, u = np.indices((120, 160))
     blob = 250 * np.exp(-((u - 101.0) ** 2 + (v - 37.0) ** 2) / (2 * 6.0**2))
     letterbox = Letterbox.fit((120, 160), (416, 416), placement)

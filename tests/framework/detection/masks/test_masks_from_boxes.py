@@ -1,4 +1,4 @@
-"""Tests of masks from boxes and depth, on scenes with known masks."""
+"""Tests for masks that are computed from boxes and depth."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_masks_in_boxes_thin_occluder_is_excluded():
     halves = disk(28) & ((U < 66) | (U > 69))
     assert not (mask & ~halves).any()
     assert mask.sum() > 0.45 * halves.sum(), "expected most of one of the two halves"
-    # without a required foreground fraction, the pole is the foreground
+    # with significance 0, the pole is the foreground
     assert mask_of(depth, significance=0.0)[50, 66:70].all()
 
 
@@ -67,8 +67,8 @@ def test_masks_in_boxes_equal_depths_select_central_object():
 
 
 @pytest.mark.parametrize(("slant", "whole"), [(75.0, True), (84.0, False)])
-def test_masks_in_boxes_slanted_plane_is_whole_below_limit(slant, whole):
-    """The plane is z = 3 m + tan(slant) x. Planes with a slant above 80 degrees are split."""
+def test_masks_in_boxes_slanted_plane_is_one_mask_below_limit(slant, whole):
+    """The depth of the plane is 3 m + tan(slant) x. Planes with a slant above 80 degrees are split."""
     direction = (U - 69.5) / CAMERA.fx
     depth = np.clip(3 / (1 - np.tan(np.radians(slant)) * direction), 0, None).astype(np.float32)
     narrow = np.array([[63.5, 19.5, 75.5, 79.5]], np.float32)
@@ -82,7 +82,7 @@ def test_region_growing_joins_pixels_below_depth_step_limit():
         assert limit == pytest.approx(z * np.tan(np.radians(80)) / 150 + 3 * (0.0012 + 0.0019 * (z - 0.4) ** 2))
         for step, joined in ((0.95 * limit, True), (1.05 * limit, False)):
             depth = np.where(U < 70, np.float32(z), np.float32(z + step))
-            # all depths are in range, so that only the depth step matters
+            # all depths are in range, so only the depth step matters
             mask = np.zeros((120, 160), np.bool_)
             ones = np.ones(160)
             step_limit = np.tan(np.radians(80)) / 150
@@ -98,7 +98,7 @@ def test_region_growing_and_hole_closing_match_labeling():
         labels, _ = ndimage.label(depth == 1)
         weights = ndimage.sum(np.outer(weight_y, weight_x), labels, np.arange(1, labels.max() + 1))
         expected = labels == 1 + weights.argmax()
-        # holes: 4-connected parts of the rest that do not touch the border
+        # holes are 4-connected background regions that do not touch the border
         holes, n = ndimage.label(~expected)
         for k in range(1, n + 1):
             hole = holes == k

@@ -1,4 +1,4 @@
-"""Tests of COCO run lengths, compared with pycocotools, and of strings that pycocotools misreads."""
+"""Tests for COCO run lengths, compared with pycocotools. pycocotools misreads some invalid strings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from framework.errors import DataError
 
 
 def random_masks(seed: int, n: int, shape: tuple[int, int]) -> np.ndarray:
-    """Return n random masks of different densities; the first is empty and the last is full."""
+    """Return n random masks of different densities. The first one is empty, and the last one is full."""
     random = np.random.default_rng(seed)
     masks = random.random((n, *shape)) < random.random((n, 1, 1))
     masks[0], masks[-1] = False, True
@@ -19,7 +19,7 @@ def random_masks(seed: int, n: int, shape: tuple[int, int]) -> np.ndarray:
 
 
 def lengths_of(mask: np.ndarray) -> list[int]:
-    """Return the run lengths, counted by pixel in column-major order; the first run is of zeros."""
+    """Return the run lengths in column-major order, computed pixel by pixel. The first run is of zeros."""
     lengths, value = [0], False
     for pixel in mask.T.ravel().tolist():
         if pixel != value:
@@ -45,7 +45,7 @@ def test_run_length_round_trip_matches_pycocotools(shape: tuple[int, int]) -> No
 
 
 def test_run_length_unpack_reads_long_runs() -> None:
-    """The encoded runs have several characters, and their differences have either sign."""
+    """Long runs are encoded as several characters, and relative to a previous run, which may be longer."""
     mask = np.zeros((480, 640), np.bool_)
     mask[100:400, 3], mask[5, 4:600], mask[200:, 630] = True, True, True
     assert unpack(encode(mask[None])[0]).tolist() == lengths_of(mask)
@@ -62,7 +62,7 @@ def test_run_length_without_masks_is_empty() -> None:
         (b"", "packed string"),
         (b"1", "got 1 px"),
         (b"!!", "packed string"),
-        (b"04o", "packed string"),  # ends in the middle of a number
+        (b"04o", "packed string"),  # the string ends in the middle of a number
         (b"0" + b"o" * 30 + b"0", "run lengths: expected at most 7 characters per number, got 31 characters"),
         (b"O8I", "negative"),
     ],

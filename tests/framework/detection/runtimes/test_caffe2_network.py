@@ -1,4 +1,4 @@
-"""Tests of 8-bit networks: operators compared with their definitions, in float and in integers."""
+"""Tests for 8-bit networks. Each operator is compared with its definition, in float and in integers."""
 
 import os
 import subprocess
@@ -30,7 +30,7 @@ def real(values, scale_zero):
 
 
 def run_one(kind, args, x_nhwc, tensors):
-    """Run one operator in the graph interpreter; input and output are NHWC, as in the graph."""
+    """Run a single operator of a graph. Input and output are NHWC."""
     operator = {"type": kind, "inputs": ["x", *tensors], "outputs": ["y"], "args": args}
     network = network_between([operator], tensors, ("x",), ("y",))
     (y,) = network(torch.from_numpy(x_nhwc.astype(np.float32)).permute(0, 3, 1, 2))
@@ -101,13 +101,13 @@ def test_caffe2_network_runs_only_operators_for_outputs():
 # Integer arithmetic
 
 IMAGE = {"type": "Int8Quantize", "inputs": ["image"], "outputs": ["x"], "args": {"Y_scale": 0.02, "Y_zero_point": 110}}
-LAST = {  # outputs are computed in float from the preceding integers, here from "y"
+LAST = {  # the output is computed in float from the integers "y"
     "type": "Int8Relu", "inputs": ["y"], "outputs": ["z"], "args": {"Y_scale": 1.0, "Y_zero_point": 0}
 }  # fmt: skip
 
 
 def integer_network(kind, args, weight, weight_scale, bias):
-    """Return the network image -> x (uint8) -> y -> z = max(y, 0), and the quantization of y."""
+    """Return a network with one quantized operator and a ReLU, and the quantization between them."""
     tensors = {"w": dequantized_weights(weight, weight_scale), "b": torch.from_numpy(bias)}
     result = Quantization(0.05, 0 if kind == "Int8ConvRelu" else 128)
     operator = {
@@ -121,7 +121,7 @@ def integer_network(kind, args, weight, weight_scale, bias):
 @pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
 def test_caffe2_quantize_rounds_half_to_even(memory_format):
     quantization = Quantization(0.25, 100)
-    steps = torch.arange(-1000, 1000).reshape(1, 5, 20, 20) / 2  # half steps, from below to above the range
+    steps = torch.arange(-1000, 1000).reshape(1, 5, 20, 20) / 2  # multiples of half a step, also outside of the range
     found = quantization.quantize((steps * 0.25).contiguous(memory_format=memory_format))
     assert found.dtype == torch.uint8
     np.testing.assert_array_equal(found, np.clip(np.rint(steps.numpy() + 100), 0, 255))
@@ -155,7 +155,7 @@ def test_caffe2_integer_convolution_is_exact_and_rounded_once(kind, stride, pad,
 
 @in_integers
 def test_caffe2_int8_kernels_with_overflow_are_detected():
-    """Without VNNI, oneDNN adds pairs of products in 16 bits. It reads ONEDNN_MAX_CPU_ISA when it is loaded."""
+    """Without VNNI, the int8 kernels of oneDNN add products in 16 bits and can overflow."""
     asked = "from framework.detection.runtimes.caffe2_network import has_int8_kernels; print(has_int8_kernels())"
     for instructions, expected in (("AVX2", "False"), ("DEFAULT", "True")):
         environment = {**os.environ, "ONEDNN_MAX_CPU_ISA": instructions}
@@ -182,8 +182,8 @@ def test_caffe2_int8_weight_overflow_rounds_only_its_channel():
 
 
 @in_integers
-def test_caffe2_blob_is_rounded_for_convolution_but_not_for_sum():
-    """In y = x + linear(relu(linear(x))), the sum uses x before it is rounded."""
+def test_caffe2_blob_is_rounded_only_for_convolution():
+    """The sum is y = x + linear(relu(linear(x)))."""
     one = {"Y_scale": 0.02, "Y_zero_point": 100}
     convolution = {"kernel": 1, "stride": 1, "pad": 0, **one}
     rectified = convolution | {"Y_zero_point": 0}
@@ -204,5 +204,5 @@ def test_caffe2_integers_without_scale_raise():
     tensors = {"w": torch.ones(1, 1, 1, 1), "b": torch.zeros(1)}
     args = {"kernel": 1, "stride": 1, "pad": 0, "Y_scale": 0.1, "Y_zero_point": 0}
     graph = [{"type": "Int8Conv", "inputs": ["x", "w", "b"], "outputs": ["y"], "args": args}, LAST]
-    with pytest.raises(DataError, match="x: expected a scale for the integers of a convolution"):
+    with pytest.raises(DataError, match="x: expected quantization parameters for the input of an 8-bit convolution"):
         network_between(graph, tensors, ("x",), ("z",), {"w": 1.0})

@@ -1,4 +1,4 @@
-"""Tests of torch's thread counts in threads of the pipeline."""
+"""Tests for the thread counts of torch in several threads."""
 
 import threading
 
@@ -10,7 +10,7 @@ PATIENCE_S = 10.0
 
 
 def test_one_torch_thread_in_two_threads_restores_thread_count():
-    """A thread that uses torch for the first time gets the last count that any thread has set."""
+    """When a new thread uses torch for the first time, it gets the count that was last set in any thread."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     first_is_in, second_is_in = threading.Event(), threading.Event()

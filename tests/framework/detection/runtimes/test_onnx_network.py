@@ -1,4 +1,4 @@
-"""Tests of ONNX networks: their outputs, and one-line errors for unsupported files."""
+"""Tests for ONNX networks, including unsupported files."""
 
 import sys
 
@@ -149,7 +149,7 @@ def test_onnx_network_input_type_unsupported_raises(tmp_path):
 
 
 def test_onnx_network_weights_listed_as_inputs_are_ignored(tmp_path):
-    """Before version 4, the format required weights to be listed as inputs."""
+    """Format versions before 4 require weights to be listed as inputs."""
     image, weight = (helper.make_tensor_value_info(n, TensorProto.FLOAT, (1, 3, 4, 4)) for n in ("images", "weight"))
     path = save(
         tmp_path / "n.onnx",
@@ -217,5 +217,5 @@ OTHER = (
 
 
 @pytest.mark.parametrize("text", OTHER)
-def test_export_metadata_other_text_is_ignored(text):
+def test_export_metadata_invalid_text_is_ignored(text):
     assert ExportMetadata.parse({"names": text, "imgsz": text}) == ExportMetadata()

@@ -1,4 +1,4 @@
-"""Tests of the detection cache: byte-identical detections, one detector call per image, no effect of errors."""
+"""Tests for the detection cache."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ FIELDS = ("masks", "boxes", "scores", "class_probabilities")
 
 @dataclass
 class Noise(Detector):
-    """Detector that returns random masks, seeded with the color image and `strength`, and counts its calls."""
+    """Detector that returns random masks and counts its calls. The seed is the color image and `strength`."""
 
     strength: float = 1.0
     broken_at: int = -1
@@ -143,7 +143,7 @@ def test_cache_with_other_detector_misses(room: CornerRoom, tmp_path: Path, chan
 
 @dataclass
 class Named(Noise):
-    """Detector that resolves its weights by name and declares its fingerprint."""
+    """Detector that resolves the name of its weights and declares its fingerprint."""
 
     revision: str = "main"
 
@@ -153,14 +153,14 @@ class Named(Noise):
 
 @dataclass
 class OldNamed(Noise):
-    """Detector for an older interface, in which Detector had a method `fingerprint`."""
+    """Detector for an older interface with the method `fingerprint`."""
 
     def fingerprint(self) -> str:
         return f"{super().fingerprint()} main"  # type: ignore[misc]
 
 
 def test_cache_identity_uses_detector_fingerprint(tmp_path: Path) -> None:
-    """A detector may declare its identity and the frame fields that it reads, but does not have to."""
+    """The fingerprint and the read fields are optional attributes of a detector."""
     assert not {"reads", "fingerprint"} & set(dir(Detector))
     silent = SphereDetector()
     assert identity_of(silent) == fingerprint(silent)
@@ -266,7 +266,7 @@ def test_cache_unknown_read_field_raises(tmp_path: Path) -> None:
 def test_detectors_read_only_declared_frame_fields(
     name: str, ready: Callable[..., Detector], room: CornerRoom, tmp_path: Path
 ) -> None:
-    """With undeclared fields, the cache could return the detections of another frame."""
+    """If a detector read other fields, the cache could return the detections of another frame."""
     detector = ready("detector", name)
     frame = room[1]
     others = {
@@ -337,7 +337,7 @@ def test_cache_read_only_writes_nothing(room: CornerRoom, tmp_path: Path) -> Non
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_cache_full_disk_stops_storing_but_not_run(
+def test_cache_full_disk_disables_storing_with_warning(
     room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(path: Path) -> Any:
@@ -404,7 +404,7 @@ def test_cache_folder_is_shared_by_two_processes(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob(".*"))
 
 
-# Selection by the config
+# Cache settings in the config
 
 
 def config(*overrides: str) -> DictConfig:
@@ -448,7 +448,6 @@ def test_cache_default_folder_is_user_cache(monkeypatch: pytest.MonkeyPatch, tmp
 @pytest.mark.usefixtures("fakes_registered")
 @pytest.mark.usefixtures("fakes_registered")
 def test_run_with_cache_is_identical_to_run_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All outputs except times are equal without a cache, with an empty cache and with a full cache."""
     asked: list[int] = []
     detect = SphereDetector.detect
     monkeypatch.setattr(SphereDetector, "detect", lambda self, frame: asked.append(frame.index) or detect(self, frame))
@@ -470,7 +469,7 @@ def test_run_with_cache_is_identical_to_run_without(tmp_path: Path, monkeypatch:
 
 
 def test_cache_seeded_detector_is_keyed_by_frame_index(room: CornerRoom, tmp_path: Path) -> None:
-    """The simulated detector is seeded with the frame index, so each index of an image has its own entry."""
+    """The simulated detector is seeded with the frame index, so equal images have different detections."""
     detector = CachedDetector(SimulatedDetector(min_pixels=1), tmp_path)
     frame = room[0]
     for index in (0, 1, 0):

@@ -1,4 +1,4 @@
-"""Tests of detector fingerprints."""
+"""Tests for detector fingerprints."""
 
 from __future__ import annotations
 
@@ -80,7 +80,6 @@ def test_fingerprint_missing_path_raises(tmp_path: Path) -> None:
 
 
 def test_fingerprint_depends_on_source_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The class path and parameters are unchanged; the module is edited."""
     path = tmp_path / "mine.py"
     code = "from dataclasses import dataclass\n@dataclass\nclass Mine:\n    a: int = 1\n"
     seen = []
@@ -120,7 +119,7 @@ def test_fingerprint_auto_device_includes_device_name(monkeypatch: pytest.Monkey
 
 
 def test_fingerprint_of_file_option_depends_on_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Labels may be `coco` or a file; a model may be a name or a folder."""
+    """Options such as the labels can be a name or a path."""
     monkeypatch.chdir(tmp_path)
     before = fingerprint(Network(labels="labels.txt"))
     (tmp_path / "labels.txt").write_text("chair")

@@ -1,4 +1,4 @@
-"""Tests of ROS bags of a small room: valid and damaged files in all formats."""
+"""Tests for ROS bags of a small room in all formats, including damaged bags."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_ros_bag_odometry_without_transform_is_of_base(tmp_path: Path, caplog: p
 
 
 def test_ros_bag_poses_are_interpolated(tmp_path: Path) -> None:
-    """The camera moves at 1 m/s along x, and two poses are known."""
+    """The camera moves at 1 m/s along x, and the bag has two poses."""
     bag = BagWriter()
     add_camera_of_ros(bag)
     for x in (0.0, 0.13):
@@ -230,7 +230,8 @@ def test_ros_bag_realsense_depth_is_registered_to_color(tmp_path: Path) -> None:
     bag = BagWriter(ros1=True)
     add_realsense(bag, DEPTH_CAMERA)
     assert not imported(bag.write(tmp_path / "recorded.bag"), tmp_path / "out")
-    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)  # registration moves depth to the nearest pixel
+    # registration moves each depth value to the nearest pixel
+    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)
     assert json.loads((tmp_path / "out/camera.json").read_text())["sensor"] == "REALSENSE_D435"
 
 
@@ -395,7 +396,7 @@ def test_topic_options_for_phone_export_raise(tmp_path: Path) -> None:
 
 # Gravity
 
-UP_WORLD = np.array([0.0, -1.0, 0.0])  # the room's y points down
+UP_WORLD = np.array([0.0, -1.0, 0.0])  # the y axis of the room points down
 R_IMU_CAMERA = Rotation.from_euler("xyz", [0.3, -1.2, 2.0]).as_matrix()
 
 
@@ -404,7 +405,12 @@ def add_accelerometer(
 ) -> None:
     """Add accelerometer messages of a slowly rotating camera at 300 Hz, with vibrations of 4 m/s^2 at 50 Hz.
 
-    `length` is the magnitude of gravity, m/s^2; `late`, s, is added to the timestamps.
+    Args:
+        bag: Bag that receives the messages.
+        topic: Topic of the messages.
+        frame_id: Frame of the sensor.
+        length: Magnitude of gravity, m/s^2.
+        late: Offset of the timestamps, s.
     """
     for n in range(-30, 10 * COUNT + 30):
         acceleration = length * UP_WORLD + np.array([4.0, 0, 0]) * np.sin(2 * np.pi * n / 6)
@@ -425,7 +431,7 @@ def check_up(folder: Path, within: float = 1.0) -> None:
 
 @pytest.mark.parametrize("name", ["ros1.bag", "ros2_folder"])
 def test_ros_bag_accelerometer_gives_up_vector_in_camera_axes(tmp_path: Path, name: str) -> None:
-    """The transforms from sensor to camera include inverted ones; messages of a gyroscope have no acceleration."""
+    """Some transforms must be inverted. Gyroscope messages have no acceleration."""
     bag = BagWriter(ros1=KINDS[name])
     add_camera_of_ros(bag)
     add_accelerometer(bag)

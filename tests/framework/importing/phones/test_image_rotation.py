@@ -1,4 +1,4 @@
-"""Tests of image rotation: images, cameras, poses and lens models are rotated consistently."""
+"""Tests for image rotation. Images, cameras, poses and lens models must be rotated consistently."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of valid and damaged exports of Polycam and 3D Scanner App, which store each frame separately."""
+"""Tests for exports of Polycam and 3D Scanner App, which store each frame in separate files."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ def test_polycam_optimized_poses_and_images_are_used(tmp_path: Path) -> None:
     write_polycam(tmp_path / "export", FRAMES, "corrected_")
     assert not write(tmp_path / "export/keyframes", tmp_path)
     check_imported(tmp_path / "out", FRAMES, tells_up=False)
-    for frame, seen in zip(drifted, RgbdFolder(tmp_path / "out"), strict=True):  # up in ARKit's world
+    for frame, seen in zip(drifted, RgbdFolder(tmp_path / "out"), strict=True):  # up in the world frame of ARKit
         np.testing.assert_allclose(frame.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)
 
 
 def test_polycam_optimized_poses_without_images_are_used(tmp_path: Path) -> None:
-    """Such exports have no optimized images, and their optimized camera files contain only the pose."""
+    """These exports have optimized poses, but neither optimized images nor optimized intrinsics."""
     drifted = [replace(frame, T_world_camera=DRIFT @ frame.T_world_camera) for frame in FRAMES]
     write_polycam(tmp_path / "export", drifted)
     write_polycam(tmp_path / "export", FRAMES, "corrected_")

@@ -1,4 +1,4 @@
-"""Tests of EXR exports and .r3d files of Record3D: valid files, damaged files and a real export."""
+"""Tests for Record3D, with EXR exports, .r3d files and a real export."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.support.recordings.phone_exports import (
 )
 
 FRAMES = room_frames()
-REAL_FRAMES = 4  # frames with images; the metadata covers all 345
+REAL_FRAMES = 4  # number of frames with images; the metadata lists 345 frames
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_record3d_older_export_uses_common_camera_and_rate(export: Path, tmp_pat
 
 
 def test_record3d_identity_first_pose_writes_no_gravity_file(export: Path, tmp_path: Path) -> None:
-    """In 2022 the app wrote poses relative to the first frame, which give no gravity direction."""
+    """In 2022 the app wrote poses relative to the first frame. They do not contain the gravity direction."""
     changed(export, lambda m: m["poses"].__setitem__(0, [0, 0, 0, 1, 0, 0, 0]))
     write_folder(open_source(export), tmp_path / "out", Writing())
     assert len(RgbdFolder(tmp_path / "out")) == 4
@@ -175,7 +175,7 @@ def test_record3d_damaged_r3d_member_skips_one_frame(
 def test_record3d_decompression_bomb_skips_its_frame(r3d: Path, tmp_path: Path) -> None:
     lzfse = pytest.importorskip("lzfse")
     packed = lzfse.compress(bytes(10**6))
-    bomb = 100 * packed[:-4] + packed[-4:]  # the last four bytes end the stream
+    bomb = 100 * packed[:-4] + packed[-4:]  # the last four bytes mark the end of the stream
     written = write_folder(open_source(rewritten(r3d, "rgbd/1.depth", bomb)), tmp_path / "out", Writing())
     assert re.search("expected at most .* (bytes|LZFSE blocks)", written.errors[0])
 

@@ -1,4 +1,4 @@
-"""Tests of Stray Scanner recordings: valid folders, damaged folders and a real recording."""
+"""Tests for recordings of Stray Scanner, with damaged folders and a real recording."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_stray_scanner_invalid_export_leaves_no_folder(
 
 
 def test_stray_scanner_real_recording_is_imported(shared_data: Path, tmp_path: Path) -> None:
-    """Poses, depth and confidence are real; the video is replaced with random images."""
+    """The recording is real except for the video, which has random images."""
     original = shared_data / "originals" / "stray_scanner"
     if not original.is_dir():
         pytest.skip(f"{original} does not exist")
@@ -156,12 +156,12 @@ def test_stray_scanner_real_recording_is_imported(shared_data: Path, tmp_path: P
     assert len(sequence) == 4
     assert len(written.errors) == len((original / "odometry.csv").read_text().splitlines()) - 1 - 4
     depth = sequence[0].depth
-    assert (depth > 0).mean() == pytest.approx(1 - 8939 / (192 * 256), abs=0.01)  # 8939 have confidence 0
+    assert (depth > 0).mean() == pytest.approx(1 - 8939 / (192 * 256), abs=0.01)  # 8939 pixels have confidence 0
     assert np.median(depth[depth > 0]) == pytest.approx(2.72, abs=0.05)
-    # the accelerometer agrees that the camera looks down: 0.20 of gravity is along its optical axis
+    # in the accelerometer data, 0.20 of gravity is along the optical axis: the camera looks down
     assert sequence[0].T_world_camera[1, 2] == pytest.approx(-0.24, abs=0.01)
     assert upright(written.ups) == Turn(1)  # the phone was held upright
-    # at rest Core Motion's acceleration points down; the camera's x, y, z are the phone's -y, -x, -z
+    # the acceleration of Core Motion points down at rest; x, y, z of the camera are -y, -x, -z of the phone
     rows = [line.split(",") for line in (original / "imu.csv").read_text().splitlines()[1:]]
     x, y, z = -np.mean([[float(word) for word in row[1:4]] for row in rows if float(row[0]) < 248630.7], axis=0)
     measured = np.array([-y, -x, -z]) / np.linalg.norm([x, y, z])

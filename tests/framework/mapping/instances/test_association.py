@@ -1,4 +1,4 @@
-"""Tests of the association of point clusters with instances, on small exact cases."""
+"""Tests for the association of point clusters with instances."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -28,7 +28,7 @@ SHAPE = (4, 5)
 
 
 def clusters_of(masks: list[np.ndarray], scores: list[float]) -> PointClusters:
-    """Return the point clusters of these (4, 5) masks; their world positions are unused."""
+    """Return the point clusters of these (4, 5) masks. All world positions are zero."""
     cluster, v, u = np.nonzero(np.array(masks))
     return PointClusters(
         points_world=np.zeros((len(u), 3), np.float32),
@@ -41,7 +41,7 @@ def clusters_of(masks: list[np.ndarray], scores: list[float]) -> PointClusters:
 
 
 def overlaps_of(clusters: PointClusters, seen: np.ndarray, stride: int = 1) -> Overlaps:
-    """Return the overlaps of the clusters with the instances `seen` at every stride-th pixel of an image."""
+    """Return the overlaps of the clusters with instances. `seen` has every stride-th pixel of the image."""
     points = list_points_by_pixel(clusters, (stride * seen.shape[0], stride * seen.shape[1]))
     return count_overlaps(points, seen, stride)
 
@@ -76,7 +76,7 @@ def test_class_agreement_is_bhattacharyya_coefficient() -> None:
 
 
 def best_first(overlap: np.ndarray, threshold: float) -> np.ndarray:
-    """Return the instance of each cluster, -1 = none; the largest overlap above `threshold` is matched first."""
+    """Match the largest overlap above `threshold` first, and return the instance of each cluster, -1 = none."""
     return match_one_to_one(overlap > threshold, overlap)
 
 
@@ -110,7 +110,8 @@ def test_overlaps_with_stride_match_full_resolution() -> None:
         pixels=pixels[kept],
         cluster=clusters.cluster[kept],
     )
-    odd = count_overlaps(list_points_by_pixel(smaller, (7, 7)), seen[:7:2, :7:2].copy(), 2)  # samples the same pixels
+    # the samples are the same pixels
+    odd = count_overlaps(list_points_by_pixel(smaller, (7, 7)), seen[:7:2, :7:2].copy(), 2)
     for name in ("instance_ids", "visible", "sizes", "votes"):
         assert getattr(sampled, name).tolist() == getattr(all_pixels, name).tolist(), name
         assert getattr(odd, name).tolist() == getattr(sampled, name).tolist(), name
@@ -124,7 +125,7 @@ def test_match_prefers_best_overlap_and_is_one_to_one() -> None:
 
 def test_overlap_min_pixels_prevents_match_with_stray_pixels() -> None:
     seen = np.zeros(SHAPE, np.int32)
-    seen[:, :3] = 1  # the object; the cluster covers most of it
+    seen[:, :3] = 1  # the object, which the cluster mostly covers
     seen[0, 0] = 2  # a single voxel of another instance
     overlaps = overlaps_of(clusters_of([columns(0, 2)], [1]), seen)
     assert best_first(overlaps.over_smaller(min_pixels=1), 0.35).tolist() == [1], (
@@ -134,7 +135,7 @@ def test_overlap_min_pixels_prevents_match_with_stray_pixels() -> None:
 
 
 def test_match_does_not_assign_table_to_book_on_top() -> None:
-    """The mask of the table covers the whole book and most of the table."""
+    """The mask of the table covers the book and most of the table."""
     seen = np.full(SHAPE, 1, np.int32)
     seen[:, 2] = 2  # the book
     overlaps = overlaps_of(clusters_of([columns(0, 4), columns(2, 3)], [1, 1]), seen)
@@ -172,7 +173,7 @@ def test_association_ignores_points_without_cluster() -> None:
 
 
 def clusters_at(points: PixelLists) -> list[list[int]]:
-    """Return the clusters in each pixel's list, row by row."""
+    """Return the clusters in the list of each pixel, row by row."""
     lists = [points.clusters[first:last].tolist() for first, last in pairwise(points.offsets.tolist())]
     assert points.pixel_counts.tolist() == np.bincount(points.list_ids.ravel(), minlength=len(lists)).tolist()
     return [lists[i] for i in points.list_ids.ravel()]
@@ -193,7 +194,7 @@ def test_keep_on_top_assigns_pixels_to_smaller_object() -> None:
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 10_000))
 def test_points_by_pixel_keep_point_order(seed: int) -> None:
-    """The points are in random order; some have no cluster, and some are duplicates."""
+    """The points have random order. Some belong to no cluster, and some are duplicates."""
     rng = np.random.default_rng(seed)
     clusters = clusters_of([rng.random(SHAPE) < filled for filled in rng.random(4)], [1] * 4)
     count = len(clusters.cluster)

@@ -1,4 +1,4 @@
-"""Tests of the confirmation of instances."""
+"""Tests for the confirmation of instances."""
 
 import numpy as np
 import pytest

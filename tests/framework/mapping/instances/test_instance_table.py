@@ -1,4 +1,4 @@
-"""Tests of the instance table: frame sets and merged instances."""
+"""Tests for the table of instances."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ frames = st.lists(st.integers(0, 40))
 
 @given(frames, frames)
 def test_frame_set_matches_python_set(ours: list[int], theirs: list[int]) -> None:
-    """Frames may be added in any order."""
+    """The frames are added in arbitrary order."""
     a, b = FrameSet(), FrameSet()
     for found, expected in ((a, ours), (b, theirs)):
         for k in expected:
@@ -25,7 +25,7 @@ def test_frame_set_matches_python_set(ours: list[int], theirs: list[int]) -> Non
 
 @pytest.mark.parametrize("second", [range(10, 20), range(5, 15)], ids=["consecutive", "half overlapping"])
 def test_instance_table_merge_equals_unfragmented_instance(second: range) -> None:
-    """Each fragment is detected in every other frame in which it is visible."""
+    """Each instance is detected in every other frame in which it is visible."""
     table = InstanceTable()
     seen = {table.create(1, 0).id: range(10), table.create(1, 0).id: second, table.create(1, 0).id: range(second.stop)}
     for instance_id, in_view in seen.items():

@@ -1,4 +1,7 @@
-"""Acceptance tests of the default refiner and fuser: they separate touching objects and keep each object whole."""
+"""Acceptance tests for the default refiner and fuser.
+
+Touching objects must be separate instances, and each object must be one instance.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +19,7 @@ CHAIR, TABLE, COUCH = 0, 1, 2
 
 
 def mapped(frames: list[Frame], detections: list[Detections], refiner: str = "chain") -> MapFuser:
-    """Return the fuser after mapping the frames with true poses."""
+    """Return the fuser after the frames have been mapped with true poses."""
     cleaner = built("refiner", refiner)
     fuser = built("fuser", "bayesian_tsdf", f"fuser.voxel_size={VOXEL}")
     for frame, found in zip(frames, detections, strict=True):
@@ -26,9 +29,9 @@ def mapped(frames: list[Frame], detections: list[Detections], refiner: str = "ch
 
 
 def shares(scene: BoxScene, fuser: MapFuser) -> np.ndarray:
-    """Return the fractions (O + 1, I + 1) of the vertices of O objects that belong to each of I instances.
+    """Return the fraction (O + 1, I + 1) of the vertices of each object that belong to each instance.
 
-    Row 0 is the room, and column 0 is "no instance".
+    Row 0 is the room. Column 0 contains the vertices without an instance.
     """
     mesh = fuser.scene.mesh()
     owners = scene.owners(mesh.vertices, VOXEL)
@@ -43,7 +46,7 @@ def true_mask(frame: Frame, *objects: int) -> np.ndarray:
 
 
 def assert_one_each(scene: BoxScene, fuser: MapFuser, least: float) -> None:
-    """Check that one instance covers more than the fraction `least` of each object, and that the room has none."""
+    """Check that one instance covers at least the fraction `least` of each object, and that the room has none."""
     found = shares(scene, fuser)
     assert found.shape[1] == scene.count, f"expected {scene.count - 1} instances, got {found.shape[1] - 1}"
     assert sorted(found[1:, 1:].argmax(axis=1)) == list(range(scene.count - 1))
@@ -51,12 +54,12 @@ def assert_one_each(scene: BoxScene, fuser: MapFuser, least: float) -> None:
     assert found[0, 0] > 0.99, found[0].round(4)
 
 
-# A fridge and a couch side by side; one face of each touches the other.
+# a fridge and a couch side by side, with contact between two faces
 TOUCHING = [[(-0.6, 1.0, 0.0, 0.0, 1.6, 1.5)], [(0.0, 0.9, 0.0, 0.9, 1.6, 0.7)]]
 
 
 def test_instances_of_touching_objects_are_separated() -> None:
-    """Even frames have one mask over both objects, odd frames one mask per object; all masks bleed by 8 px."""
+    """Every other frame has one mask for both objects instead of two. All masks bleed by 8 px."""
     scene = BoxScene(TOUCHING)
     frames = [scene.frame(look_from(-1.2 + 0.1 * k, -1.6, 1.4, (0.1, 1.2, 0.5)), k) for k in range(24)]
     detections = []
@@ -80,7 +83,7 @@ def test_instance_of_bleeding_mask_excludes_neighbor() -> None:
 
 
 def test_instances_of_adjacent_chairs_stay_separate() -> None:
-    """Identical chairs 10 cm apart are seen along the row and from the side; a third of the detections are missing."""
+    """The chairs are identical and 10 cm apart. A third of their detections are missing."""
     scene = BoxScene([chair(-0.275, 1.2), chair(0.275, 1.2)])
     frames = [
         scene.frame(look_from(2.4 * np.sin(a), 1.2 - 2.4 * np.cos(a), 1.3, (0.0, 1.2, 0.5)), k)
@@ -94,7 +97,7 @@ def test_instances_of_adjacent_chairs_stay_separate() -> None:
 
 
 def test_table_seen_from_two_sides_is_one_instance() -> None:
-    """The camera is low; it sees one side and then, after a jump, the other side."""
+    """The camera jumps from one side of the table to the other side."""
     scene = BoxScene([table(0.0, 0.0)])
     sides = [(x, y, 1.2) for y in (-2.2, 1.8) for x in np.linspace(-0.8, 0.8, 12)]
     frames = [scene.frame(look_from(*at, (0.0, 0.0, 0.5)), k) for k, at in enumerate(sides)]

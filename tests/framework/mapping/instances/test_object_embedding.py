@@ -1,4 +1,4 @@
-"""Tests of object embeddings: mean, spread, and their assignment to objects."""
+"""Tests for object embeddings."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_embeddings_invalid_values_raise(kind: type, embeddings: np.ndarray | No
 
 
 def mapped(name: str, frames: int = 4, embeddings: np.ndarray | None = None, space: str = "words@1") -> MapFuser:
-    """Map the analytic room with three objects, the last of which has no embedding."""
+    """Map the analytic room. The last of its three objects has no embedding."""
     fuser: MapFuser = registered.built("fuser", name, "fuser.voxel_size=0.08")
     for k, T in enumerate(walk(4)[:frames]):
         frame = room().frame(T, k)

@@ -1,4 +1,4 @@
-"""Tests of vectorized class slots, compared with scalar loops."""
+"""Tests for vectorized class slots, compared with scalar loops."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -26,7 +26,7 @@ def least_likely_slot(scores):
 
 
 def voxel(seed: int, largest: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the classes and scores of a voxel with some filled slots; scores are in [-largest, largest]."""
+    """Return the classes and scores of a voxel with `filled` slots and scores in [-largest, largest]."""
     rng = np.random.default_rng(seed)
     filled = rng.integers(0, CLASS_SLOTS + 1)
     classes = np.full(CLASS_SLOTS, NO_CLASS, np.uint8)
@@ -65,7 +65,7 @@ def test_class_slots_exact_storage_handles_80_classes() -> None:
 
 
 def test_add_scores_unaligned_slots_matches_reference() -> None:
-    """The slots of all voxels are in one structured array, between other fields."""
+    """The slots are fields of a structured array."""
     record = np.dtype([("flag", np.uint8), ("classes", np.uint8, (CLASS_SLOTS,)), ("scores", np.int16, (CLASS_SLOTS,))])
     records = np.zeros(3, record)
     for i, seed in enumerate((3, 4, 5)):

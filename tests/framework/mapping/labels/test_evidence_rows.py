@@ -1,4 +1,4 @@
-"""Tests of evidence rows, compared voxel by voxel: updates, merged instances and growing slots."""
+"""Tests for the evidence rows of labeled voxels, compared with a voxel-by-voxel reference."""
 
 import numpy as np
 import pytest
@@ -31,10 +31,11 @@ def with_voxels(count: int) -> EvidenceRows:
 @pytest.mark.parametrize(
     ("ids", "logs", "merged_ids", "merged_logs"),
     [
-        ([1, 2, 3, 0], [5, 4, 3, 0], [3, 1, 0, 0], [7, 5, 0, 0]),  # both instances: their sum becomes the best
-        ([2, 1, 4, 5], [5, 4, 3, 2], [3, 1, 4, 5], [5, 4, 3, 2]),  # only the dropped instance: it is renamed
+        ([1, 2, 3, 0], [5, 4, 3, 0], [3, 1, 0, 0], [7, 5, 0, 0]),  # voxel with both instances: the sum is the best
+        # voxel with only the dropped instance, which is renamed
+        ([2, 1, 4, 5], [5, 4, 3, 2], [3, 1, 4, 5], [5, 4, 3, 2]),
         ([1, 2, 3, 4], [5, 4, -6, 1], [1, 4, 3, 0], [5, 1, -2, 0]),  # negative evidence is added, too
-        ([1, 3, 4, 0], [5, 4, 3, 0], [1, 3, 4, 0], [5, 4, 3, 0]),  # no dropped instance: nothing changes
+        ([1, 3, 4, 0], [5, 4, 3, 0], [1, 3, 4, 0], [5, 4, 3, 0]),  # voxel without the dropped instance: no change
     ],
 )
 def test_evidence_merge_adds_evidence_and_keeps_best_first(
@@ -53,7 +54,7 @@ def test_evidence_merge_adds_evidence_and_keeps_best_first(
 
 @pytest.mark.parametrize("count", [1, 511, 512, 513, 2000])
 def test_evidence_merge_updates_all_labeled_voxels(count: int) -> None:
-    """Only the first voxel, the last and one between them have the dropped instance."""
+    """The first voxel, the last voxel and a voxel between them contain the dropped instance."""
     rows = with_voxels(count)
     evidence = rows.evidence
     evidence.instance_ids[: count + 100], evidence.instance_value[: count + 100] = [4, 2, 0, 0], [7, 5, 0, 0]
@@ -76,14 +77,14 @@ def test_evidence_rows_with_256_classes_raise() -> None:
 
 
 def at_pixel(block: int, *voxels: int) -> SeenBlocks:
-    """Return the seen blocks of a frame in which these voxels of one block project to the only pixel."""
+    """Return the seen blocks of an image with one pixel, to which these voxels of a block project."""
     pixel = np.full((1, 512), -1, np.int32)
     pixel[0, voxels] = 0
     return seen_at(np.array([block], np.int32), pixel)
 
 
 def seen_at(blocks: Int32, pixels: Int32) -> SeenBlocks:
-    """Return the seen blocks of a frame; `pixels` (A, 512) are the pixels of the voxels, -1 = far from the surface."""
+    """Return the seen blocks of a frame. `pixels` (A, 512) has the pixel of each voxel, -1 = far from the surface."""
     block, voxel = np.nonzero(pixels >= 0)
     count = np.bincount(block, minlength=len(blocks))
     return SeenBlocks(
@@ -114,7 +115,7 @@ def test_evidence_rows_allocate_only_labeled_voxels() -> None:
 def test_evidence_update_of_many_blocks_matches_voxelwise(
     blocks: int, frames: int, max_blocks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Pixels have zero to several clusters, with and without an instance; some updates need new slots."""
+    """Each pixel has any number of clusters, with or without an instance. Some updates need new slots."""
     monkeypatch.setattr(evidence_rows, "RESERVED", 1 if max_blocks == 4 else 128)
     first, other = by_one_thread_and_two(lambda: _updated(blocks, frames, max_blocks))
     for one, two in zip(first, other, strict=True):
@@ -122,7 +123,7 @@ def test_evidence_update_of_many_blocks_matches_voxelwise(
 
 
 def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
-    """Return the evidence of some blocks after updates and merges that are compared voxel by voxel."""
+    """Return the evidence of some blocks, after comparing every update and merge with the reference."""
     rng = np.random.default_rng(3)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, max_blocks))
     rows.begin(6)
@@ -142,7 +143,7 @@ def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
             clusters=np.array([k for clusters in lists for k in clusters], np.int32),
             absence=np.float32(-0.2),
         )
-        # The types and limits of compact storage.
+        # types and limits of compact storage
         measurement = measurement._replace(class_scores=measurement.class_scores.astype(np.int32), max_score=MAX_SCORE)
         blocks = rng.permutation(block_count)[1:].astype(np.int32)
         pixels = rng.integers(-1, 10, (len(blocks), 512)).astype(np.int32)
@@ -182,7 +183,7 @@ def test_evidence_rows_count_evictions_of_new_voxel() -> None:
 
 
 def test_evidence_rows_exact_storage_keeps_all_evidence() -> None:
-    """Every sum is kept, although there are many more instances and classes than compact slots."""
+    """There are more instances and classes than slots in compact storage."""
     rng = np.random.default_rng(0)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=Storage.EXACT)
     rows.begin(30)

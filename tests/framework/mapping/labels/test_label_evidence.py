@@ -1,4 +1,4 @@
-"""Tests of the compact Bayesian update, compared with the recursions over all instances and all classes."""
+"""Tests for the compact Bayesian update of labels, compared with the complete recursions of the paper."""
 
 import numpy as np
 import pytest
@@ -22,9 +22,9 @@ from tests.support.one_pixel import BARE, COVERED, FLOOR, SCORE_SCALE, blank, di
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10_000), labels=st.integers(1, INSTANCE_SLOTS))
 def test_label_update_matches_full_recursion_if_labels_fit(seed: int, labels: int) -> None:
-    """With no more labels than slots, no label is evicted and posteriors equal those of eqs. (7) and (8)."""
+    """There are at most as many labels as slots. The posteriors are those of eqs. (7) and (8)."""
     rng = np.random.default_rng(seed)
-    classes = labels  # every class is named
+    classes = labels  # all classes are named
     evidence = blank()
     instance_log = np.zeros(labels + 1)  # [0]: all other instances together
     class_log = np.zeros(classes)
@@ -50,7 +50,7 @@ def test_label_update_matches_full_recursion_if_labels_fit(seed: int, labels: in
 
 
 def test_label_update_matches_full_recursion_for_80_classes() -> None:
-    """With more classes than slots, the argmax almost always agrees, and evictions are counted."""
+    """There are more classes than slots, so labels are evicted. The best class is almost always correct."""
     rng = np.random.default_rng(0)
     agree = 0
     evictions = 0
@@ -185,7 +185,7 @@ def test_compact_scores_saturate_without_wrapping() -> None:
 
 @pytest.mark.parametrize(("classes", "best"), [(2, 0.7), (3, 0.6), (9, 0.8), (80, 0.5)])
 def test_most_likely_class_is_stable_over_repetition(classes: int, best: float) -> None:
-    """The last class is the most likely, and the first class the second most likely; 1000 updates are fused."""
+    """The last class is more likely than the first class, and both are more likely than the others."""
     p = np.full((1, classes), 0.1 * (1 - best) / max(classes - 2, 1))
     p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
     relative, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
@@ -199,7 +199,7 @@ def test_most_likely_class_is_stable_over_repetition(classes: int, best: float) 
 
 
 def test_packed_scores_match_in_int32_and_int64() -> None:
-    """The scores are the largest that compact storage allows."""
+    """The scores are the maximum of compact storage."""
     relative = np.array([[MAX_CLUSTER_SCORE, -MAX_CLUSTER_SCORE, 0.4, -0.6]])
     bits = np.zeros((1, NO_CLASS + 1), np.uint8)
     bits[0, :4] = 1 << np.arange(4)

@@ -1,4 +1,4 @@
-"""Tests of the vertex label vote, compared with a voxel-wise reference."""
+"""Tests for the votes on vertex labels, compared with a voxel-by-voxel reference."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.scenes.analytic_scene import CAMERA, room, walk
 
 @pytest.fixture(scope="module")
 def fuser() -> BayesianTsdf:
-    """Map three spheres; the upper part of each is a second instance, so that spheres contain label borders."""
+    """Map three spheres. The upper part of each sphere is a separate instance, so there are label borders."""
     fuser = assemble(BayesianTsdf, voxel_size=0.03, max_depth=4.0, min_observations=1)
     for k, T in enumerate(walk(4)):
         frame = room().frame(T, k)
@@ -88,7 +88,7 @@ def test_vertex_labels_match_voxelwise_reference(fuser: BayesianTsdf, dropped: t
     near_labels = np.flatnonzero(instances > 0)
     chosen = np.concatenate([rng.choice(near_labels, 400), rng.choice(len(instances), 400)])
     expected = [slow_vote(fuser, counts, surface.vertices[v]) for v in chosen]
-    # if an instance has exactly half of the votes, the result depends on rounding
+    # with exactly half of the votes, the result depends on rounding
     agree = np.mean([(instances[v], classes[v]) == e for v, e in zip(chosen.tolist(), expected, strict=True)])
     assert agree >= 0.995
     assert not set(dropped) & set(instances.tolist())

@@ -1,4 +1,4 @@
-"""Tests of invalid arrays in a map file, which raise a one-line error before a kernel reads them."""
+"""Tests for map files with invalid arrays. The error must be raised before a kernel reads the arrays."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def content(path: Path) -> dict[str, np.ndarray]:
 
 
 def refused(kind: type[SceneMap], path: Path, changes: dict[str, np.ndarray]) -> str:
-    """Return the error raised for the file with some arrays replaced."""
+    """Return the error that is raised if some arrays of the file are replaced."""
     np.savez(path.with_name("changed.npz"), **(content(path) | changes))
     with pytest.raises(DataError) as caught:
         kind.load(path.with_name("changed.npz"))
@@ -54,7 +54,7 @@ def test_map_arrays_of_wrong_type_or_shape_raise(saved: tuple[type[SceneMap], Pa
             assert name in refused(kind, path, {name: array.astype(other)})
             assert name in refused(kind, path, {name: array[..., None]})
             assert array.ndim == 1 or name in refused(kind, path, {name: array[..., :-1]})
-            refused(kind, path, {name: array[:-1]})  # the error may name another array of the same length
+            refused(kind, path, {name: array[:-1]})  # another array of the same length may be named
 
 
 def test_map_arrays_with_invalid_ids_raise(

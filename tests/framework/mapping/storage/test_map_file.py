@@ -1,4 +1,4 @@
-"""Tests of the map file: round trips of any array, NumPy compatibility, and damaged files."""
+"""Tests for map files, including damaged files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fuzz tests of map files with valid checksums: a file is a usable map, or raises a one-line error."""
+"""Fuzz tests for map files with valid checksums. A file must be usable or raise a one-line error."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.support.true_masks import fuse_masks, masks_of
 
 pytestmark = pytest.mark.integration
 
-SLOWEST = 5.0  # maximum CPU time, s; elapsed time would depend on other processes
+SLOWEST = 5.0  # s, maximum CPU time; wall time would depend on other processes
 CAMERA = Camera(24, 18, 20.0, 20.0, 11.5, 8.5)
 KINDS = ("bayesian_tsdf", "words", "exact", "last_write", "object_volumes", "open3d_vbg", "class_only_fusion")
 
@@ -35,13 +35,13 @@ KINDS = ("bayesian_tsdf", "words", "exact", "last_write", "object_volumes", "ope
 class Saved:
     """Content of a map file."""
 
-    path: Path  # where changed copies are written
+    path: Path  # path for changed copies
     arrays: dict[str, np.ndarray] = field(repr=False)
 
 
 @pytest.fixture(scope="module", params=KINDS)
 def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Saved:
-    """Return the map file of a fuser, one per kind."""
+    """Return the map file of a fuser. There is one fuser for each kind of map."""
     name = request.param
     variants = {"exact": ["bayesian_tsdf", "fuser.storage=EXACT"], "words": ["bayesian_tsdf"]}
     chosen = variants.get(name, [name])
@@ -76,7 +76,7 @@ def use(scene: SceneMap) -> None:
 
 
 def load_and_use(path: Path, content: bytes) -> str:
-    """Load and use a map file; return the error line, or "" if the file is usable."""
+    """Load and use a map file. Return the error line, or "" without an error."""
     path.write_bytes(content)
     began = time.process_time()
     try:
@@ -101,7 +101,7 @@ def archive(arrays: dict[str, np.ndarray]) -> bytes:
 
 
 def changed_array(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
-    """Return the array with other values, length, shape or type."""
+    """Return the array with a random change of values, length, shape or type."""
     array = np.atleast_1d(array)
     match draw(st.sampled_from(("number", "number", "number", "all", "cut", "repeat", "type", "shape", "roll"))):
         case "number" if array.size:
@@ -126,7 +126,7 @@ def changed_array(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
 def odd_number(draw: st.DrawFn, dtype: np.dtype[Any]) -> Any:
     if dtype.kind == "f":
         return draw(st.sampled_from((0.0, -1.0, 1e38, -1e38, 1e-40, np.nan, np.inf, -np.inf)))
-    if dtype.kind not in "iu":  # a previous change replaced the type
+    if dtype.kind not in "iu":  # the type was replaced by a previous change
         return np.ones(1, dtype)[0]
     low, high = np.iinfo(dtype).min, np.iinfo(dtype).max
     return draw(st.sampled_from([n for n in (*LARGE, low, high, low + 1) if low <= n <= high]))
@@ -153,7 +153,7 @@ def test_map_fuzz_changed_content_loads_or_raises(saved: Saved, data: st.DataObj
 )
 @given(data=st.data())
 def test_map_fuzz_damaged_bytes_load_or_raise(saved: Saved, data: st.DataObject) -> None:
-    """Bytes in and after the headers of the archive and of its arrays are changed."""
+    """The changed bytes are in or after the headers of the archive and of its arrays."""
     content = bytearray(archive(saved.arrays))
     headers = [match.start() for match in re.finditer(rb"PK|\x93NUMPY", content)]
     for _ in range(data.draw(st.integers(1, 4))):

@@ -1,4 +1,4 @@
-"""Tests of TSDF integration, compared with a slow reference and with exact surfaces."""
+"""Tests for TSDF integration, compared with a slow reference and with exact surfaces."""
 
 import tracemalloc
 from dataclasses import replace
@@ -30,7 +30,7 @@ def new_integrator() -> Integrator:
 
 
 def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the updated blocks (A,) and the pixels (A, 512) of their voxels, -1 = far from the surface."""
+    """Return the updated blocks (A,) and the pixel of each voxel (A, 512), -1 = far from the surface."""
     seen = integrator.integrate(frame, T_world_camera, VOXEL)
     pixels = np.full((len(seen.blocks), 512), -1)
     for a, (first, count) in enumerate(zip(seen.near_start, seen.near_count, strict=True)):
@@ -41,7 +41,7 @@ def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) ->
 
 
 def test_integration_of_one_frame_matches_reference() -> None:
-    """The reference computes every voxel of the active blocks with plain NumPy in double precision."""
+    """The reference updates all voxels of the blocks with NumPy in double precision."""
     frame = room().frame(pose(0.1, -0.05, 0.0, (0.1, -0.2, 0.05)))
     integrator = new_integrator()
     active, near_pixel = seen_by(integrator, frame, frame.T_world_camera)
@@ -60,7 +60,7 @@ def test_integration_of_one_frame_matches_reference() -> None:
     band = SENSOR.truncation + SENSOR.truncation_slope * d
     seen = inside & (d > SENSOR.min_depth) & (d < SENSOR.max_depth) & (d - p[..., 2] >= -band)
     distance = np.minimum(d - p[..., 2], band)
-    # in float32, a voxel on a pixel border or at the edge of the band may be rounded to either side
+    # in float32, voxels at a pixel border or at the edge of the band can be rounded to either side
     clear = (np.abs(u + 0.5 - np.round(u + 0.5)) > 1e-3) & (np.abs(v + 0.5 - np.round(v + 0.5)) > 1e-3)
     clear &= (np.abs(d - p[..., 2] + band) > 1e-4) & inside
     stored = grid.tsdf[active]
@@ -93,13 +93,13 @@ def test_integration_reuses_reserved_memory_for_more_blocks(monkeypatch: pytest.
 
 
 def near_pixels(seen: SeenBlocks) -> list[int]:
-    """Return the sorted pixels of the voxels near the surface, one entry per voxel."""
+    """Return the sorted pixels of all voxels near the surface, one entry per voxel."""
     parts = zip(seen.near_start.tolist(), seen.near_count.tolist(), strict=True)
     return sorted(p for first, count in parts for p in seen.near_pixel[first : first + count].tolist())
 
 
 def test_integration_allocates_blocks_near_surface() -> None:
-    """Blocks are allocated in the whole truncation band instead of only along rays."""
+    """Blocks are allocated in the whole truncation band, not only along the rays."""
     frame = room().frame(pose())
     integrator = new_integrator()
     integrator.integrate(frame, frame.T_world_camera, VOXEL)
@@ -114,14 +114,14 @@ def test_integration_allocates_blocks_near_surface() -> None:
 
 
 def test_integration_rounding_averages_are_unbiased() -> None:
-    """The average of a constant between two stored units is exact, although values are integers."""
+    """The stored values are integers, but the average of a constant must be exact."""
     rounding = [(k * GOLDEN) % 1.0 for k in range(1, 1001)]
     assert abs(np.mean(np.floor(0.3 + np.array(rounding))) - 0.3) < 0.01
 
 
 @pytest.mark.parametrize("frame_number", [987, 2584, 121393])
 def test_integration_rounding_does_not_wrap_around(frame_number: int) -> None:
-    """At these frames frac(k * GOLDEN) is almost 1, and rounding must not exceed the largest distance or white."""
+    """In these frames, the rounding offset is almost 1 and must not cause an overflow."""
     assert (frame_number * GOLDEN) % 1.0 > 0.9995
     scene = room()
     frame = scene.frame(pose())
@@ -204,7 +204,7 @@ def test_integration_stores_color_only_near_surface() -> None:
 
 
 def test_integration_does_not_average_color_of_free_space() -> None:
-    """A wall moves into free space: its color is not mixed with the initial black."""
+    """The initial color of free space is black. If a wall moves there, its color must not be mixed with black."""
     integrator = new_integrator()
     for depth, frames in ((1.5, 5), (1.4, 13)):
         wall = np.full(CAMERA.shape, depth, np.float32)
@@ -218,10 +218,9 @@ def test_integration_does_not_average_color_of_free_space() -> None:
 
 
 def test_integration_next_observation_replaces_outdated_color() -> None:
-    """The next observation replaces an outdated color; later observations are averaged with the new color."""
     integrator = new_integrator()
     wall = np.full(CAMERA.shape, 1.5, np.float32)
-    wall[:, CAMERA.width // 2 :] = 0  # seen by the first frames only
+    wall[:, CAMERA.width // 2 :] = 0  # visible only in the first frames
     whole = np.full(CAMERA.shape, 1.5, np.float32)
 
     def integrate(depth: np.ndarray, level: int) -> None:
@@ -239,11 +238,10 @@ def test_integration_next_observation_replaces_outdated_color() -> None:
     integrate(wall, 80)
     averaged = channels(grid.color[:blocks][(grid.color[:blocks] > 0) & (grid.color[:blocks] < OUTDATED)])[:, 0]
     assert (averaged > 40).all()
-    assert (averaged < 60).all()  # the weight of depth is not reset
+    assert (averaged < 60).all()  # the depth weight is not reset
 
 
 def test_integration_limits_weight_to_maximum() -> None:
-    """The stored weight is limited to max_weight, also at the largest valid max_weight."""
     frame = room().frame(pose())
     for most in (3.0, 255.0):
         sensor = SENSOR._replace(max_weight=np.float32(most), full_weight_depth=np.float32(100.0))
@@ -254,7 +252,7 @@ def test_integration_limits_weight_to_maximum() -> None:
 
 
 def test_integration_averages_noise() -> None:
-    """After 40 frames with noise of 10 mm, voxels near the surface have noise of about 10 / sqrt(40) mm."""
+    """After 40 frames with noise of 10 mm, the noise of voxels near the surface is about 10 / sqrt(40) mm."""
     frame = room().frame(pose())
     integrator = new_integrator()
     rng = np.random.default_rng(0)
@@ -277,7 +275,7 @@ def test_integration_averages_noise() -> None:
 
 
 def test_integration_removes_objects_seen_through() -> None:
-    """A removed sphere disappears from the map after the wall behind it has been observed in enough frames."""
+    """A sphere is removed from the scene, and the camera then observes the wall behind the sphere."""
     scene, empty = room(), room()
     empty.spheres = []
     integrator = new_integrator()

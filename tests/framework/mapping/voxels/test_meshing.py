@@ -1,4 +1,4 @@
-"""Tests of surface nets, compared with a slow reference and exact surfaces, and of their incremental updates."""
+"""Tests for surface nets and their incremental updates, compared with a slow reference and exact surfaces."""
 
 import itertools
 
@@ -30,13 +30,13 @@ MESH_ARRAYS = ("vertices", "triangles", "colors", "instance_ids", "class_ids")
 
 
 def block_of(distance: np.ndarray, block: np.ndarray) -> np.ndarray:
-    """Return the voxels (512,) of the block at coordinates `block` of a dense (X, Y, Z) array; x varies fastest."""
+    """Return the voxels (512,) of a block of a dense (X, Y, Z) array. x varies fastest."""
     x, y, z = 8 * block
     return distance[x : x + 8, y : y + 8, z : z + 8].transpose(2, 1, 0).ravel()
 
 
 def grid_of(distance: np.ndarray, blocks: np.ndarray, origin: tuple[int, int, int]) -> VoxelGrid:
-    """Return a grid with the blocks (N, 3) of a dense array of stored distances, shifted by `origin` blocks."""
+    """Return a grid with the given blocks (N, 3) of a dense array of distances, shifted by `origin` blocks."""
     voxels = VoxelGrid(VOXEL, BAND, 1000)
     voxels.allocate((blocks + origin).astype(np.int32))
     for number, block in enumerate(blocks):
@@ -45,7 +45,7 @@ def grid_of(distance: np.ndarray, blocks: np.ndarray, origin: tuple[int, int, in
 
 
 def slow_surface_nets(stored: np.ndarray, most_jump: float) -> tuple[dict, set]:
-    """Return the vertex of each cell, in voxels, and the quads as tuples of cells, as surface nets define them."""
+    """Return the vertex of each cell, in voxels, and the quads as tuples of cells."""
     corners = np.array(list(itertools.product((0, 1), repeat=3)))
     vertices = {}
     for cell in itertools.product(*(range(n - 1) for n in stored.shape)):
@@ -74,7 +74,7 @@ def slow_surface_nets(stored: np.ndarray, most_jump: float) -> tuple[dict, set]:
 
 
 def test_surface_nets_match_reference() -> None:
-    """The field has random steps, unseen voxels and absent blocks, and extends across the origin."""
+    """The field has random steps, unseen voxels and missing blocks, and some coordinates are negative."""
     rng = np.random.default_rng(5)
     side, origin = 24, (-1, -2, 7)
     i, j, k = np.mgrid[:side, :side, :side] * 0.35
@@ -107,7 +107,7 @@ def test_surface_nets_match_reference() -> None:
 
 @pytest.fixture(scope="module")
 def sphere() -> VoxelGrid:
-    """Return a grid with exact distances from a sphere with radius 0.6 m and center (0.9, 0.85, 0.8) m."""
+    """Return a grid with exact distances from a sphere."""
     blocks = np.array(list(itertools.product(range(5), repeat=3)))
     points = np.stack(np.mgrid[:40, :40, :40], axis=-1) * VOXEL
     distance = np.linalg.norm(points - (0.9, 0.85, 0.8), axis=-1) - 0.6
@@ -138,7 +138,7 @@ def copied(surface: UnlabeledMesh) -> UnlabeledMesh:
 
 
 def test_surface_nets_reread_only_changed_blocks(sphere: VoxelGrid) -> None:
-    """A changed block keeps its old surface until it is listed; then it and its neighbors are updated."""
+    """The surface of a changed block is updated only after the block has been reported as changed."""
     nets = SurfaceNets(sphere)
     before = copied(nets.extract())
     block = int(np.bincount(before.voxels // 512).argmax())
@@ -173,7 +173,7 @@ def test_surface_nets_are_independent_of_thread_count(sphere: VoxelGrid, threads
 
 
 def detections(frame: Frame) -> Detections:
-    """Return exact masks of the spheres, each split into two instances without shared pixels."""
+    """Return exact masks of the spheres. Each sphere is split into two instances."""
     assert frame.truth is not None
     ids = frame.truth.instance_ids
     u = np.arange(frame.camera.width)[None]
@@ -190,7 +190,7 @@ def fuse(fuser: BayesianTsdf, T_world_camera: np.ndarray, k: int) -> None:
 
 
 def same_mesh(ours: InstanceMap) -> bool:
-    """Return True if the map's mesh equals a full extraction."""
+    """Return True if the mesh of the map equals a full extraction."""
     mesh = ours.mesh()
     ours.volume.changed()
     return equal(mesh, ours.mesh())
@@ -201,7 +201,7 @@ def equal(ours: InstanceMesh, theirs: InstanceMesh) -> bool:
 
 
 def test_mesh_updates_match_full_extraction() -> None:
-    """The meshes are bit-identical after every frame and merge, while blocks, instances and confirmations change."""
+    """The meshes must be identical after every frame and merge, while instances are confirmed and the grid grows."""
     updated, asked_late = (assemble(BayesianTsdf, voxel_size=0.019, max_depth=4.0) for _ in range(2))
     sizes, named = [], []
     for k, T in enumerate(walk(40)[::4]):
@@ -228,7 +228,7 @@ def test_mesh_updates_match_full_extraction() -> None:
 
 
 def test_mesh_of_furnished_room_lies_on_surface() -> None:
-    """The poses are exact, the depth has no noise and the voxel size is 1 cm."""
+    """Poses and depth are exact."""
     sequence = Synthetic(kind=RoomKind.LIVING_ROOM, frames=240, stride=12, noise=0.0)
     fuser = assemble(BayesianTsdf, voxel_size=0.01)
     nothing = NoDetections()

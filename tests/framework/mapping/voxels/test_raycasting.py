@@ -1,4 +1,4 @@
-"""Tests of rendered views of the map, compared with closed-form depth, normals and color."""
+"""Tests for rendered views of the map, compared with exact depth, normals and colors."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def mapped(scene: Scene, poses: list[np.ndarray]) -> VoxelGrid:
 
 @pytest.mark.parametrize("slant", [0.0, 0.4, 0.8, 1.1])
 def test_raycast_slanted_plane_depth_is_unbiased(slant: float) -> None:
-    """An offset of half a pixel or half a voxel would cause a bias that depends on the slant."""
+    """If a pixel or voxel center were off by half a unit, the bias would depend on the slant."""
     n = np.array([np.sin(slant), 0.3, -np.cos(slant)]) / np.linalg.norm([np.sin(slant), 0.3, -np.cos(slant)])
     scene = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.8]))])
     voxels = mapped(scene, walk(20))
@@ -48,7 +48,7 @@ def test_raycast_slanted_plane_depth_is_unbiased(slant: float) -> None:
 
 
 def test_raycast_noisy_distant_wall_is_unbiased() -> None:
-    """Depth in front of and behind the surface must have equal weight if noise exceeds a voxel."""
+    """The noise exceeds a voxel. Depth in front of and behind the surface must have equal weights."""
     voxel, depth = 0.01, 4.0
     sensor = Sensor(*map(np.float32, (4 * voxel, 0.01, 0.2, 5.0, 200.0, 1.5)))
     integrator = Integrator(VoxelGrid(voxel, sensor.max_truncation, 100_000), sensor)
@@ -91,9 +91,9 @@ def test_raycast_without_front_face_in_view_is_empty() -> None:
 
 @pytest.mark.parametrize("d", [0.0, -0.0, 1e-20, -1e-20])
 def test_leave_cell_axis_parallel_ray_exits_opposite_side(d: float) -> None:
-    """A ray on a block face must not advance in steps of a thousandth of a voxel.
+    """A ray along a block face must not advance in steps of 0.001 voxels.
 
-    The middle column of a camera with cx at a pixel center has such rays.
+    Such rays are in the middle column of a camera with cx at a pixel center.
     """
     direction = tuple(np.float32([d, d, 1.0]))
     start = tuple(np.float32([0.03, -0.05, 0.01]))
@@ -112,7 +112,7 @@ def test_leave_cell_slanted_ray_exits_nearest_border(d: float) -> None:
 
 @pytest.mark.parametrize("k", range(6))
 def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
-    """Searching every pixel from the nearest to the farthest depth finds no additional surface."""
+    """A search along the complete ray of every pixel finds no other surface."""
     voxels = mapped(room(), [pose()])
     camera = Camera(161, 119, 90.0, 95.0, 70.0, 61.0) if k % 2 else CAMERA
     rng = np.random.default_rng(k)
@@ -120,7 +120,7 @@ def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
     depth, _ = cast_view(voxels, SENSOR, camera, T)
     exhaustive = every_ray(voxels, T, camera)
     assert (exhaustive > 0).mean() > 0.1
-    # at ragged borders of the map, small gaps depend on the start of a step
+    # at the ragged border of the map, gaps depend on where a step starts
     assert ((depth == 0) & (exhaustive > 0)).mean() < 4e-3
     assert ((depth > 0) & (exhaustive == 0)).mean() < 15e-3
     both = (depth > 0) & (exhaustive > 0)
@@ -129,7 +129,7 @@ def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
 
 @pytest.mark.parametrize("sparse", ["every pixel", "every fourth column", "one in ten"])
 def test_raycast_near_sensor_depth_finds_surface(sparse: str) -> None:
-    """The surface is found at every pixel with sensor depth, including those between the coarse rays."""
+    """The surface must be found at all pixels with sensor depth, including those between the coarse rays."""
     voxels = mapped(room(), [pose()])
     T = pose(0.1, -0.05, 0.1, (0.05, 0.1, 0.0))
     exhaustive = every_ray(voxels, T)
@@ -148,7 +148,7 @@ def test_raycast_near_sensor_depth_finds_surface(sparse: str) -> None:
 
 
 def test_raycast_ignores_surface_beyond_sensor_range() -> None:
-    """The map may be from a sensor with a longer range."""
+    """The map was made with a sensor that has a longer range."""
     voxels = mapped(room(), [pose()])
     farthest = cast_view(voxels, SENSOR, CAMERA, pose())[0].max()
     short = SENSOR._replace(max_depth=np.float32(0.8 * farthest))
@@ -159,7 +159,7 @@ def test_raycast_ignores_surface_beyond_sensor_range() -> None:
 
 
 def every_ray(voxels: VoxelGrid, T: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """Return the depth (H, W), m, found by searching every pixel from the nearest to the farthest depth."""
+    """Return the depth (H, W), m, found by a search along the complete ray of every pixel."""
     tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
     near, far = (np.full(tiles, bound, np.float32) for bound in (SENSOR.min_depth, SENSOR.max_depth))
     depth = np.empty((camera.height + 1, camera.width + 1), np.float32)

@@ -1,4 +1,4 @@
-"""Tests of the voxel grid: its hash table and its blocks."""
+"""Tests for the voxel grid."""
 
 import resource
 
@@ -40,7 +40,7 @@ def test_find_block_returns_only_allocated_blocks() -> None:
 
 @pytest.mark.parametrize("promised", [64, 100_000])
 def test_voxel_grid_growth_keeps_content(promised: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the system reserves memory for all blocks, nothing is copied; some systems reserve less."""
+    """Nothing is copied if the system reserves memory for all blocks. Some systems reserve less."""
     monkeypatch.setattr(voxel_grid, "reserved", lambda most, make: make(min(most, promised)))
     voxels = VoxelGrid(0.01, 0.05, 100_000)
     voxels.allocate(np.zeros((1, 3), np.int32))
@@ -72,4 +72,4 @@ def test_voxel_grid_over_budget_raises() -> None:
     with pytest.raises(MapFullError, match=r"fuser\.max_blocks"):
         voxels.allocate(np.arange(33, dtype=np.int32).reshape(11, 3))
     assert voxels.block_count == 10
-    voxels.allocate(np.arange(3, dtype=np.int32).reshape(1, 3))  # existing blocks are still found
+    voxels.allocate(np.arange(3, dtype=np.int32).reshape(1, 3))  # existing blocks must still be found

@@ -1,4 +1,4 @@
-"""Tests of Lloyd's algorithm, compared with scikit-learn, and of its start labels, compared with a reference."""
+"""Tests for Lloyd's algorithm, compared with scikit-learn, and for the start labels."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def test_nearest_centers_tie_returns_first_center():
 
 
 def around(counts: list[tuple[int, int]]) -> tuple[Neighborhoods, np.ndarray]:
-    """Return neighborhoods with these (mask, ring) point counts, and the log-odds of the points.
+    """Return neighborhoods with the given numbers of (mask, ring) points, and the log-odds of the points.
 
-    The points are in four blobs; the log-odds are negative in the rings and for a third of the mask points.
+    The points are in four blobs. The log-odds are negative for the points in a ring and for a third of the others.
     """
     rng = np.random.default_rng(0)
     masks, rings = np.transpose(counts)
@@ -74,7 +74,7 @@ def around(counts: list[tuple[int, int]]) -> tuple[Neighborhoods, np.ndarray]:
 
 
 def groups_of(points: np.ndarray, groups: int, iterations: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the labels and centers of Lloyd's algorithm, started from the means of equal parts by depth."""
+    """Return the labels and centers of Lloyd's algorithm. The start centers are the means of equal parts by depth."""
     by_depth = points[np.argsort(points[:, 2], kind="stable")]
     cuts = np.arange(groups + 1) * len(points) // groups
     centers = np.array([by_depth[a:b].mean(axis=0) for a, b in pairwise(cuts)])

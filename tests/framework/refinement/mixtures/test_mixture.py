@@ -1,4 +1,4 @@
-"""Tests of the Gaussian mixtures, compared with scikit-learn from the same start."""
+"""Tests for Gaussian mixtures, compared with scikit-learn."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from framework.refinement.mixtures.mixture_kernels import EmSettings, Mixtures
 
 
 def blobs(seed: int, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points of four overlapping Gaussians far from the origin, and start labels, half of them wrong."""
+    """Return the points of four overlapping Gaussians far from the origin, and start labels that are half wrong."""
     rng = np.random.default_rng(seed)
     true = rng.integers(0, 4, count)
     mixing = rng.normal(0, 0.2, (4, 3, 3)) + 0.1 * np.eye(3)
@@ -22,7 +22,7 @@ def blobs(seed: int, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sklearn_from(points: np.ndarray, labels: np.ndarray, iterations: int, floor: float = 0.0) -> GaussianMixture:
-    """Return scikit-learn's mixture, initialized by an M-step from `labels`."""
+    """Return the mixture of scikit-learn after an M-step with `labels`."""
     covariances = np.array([np.cov(points[labels == j].T, bias=True) for j in range(4)], np.float64)
     reference = GaussianMixture(
         4,
@@ -61,7 +61,7 @@ def test_mixture_fit_matches_scikit_learn(iterations):
 
 @pytest.mark.parametrize("bound", [0.1, 0.5, 0.9])
 def test_likely_members_match_analytic_posterior(bound):
-    """The object is a Gaussian at x = -1; the background is a Gaussian at x = 1 and a uniform density."""
+    """The object is a Gaussian at x = -1. The background is a Gaussian at x = 1 and a uniform density."""
     ours = Mixtures(
         weights=np.array([[0.3, 0.6]]),
         means=np.array([[[-1.0, 0, 0], [1.0, 0, 0]]]),
@@ -87,7 +87,7 @@ def test_likely_members_match_analytic_posterior(bound):
 
 @pytest.mark.parametrize("components", [1, 3, 8])
 def test_likely_members_match_full_posterior(components):
-    """Some points are near the decision boundary; those far from it are decided without the full sum."""
+    """Points far from the decision boundary are decided without computing all densities."""
     rng = np.random.default_rng(components)
     n = components + 2
     ours = Mixtures(
@@ -134,7 +134,7 @@ def test_mixture_fit_likelihood_increases_until_tolerance():
 
 
 def test_mixture_fit_floors_only_small_eigenvalues():
-    """For points on a slanted plane, the eigenvalue along the normal is raised to the floor."""
+    """All points are on a slanted plane, so the eigenvalue along the normal is below the minimum."""
     rng = np.random.default_rng(0)
     plane = rng.normal(size=(5000, 2)) * [0.5, 0.3]
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -173,7 +173,7 @@ def test_mixture_fit_small_sets_stay_finite():
 
 
 def test_mixture_fit_prior_separates_equal_components():
-    """The two components are equal, so the means of the first M-step depend only on the prior."""
+    """The two components are equal at the start, so the first means depend only on the prior."""
     points = np.zeros((200, 3), np.float32)
     points[:, 0] = np.linspace(-1, 1, 200)
     odds = np.where(points[:, 0] < 0, np.log(4), -np.log(4)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Tests of mixture trees, compared with a slow NumPy recursion and with flat mixtures."""
+"""Tests for mixture trees, compared with a slow recursion and with flat mixtures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FLOOR = 0.02**2  # m^2
 
 
 def surface(seed: int, count: int) -> np.ndarray:
-    """Return the points (count, 3), m, of a wavy surface with a step, about 2 m away, with 2 % outliers."""
+    """Return the points (count, 3), m, of a wavy surface with a step about 2 m away. 2 % of the points are outliers."""
     rng = np.random.default_rng(seed)
     u, v = rng.uniform(-1, 1, (2, count))
     z = 2 + 0.4 * np.sin(3 * u) * np.cos(2 * v) + np.where(u > 0.2, 0.5, 0.0)
@@ -32,7 +32,7 @@ def grown(points: np.ndarray, starts: np.ndarray, **changed: float) -> MixtureTr
     return mixture_tree.fit(points, starts, settings, **parameters)
 
 
-# Reference implementation of the recursion in the paper
+# Reference for the recursion of the paper
 
 
 def slow_cut(points: np.ndarray, groups: int) -> np.ndarray:
@@ -57,7 +57,7 @@ def floored(Sigma: np.ndarray) -> np.ndarray:
 
 @dataclass
 class SlowNode:
-    """Gaussian of weight `weight` with its own points; `children` is filled if the node is expanded."""
+    """Gaussian with its weight and points. `children` is empty unless the node is expanded."""
 
     weight: float
     mean: np.ndarray
@@ -119,12 +119,12 @@ def test_mixture_tree_single_level_equals_flat_mixture():
     np.testing.assert_allclose(tree.levels[0].outlier_densities, flat.outlier_densities, rtol=1e-6)
     more = mixture.fit(
         points, starts, mixture_tree.cut(points, starts, 8), 8, EmSettings(9, -np.inf, FLOOR, 0.02),
-    )  # its last E-step uses the parameters after eight steps  # fmt: skip
+    )  # the last E-step uses the parameters after eight steps  # fmt: skip
     np.testing.assert_allclose(log_likelihoods(tree, points, starts), more.log_likelihoods, atol=1e-4)
 
 
 def masses(tree: MixtureTree, depth: int, sets: int) -> np.ndarray:
-    """Return the total weight (sets,) of the leaves and uniform components of each tree."""
+    """Return the total weight (sets,) of the leaves and uniform components in each tree."""
     mass = np.zeros(sets)
     for k, rows in leaves(tree, depth):
         np.add.at(mass, owners(tree, k)[rows], tree.levels[k].weights[rows])
@@ -160,7 +160,7 @@ def test_mixture_tree_likelihood_increases_with_depth(seed):
 
 
 def test_mixture_tree_assigns_points_to_best_child():
-    """Each point is assigned to its most likely node, and the outlier to -1."""
+    """Each point is assigned to the most likely node, and an outlier to -1."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0.5, 5, 5], [0.4, 0, 0]], np.float32)
     level = Level(
         weights=np.array([0.3, 0.5]), means=np.array([[0.0, 0, 0], [1.0, 0, 0]]),

@@ -1,4 +1,4 @@
-"""Tests of convex segments of rendered boxes, and of each step, compared with a slow reference."""
+"""Tests for convex segments of rendered boxes. Each step is compared with a slow reference."""
 
 from __future__ import annotations
 
@@ -30,9 +30,14 @@ def rendered(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the depth (H, W), m, and the ids (H, W) of a floor and of boxes.
 
-    `boxes` (B, 6) are the lowest and highest corners, m; their ids start at 1. The floor has id 0 and is `floor` m
-    below the camera. In the world y points down. The camera is at the origin and looks along z, rotated down by
-    `pitch` rad. Pixels without a surface have depth 0 and id -1.
+    The floor has id 0 and box k has id k. Pixels without a surface have depth 0 and id -1. The camera is at the origin.
+    The y axis of the world points down, and z is forward.
+
+    Args:
+        boxes: The minimum and maximum corners (B, 6), m.
+        floor: Height of the camera above the floor, m; None = no floor.
+        pitch: Angle by which the camera looks down, rad.
+        camera: Intrinsics of the rendered images.
     """
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     x, y, z = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)
@@ -56,7 +61,7 @@ def noisy(depth: np.ndarray, noise: float) -> np.ndarray:
 
 
 def main_segment(labels: np.ndarray, region: np.ndarray) -> tuple[int, float, float]:
-    """Return the segment that covers most of a region, the covered fraction of the region, and that of the segment."""
+    """Return the main segment of a region, its fraction of the region, and the region's fraction of the segment."""
     label = np.bincount(labels[region] + 1).argmax() - 1
     both = ((labels == label) & region).sum()
     return int(label), both / region.sum(), both / (labels == label).sum()
@@ -65,7 +70,7 @@ def main_segment(labels: np.ndarray, region: np.ndarray) -> tuple[int, float, fl
 @pytest.mark.parametrize("cell", [1, 2])
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_segments_separate_boxes_adjacent_in_image(cell, noise):
-    """The near box occludes an edge of the far box; their common border has a depth step of 0.4 m."""
+    """The near box occludes an edge of the far box. The depth step between them is 0.4 m."""
     boxes = np.array([[-0.5, -0.3, 1.2, 0.0, 0.3, 1.5], [-0.1, -0.4, 1.6, 0.6, 0.4, 2.0]])
     depth, ids = rendered(boxes, None, 0.0)
     labels, count = cut(noisy(depth, noise), cell=cell)
@@ -80,7 +85,7 @@ def test_segments_separate_boxes_adjacent_in_image(cell, noise):
 @pytest.mark.parametrize("cell", [1, 2])
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_segments_separate_box_from_table(cell, noise):
-    """The camera looks down from the side and sees the front, the top and the left face of the box."""
+    """The camera looks down at the front, the top and the left face of the box."""
     camera = Camera(160, 120, 90.0, 90.0, 79.5, 59.5).scaled(cell)
     boxes = np.array([[0.35, 0.3, 0.9, 0.65, 0.6, 1.3]])
     depth, ids = rendered(boxes, 0.6, 0.5, camera)
@@ -106,8 +111,8 @@ def faces_of(box: np.ndarray, pitch: float, camera: Camera, depth: np.ndarray, i
 
 
 @pytest.mark.parametrize("cell", [1, 2])
-def test_segments_split_at_depth_step_but_not_at_slope(cell):
-    """The step is 2.5 cm, like that of a book on a table; the depth of the slope changes more per pixel."""
+def test_segments_split_at_depth_step_not_at_slope(cell):
+    """The step is 2.5 cm, like between a book and a table. On the slope, depth changes more from pixel to pixel."""
     depth = np.full(CAMERA.shape, 1.025)
     depth[30:90, 40:100] = 1.0
     labels, count = cut(depth, cell=cell)
@@ -119,8 +124,7 @@ def test_segments_split_at_depth_step_but_not_at_slope(cell):
     assert cut(sloped, Camera(130, 120, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), cell=cell)[1] == 1
 
 
-def test_segments_ball_is_one_segment():
-    """A convex surface may curve away from the camera by any angle."""
+def test_segments_convex_ball_is_one_segment():
     v, u = np.mgrid[:120, :160]
     x, y = (u - 79.5) / 135, (v - 59.5) / 135
     # first intersection of each ray with a ball of radius 0.3 m around (0, 0, 1.2) m
@@ -134,7 +138,7 @@ def test_segments_ball_is_one_segment():
 
 
 def test_fit_planes_on_plane_is_exact():
-    """A plane is linear in inverse depth, so every window gives the same plane."""
+    """The inverse depth of a plane is linear in the pixel, so all windows give the same plane."""
     v, u = np.mgrid[:12, :20]
     inverse = (0.5 + 0.004 * u - 0.003 * v).astype(np.float32)
     fits = convexity_kernels.fit_planes(inverse, 2, NOISE, np.float32(0.1))
@@ -147,7 +151,7 @@ def test_fit_planes_on_plane_is_exact():
 def test_fit_planes_matches_lstsq_on_similar_depth():
     rng = np.random.default_rng(0)
     inverse = (0.5 + rng.normal(0, 0.002, (9, 11))).astype(np.float32)
-    inverse[:, 6:] += 0.4  # another surface, in front
+    inverse[:, 6:] += 0.4  # another surface in front of the first one
     inverse[rng.random(inverse.shape) < 0.2] = 0
     fits = convexity_kernels.fit_planes(inverse, 2, NOISE, np.float32(0.01))
     found = 0
@@ -165,7 +169,7 @@ def test_fit_planes_matches_lstsq_on_similar_depth():
     assert found > 50
 
 
-def test_best_planes_at_crease_use_own_side():
+def test_best_planes_at_crease_use_same_side():
     u = np.arange(31)
     inverse = np.tile(np.where(u < 15, 0.5, 0.5 + 0.02 * (u - 14.5)), (15, 1)).astype(np.float32)
     planes = convexity_kernels.best_planes(
@@ -176,7 +180,7 @@ def test_best_planes_at_crease_use_own_side():
 
 
 def test_normal_sigma_matches_spread_of_fitted_normals():
-    """The angle between the normals of two windows is measured on a noisy wall 1 m away."""
+    """The angle between the normals of separate windows is measured on a noisy wall 1 m away."""
     rng = np.random.default_rng(0)
     cell, window, sigma = 1, 3, 0.002
     depth = 1 + rng.normal(0, sigma, (7 * 30, 7 * 40))
@@ -184,7 +188,7 @@ def test_normal_sigma_matches_spread_of_fitted_normals():
     fits = convexity_kernels.fit_planes(
         (1 / depth).astype(np.float32), window, NOISE._replace(factor=10.0), np.float32(1.0)
     )
-    slopes = fits[0, 3::7, 3::7] * camera.fx  # slopes of the depth along x, in windows without overlap
+    slopes = fits[0, 3::7, 3::7] * camera.fx  # depth slopes along x in separate windows
     assert np.sqrt(2) * slopes.std() == pytest.approx(normal_sigma(sigma, window, cell, camera), rel=0.1)
 
 
@@ -196,7 +200,8 @@ def test_convexity_components_match_scipy():
         labels, count = convexity_kernels.connected(inverse, edges, NOISE, np.float32(0.1), 1)
         expected, expected_count = ndimage.label(~edges)
         assert count == expected_count
-        np.testing.assert_array_equal(labels, expected - 1)  # both number components by their first cell
+        # in both results, components are ordered by their first cell
+        np.testing.assert_array_equal(labels, expected - 1)
         large, large_count = convexity_kernels.connected(inverse, edges, NOISE, np.float32(0.1), 5)
         sizes = np.bincount(expected.ravel())
         np.testing.assert_array_equal(large >= 0, (sizes[expected] >= 5) & ~edges)
@@ -252,5 +257,5 @@ def test_segments_are_independent_of_thread_count():
 @pytest.mark.parametrize(("sensor", "count"), [(SensorKind.KINECT_V1, 1), (SensorKind.EXACT, 2)])
 def test_segments_split_at_steps_above_sensor_noise(sensor, count):
     depth = np.full(CAMERA.shape, 3.0)
-    depth[:, 80:] = 3.03  # a step of 2 standard deviations of the Kinect noise
+    depth[:, 80:] = 3.03  # the step is 2 standard deviations of the Kinect noise
     assert cut(depth, sensor=sensor)[1] == count

@@ -1,4 +1,4 @@
-"""Tests of plane detection in depth images: exact planes are recovered, and noisy planes match Open3D's RANSAC."""
+"""Tests for plane detection in depth images. Noisy planes are compared with the RANSAC of Open3D."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from framework.refinement.segmentation.planes_kernels import _order
 from tests.support.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
-FLOOR, WALL = np.array([0.0, 1 / 1.2, 0.0]), np.array([0.1, 0.05, 0.3])  # unit normal divided by distance, 1/m
+FLOOR, WALL = np.array([0.0, 1 / 1.2, 0.0]), np.array([0.1, 0.05, 0.3])  # 1/m, unit normal divided by the distance
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 10, 257])
@@ -28,7 +28,7 @@ def rays(camera: Camera = CAMERA) -> np.ndarray:
 
 
 def depth_of(*planes: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """Return the depth (H, W), m, of the nearest plane at each pixel; 0 = no plane in front of the camera."""
+    """Return the depth (H, W), m, of the nearest plane at each pixel, 0 = no plane."""
     q = np.max([rays(camera) @ m for m in planes], axis=0)
     return np.where(q > 0.02, 1 / np.maximum(q, 1e-9), 0)
 
@@ -66,7 +66,7 @@ def test_plane_area_matches_pixel_triangle_area():
 
 
 def test_find_planes_in_noisy_room_matches_open3d():
-    """Floor and wall have Kinect noise. Both are compared with the truth, and the larger one with segment_plane."""
+    """Floor and wall have Kinect noise. The larger plane is also compared with segment_plane of Open3D."""
     open3d = pytest.importorskip("open3d")
     exact = depth_of(FLOOR, WALL)
     depth = exact + np.random.default_rng(0).normal(0, 0.002, exact.shape) * exact**2
@@ -110,7 +110,7 @@ def test_find_planes_separates_parallel_planes():
 
 
 def test_plane_image_assigns_depth_within_distance():
-    """The plane has a slope of 45 degrees; the points are 19 mm or 21 mm from it along its normal."""
+    """The distance of the points along the normal of the plane is 19 mm or 21 mm."""
     m = np.array([0.0, 0.5, 0.5])
     planes = found(depth_of(m))
     image = plane_image(frame_of(depth_of(m)), planes, 0.02)
@@ -163,7 +163,7 @@ def test_find_planes_is_independent_of_thread_count():
 
 
 def test_inverse_depth_of_plane_is_linear_in_pixel():
-    """Plane detection relies on this property."""
+    """Plane detection depends on this property."""
     depth = depth_of(WALL).astype(np.float32)
     v, u = np.mgrid[:240, :320]
     points = back_project(CAMERA, np.stack([u.ravel(), v.ravel()], axis=1).astype(np.int32), depth.ravel())

@@ -1,4 +1,4 @@
-"""Tests of the camera pose recovered from lifted points."""
+"""Tests for the recovery of the camera pose from lifted points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the components of a union-find forest."""
+"""Tests for the components of a union-find structure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of furniture solids: they are closed and oriented outward, and their normals match."""
+"""Tests for the solids of furniture."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def test_panel_triangles_face_forward():
 
 
 @pytest.mark.parametrize("class_name", sorted(LABELED))
-def test_furniture_stands_on_floor_and_has_expected_size(class_name):
+def test_furniture_is_on_floor_and_has_expected_size(class_name):
     largest = {
         "bed": (1.9, 2.3, 1.3), "chair": (0.6, 0.7, 1.1), "couch": (2.7, 1.05, 1.0), "dining table": (1.7, 1.2, 0.8),
         "book": (0.4, 0.4, 0.1), "refrigerator": (0.8, 0.8, 1.9), "tv": (1.3, 0.3, 0.8), "toilet": (0.5, 0.8, 0.9),
