@@ -202,6 +202,7 @@ class Mapper(Map):
         up: Float64 | None = None,
         depth_timestamp: float | None = None,
         sensor: SensorKind | None = None,
+        odometry: Float64 | None = None,
     ) -> FrameResult:
         """Detect, track, refine and fuse the next frame of a video. A lost frame is not fused.
 
@@ -214,6 +215,7 @@ class Mapper(Map):
             up: Up direction (3,) in the camera frame, a unit vector; None = unknown.
             depth_timestamp: Time of the depth image, s; None = the time of the color image.
             sensor: The kind of depth sensor; None = the kind of the last frame, initially KINECT_V1.
+            odometry: (4, 4) T_odom_camera, the pose of the camera in any fixed frame by odometry; None = unknown.
 
         Returns:
             The pose of the frame, and the new and removed objects.
@@ -240,7 +242,7 @@ class Mapper(Map):
                 time = self._frames / FRAME_RATE if timestamp is None else timestamp
                 frame = Frame(
                     self._frames, time, color, depth, camera, pose, up=up, depth_timestamp=depth_timestamp,
-                    sensor=sensor or self._sensor,
+                    sensor=sensor or self._sensor, T_odom_camera=odometry,
                 )  # fmt: skip
             self._camera, self._sensor = frame.camera, frame.sensor
             self._frames += 1

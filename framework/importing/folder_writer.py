@@ -27,6 +27,7 @@ from framework.importing.source import SURE, UNSURE, DeviceFrame, Source
 DEPTH_SCALE = 1000.0  # units per meter
 LONGER_SIDE = 640  # px, default for written images; trackers and detectors are tuned for this size
 JPEG_QUALITY = 95  # percent
+ODOMETRY = "odometry.txt"  # file for dataset.odometry, which is not read by default
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,9 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
         raise DataError(f"{source.format}: expected usable frames, got none; {reason}")
     if source.posed:
         write_tum(directory / "poses.txt", written.timestamps, written.poses)
+    if source.odometry is not None:
+        poses = [turn.pose(T) if source.odometry.of_camera else T for T in source.odometry.poses]
+        write_tum(directory / ODOMETRY, source.odometry.timestamps, poses)
     if any(time is not None for time in written.depth_timestamps):
         pairs = zip(written.timestamps, written.depth_timestamps, strict=True)
         times = [(color, color if depth is None else depth) for color, depth in pairs]

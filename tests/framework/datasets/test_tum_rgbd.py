@@ -187,7 +187,7 @@ def test_tum_rgbd_duplicate_image_timestamps_keep_first(folder: Path, caplog: py
 
 
 def test_tum_rgbd_recording_without_image_pairs_raises(folder: Path) -> None:
-    with pytest.raises(DataError, match=r"within dataset\.max_time_difference \(0\.01 s\), got none"):
+    with pytest.raises(DataError, match=r"within dataset\.max_time_difference \(0\.01 s\) of each other, got none"):
         TumRgbd(folder, max_time_difference=0.01)
 
 
