@@ -308,10 +308,8 @@ def slowly_smoothed(scene: SemanticMap, smoothness: float) -> Int32:
     while class_ids != before:
         before = list(class_ids)
         for v, (block, n) in enumerate(divmod(int(voxel), 512) for voxel in surface.voxels):
-            row, absent = (
-                grid.label_row[block],
-                np.log(scene.elections.absence_likelihood_ratio) * evidence.unmasked[block, n],
-            )
+            row = grid.label_row[block]
+            absent = np.log(scene.elections.absence_likelihood_ratio) * evidence.unmasked[block, n]
             log = [absent + (evidence.rest[row, n] if row >= 0 else 0)] * 2 + [0.0]  # two classes, background
             for label, ratio in zip(evidence.class_ids[row, n], evidence.log_ratio[row, n], strict=True):
                 if row >= 0 and label < 2:
