@@ -106,7 +106,7 @@ $(INSTALLED): pyproject.toml
 	@touch $(INSTALLED)
 
 $(INSTALLED_DEV): $(INSTALLED)
-	@$(MAKE) --no-print-directory browser
+	@$(MAKE) --no-print-directory browser latex
 	@echo "installing the development tools into $(VENV)"
 	@$(PIP_INSTALL) --group dev --editable '.[all]'
 	@touch $(INSTALLED_DEV)
@@ -133,6 +133,16 @@ browser:
 		echo "installing chromium for the browser tests"; \
 		{ apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install --yes --no-install-recommends \
 			chromium fonts-dejavu-core libatomic1; } >/dev/null || echo "chromium: installation failed; browser tests are skipped"; \
+	fi
+
+# LaTeX for the tests of tables, which are skipped without it.
+.PHONY: latex
+latex:
+	@if ! command -v pdflatex >/dev/null && command -v apt-get >/dev/null && test "$$(id -u)" = 0; then \
+		echo "installing LaTeX for the tests of tables"; \
+		{ apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install --yes --no-install-recommends \
+			texlive-latex-base texlive-latex-recommended; } >/dev/null || \
+			echo "LaTeX: installation failed; its tests are skipped"; \
 	fi
 
 .PHONY: system-libraries

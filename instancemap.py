@@ -77,6 +77,7 @@ _SHARED_WITH_PLUGINS = {
     "inverse": "framework.geometry",
     "keep_points": "framework.refinement.refine",
     "list_points_by_pixel": "framework.mapping.labels.pixel_lists",
+    "normals_of": "framework.tracking.pyramid",
     "project": "framework.geometry",
     "transform": "framework.geometry",
     "vote_for_best": "framework.mapping.labels.label_rule",
@@ -98,6 +99,7 @@ if TYPE_CHECKING:
     from framework.mapping.labels.pixel_lists import list_points_by_pixel
     from framework.refinement.refine import keep_points
     from framework.registry import assemble
+    from framework.tracking.pyramid import normals_of
 
 
 def __getattr__(name: str) -> Any:

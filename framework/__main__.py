@@ -17,7 +17,7 @@ import framework
 
 COMMANDS = {
     "tables": "write the tables of an experiment or sweep: Markdown, LaTeX, CSV",
-    "figures": "draw the figures of an experiment",
+    "figures": "draw the figure of an experiment or sweep",
     "raycast": "draw a ray-cast view of a map: depth, normals, vertex map, RGB, object indices",
     "report": "write HTML reports of runs and compare them",
     "import": "convert a phone or sensor recording to an RGB-D folder for dataset=rgbd_folder",
@@ -89,7 +89,7 @@ def module_of(command: str) -> str:
 
 
 def leave_working_folder(arguments: list[str]) -> None:
-    """Remove the working directory from the module search path.
+    """Remove the working directory from the module search path, unless it is the checkout of the project.
 
     Its files may be from an untrusted source. With --config-dir, which registers plugins of the user, the directory is
     moved to the end of the search path instead. `python -P` always excludes it.
@@ -130,8 +130,8 @@ def main() -> None:
     leave_working_folder(sys.argv[1:])
     if any(word.startswith("--e") and RERUN.startswith(word.partition("=")[0]) for word in sys.argv[1:]):
         sys.exit(
-            f"error: {RERUN}: expected KEY=VALUE overrides, got a pickle file, which is unsafe; pass the run's "
-            "overrides instead"
+            f"error: {RERUN}: expected KEY=VALUE overrides, got a pickle file (unsafe); pass the run's overrides "
+            "instead"
         )
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # file names may contain invalid Unicode
@@ -152,8 +152,8 @@ def main() -> None:
     elif word and not of_run:
         close = get_close_matches(word, COMMANDS, n=1)
         expected = "a known command" if close else f"one of {', '.join(COMMANDS)}"
-        hint = f"; did you mean {close[0]}?" if close else ""
-        sys.exit(f"error: command: expected {expected}, got {word!r}{hint}")
+        fix = f"did you mean {close[0]}?" if close else f"omit the command to start a run: {program} KEY=VALUE ..."
+        sys.exit(f"error: command: expected {expected}, got {word!r}; {fix}")
     else:
         word = "run"
     if word in PRINTING and hasattr(signal, "SIGPIPE"):  # not on Windows

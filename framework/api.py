@@ -159,13 +159,14 @@ class Mapper(Map):
     command line, as strings or as keywords. The defaults are those of a run.
 
     Overrides of `dataset` are not supported. `prefetch` and `skip_completed` have no effect. `resume_from=DIR` resumes
-    the map of a run. `viewer="rerun"` shows the map until the mapper is deleted.
+    the map of a run. `viewer="rerun"` records or shows the map until the mapper is deleted.
 
     All methods are thread-safe. While another thread may call `add`, hold the lock to read `scene` itself:
     `with mapper.lock: mesh = mapper.scene.mesh()`.
 
     Raises:
         ConfigError: A name is unknown, or a value is invalid.
+        DataError: The map of `resume_from` or `localize_in` cannot be read.
     """
 
     def __init__(self, *overrides: str, **named: object) -> None:
@@ -203,6 +204,7 @@ class Mapper(Map):
         up: Float64 | None = None,
         depth_timestamp: float | None = None,
         sensor: SensorKind | None = None,
+        odometry: Float64 | None = None,
     ) -> FrameResult:
         """Detect, track, refine and fuse the next frame of a video. A lost frame is not fused.
 
@@ -215,6 +217,7 @@ class Mapper(Map):
             up: Up direction (3,) in the camera frame, a unit vector; None = unknown.
             depth_timestamp: Time of the depth image, s; None = the time of the color image.
             sensor: The kind of depth sensor; None = the kind of the last frame, initially KINECT_V1.
+            odometry: (4, 4) T_odom_camera, the pose of the camera in any fixed frame by odometry; None = unknown.
 
         Returns:
             The pose of the frame, and the new and removed objects.
@@ -241,7 +244,7 @@ class Mapper(Map):
                 time = self._frames / FRAME_RATE if timestamp is None else timestamp
                 frame = Frame(
                     self._frames, time, color, depth, camera, pose, up=up, depth_timestamp=depth_timestamp,
-                    sensor=sensor or self._sensor,
+                    sensor=sensor or self._sensor, T_odom_camera=odometry,
                 )  # fmt: skip
             self._camera, self._sensor = frame.camera, frame.sensor
             self._frames += 1
@@ -353,7 +356,8 @@ def export(
         out: The output folder; None = `export` in the run directory.
         objects: Classes or ids of the exported objects; () = the whole scene.
         up: The up direction (3,) in the world frame; None = the up direction of the run.
-        floor: The floor height along the up direction, m; None = the floor height of the run.
+        floor: The floor height along the up direction, m; None = the floor height of the run, or unknown if `up` is
+            given.
         choices: min_confidence, triangles, coloring, collision, resolution, robot_height; see `instancemap export
             --help`.
 

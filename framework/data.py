@@ -178,6 +178,7 @@ class Frame:
     color_timestamp: float | None = None  # s, of the color image; None = timestamp
     depth_timestamp: float | None = None  # s, of the depth image; None = timestamp
     sensor: SensorKind = SensorKind.KINECT_V1  # kind of depth sensor, which determines the noise model
+    T_odom_camera: Float64 | None = None  # (4, 4) pose of odometry, at the time of depth; None = unknown
 
     def __post_init__(self) -> None:
         index, camera = cast(object, self.index), cast(object, self.camera)  # the caller may pass any type
@@ -196,6 +197,8 @@ class Frame:
             raise DataError(f"{where}depth: expected values of at least 0 m, got {self.depth.min()} m")
         if self.T_world_camera is not None:
             check_rigid(where + "T_world_camera", self.T_world_camera)
+        if self.T_odom_camera is not None:
+            check_rigid(where + "T_odom_camera", self.T_odom_camera)
         if self.up is not None:
             check_array(where + "up", self.up, (3,), np.float64)
             if abs(np.linalg.norm(self.up) - 1) > UNIT_TOLERANCE:
@@ -206,6 +209,7 @@ class Frame:
             raise DataError(
                 f"{where}sensor: expected a SensorKind, got {self.sensor!r}; pass a member such as SensorKind.KINECT_V1"
             )
+        object.__setattr__(self, "_depth_cache", {})
         # kernels require contiguous writable arrays; views such as bgr[..., ::-1] and read-only arrays are copied
         object.__setattr__(self, "color", np.require(self.color, requirements=("C", "W")))
         object.__setattr__(self, "depth", np.require(self.depth, requirements=("C", "W")))
@@ -223,6 +227,12 @@ class Frame:
         frame = copy.copy(self)
         object.__setattr__(frame, "color", np.require(color, requirements=("C", "W")))
         return frame
+
+    @property
+    def depth_cache(self) -> dict[str, Array]:
+        """Arrays computed from depth and camera alone, by name; shared with the frames that `with_color` returns."""
+        cache: dict[str, Array] = vars(self)["_depth_cache"]
+        return cache
 
     @property
     def color_time(self) -> float:

@@ -101,5 +101,5 @@ def import_optional(module: str, purpose: str, extra: str) -> Any:
     except ImportError as error:
         name = module.partition(".")[0]
         raise ConfigError(
-            f"{name}: expected an installed package (it {purpose}), got none; run pip install instancemap[{extra}]"
+            f"{name}: expected an installed package (it {purpose}), got none; run pip install 'instancemap[{extra}]'"
         ) from error

@@ -115,7 +115,7 @@ def nearest_rigid(matrix: Float64) -> Float64:
     """Return the nearest rigid transform (4, 4), for example to remove rounding errors.
 
     Raises:
-        DataError: The matrix is not finite, or its error exceeds RIGID_WITHIN.
+        DataError: The matrix is not finite, or differs from a rigid transform by more than RIGID_WITHIN.
     """
     if not np.isfinite(matrix).all():
         raise DataError("pose: expected finite values, got NaN or infinity")

@@ -68,7 +68,7 @@ class Pipeline:
             raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}; set it to 0")
         self.viewer = GuardedViewer(self.viewer)
         self.color_to_depth = ColorToDepth(delay=None)
-        self.T_world_color: Float64 | None = None  # (4, 4) pose of the color camera in the last mapped frame
+        self.T_world_color: Float64 | None = None  # (4, 4) pose of the color camera in the last tracked frame
 
     def run(self, video: RGBDVideo) -> RunResult:
         """Map a sequence or live video, frame by frame.

@@ -14,9 +14,9 @@ A voxel is *under a mask* if its pixel is inside the mask. It then gets the clas
 outside the masks are equal evidence for the background, so a voxel only counts these frames. Blocks with voxels under a
 mask have a row of evidence.
 
-Each mask *names* its most likely classes. A voxel stores the most likely CLASS_SLOTS named classes. A newly named class
-replaces the least likely one. The unnamed classes share one log ratio, `rest`, which is the initial value of a newly
-named class.
+Each mask *names* its most likely classes. A voxel has slots for at most CLASS_SLOTS named classes. If all slots are
+used, a newly named class replaces the least likely one, unless it is itself the least likely. The unnamed classes share
+one log ratio, `rest`, which is the initial value of a newly named class.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ class ClassRows:
         check_like(arrays, free, len(arrays["rest"]))
         check_known("class_ids", arrays["class_ids"], [*range(classes), NO_CLASS])
         if len(arrays["rest"]) and not classes:
-            raise DataError(f"unnamed_log_ratio: expected 0 rows in a map without classes, got {len(arrays['rest'])}")
+            raise DataError(f"rest: expected 0 rows in a map without classes, got {len(arrays['rest'])}")
         _check_order(arrays["class_ids"], arrays["log_ratio"], arrays["rest"], classes)
         self.evidence = ClassEvidence(**{name: arrays[name] for name in ClassEvidence._fields})
         self.row_count = len(self.evidence.rest)
@@ -189,12 +189,12 @@ def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: i
     wrong = ratios[..., 0] < best
     if wrong.any():
         raise DataError(
-            f"log_ratio: expected the maximum of a voxel in slot 0 ({best[wrong][0]:g}), got {ratios[wrong][0, 0]:g}"
+            f"log_ratio: expected {best[wrong][0]:g} (the maximum of the voxel) in slot 0, got {ratios[wrong][0, 0]:g}"
         )
     excess = np.where(named.sum(axis=-1) == classes, rest - np.maximum(best, 0), np.float32(-np.inf))
     if (excess > MAX_EXPONENT).any():
         raise DataError(
-            f"unnamed_log_ratio: expected a log ratio at most {MAX_EXPONENT:g} above the best class in voxels without "
+            f"rest: expected a log ratio at most {MAX_EXPONENT:g} above the best class in voxels without "
             f"unnamed classes, got {excess.max():g}"
         )
 

@@ -94,7 +94,7 @@ def observe_mask(evidence, row, n, masks, k):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_blocks_under_masks(grid, seen, cluster, wants_row):
-    """Find the blocks (A,) that need a row, because a voxel near the surface is under a mask."""
+    """Set `wants_row` (A,) to True for blocks without a row that have a voxel near the surface under a mask."""
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
         start = seen.near_start[a]
@@ -112,7 +112,7 @@ def update_classes(grid, seen, evidence, masks, evicted):
     Voxels outside all masks only count the frame. The number of evicted classes of each block is written to `evicted`
     (A,).
     """
-    unmasked = evidence.unmasked  # numba 0.68 drops assignments to an element of a tuple's array within prange
+    unmasked = evidence.unmasked  # Numba 0.68 loses assignments to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):
         evicted[a] = 0
         block = seen.blocks[a]

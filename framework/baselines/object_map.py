@@ -63,7 +63,7 @@ class ObjectMap(InstanceTableMap):
 
     @property
     def block_count(self) -> int:
-        """Number of blocks of all volumes."""
+        """Number of blocks in all volumes."""
         return self.background.voxels.block_count + sum(volume.block_count for volume in self.volumes.values())
 
     @property
@@ -96,7 +96,7 @@ class ObjectMap(InstanceTableMap):
             frame: The frame.
             T_world_camera: The camera pose (4, 4).
             masks: The mask (H, W) of each detected object by id.
-            band: The maximum distance from the measured surface of voxels that count observations, m.
+            band: The maximum distance between the measured surface and the voxels that count observations, m.
 
         Raises:
             MapFullError: If the map needs too many blocks.
@@ -233,7 +233,7 @@ class ObjectMap(InstanceTableMap):
             foreground, observed = (arrays[OBJECT + name] for name in ("foreground", "observed"))
             if (wrong := foreground > observed).any():
                 raise DataError(
-                    f"{OBJECT}foreground: expected at most the value in {OBJECT}observed, {observed[wrong][0]}, got "
+                    f"{OBJECT}foreground: expected at most {observed[wrong][0]} (the value in {OBJECT}observed), got "
                     f"{foreground[wrong][0]}"
                 )
             start = 0

@@ -58,7 +58,7 @@ class ObjectVolume:
             frame: The frame.
             T_world_camera: The camera pose (4, 4).
             mask: The mask (H, W) of the object.
-            band: The maximum distance from the measured surface of voxels that count observations, m.
+            band: The maximum distance between the measured surface and the voxels that count observations, m.
 
         Raises:
             MapFullError: If the map needs too many blocks. The frame is then not integrated.
@@ -86,7 +86,7 @@ class ObjectVolume:
         return np.asarray(((points_world >= self.low) & (points_world <= self.high)).all(axis=1))
 
     def foreground_at(self, points_world: Float32) -> Float32:
-        """Return the foreground probability (P,) at surface points (P, 3), m."""
+        """Return the foreground probability (P,) at world points (P, 3), m, on the surface."""
         probability = np.empty(len(points_world), np.float32)
         foreground_at(self.voxels.grid, self.counts, points_world, probability)
         return probability
@@ -113,8 +113,8 @@ def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: F
     Args:
         camera: The camera.
         T_world_camera: The camera pose (4, 4).
-        low: The minimum corners (N, 3) of the boxes, m.
-        high: The maximum corners (N, 3) of the boxes, m.
+        low: The minimum corners (N, 3) of the boxes in the world frame, m.
+        high: The maximum corners (N, 3) of the boxes in the world frame, m.
         near: The minimum visible depth, m.
     """
     T_camera_world = inverse(T_world_camera)

@@ -86,7 +86,7 @@ def look_up_object(
 
 @njit(cache=True, nogil=True, parallel=True)
 def foreground_at(grid, counts, points, probability):
-    """Interpolate the foreground probability (P,) at points (P, 3), m."""
+    """Interpolate the foreground probability (P,) at world points (P, 3), m."""
     for chunk in prange(-(-len(points) // CHUNK)):
         blocks, voxels = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
         weights = np.empty(CORNERS, np.float32)

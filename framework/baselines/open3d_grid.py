@@ -45,7 +45,7 @@ CPU = o3d.core.Device("CPU:0")
 
 @dataclass(frozen=True)
 class BlockGridSettings:
-    """Parameters of a BlockGrid."""
+    """Parameters of the voxel blocks."""
 
     voxel_size: float  # side of a voxel, m
     block_resolution: int  # number of voxels per side of a block
@@ -375,7 +375,7 @@ def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
 
 
 def points_of(surface: SurfaceView) -> Float32:
-    """Return the surface points (H, W, 3), m, or the camera center where there is no surface."""
+    """Return the surface points (H, W, 3) in the world frame, m, or the camera center where there is no surface."""
     points = _rays(surface.camera, surface.T_world_camera)
     points *= surface.depth[..., None]
     points += surface.T_world_camera[:3, 3].astype(np.float32)

@@ -88,11 +88,11 @@ class Open3DMap(InstanceTableMap):
         self.changed()
 
     def changed(self) -> None:
-        """Discard the cached mesh after a change of the map."""
+        """Discard the cached mesh after a change to the map."""
         self.__dict__.pop("_mesh", None)
 
     def instances_at(self, points_world: Float32) -> Int32:
-        """Return the instance (P,) of the voxel nearest to each point (P, 3), m, 0 = none."""
+        """Return the instance (P,) of the voxel nearest to each world point (P, 3), m, 0 = none."""
         voxels = self.grid.voxels_at(points_world)
         return np.where(voxels >= 0, self.grid.flat("instance")[voxels], 0).astype(np.int32)
 

@@ -27,7 +27,7 @@ from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
-MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of the fields of Elections
+ABSENCE, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds
 SWEEPS = 20  # maximum number of sweeps of the regularization
 FORMAT = "semantic 4"  # format of the map file; increment it when the meaning of the contents changes
 
@@ -35,7 +35,7 @@ FORMAT = "semantic 4"  # format of the map file; increment it when the meaning o
 class Elections(NamedTuple):
     """Parameters for the classes and instances of the mesh."""
 
-    missed: float  # likelihood ratio P(no mask | any class) / P(no mask | background)
+    absence_likelihood_ratio: float  # likelihood ratio P(no mask | any class) / P(no mask | background)
     min_area: float  # minimum surface area of an instance, m^2
     smoothness: float  # log-odds for each neighboring vertex of the same class
 
@@ -68,7 +68,7 @@ class SemanticMap(SceneMap):
         """Set the label space of the map.
 
         Raises:
-            DataError: If the map has a different label space.
+            DataError: If the map has a different label space, or if there are too many classes.
         """
         if not self.classes:
             self.labels.begin(len(classes))
@@ -88,7 +88,7 @@ class SemanticMap(SceneMap):
 
     @property
     def _log_missed(self) -> np.float32:
-        return np.float32(np.log(self.elections.missed))
+        return np.float32(np.log(self.elections.absence_likelihood_ratio))
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         """Return the view with classes.
@@ -121,7 +121,7 @@ class SemanticMap(SceneMap):
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
     def _smooth(self, surface: UnlabeledMesh, class_ids: Int32) -> None:
-        """Regularize the classes (V,) in place by a Potts model over the edges of the mesh."""
+        """Regularize the classes (V,) in place with a Potts model over the edges of the mesh."""
         # iterated conditional modes (Besag, 1986)
         starts, neighbors = vertex_neighbors(surface.triangles, len(class_ids))
         grid, evidence = self.volume.voxels.grid, self.labels.evidence
@@ -135,9 +135,9 @@ class SemanticMap(SceneMap):
     def instances(self) -> Mapping[int, Instance]:
         """Return the connected components of the mesh as instances.
 
-        The class distribution is the mean over the voxels nearest to the vertices, without the background. The
-        confidence is the mean probability of the class, including the background. The number of observations is the
-        maximum number of frames under a mask of any of these voxels.
+        The class distribution is the mean over the voxels nearest to the vertices, renormalized without the background.
+        The confidence is the mean probability of the class of the instance before this normalization. The number of
+        observations is the maximum, over these voxels, of the number of frames under a mask.
         """
         mesh, up, instances = self.mesh(), self.gravity().up, {}
         found = self._sum_components(self.volume.surface().voxels, mesh.instance_ids)
@@ -182,7 +182,7 @@ class SemanticMap(SceneMap):
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *ClassEvidence._fields))
         with map_file_errors(path):
             volume = TsdfVolume.load(header, arrays, len(arrays["rest"]))
-            bounds = {"missed": MISSED, "min_area": AREA, "smoothness": SMOOTHNESS}
+            bounds = {"absence_likelihood_ratio": ABSENCE, "min_area": AREA, "smoothness": SMOOTHNESS}
             scene = cls(volume, Elections(**{name: header.number(name, limits) for name, limits in bounds.items()}))
             classes = header.classes()
             scene.begin(classes)

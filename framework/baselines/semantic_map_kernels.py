@@ -20,7 +20,7 @@ def label_view(grid, evidence, log_missed, view, depth, class_ids):
     Args:
         grid: The voxel grid.
         evidence: The class evidence.
-        log_missed: See best_class().
+        log_missed: The log ratio of every class to the background for a frame outside all masks.
         view: The camera with the pose T_world_camera.
         depth: The depth (H, W) of the surface, m.
         class_ids: The output (H, W), -1 = none.
@@ -84,8 +84,8 @@ def smooth_classes(grid, evidence, log_missed, voxels, starts, neighbors, smooth
     Args:
         grid: The voxel grid.
         evidence: The class evidence.
-        log_missed: See best_class().
-        voxels: The voxel (V,) nearest to each vertex.
+        log_missed: The log ratio of every class to the background for a frame outside all masks.
+        voxels: The voxel (V,) nearest to each vertex, as block * 512 + index in the block.
         starts: The start (V + 1,) of the neighbors of each vertex in `neighbors`.
         neighbors: The neighbors of the vertices.
         smoothness: The log-odds for each neighbor of the same class.
@@ -139,8 +139,8 @@ def sum_components(grid, evidence, log_missed, voxels, instance_ids, found):
     Args:
         grid: The voxel grid.
         evidence: The class evidence.
-        log_missed: See best_class().
-        voxels: The voxel (V,) nearest to each vertex, numbered as in an UnlabeledMesh.
+        log_missed: The log ratio of every class to the background for a frame outside all masks.
+        voxels: The voxel (V,) nearest to each vertex, as block * 512 + index in the block.
         instance_ids: The component (V,) of each vertex, 0 = none.
         found: The statistics, initially empty, modified in place.
     """

@@ -141,7 +141,7 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
         return PoseJudgment((Finding(Verdict.FINE, "poses", f"valid: {measured}"),), as_given, as_given, others)
     if chosen.error > MAX_RELATIVE_ERROR * motion:
         text = f"inconsistent with the images in all supported conventions: {measured}"
-        finding = Finding(Verdict.ERROR, "poses", text, "tracker=voxel_hashing_icp, which needs no poses")
+        finding = Finding(Verdict.ERROR, "poses", text, "tracker=voxel_hashing_icp")
         return PoseJudgment((finding,), as_given, best, others)
     findings = []
     if reading != given:

@@ -38,7 +38,8 @@ class EdgeAlignment:
     delay: int  # frames; positive = depth images from later frames
     zoom: float  # scale of the depth image
     strength: float  # mean gradient at the depth edges for the best shift, in standard deviations
-    shift: tuple[float, float]  # best shift (x, y), as fractions of the image width
+    # best shift of the depth edges (x to the right, y down), as fractions of the image width
+    shift: tuple[float, float]
 
     @property
     def moved(self) -> bool:
@@ -160,8 +161,8 @@ def judge(
     if zoomed.zoom != 1.0 or zoomed.moved:
         x, y = (100 * fraction for fraction in zoomed.shift)
         text = (
-            f"depth is not registered to color: edges fit best {x:+.1f} % of the width to the right and {y:+.1f} % "
-            f"down, scaled by {zoomed.zoom:g}; enable the alignment of depth to color in the camera's driver"
+            f"depth is not registered to color: depth edges fit best {x:+.1f} % of the width to the right and "
+            f"{y:+.1f} % down, scaled by {zoomed.zoom:g}; enable the alignment of depth to color in the camera's driver"
         )
         return Finding(Verdict.ERROR, subject, text), 0
     return Finding(Verdict.FINE, subject, "edges match without a delay"), 0

@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
@@ -90,18 +90,32 @@ def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
     return parsed
 
 
-def print_for_directories(description: str, directory_help: str, write: Callable[[Path], str]) -> None:
-    """Run a command with arguments DIR..., and print the result of `write` for each directory.
+def print_for_directories(
+    description: str, directory_help: str, block: str, write: Callable[[Path, Sequence[str]], str]
+) -> None:
+    """Run a command with arguments DIR... and BLOCK.KEY=VALUE..., and print the result of `write` for each directory.
 
     An error in one directory does not stop the others.
+
+    Args:
+        description: Description of the command.
+        directory_help: Description of DIR.
+        block: Block of the sweep's config that the overrides change, such as `table`.
+        write: Function of a directory and the overrides.
     """
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("directory", metavar="DIR", nargs="+", type=Path, help=directory_help)
+    parser = argparse.ArgumentParser(description=description, usage=f"%(prog)s DIR... [{block}.KEY=VALUE ...]")
+    help_text = f"{directory_help}; {block}.KEY=VALUE changes a setting of the stored sweep"
+    parser.add_argument("words", metavar="DIR", nargs="+", help=help_text)
     failed = False
     with one_line_errors():
-        for directory in arguments(parser).directory:
+        words = arguments(parser).words
+        overrides = [word for word in words if word.startswith(f"{block}.") and "=" in word]
+        directories = [Path(word) for word in words if word not in overrides]
+        if not directories:
+            parser.error("DIR: expected a folder, got only settings")
+        for directory in directories:
             try:
-                print(write(directory))
+                print(write(directory, overrides))
             except KNOWN_ERRORS as error:
                 print_error(error)
                 failed = True

@@ -226,7 +226,7 @@ def running_loader() -> Any | None:
 def one_line(error: BaseException) -> str:
     """Return the message of an error on one line.
 
-    Messages of Hydra and OmegaConf are rewritten to include the fix.
+    Some messages of Hydra and OmegaConf are rewritten to include the fix.
     """
     return printable(_message_of(error))
 
@@ -268,12 +268,12 @@ def _no_such_option(error: MissingConfigException) -> str:
         return _joined(str(error))
     if str(error.missing_cfg_file) in _EXTRAS:
         override, extra = _EXTRAS[str(error.missing_cfg_file)]
-        return f"{override}: expected the installed extra {extra}, got none; run pip install instancemap[{extra}]"
+        return f"{override}: expected the installed extra {extra}, got none; run pip install 'instancemap[{extra}]'"
     options = list(error.options or ())
     if group == "hydra/sweeper" and name in _OLD_SWEEPERS:
         return (
-            f"{group}: expected a sweeper for Python 3.11 and later, got {name}; set hydra/sweeper=optuna, which needs "
-            "pip install instancemap[sweepers]"
+            f"{group}: expected a sweeper for Python 3.11 and later, got {name}; set hydra/sweeper=optuna and run "
+            "pip install 'instancemap[sweepers]'"
         )
     close = get_close_matches(name, options, n=1)
     suggestion = f"; did you mean {close[0]}?" if close else ""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from enum import Enum
 from pathlib import Path
 from types import NoneType, UnionType
@@ -74,7 +75,7 @@ def require(holds: bool, name: str, value: object, allowed: str) -> None:
 def check_package(key: str, package: str, extra: str) -> None:
     """Raise ConfigError with the installation command if an optional package is missing."""
     if importlib.util.find_spec(package) is None:
-        raise ConfigError(f"{key}: expected the package {package}, got none; run pip install instancemap[{extra}]")
+        raise ConfigError(f"{key}: expected the package {package}, got none; run pip install 'instancemap[{extra}]'")
 
 
 def checked_path(name: str, value: object) -> Path:
@@ -111,6 +112,20 @@ def check_count(name: str, value: int, most: int) -> None:
     require(1 <= value <= most, name, value, f"a value in [1, {most}]")
 
 
+def check_page_columns(name: str, value: int | None) -> None:
+    """Raise ConfigError unless the width `value` of a table or figure is 1 or 2 columns of a page, or None."""
+    require(value in (None, 1, 2), name, value, "1, 2 or null")
+
+
+def check_known(settings: Iterable[tuple[str, str]], known: Collection[str]) -> None:
+    """Raise ConfigError for a key of a run that is not in `known`; `settings` are (setting, key) pairs."""
+    for name, key in settings:
+        if key not in known:
+            close = get_close_matches(key, known, n=1)
+            fix = f"did you mean {close[0]}?" if close else "set a group such as dataset, or a parameter of all runs"
+            raise ConfigError(f"{name}: expected a group of options or a parameter, got {key}; {fix}")
+
+
 def checked_rows(node: Any) -> dict[str, list[str]]:
     """Return the overrides of each row by name, from the value of the config key `rows`.
 
@@ -119,7 +134,8 @@ def checked_rows(node: Any) -> dict[str, list[str]]:
     """
     if node is not None and not isinstance(node, Mapping):
         raise ConfigError(
-            f"rows: expected a mapping of names to overrides, got {node!r}; for example, mine: [refiner=identity]"
+            f"rows: expected a mapping of names to overrides, got {node!r}; write, for example, "
+            "mine: [refiner=identity]"
         )
     rows = {str(name): overrides for name, overrides in (node or {}).items()}
     for name, overrides in rows.items():

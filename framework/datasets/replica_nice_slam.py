@@ -5,7 +5,7 @@ References: Straub et al., 2019; Zhu et al., CVPR 2022.
     cam_params.json                     for all scenes: {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}
     room0/results/frame000000.jpg       8-bit color, numbered from 0
     room0/results/depth000000.png       uint16 along z, `scale` units per meter
-    room0/traj.txt                      line k: T_world_camera of frame k, 16 numbers, row-major, m
+    room0/traj.txt                      line k, from 0: T_world_camera of frame k, 16 numbers, row-major, m
 
 The camera axes are x right, y down, z forward.
 """

@@ -68,8 +68,8 @@ def _color_pose(path: Path) -> Float64:
 def register(raw: UInt16) -> UInt16:
     """Register a depth image (H, W), mm, to the color camera.
 
-    The color camera has a wider field of view, so that the border of the result has no readings. An image of the wrong
-    size is returned unchanged, and the reader then rejects it.
+    The color camera has a wider field of view, so the border of the result has no readings. An image of the wrong size
+    is returned unchanged, and the reader then rejects it.
     """
     if raw.shape != DEPTH_CAMERA.shape:
         return raw

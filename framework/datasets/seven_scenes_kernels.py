@@ -17,7 +17,7 @@ def register_depth(raw: UInt16, ratio: float, u_0: float, v_0: float, disparity_
 
     Args:
         raw: The depth (h, w), mm.
-        ratio: The ratio of the focal lengths.
+        ratio: The focal length of the other camera divided by that of the depth camera.
         u_0: The horizontal offset, px.
         v_0: The vertical offset, px.
         disparity_1: The disparity at a depth of 1 mm, px.

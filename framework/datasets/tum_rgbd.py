@@ -6,7 +6,8 @@ Kinect videos with motion-capture poses:
     rgb/, depth/            8-bit color; uint16 depth along z, registered to color, 5000 units per m; 0 = no reading
     groundtruth.txt         optional; TUM format, T_world_camera of the color camera, about 100 poses per second
     camera.json             for other recordings in this layout: intrinsics, depth scale and distortion, with the
-                            same keys as in an RGB-D folder; read if the folder's name does not contain freiburg
+                            same keys as in an RGB-D folder; read with intrinsics=AUTO if the folder's name does not
+                            contain freiburg1, freiburg2 or freiburg3
 
 The published depth correction factors are already applied. The images of freiburg1 and freiburg2 have a lens distortion
 of 5 px or more in half of the pixels, which is corrected on reading. The images of freiburg3 were published
@@ -92,7 +93,7 @@ class TumRgbd(Recording):
         if not pairs:
             raise DataError(
                 f"{self.folder}: expected images of rgb.txt and depth.txt within dataset.max_time_difference "
-                f"({self.max_time_difference:g} s), got none"
+                f"({self.max_time_difference:g} s) of each other, got none"
             )
         if len(pairs) < len(color):
             log.info("%s: %d of %d color images have no depth image", self.name, len(color) - len(pairs), len(color))
@@ -143,7 +144,7 @@ class Trajectory:
 
     @classmethod
     def of(cls, path: Path, lines: Sequence[TumLine], max_difference: float) -> Trajectory:
-        """Return the trajectory in a file.
+        """Return the trajectory that consists of the lines of a file.
 
         If a timestamp is repeated, only its first line is used.
         """
@@ -190,7 +191,7 @@ def associate(first: Sequence[float], second: Sequence[float], max_difference: f
 
 
 def _first_of_each(path: Path, items: Sequence[Timed], name: str) -> list[Timed]:
-    """Return the first item of each timestamp."""
+    """Return the first item with each timestamp."""
     at: dict[float, Timed] = {}  # association is quadratic in the number of duplicates
     for item in items:
         at.setdefault(item.timestamp, item)

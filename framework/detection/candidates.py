@@ -41,7 +41,7 @@ class Candidates:
     """
 
     boxes: Float32  # (K, 4) px
-    class_scores: Float32  # (K, C) in [0, 1], multiplied by the objectness
+    class_scores: Float32  # (K, C) in [0, 1], multiplied by the objectness, if any
 
     def best(self, threshold: float, nms: float, limit: int) -> Int32:
         """Select candidates by score and non-maximum suppression.

@@ -28,7 +28,7 @@ class FalsePositiveCell:
 def false_positive_cells(frame: Frame, seed: int, count: int) -> list[FalsePositiveCell]:
     """Return the visible grid cells at which false positives are simulated.
 
-    Cells with objects of known class are excluded. The result is empty if the frame has no pose or no ground truth.
+    Readings on objects of known class are ignored. The result is empty if the frame has no pose or no ground truth.
 
     Args:
         frame: The frame.

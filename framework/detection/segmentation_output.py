@@ -220,9 +220,12 @@ def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness:
 
 
 def _box_kind(boxes: Float32, suppressed: bool) -> BoxKind | None:
-    """Detect if boxes (K, 4) are corners or centers and sizes.
+    """Detect whether boxes (K, 4) are corners, or centers and sizes.
 
-    The result is None if the boxes of detections are ambiguous. The boxes of cells must not be ambiguous.
+    The result is None if the boxes of detections are ambiguous.
+
+    Raises:
+        DataError: The boxes of cells are ambiguous.
     """
     if suppressed and len(boxes) < MIN_ROWS:
         return None
@@ -241,7 +244,11 @@ def _box_kind(boxes: Float32, suppressed: bool) -> BoxKind | None:
 
 
 def _is_unit(boxes: Float32, shape: tuple[int, int], suppressed: bool) -> bool | None:
-    """Return True if boxes (K, 4) are in 0..1, False if they are in px, and None without boxes."""
+    """Return True if boxes (K, 4) are in 0..1, False if they are in px, and None without boxes.
+
+    Raises:
+        DataError: The boxes of cells do not cover the input.
+    """
     if not len(boxes):
         return None
     if float(np.abs(boxes).max()) <= LARGEST_UNIT:

@@ -35,7 +35,7 @@ def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) ->
         min_pixels: The minimum number of pixels of an instance.
 
     Raises:
-        DataError: The sequence has no instance ground truth, or a class is missing in `classes`.
+        DataError: The sequence has no instance ground truth, or a class is missing from `classes`.
     """
     if frame.truth is None:
         raise DataError(

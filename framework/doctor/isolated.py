@@ -47,7 +47,7 @@ def _run(code: str) -> tuple[str, str]:
 
 
 def acceleration() -> None:
-    """Print, as JSON, the GPUs and the support of 8-bit kernels by the CPU."""
+    """Print, as JSON, the GPUs and the CPU support for 8-bit kernels."""
     import torch
 
     from framework.detection.runtimes.caffe2_network import has_int8_kernels

@@ -22,7 +22,7 @@ MODULES = {
     "pyyaml": "yaml",
     "scikit-learn": "sklearn",
 }
-"""Import name of each package whose import name differs from its package name."""
+"""Import name of each package whose import name differs from its package name, apart from - and _."""
 
 
 @cache

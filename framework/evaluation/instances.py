@@ -230,7 +230,7 @@ def judge(
     Predictions are matched as for `InstanceEvaluation.overall`.
 
     Returns:
-        The result of each prediction, in order of decreasing confidence. The class of each evaluated ground-truth
+        The result of each prediction, in order of decreasing confidence, and the class of each evaluated ground-truth
         instance without a correct prediction, by id.
     """
     overlaps = _Overlaps.between(predictions, truth, Transfer.TO_TRUTH, MAX_DISTANCE, MIN_POINTS)

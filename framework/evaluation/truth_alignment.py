@@ -18,7 +18,8 @@ def in_map_world(truth: SceneTruth, timestamps: Float64, poses: Float64) -> Scen
     """Return the ground truth in the world frame of a map.
 
     Both share one world frame if the run can read the ground-truth poses and the first common pose is equal. Otherwise,
-    the ground truth is rigidly aligned with the map by the poses at common times.
+    the ground truth is rigidly aligned with the map by the poses at common times. A ground truth without a trajectory
+    is returned unchanged.
 
     Args:
         truth: Ground truth.

@@ -117,7 +117,7 @@ def export(
         out: Output folder; None = `export` in the run directory.
         chosen: Options; None = defaults.
         up: Up direction (3,) in the world frame; None = stored direction.
-        floor: Floor height along the up direction, m; None = stored height.
+        floor: Floor height along the up direction, m; None = stored height, or unknown if `up` is given.
 
     Returns:
         The paths of the files.

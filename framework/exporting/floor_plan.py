@@ -34,7 +34,7 @@ TONES = {
 DPI = 150
 TINT = 0.6  # fraction of the object's color in its cells
 DARKER = 0.65  # brightness factor of outlines
-LONGER_SIDE, SHORTEST_SIDE = 9.0, 4.5  # of the plan, inches
+LONGER_SIDE, SHORTEST_SIDE = 9.0, 4.5  # inches, longer side and minimum width of the plan
 FOOT = 0.72  # height of the legend, inches
 EDGE = 0.15  # margin of the page, inches
 TEXT_PT, SMALL_PT = 8.0, 7.0
@@ -43,7 +43,7 @@ MAX_BAR_FRACTION = 0.25  # maximum length of the scale bar, as a fraction of the
 MOVES = ((0, 0), (0, 1), (0, -1), (0, 2), (0, -2), (0.6, 1), (-0.6, 1), (0.6, -1), (-0.6, -1))
 """Candidate offsets of a name in x and y, as multiples of its width and height."""
 COORDINATES = "x, y in meters in the room frame (z up, floor at z = 0), not longitude and latitude"
-DIGITS = 4  # decimal places, of meters
+DIGITS = 4  # decimal places of lengths in m
 
 
 def write_floor_plan(path: Path, room: UprightRoom, plan: Plan, robot_height: float) -> None:

@@ -45,7 +45,8 @@ class Relation:
     source: int  # object id
     name: str  # "on", "in", "next_to", "attached_to"
     target: int | str  # object id, "floor" or "walls"
-    measures: Mapping[str, float] = field(default_factory=dict)  # "height" or "distance", m
+    # m, "height" of the base of the source above z = 0, or "distance" between the two surfaces
+    measures: Mapping[str, float] = field(default_factory=dict)
 
 
 def relations(room: UprightRoom, plan: Plan | None) -> list[Relation]:

@@ -16,7 +16,7 @@ from framework.exporting.rooms import Rooms, rooms
 from framework.exporting.upright_room import RoomObject, UprightRoom
 from framework.files.json_file import write_json
 
-DIGITS = 4  # decimal places of meters
+DIGITS = 4  # decimal places of lengths in m and areas in m^2
 
 
 def write_scene_graph(path: Path, room: UprightRoom, plan: Plan | None) -> None:

@@ -117,7 +117,7 @@ class UprightRoom:
             if not by_id and not of_class:
                 best = max(one.confidence for one in by_class)
                 raise DataError(
-                    f"object: expected a confidence >= {min_confidence:g} of {word!r}, got at most {best:.2f}; "
+                    f"object: expected a confidence >= {min_confidence:g} for {word!r}, got at most {best:.2f}; "
                     "lower min_confidence"
                 )
             found |= {one.id: one for one in (*by_id, *of_class)}
@@ -139,7 +139,7 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
     Args:
         run: Run directory.
         up: Up direction (3,) in the world frame; None = stored direction.
-        floor: Floor height along the up direction, m; None = stored height.
+        floor: Floor height along the up direction, m; None = stored height, or unknown if `up` is given.
 
     Raises:
         DataError: Files are missing, invalid or inconsistent.
@@ -175,13 +175,14 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
     }
     seen = sorted((one for one in instances if len(owned[one.id])), key=lambda one: one.id)
     likely = {one.id for one in seen if one.confidence >= LIKELY}
-    colors = object_colors({one.id: mesh.vertices[owned[one.id]].mean(axis=0) for one in seen}, likely)
+    centers = {one.id: mesh.vertices[owned[one.id]].mean(axis=0).astype(np.float64) for one in seen}
+    colors = object_colors(centers, likely)
     of_class = class_colors([(one.class_name, one.confidence) for one in seen])
     found = []
     for one in seen:
         own = owned[one.id]
         _, piece, sizes = np.unique(pieces[own], return_inverse=True, return_counts=True)
-        own = own[(sizes >= min(SPECK * len(own), sizes.max()))[piece]]
+        own = own[(sizes >= min(SPECK * len(own), int(sizes.max())))[piece]]
         found.append(
             RoomObject(
                 id=one.id,

@@ -27,7 +27,7 @@ from framework.errors import DataError
 from framework.exporting.object_meshes import Coloring, Part, linear, part_colors
 from framework.files.atomic_write import atomic_write
 
-MISSING = "usd: expected the package usd-core, got none; run pip install instancemap[usd]"
+MISSING = "usd: expected the package usd-core, got none; run pip install 'instancemap[usd]'"
 NOT_WRITTEN = "the USD library failed"
 THINNEST = 0.002  # minimum side of a collision box, m; an object observed from one side may be flat
 GRAVITY = 9.81  # m/s^2

@@ -3,115 +3,45 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 from tqdm import tqdm
 
-from framework.config.validation import checked_rows
 from framework.data import SceneTruth
 from framework.errors import DataError, InstanceMapError
-from framework.figures.figure_choice import FigureChoice
+from framework.figures.class_heatmap import class_heatmap
+from framework.figures.curve_figure import curve_figure, progress_figure
+from framework.figures.distribution_figure import bar_figure, box_figure
 from framework.figures.figure_page import Page
+from framework.figures.figure_runs import Pictured
 from framework.figures.map_figure import CaptionedLine, map_figure, panel_size
 from framework.figures.map_panels import panel_line
 from framework.figures.stage_times import COLUMNS, WINDOW, MeanTimes, stage_times_figure
+from framework.figures.tradeoff_figure import tradeoff_figure
 from framework.runs.reevaluation import Truth
-from framework.runs.run_rows import Run, RunRow, natural, rows_of
+from framework.runs.run_rows import Run, RunRow
 from framework.runs.stored_map import StoredMap
-from framework.runs.stored_runs import Incomplete, Record, completed_runs, read_yaml
-from framework.runs.sweep_file import SWEEP, asked_keys, command_line
+from framework.runs.stored_runs import Record
 from framework.runs.timings_file import StageTimes, read_timings
-from framework.tables.table_notes import counted, data, machine
-
-NAME = "figure"  # name of the files and of the config block
 
 log = logging.getLogger(__name__)
 
 Read = TypeVar("Read")
 
 
-def write_figure(directory: Path) -> list[Path]:
+def write_figure(directory: Path, overrides: Sequence[str] = ()) -> list[Path]:
     """Write figure.png and figure.pdf of the runs below `directory` into it, and return their paths.
 
-    Incomplete or unreadable runs are logged and omitted. Raises DataError if no run remains.
+    `overrides` change the settings of the figure, such as figure.kind=bar; figure.file_name names other files.
+    Incomplete or unreadable runs are logged and omitted. Raises DataError if no run remains, and ConfigError for an
+    invalid figure.
     """
-    pictured = Pictured.below(directory)
+    pictured = Pictured.below(directory, overrides)
     if missing := list(pictured.missing()):
         log.warning("omitted from the figure: %s", "; ".join(missing))
-    return DRAWN[pictured.choice.kind](pictured).write(directory / NAME)
-
-
-@dataclass(frozen=True)
-class Pictured:
-    """The runs shown in a figure."""
-
-    choice: FigureChoice
-    rows: Mapping[str, RunRow | None]  # by display name; None = no complete run
-    incomplete: Sequence[Incomplete]
-    command_line: Sequence[str] = ()  # overrides of the sweep on the command line
-
-    @classmethod
-    def below(cls, directory: Path) -> Pictured:
-        """Read the runs in and below `directory`, as defined by the sweep's config.
-
-        Raises DataError if the sweep has no figure or no complete run, and ConfigError if its figure block is invalid.
-        """
-        if not directory.is_dir():
-            raise DataError(f"{directory}: expected a folder of runs, got no folder")
-        if not (directory / SWEEP).exists():
-            raise DataError(
-                f"{directory}: expected the folder of an experiment, got a folder without {SWEEP}; run an "
-                "experiment such as experiment=figure4_progress"
-            )
-        sweep = read_yaml(directory / SWEEP)
-        if not sweep.get(NAME):
-            raise DataError(
-                f"{directory / SWEEP}: expected a block `{NAME}:`, got none; run an experiment with a figure "
-                "such as experiment=figure4_progress"
-            )
-        choice = FigureChoice.of(sweep[NAME])
-        overrides = checked_rows(sweep.get("rows"))
-        records, incomplete = completed_runs(directory)
-        found = rows_of(records, choice.over, overrides, asked_keys(sweep))
-        rows: dict[str, RunRow | None] = {}
-        for system in dict.fromkeys([*overrides, *(row.system for row in found)]):
-            of_system: dict[str, RunRow | None] = {choice.called(row): row for row in found if row.system == system}
-            rows |= of_system or {choice.names.get(system, system): None}
-        return cls(choice, rows, incomplete, command_line(sweep))
-
-    @property
-    def runs(self) -> list[Run]:
-        """All runs of the rows, sorted by sequence."""
-        found = {run for row in self.rows.values() if row for run in row.records}
-        return sorted(found, key=lambda run: natural(run[::-1]))
-
-    @property
-    def records(self) -> list[Record]:
-        return [record for row in self.rows.values() if row for record in row.records.values()]
-
-    @property
-    def origin(self) -> str:
-        """Return the data, the overrides on the command line, the machine and the code of the runs."""
-        chosen = f" Command line: {' '.join(self.command_line)}." if self.command_line else ""
-        runs = self.records
-        code = counted(record.commit for record in runs)
-        return f"Data: {data(runs)}.{chosen} {counted(map(machine, runs))}; code {code}."
-
-    def called(self, run: Run) -> str:
-        """Return the name of the run's sequence, with the seed if the runs have several seeds."""
-        seeds = {other[0] for other in self.runs}
-        return run[-1] if len(run) == 1 or len(seeds) == 1 else f"{run[-1]}, seed {run[0]}"
-
-    def missing(self) -> Iterator[str]:
-        """Yield incomplete runs with their reasons, and the missing runs of each row."""
-        for one in self.incomplete:
-            yield f"{one.directory.name}: {one.reason}"
-        for name, row in self.rows.items():
-            if absent := [self.called(run) for run in self.runs if row is None or run not in row.records]:
-                yield f"{name} without {', '.join(absent)}"
+    return DRAWN[pictured.choice.kind](pictured).write(directory / pictured.choice.file_name)
 
 
 def _stage_times(pictured: Pictured) -> Page:
@@ -168,7 +98,16 @@ def _maps(pictured: Pictured) -> Page:
     return map_figure(heads, lines, f"{note} {pictured.origin}")
 
 
-DRAWN: Mapping[str, Callable[[Pictured], Page]] = {"stage_times": _stage_times, "maps": _maps}
+DRAWN: Mapping[str, Callable[[Pictured], Page]] = {
+    "stage_times": _stage_times,
+    "maps": _maps,
+    "bar": bar_figure,
+    "box": box_figure,
+    "tradeoff": tradeoff_figure,
+    "curve": curve_figure,
+    "progress": progress_figure,
+    "class_heatmap": class_heatmap,
+}
 """Drawing functions by FigureChoice.kind."""
 
 

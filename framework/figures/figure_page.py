@@ -26,6 +26,7 @@ PNG_DPI = 200
 PDF_DPI = 300  # resolution of raster images in a PDF
 NOTE_LINE_MM = 2.35  # line spacing of the note
 MARGIN_MM = 1.0
+BREAKS = "_=,/-"  # characters after which a long word is broken
 HINTED = 1.03  # maximum ratio of the width of hinted text in a PNG to the width of its outlines
 
 logging.getLogger("fontTools").setLevel(logging.WARNING)  # fontTools logs a hundred lines about each font in a PDF
@@ -35,7 +36,7 @@ class Page:
     """A white page with a note at the bottom. Coordinates are in mm from the lower left corner above the note."""
 
     def __init__(self, width: float, height: float, note: str) -> None:
-        lines = _wrapped(note, (width - 2 * MARGIN_MM) / HINTED)
+        lines = wrapped(note, (width - 2 * MARGIN_MM) / HINTED, NOTE_PT)
         self._foot = NOTE_LINE_MM * len(lines) + 2 * MARGIN_MM
         self._size = width, height + self._foot
         self.figure = Figure((self._size[0] / INCH_MM, self._size[1] / INCH_MM), facecolor="white")
@@ -74,15 +75,23 @@ def text_width(text: str, size: float) -> float:
     return float(width) / 72 * INCH_MM
 
 
-def _wrapped(text: str, width: float) -> list[str]:
-    """Return the text as lines that are at most `width` mm wide."""
+def wrapped(text: str, width: float, size: float) -> list[str]:
+    """Return the text as lines that are at most `width` mm wide with font size `size`, pt.
+
+    Lines break at spaces, and after the characters in BREAKS or anywhere in a word that is wider than a line.
+    """
     lines: list[str] = []
     for word in text.split():
         longer = f"{lines[-1]} {word}" if lines else word
-        if lines and text_width(longer, NOTE_PT) <= width:
+        if lines and text_width(longer, size) <= width:
             lines[-1] = longer
-        else:
-            lines.append(word)
+            continue
+        while text_width(word, size) > width and len(word) > 1:
+            fitting = next(k for k in range(len(word) - 1, 0, -1) if k == 1 or text_width(word[:k], size) <= width)
+            end = max((k for k in range(1, fitting + 1) if word[k - 1] in BREAKS), default=fitting)
+            lines.append(word[:end])
+            word = word[end:]
+        lines.append(word)
     return lines
 
 
@@ -109,5 +118,7 @@ def draw_names(axes: Axes, ids: Int32, names: Mapping[int, str], size: float, wi
 
 
 def write_message(axes: Axes, text: str) -> None:
-    """Write a message into empty axes."""
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=TEXT_PT, color=FAINT_INK)
+    """Write a message into empty axes, smaller in narrow axes."""
+    width = axes.bbox.width / axes.figure.dpi * INCH_MM
+    size = TEXT_PT * min(1.0, (width - MARGIN_MM) / text_width(text, TEXT_PT) / HINTED)
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=size, color=FAINT_INK)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -11,6 +12,7 @@ from matplotlib.patches import Rectangle
 
 from framework.figures.figure_page import (
     FAINT_INK,
+    HINTED,
     INCH_MM,
     INK,
     NOTE_PT,
@@ -21,6 +23,7 @@ from framework.figures.figure_page import (
     Page,
     draw_names,
     text_width,
+    wrapped,
     write_message,
 )
 from framework.figures.map_panels import Panel, PanelLine
@@ -28,6 +31,7 @@ from framework.rendering.camera_path import ProjectedPath
 
 HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # space above the columns, below a line of panels, and between panels
 LEFT_MM, RIGHT_MM = 3.5, 0.3  # space to the left and to the right of the panels
+TEXT_LINE_MM, SMALL_LINE_MM = 3.0, 2.6  # line spacing of headings and captions
 ASPECT = 0.78  # height of a panel divided by its width
 
 
@@ -62,17 +66,22 @@ def map_figure(heads: Sequence[str], lines: Sequence[CaptionedLine], note: str) 
     width = _panel_mm(len(heads))
     height = width * ASPECT
     lefts = [LEFT_MM + k * (width + GAP_MM) for k in range(len(heads))]
-    top = sum(line.rows * (height + GAP_MM) - GAP_MM + CAPTION_MM for line in lines)
-    page = Page(PAGE_MM, top + HEAD_MM, note)
-    for left, head in zip(lefts, heads, strict=True):
-        page.text(left + width / 2, top + 1.2, head, ha="center", fontsize=TEXT_PT, color=INK)
-    for line in lines:
+    headings = [wrapped(head, width / HINTED, TEXT_PT) for head in heads]
+    captions = [[wrapped(text, width / HINTED, SMALL_PT) for text in line.captions] for line in lines]
+    feet = [CAPTION_MM + SMALL_LINE_MM * (max([1, *map(len, texts)]) - 1) for texts in captions]
+    top = sum(line.rows * (height + GAP_MM) - GAP_MM + foot for line, foot in zip(lines, feet, strict=True))
+    page = Page(PAGE_MM, top + HEAD_MM + TEXT_LINE_MM * (max(map(len, headings)) - 1), note)
+    for left, heading in zip(lefts, headings, strict=True):
+        style: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": TEXT_PT, "color": INK}
+        page.text(left + width / 2, top + 0.8, "\n".join(heading), **style)
+    for line, texts, below in zip(lines, captions, feet, strict=True):
         foot = top - line.rows * (height + GAP_MM) + GAP_MM
         vertical = {"rotation": 90, "ha": "center", "va": "center"}
         size = TEXT_PT * (top - foot) / max(top - foot, text_width(line.name, TEXT_PT))
         page.text(LEFT_MM / 2 - 0.2, (top + foot) / 2, line.name, fontsize=size, color=INK, **vertical)
-        for left, caption in zip(lefts, line.captions, strict=True):
-            page.text(left + width / 2, foot - 1, caption, ha="center", va="top", fontsize=SMALL_PT, color=FAINT_INK)
+        for left, caption in zip(lefts, texts, strict=True):
+            style = {"ha": "center", "va": "top", "fontsize": SMALL_PT, "color": FAINT_INK}
+            page.text(left + width / 2, foot - 1, "\n".join(caption), **style)
         overall = [page.axes(left, top - height, width, height) for left in lefts]
         for axes, panel in zip(overall, line.panels.maps, strict=False):
             _draw(axes, panel, "incomplete")
@@ -87,7 +96,7 @@ def map_figure(heads: Sequence[str], lines: Sequence[CaptionedLine], note: str) 
                 if panel:
                     draw_names(larger, panel.objects, panel.names, NOTE_PT, width)
                     axes.add_patch(Rectangle(corner, window.width, window.height, fill=False, ec=INK, linewidth=0.5))
-        top = foot - CAPTION_MM
+        top = foot - below
     return page
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
-from scipy.optimize import isotonic_regression
 
 from framework.data import Float64, Int64
 from framework.figures.figure_page import COLUMN_MM, FAINT_INK, INK, NOTE_PT, SMALL_PT, TEXT_PT, Page, write_message
+from framework.figures.metric_axes import spread, style_axes
 from framework.runs.timings_file import StageTimes
 
 WINDOW = 9  # number of frames in the window of the running median
@@ -94,15 +94,6 @@ def running_median(values: Float64, window: int) -> Float64:
     return np.where(np.isnan(values), np.nan, medians)
 
 
-def spread(positions: Sequence[float], gap: float) -> list[float]:
-    """Return positions in the same order, at least `gap` apart, with the smallest sum of squared displacements."""
-    order = np.argsort(positions, kind="stable")
-    steps = gap * np.arange(len(order))
-    result = np.empty(len(order))
-    result[order] = isotonic_regression(np.asarray(positions)[order] - steps).x + steps
-    return result.tolist()
-
-
 def stage_times_figure(rows: Mapping[str, MeanTimes | None], note: str) -> Page:
     """Return a page with one diagram per row (None = no run) and `note` at the bottom."""
     step = HEAD_MM + PLOT_MM + AXIS_MM
@@ -133,16 +124,11 @@ def _draw(axes: Axes, times: MeanTimes) -> None:
     axes.set_xlim(times.frames[0], max(times.frames[-1], times.frames[0] + 1))
     lowest, highest = axes.get_ylim()
     axes.set_ylim(lowest, max(highest, 1.25 * max(RATES)))
+    style_axes(axes, "frame", "milliseconds per frame", "y")
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.yaxis.set_major_locator(LogLocator())
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.tick_params(labelsize=SMALL_PT, width=0.4, length=2, pad=2, color=FAINT_INK, labelcolor=INK)
     axes.tick_params(which="minor", width=0.3, length=1.2, color=FAINT_INK)
-    axes.grid(axis="y", color="#e6e8eb", linewidth=0.4)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel("frame", fontsize=SMALL_PT, labelpad=1.5, color=INK)
-    axes.set_ylabel("milliseconds per frame", fontsize=SMALL_PT, labelpad=1.5, color=INK)
     for milliseconds, rate in RATES.items():
         axes.axhline(milliseconds, color=FAINT_INK, linewidth=0.5, dashes=(1.5, 2))
         halo = [withStroke(linewidth=1.2, foreground="white")]

@@ -65,8 +65,8 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
             owner = holder(directory) or "another process"
             if not wait:
                 raise DataError(
-                    f"{directory}: expected an unlocked directory, got one in use by {owner}; wait for it to exit, or "
-                    "stop it"
+                    f"{directory}: expected an unlocked directory, got a directory in use by {owner}; wait for it to "
+                    "exit, or stop it"
                 ) from error
             log.warning("%s: in use by %s; waiting for it to exit", directory, owner)
             lock.acquire()

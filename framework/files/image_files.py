@@ -1,6 +1,6 @@
 """Image readers that reject damaged files.
 
-Pillow accepts truncated files, so that the end marker is checked here. JPEG files are decoded with simplejpeg, which
+Pillow accepts truncated files, so the end marker is checked here. JPEG files are decoded with simplejpeg, which
 raises an error for damaged data. OpenCV fills the damaged regions without an error.
 """
 

@@ -18,7 +18,7 @@ from framework.errors import DataError, errors_of
 from framework.files.atomic_write import atomic_write, read_text
 from framework.geometry import nearest_rigid
 
-SHOWN = 60  # maximum number of characters of a file in an error message
+SHOWN = 60  # maximum number of characters that an error message quotes from a file
 COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is NaN in Microsoft's C library
 GRAVITY_COLUMNS = "x y z"
 IMAGE_TIME_COLUMNS = "color depth"

@@ -60,7 +60,7 @@ def check_yaml(where: object, text: str) -> None:
     """Check a YAML text without loading it.
 
     Raises:
-        DataError: There are more than MAX_VALUES values or MAX_DEPTH levels.
+        DataError: There are more than MAX_VALUES values or MAX_DEPTH levels, or an alias precedes its anchor.
         YAMLError: The text is not valid YAML.
     """
     counts = [0]  # number of values of each open mapping and list, outermost first

@@ -39,7 +39,7 @@ def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, targ
 
     Depth is interpolated if the four readings around a pixel belong to one surface. Otherwise, the pixel gets the
     reading with the largest weight, so that no depth lies between two surfaces. The weights are those of joint
-    bilateral upsampling (Kopf et al., SIGGRAPH 2007). Pixels without a reading stay empty.
+    bilateral upsampling (Kopf et al., SIGGRAPH 2007). Pixels whose nearest reading is missing get 0.
 
     Args:
         depth: The depth (h, w), m, with the field of view of `camera`, 0 = no reading.

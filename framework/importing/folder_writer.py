@@ -27,13 +27,14 @@ from framework.importing.source import SURE, UNSURE, DeviceFrame, Source
 DEPTH_SCALE = 1000.0  # units per meter
 LONGER_SIDE = 640  # px, default for written images; trackers and detectors are tuned for this size
 JPEG_QUALITY = 95  # percent
+ODOMETRY = "odometry.txt"  # file for dataset.odometry, which is not read by default
 
 
 @dataclass(frozen=True)
 class Writing:
     """Options for writing an RGB-D folder."""
 
-    width: int = 0  # px, before rotation, at most the stored width; 0 = LONGER_SIDE for the longer side
+    width: int = 0  # width of the images before rotation, px, at most the stored width; 0 = 640 px for the longer side
     stride: int = 1  # step between frames; 1 = every frame
     confidence: int = 1  # minimum confidence of depth readings, 0, 1 or 2, for recordings with confidence images
     rotate: int = 0  # rotation of the written images, degrees clockwise, 0, 90, 180 or 270
@@ -75,7 +76,7 @@ def check_new(directory: Path) -> None:
     if directory.is_dir() and not any(directory.iterdir()):
         return
     if directory.exists() or directory.is_symlink():
-        found = "got a file or non-empty folder; remove it or set another"
+        found = "got a file or non-empty folder; remove it or set another folder"
         raise DataError(f"{directory}: expected a new or empty folder, {found}")
 
 
@@ -116,6 +117,9 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
         raise DataError(f"{source.format}: expected usable frames, got none; {reason}")
     if source.posed:
         write_tum(directory / "poses.txt", written.timestamps, written.poses)
+    if source.odometry is not None:
+        poses = [turn.pose(T) if source.odometry.of_camera else T for T in source.odometry.poses]
+        write_tum(directory / ODOMETRY, source.odometry.timestamps, poses)
     if any(time is not None for time in written.depth_timestamps):
         pairs = zip(written.timestamps, written.depth_timestamps, strict=True)
         times = [(color, color if depth is None else depth) for color, depth in pairs]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,6 +56,15 @@ class DeviceFrame:
             raise FrameError(f"{self.name}: {expected}, got {self.confidence.shape}")
 
 
+@dataclass(frozen=True)
+class StoredOdometry:
+    """Odometry of a recording, at its own rate."""
+
+    timestamps: Float64  # (L,) s, increasing
+    poses: Sequence[Float64]  # T_odom_camera (4, 4), or T_odom_base if not `of_camera`
+    of_camera: bool
+
+
 StoredFrame = Callable[[], DeviceFrame]  # reads a frame; raises DataError if the frame is unusable
 
 
@@ -72,6 +81,7 @@ class Source:
     posed: bool  # True if the recording has poses; frames without a pose are then skipped
     distortion: Distortion | None = None  # lens distortion of color and depth; None = pinhole camera
     sensor: SensorKind | None = None  # kind of the depth sensor; None = unknown
+    odometry: StoredOdometry | None = None  # None = none
 
 
 @dataclass(frozen=True)
@@ -108,5 +118,5 @@ def meters(raw: NDArray[np.uint16]) -> Float32:
 
 
 def readings(depth: NDArray[np.floating]) -> Float32:
-    """Convert depth (h, w), m, to float32 and replace invalid values by 0."""
+    """Convert depth (h, w), m, to float32 and replace invalid values with 0."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

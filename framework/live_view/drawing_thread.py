@@ -198,7 +198,7 @@ class DrawingThread:
 class Pace:
     """Rate limiter of an operation.
 
-    The operation may run once per interval, and may take a fraction of the time of the clock.
+    The operation runs at most once per interval. It takes at most the given fraction of the clock's time on average.
     """
 
     def __init__(self, interval: float, fraction: float, clock: Callable[[], float] = time.perf_counter) -> None:

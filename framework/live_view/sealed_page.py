@@ -1,6 +1,6 @@
 """Server of the web viewer of rerun that blocks requests to other hosts.
 
-In rerun-sdk 0.41, `rr.serve_web_viewer` has no bind address and listens on 0.0.0.0. `rerun --serve-web --bind` listens
+In rerun-sdk 0.41, `rr.serve_web_viewer` has no bind option and listens on 0.0.0.0. `rerun --serve-web --bind` listens
 on 127.0.0.1, but its page sends usage statistics and requests news, examples and fonts. This module therefore downloads
 the files of the page from the server of rerun. It serves them on 127.0.0.1 with a Content-Security-Policy.
 """

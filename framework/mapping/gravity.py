@@ -171,7 +171,7 @@ def half_sphere(count: int) -> Float64:
 
 
 def level_or_upright(normals: Float64, areas: Float64, directions: Float64, facing_up: float = 1.0) -> Float64:
-    """Return the fraction (D,) of the surface that is horizontal or vertical if each direction is up.
+    """Return the fraction (D,) of the surface that is horizontal or vertical for each candidate up direction.
 
     The contribution of a triangle decreases with its angle to horizontal or vertical.
 
@@ -179,7 +179,7 @@ def level_or_upright(normals: Float64, areas: Float64, directions: Float64, faci
         normals: The unit normals (N, 3) of the triangles.
         areas: The areas (N,) of the triangles, m^2.
         directions: The candidate up directions (D, 3), unit vectors.
-        facing_up: The weight of horizontal triangles that face up.
+        facing_up: The weight of horizontal triangles that face up. If it is not 1, the result is not a fraction.
     """
     signed = normals.astype(np.float32) @ directions.T.astype(np.float32)
     cosines = np.abs(signed)

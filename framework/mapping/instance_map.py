@@ -48,7 +48,7 @@ class InstanceMap(InstanceTableMap):
         self,
         volume: TsdfVolume,
         labels: EvidenceRows,
-        logarithmic: bool,  # True if the evidence is log-likelihoods
+        logarithmic: bool,  # True = the evidence consists of log-likelihoods
         confirmation: Confirmation,
         instance_class: InstanceClass = InstanceClass.DETECTIONS,
     ) -> None:

@@ -20,7 +20,7 @@ BY = ("embeddings", "names")
 MIN_MATCH = 0.1  # minimum similarity of a match by names
 LONGEST_QUERY = 1000  # maximum number of characters of a query
 NAME_IT = "set --model (Python: model=)"
-WITH_EMBEDDINGS = "detector=with_embeddings (CLIP or SigLIP: pip install instancemap[transformers])"
+WITH_EMBEDDINGS = "detector=with_embeddings (CLIP or SigLIP: pip install 'instancemap[transformers]')"
 
 
 @dataclass(frozen=True)

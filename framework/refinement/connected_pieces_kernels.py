@@ -28,7 +28,7 @@ def find_pieces(
     pixels: Int32, firsts: Int64, depth: Float32, connection: Connection, min_ratio: np.float32, max_slope: np.float32,
     schedule: ThreadSchedule, stays: Bool,
 ) -> None:  # fmt: skip
-    """Find the points that in_near_pieces() keeps.
+    """Find the points in the kept connected components of their cluster.
 
     Args:
         pixels: The pixels (M, 2), u and v, of the points, cluster by cluster.

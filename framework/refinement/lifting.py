@@ -24,7 +24,7 @@ def lift(detections: Detections, frame: Frame, pose: Pose, color_pixels: Int32 |
             have the same pixels. Ignored for exact masks of the depth image.
 
     Raises:
-        DataError: If `detections` has another type, or if its masks have another size than the frame.
+        DataError: If `detections` is not a Detections object, or if the size of its masks differs from the frame.
     """
     if not isinstance(cast(object, detections), Detections):
         raise DataError(f"frame {frame.index}: expected Detections from the detector, got {type(detections).__name__}")

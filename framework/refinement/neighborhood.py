@@ -60,9 +60,9 @@ class Neighborhoods:
     def mask_log_odds(self, largest: float, expected_bleed: float) -> Float32:
         """Return the log-odds (S,) of each point for the object, from its distance to the border of the mask.
 
-        The log-odds change linearly from `largest` inside the mask to -`largest` outside. They are 0 inside the border,
-        because masks often extend beyond the object. Thin masks get a shorter ramp, so that their center reaches
-        `largest`.
+        The log-odds change linearly from `largest` inside the mask to -`largest` outside. They are 0 at some distance
+        inside the border, because masks often extend beyond the object. Thin masks get a shorter ramp, so that their
+        center reaches `largest`.
 
         Args:
             largest: The maximum log-odds.
@@ -112,7 +112,7 @@ class Surroundings:
         return self._gathered(self.mask_counts, self.mask_counts, np.ones_like(self.ring_counts))
 
     def kept(self, good: Bool, judged: Bool) -> Bool:
-        """Return a Boolean array (P,), True for the points of all clusters to keep.
+        """Return a Boolean array (P,) over the points of all clusters, True for points to keep.
 
         Args:
             good: A Boolean array (M,) in the order of own(), True for points to keep.
@@ -190,8 +190,8 @@ def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
 def thread_schedule(costs: Int64) -> ThreadSchedule:
     """Assign each cluster to the thread with the least work, in order of decreasing cost.
 
-    `costs` (N,) is the number of points of each cluster. Numba would assign equal numbers of clusters, but a few large
-    clusters contain most of the points.
+    `costs` (N,) contains the number of points of each cluster. Numba would assign equal numbers of clusters, but a few
+    large clusters contain most of the points.
     """
     longest_first = np.argsort(-costs, kind="stable")
     return ThreadSchedule(*share_among_threads(costs, longest_first, numba.get_num_threads()))

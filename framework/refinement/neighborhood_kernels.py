@@ -12,7 +12,7 @@ from framework.data import Bool, Float32, Int32, Int64
 
 Int16 = npt.NDArray[np.int16]
 
-# 3-4 chamfer distance (Borgefors, 1986) in thirds of a pixel; within 8 % of the Euclidean distance
+# 3-4 chamfer distance (Borgefors, 1986) in thirds of a pixel; within 8% of the Euclidean distance
 CHAMFER_STEP, CHAMFER_DIAGONAL = np.int16(3), np.int16(4)
 FAR = np.int16(30000)  # 10,000 px; two more steps do not overflow
 PX_PER_STEP = np.float32(1) / np.float32(CHAMFER_STEP)
@@ -122,8 +122,8 @@ def signed_distances(
 ) -> None:  # fmt: skip
     """Compute the distance of each pixel to the border of the mask, and the size of the ring.
 
-    The border is next to depth readings outside the mask. Pixels without a reading are no border, because the depth of
-    objects often has holes.
+    The border is next to depth readings outside the mask. Pixels without a reading are not a border, because the depth
+    of objects often has holes.
 
     Args:
         windows: The windows of the clusters.
@@ -328,7 +328,7 @@ def _back_project(u: int, v: int, z: np.float32, pinhole: Float32, points: Float
 def ramps(
     depth_in_mask: Float32, starts: Int64, widths: Float32, expected_bleed: float, largest: float, log_odds: Float32
 ) -> None:
-    """Compute the log-odds of Neighborhoods.mask_log_odds().
+    """Compute the log-odds of each point for the object, from its distance to the border of the mask.
 
     Args:
         depth_in_mask: The distance (S,) of each point to the border of the mask, px.

@@ -17,7 +17,7 @@ from framework.refinement.refine_kernels import compress, part_starts
 def refine(refiner: ClusterRefiner, clusters: PointClusters, frame: Frame) -> PointClusters:
     """Return the refined clusters.
 
-    Clusters from exact masks, and of frames without a detector run, are returned unchanged.
+    Clusters from exact masks or from frames without a detector run are returned unchanged.
 
     Raises:
         DataError: If the refiner does not return PointClusters, or if it returns pixels outside the image.

@@ -39,7 +39,7 @@ class Hits:
         return self.interpolated(self.vertices)
 
     def subsampled(self, n: int) -> Hits:
-        """Return the hits of every n-th column and row."""
+        """Return the visible surface points of every n-th column and row."""
         seen, c = self.buffer, self.camera
         triangle, depth = np.ascontiguousarray(seen.triangle[::n, ::n]), np.ascontiguousarray(seen.depth[::n, ::n])
         height, width = depth.shape

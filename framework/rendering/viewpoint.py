@@ -123,7 +123,7 @@ def looking(forward: Float64, up: Float64) -> Float64:
 
 
 def fitted(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return a camera and its pose (4, 4), from which all points except outliers are visible.
+    """Return a camera and a camera pose (4, 4) from which all points except outliers are visible.
 
     Args:
         R_world_camera: The rotation (3, 3) of the camera.
@@ -142,7 +142,7 @@ def _without_strays(points: Float32) -> Float32:
 
 
 def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return a camera and its pose (4, 4), from which all points are visible."""
+    """Return a camera and a camera pose (4, 4) from which all points are visible."""
     focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     x, y, z = R_world_camera.T @ points_world.T

@@ -10,7 +10,7 @@ from framework.data import Float32, Float64, Int32
 
 @njit(cache=True, nogil=True)
 def sum_level_normals(normals: Float32, up: Float64, cosine: float) -> tuple[Float64, float]:
-    """Return the sum (3,) of the face normals in a cone around `up`, and the fraction of their area.
+    """Return the sum (3,) of the face normals in a cone around `up`, and their fraction of the total area.
 
     Args:
         normals: The face normals (F, 3), with a length proportional to the area.

@@ -198,7 +198,7 @@ def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int]
 
     Args:
         frames: Frame numbers (n,).
-        fraction: Fraction (n,) of the final surface that was visible up to each frame, in [0, 1].
+        fraction: Fraction (n,) of the visible surface that was seen up to each frame, in [0, 1].
         first_frames: Number of the frame in which each object was first detected.
         last_frame: Number of the last frame of the sequence.
     """

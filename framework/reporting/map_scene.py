@@ -41,7 +41,7 @@ class ProgressPicture:
 
     url: str  # `data:` URL
     frame: int  # frame number
-    fraction: float  # visible fraction of the surface, in [0, 1]
+    fraction: float  # fraction of the visible surface that was seen up to this frame, in [0, 1]
 
 
 @dataclass(frozen=True)

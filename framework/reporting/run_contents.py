@@ -35,7 +35,7 @@ TIMINGS_HEADER = "frame,stage,milliseconds\n"
 
 @dataclass(frozen=True)
 class RunContents:
-    """The outputs of a run. Missing outputs are None."""
+    """The outputs of a run. Missing outputs are None or empty."""
 
     record: Record
     partial: str  # reason for the early end of the run, "" = complete run

@@ -33,7 +33,7 @@ class Sightings:
     def growth(self) -> Float64:
         """Fraction (n,) of the visible vertices that were seen up to each pose, in [0, 1]."""
         counts = np.bincount(self.first_seen, minlength=len(self.chosen) + 1)[: len(self.chosen)]
-        return np.asarray(np.cumsum(counts) / max(1, counts.sum()))
+        return np.asarray(np.cumsum(counts) / max(1, int(counts.sum())))
 
 
 def spread_out(count: int, most: int = LOOKS) -> list[int]:

@@ -34,7 +34,7 @@ TRUTH = "truth_sha256"  # key of the ground-truth hash in metrics.json
 
 
 def run_metrics(result: RunResult) -> Metrics:
-    """Return the frame counts, speed, stage times, map size and color delay of a run.
+    """Return the frame counts, speed, pose source, stage times, map size and color delay of a run.
 
     The dropped frames and the latency are included for live video.
     """

@@ -28,7 +28,7 @@ from framework.runs.stored_runs import (
 )
 from framework.runtime.run_log import FUSION, STAGES
 
-COMPARED = (TRAJECTORY, INSTANCES, MESH, MAP, KEYFRAMES)  # result files, which contain no times
+COMPARED = (TRAJECTORY, INSTANCES, MESH, MAP, KEYFRAMES)  # result files, which contain no run times
 PACKAGES = ("numba", "numpy", "onnxruntime", "opencv-python-headless", "scipy", "torch", "transformers")
 """Packages that may affect the last digits of results."""
 
@@ -37,7 +37,7 @@ ORDER = (*STAGES, FUSION)  # order of the stages within a frame
 
 
 def causes(record: Record) -> list[str]:
-    """Return one message for each change since a run that may affect its results.
+    """Return the changes since a run that may make its repetition differ, one message each.
 
     The changes are in stored files, parameters, input files, plugin code, the commit and the versions of numerical
     packages.
@@ -74,7 +74,7 @@ def _changed_inputs(before: Mapping[str, str], now: Mapping[str, str], config: M
         if now.get(key) == sha256:
             continue
         if key == ROOT:
-            yield f"{key}: expected the names, sizes and modification times of the run's recording, got others"
+            yield f"{key}: expected the file names, sizes and modification times as in the run, got different ones"
         else:
             found = f"the SHA-256 {now[key][:12]}" if key in now else "no file"
             yield f"{key}: expected the file with the SHA-256 {sha256[:12]}, got {found} in {values.get(key)}"
@@ -104,7 +104,7 @@ def _changed_packages(path: Path) -> Iterator[str]:
 class Reproduction:
     """Differences between a stored run and its repetition."""
 
-    files: tuple[str, ...]  # names of the different files; empty = byte-identical
+    files: tuple[str, ...]  # names of the different result files; empty = all are byte-identical
     frame: int | None = None  # first frame with a different result; None = unknown or no difference
     stage: str = ""  # first different stage of this frame
 

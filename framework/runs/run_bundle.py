@@ -18,7 +18,7 @@ from framework.runs.reproduction import LARGE
 from framework.runs.stored_runs import completed_runs
 from framework.runs.sweep_file import SWEEP
 
-SWEEP_FILES = (SWEEP, "table.md", "table.tex", "table.csv")
+SWEEP_FILES = (SWEEP, "table.md", "table.tex", "table.csv", "table.yaml")
 PLUGINS = "plugins"  # folder with the code of third-party plugins
 OPTIONS = "options"  # config folder with an option for each of these plugins
 MAX_SIZE = 2**36  # maximum total size of an extracted bundle, bytes
@@ -88,7 +88,7 @@ def opened_bundle(path: Path, trust_code: bool) -> Iterator[Path]:
         if has_code and not trust_code:
             raise DataError(
                 f"{path}: expected --trust-code for a bundle with plugin code, got none; inspect {PLUGINS}/ in the "
-                "file first"
+                "file, then set --trust-code"
             )
         archive.extractall(temporary)
         folder = Path(temporary)

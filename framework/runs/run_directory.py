@@ -74,7 +74,7 @@ class RunRecord:
 
     @classmethod
     def begin(cls, directory: Path, config: DictConfig, choices: Mapping[str, str | None]) -> RunRecord:
-        """Prepare the directory for a run, and remove the metrics and the report of an earlier run."""
+        """Prepare the directory for a run, and remove the metrics, manifest and report of an earlier run."""
         plain = resolved(config)
         inputs = input_hashes(plain)
         provenance: Metrics = {**code_version(), **plugin_code(plain), **environment()}

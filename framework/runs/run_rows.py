@@ -15,7 +15,7 @@ from framework.runs.stored_runs import CHOICE, Record, is_number
 
 DATA = "dataset.root"  # config key of the dataset folder
 ANNOTATION = "annotation"  # name of the ground-truth release in the variant of a row
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # level of confidence intervals
 PRESET_STAGES = ("tracker", "refiner", "fuser")  # stages set by preset=NAME
 
 OURS = "InstanceMap"  # name of runs without other settings, next to the rows of imported maps

@@ -60,7 +60,7 @@ def read_objects(record: Record) -> tuple[InstanceMesh, list[StoredInstance]]:
     if len(instances) != record.metrics.get("instances.count"):
         raise DataError(
             f"{record.directory / INSTANCES}: expected {record.metrics.get('instances.count')} instances (as "
-            f"in {METRICS}), got {len(instances)}; the files are from different runs, repeat the run"
+            f"in {METRICS}), got {len(instances)}; repeat the run, because the files are from different runs"
         )
     return mesh, instances
 
@@ -79,6 +79,7 @@ def read_labeled_mesh(directory: Path) -> tuple[InstanceMesh, list[StoredInstanc
         if vertices.get(instance.id, 0) != instance.vertices:
             raise DataError(
                 f"{instances_path}: expected {vertices.get(instance.id, 0)} vertices of instance {instance.id} "
-                f"(as in {mesh_path}), got {instance.vertices}; the files are from different runs, repeat the run"
+                f"(as in {mesh_path}), got {instance.vertices}; repeat the run, because the files are from different "
+                "runs"
             )
     return mesh, instances

@@ -71,7 +71,7 @@ class Record:
     """A stored run."""
 
     directory: Path
-    metrics: Mapping[str, Any]  # flat; None = undefined
+    metrics: Mapping[str, Any]  # by key of metrics.json; a value of None = undefined
     config: Mapping[str, Any]  # resolved config
     written: float  # modification time of the metrics file, s since the epoch
 
@@ -309,7 +309,7 @@ def read_metrics(directory: Path) -> dict[str, Any]:
     for name in (METRICS, PARTIAL_METRICS):
         if path_exists(directory / name):
             return _read_flat(directory / name)
-    raise DataError(f"{directory}: expected a run directory, got no {METRICS} or {PARTIAL_METRICS}")
+    raise DataError(f"{directory}: expected a run directory with {METRICS} or {PARTIAL_METRICS}, got neither")
 
 
 def _read_flat(path: Path) -> dict[str, Any]:

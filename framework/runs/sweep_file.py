@@ -6,6 +6,7 @@ import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -15,7 +16,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.config.validation import checked_rows
+from framework.errors import ConfigError, first_line
 from framework.runs.provenance import OF_SPEED, WITHOUT_EFFECT
+from framework.runs.stored_runs import read_yaml
 
 # references to keys of the same config, such as ${sequences.all}
 _INTERNAL_REFERENCE = re.compile(r"\$\{[\w.]+\}|\$\{all_of:\$\{[\w.]+\}\}")
@@ -26,6 +29,26 @@ WITHOUT_CHANGES = {"experiment", "launcher", *WITHOUT_EFFECT} - {*OF_SPEED, "seq
 SWEEP = "multirun.yaml"  # written by Hydra's sweeper
 MAX_VALUES = 1000  # maximum number of values of a key; a range may have more
 MAX_RUNS = 100_000  # maximum number of combinations of the values of all keys
+
+
+def read_sweep(directory: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Read the config of the last sweep in `directory`; {} = no sweep. Apply `overrides` to its table and figure.
+
+    Raises DataError if the file cannot be read, and ConfigError for an invalid override.
+    """
+    sweep = read_yaml(directory / SWEEP) if (directory / SWEEP).exists() else {}
+    for text in overrides:
+        try:
+            override = OverridesParser.create().parse_override(text)
+        except HydraException as error:
+            raise ConfigError(f"{text}: expected KEY=VALUE, got an error ({first_line(error)})") from error
+        if override.is_sweep_override() or override.is_delete():
+            raise ConfigError(f"{text}: expected one value, got a sweep or a deletion; set one value")
+        block, _, key = override.key_or_group.partition(".")
+        node = OmegaConf.create({} if sweep.get(block) is None else sweep[block])
+        OmegaConf.update(node, key, override.value(), force_add=True)
+        sweep[block] = OmegaConf.to_container(node, resolve=False)
+    return sweep
 
 
 def requested_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str, ...]]:

@@ -36,7 +36,7 @@ from framework.synthetic.walk import CameraPath, plan_path
 
 MIN_ROOM_SIZE = (4.8, 4.2)  # m, width and depth of the smallest candidate room
 STREWN = 9  # maximum number of objects on the floor next to furniture
-ATTEMPTS = 6  # number of candidate scenes; the scene with the best visibility is kept
+ATTEMPTS = 6  # maximum number of candidate scenes; the scene with the best visibility is kept
 JUDGED_VIEWS = 30  # maximum number of views for the visibility score of a scene
 # minimum number of pixels of a visible object in a view, and minimum fraction of views in which it is visible
 WELL_SEEN, LONG_SEEN = 10, 1 / 6

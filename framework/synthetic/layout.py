@@ -175,7 +175,7 @@ def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
 def strew(layout: Layout, things: Sequence[Furniture], rng: Rng) -> Layout:
     """Place objects on the floor next to furniture.
 
-    Objects that do not fit or block the camera path are omitted.
+    Objects that do not fit, or that block the camera path, are omitted.
     """
     for thing in things:
         layout = _with_thing(layout, thing, rng)

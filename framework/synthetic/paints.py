@@ -67,7 +67,7 @@ class Material:
     color: Color
     second: Color  # second color of the pattern
     scale: float = 0.1  # m, size of the pattern
-    extent: tuple[float, float] = (1.0, 1.0)  # m, size of a painting or screen
+    extent: tuple[float, float] = (1.0, 1.0)  # m, width and height of a picture, such as a painting or a book cover
     seed: int = 0
     emission: float = 0.0  # emitted light, 1 = radiance of a white wall in the mean light of the room
     dark: float = 0.0  # in [0, 1], fraction of a structured-light camera's depth readings lost at all angles
@@ -93,7 +93,7 @@ def _to_linear(srgb: Float64) -> Float64:
 
 
 def absorbed(color: Color) -> float:
-    """Return the fraction of depth readings that are lost on a surface with an sRGB color."""
+    """Return the fraction of depth readings that are lost on a surface with the given sRGB color."""
     return ABSORBED * max(0.0, 1 - sum(color) / 3 / DARKEST)
 
 

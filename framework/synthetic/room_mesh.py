@@ -11,7 +11,8 @@ from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.surfaces import Surfaces
 
-ON_SURFACE = 1.001  # maximum distance of a hit, relative to the vertex; above 1 to include the surface at the vertex
+# maximum distance of a hit, relative to the distance of the vertex; above 1 to include the surface at the vertex
+ON_SURFACE = 1.001
 LONGEST_EDGE = 0.02  # m, maximum edge length of the mesh
 
 

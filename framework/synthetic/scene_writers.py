@@ -146,7 +146,8 @@ class _Scene:
 def _choose(scenes: list[_Scene], last: _Scene | None) -> _Scene | None:
     """Return the next scene for a process, or None if no task can be started.
 
-    The order of preference is the last scene, a scene that is not started, and the scene with the most remaining tasks.
+    The order of preference is the last scene, a scene that has not been started, and the scene with the most remaining
+    tasks.
     """
     if last is not None and last.ready:
         return last

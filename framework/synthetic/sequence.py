@@ -23,7 +23,7 @@ from framework.synthetic.room import RoomKind, furnish
 from framework.synthetic.walk import FRAME_RATE, plan_path
 
 MAX_FRAMES = 10**6  # nine hours at 30 Hz
-MAX_SIDE = 5792  # px, maximum width and height; its square is MAX_PIXELS
+MAX_SIDE = 5792  # px, maximum width and height; its square is just below MAX_PIXELS
 FOCAL_LENGTH = 525.0 / 640  # fraction of the image width, as in the color camera of a Kinect
 TRUTH_VIEWS = 60  # maximum number of frames for the ground-truth surface; views of neighboring frames are nearly equal
 

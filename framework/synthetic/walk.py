@@ -130,7 +130,10 @@ def _allowed_phase_speed(path: CameraPath) -> float:
 
 
 def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[int]) -> float:
-    """Return the start phase, rad, from which most wanted instances are visible along the path."""
+    """Return the start phase, rad, from which most wanted instances are visible along the path.
+
+    `sweep` is the change of the phase along the path, rad, negative if clockwise as seen from above.
+    """
     phases = 2 * np.pi * np.arange(PHASES) / PHASES
     ids = sorted(wanted)
     pixels = np.array(
@@ -149,9 +152,9 @@ def look(position: Float64, yaw: float, pitch: float, roll: float) -> Float64:
 
     Args:
         position: The position (3,), m.
-        yaw: The yaw about z, rad. A camera with a yaw of 0 faces +x.
+        yaw: The yaw about z, rad. A camera with a yaw of 0 faces +x, and one with a yaw of pi / 2 faces +y.
         pitch: The pitch, rad. A camera with a positive pitch faces up.
-        roll: The roll about the optical axis, rad.
+        roll: The roll about the optical axis, rad. A positive roll is clockwise as seen from behind the camera.
     """
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])

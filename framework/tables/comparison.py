@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 from framework.errors import DataError
 from framework.runs.metrics import is_evaluation
 from framework.runs.run_rows import DATA, Mean, Run, RunRow, is_below, is_of_data, natural, rows_of
-from framework.runs.stored_runs import Incomplete, Record, completed_runs, read_yaml
-from framework.runs.sweep_file import SWEEP, asked_keys, command_line, requested_runs, sweep_rows
+from framework.runs.stored_runs import Incomplete, Record, completed_runs
+from framework.runs.sweep_file import asked_keys, command_line, read_sweep, requested_runs, sweep_rows
 from framework.tables.published import (
     DATASET,
     NOTHING_PUBLISHED,
@@ -45,21 +45,21 @@ class ComparisonTable:
     asked: Collection[str] | None = None  # keys in the overrides of the sweep; None = unknown
 
     @classmethod
-    def below(cls, directory: Path) -> ComparisonTable:
+    def below(cls, directory: Path, overrides: Sequence[str] = ()) -> ComparisonTable:
         """Return the table of the runs in and below `directory`, as set by its sweep, or with default settings.
 
-        Raises DataError if no run is complete, or if the sweep's config cannot be read, and ConfigError for an invalid
-        table.
+        `overrides` change the settings, such as table.base=chain. Raises DataError if no run is complete, or if the
+        sweep's config cannot be read, and ConfigError for an invalid table.
         """
         records, incomplete = completed_runs(directory)
-        sweep = read_yaml(directory / SWEEP) if (directory / SWEEP).exists() else {}
+        sweep = read_sweep(directory, overrides)
         choice, asked = TableChoice.of_stored_sweep(sweep.get("table")), asked_keys(sweep)
         choice.check_keys({key for record in records for key in record.settings} | (asked or set()))
         selected = [record for record in records if choice.selects(record)]
         if not selected:
             raise DataError(f"table.where: expected a completed run with {as_text(choice.conditions)}, got none")
-        overrides = sweep_rows(sweep)
-        rows = rows_of(selected, choice.averaged, overrides, asked)
+        changes = sweep_rows(sweep)
+        rows = rows_of(selected, choice.averaged, changes, asked)
         requested = [run for run in requested_runs(sweep, choice.averaged) if _is_selected(choice, run)]
         superseded = len(selected) - sum(len(row.records) for row in rows)
         left_out: list[str] = []
@@ -73,7 +73,7 @@ class ComparisonTable:
             directory.resolve().name,
             choice,
             rows,
-            overrides,
+            changes,
             requested,
             incomplete,
             superseded,

@@ -16,7 +16,9 @@ from framework.evaluation.detection_errors import FOUND_IOU, DetectionErrors
 from framework.files.atomic_write import atomic_write
 from framework.files.json_file import read_json, write_json
 from framework.runs.stored_runs import is_number
-from framework.tables.grid import TextTable, decimals, figure, latex_grid, markdown_grid
+from framework.tables.grid import TextTable, decimals, figure, markdown_grid
+from framework.tables.latex_table import LatexTable, escaped, latex_file, latex_label
+from framework.tables.metric_columns import Direction
 
 METRICS = "detection_metrics.json"  # file in the folder of each job
 OVERRIDES = "overrides"  # key of the overrides in this file
@@ -35,6 +37,9 @@ COLUMNS = {
 }
 """Column headings by metric."""
 
+DIRECTIONS = [Direction.HIGHER] * 6 + [Direction.LOWER]
+"""Directions of better values, in the order of COLUMNS."""
+
 COUNTS = ("frames", "detections", "objects", "classes")
 
 
@@ -44,7 +49,7 @@ class Job:
 
     folder: str  # relative to the sweep
     overrides: Sequence[str]
-    metrics: Mapping[str, Any]  # None = undefined
+    metrics: Mapping[str, Any]  # by name; a value of None = undefined
 
     def called(self, swept: Collection[str]) -> str:
         """Return the overrides of the swept keys, or the folder of the job if there are none."""
@@ -101,7 +106,8 @@ def write_detection_table(directory: Path, swept: Collection[str], min_pixels: i
     grid = _grid(jobs, swept)
     notes = list(_notes(jobs, incomplete, min_pixels))
     text = "\n\n".join([f"# {directory.name}", markdown_grid(grid), "\n".join(f"- {note}" for note in notes)]) + "\n"
-    latex = "\n".join([*(f"% {note}" for note in notes), *latex_grid(grid)])
+    caption = escaped(f"{directory.name}: 2D metrics of detections. {notes[0]}")
+    latex = latex_file([LatexTable(grid, caption, latex_label(directory.name))], notes)
     for name, content in (("md", text), ("tex", latex), ("csv", _comma_separated(jobs))):
         with atomic_write(directory / f"table.{name}") as temporary:
             temporary.write_text(content, "utf-8")
@@ -124,18 +130,21 @@ def _grid(jobs: Sequence[Job], swept: Collection[str]) -> TextTable:
         values = [(key, job.value(key)) for key in COLUMNS]
         cells = ["–" if math.isnan(value) else figure(value, math.nan, digits[key]) for key, value in values]
         body.append([job.called(swept), str(job.metrics.get("sequence")), *counts, *cells])
-    return TextTable(["row", "sequence", *COUNTS, *COLUMNS.values()], body, 2)
+    heads = ["row", "sequence", *COUNTS]
+    directions = {len(heads) + k: direction for k, direction in enumerate(DIRECTIONS)}
+    return TextTable([*heads, *COLUMNS.values()], body, 2, directions=directions)
 
 
 def _notes(jobs: Sequence[Job], incomplete: Sequence[str], min_pixels: int) -> Iterator[str]:
     if any(job.value("objects") for job in jobs):
         yield (
             "AP: COCO, in [0, 1], by the IoU of masks or boxes, mean over IoU 0.5 to 0.95 and the classes. AP50: at "
-            f"IoU 0.5. objects: ground-truth objects of at least {min_pixels} px in all frames. classes: of objects."
+            f"IoU 0.5. objects: number of ground-truth objects of at least {min_pixels} px, summed over the frames. "
+            "classes: number of their classes."
         )
         yield (
             f"found: fraction of the objects with a mask IoU of at least {FOUND_IOU:g}, regardless of class. correct "
-            "class: fraction of these with the most likely class of the ground truth."
+            "class: fraction of these whose most likely class is that of the ground truth."
         )
     if not all(job.value("objects") for job in jobs):
         yield "–: the sequence has no ground-truth instances of the detector's classes."

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+
+from omegaconf import OmegaConf
 
 from framework.files.atomic_write import atomic_write
 from framework.runs.data_frame import data_frame
 from framework.tables.comparison import ComparisonTable
-from framework.tables.grid import TextTable, latex_grid, markdown_grid
+from framework.tables.grid import TextTable, markdown_grid
+from framework.tables.latex_captions import CAPTIONS, DIFFERENCES, STATISTICS, VALUES
+from framework.tables.latex_table import LatexTable, latex_file, latex_label
 from framework.tables.layouts import (
     across_grid,
     by_grid,
@@ -19,28 +23,42 @@ from framework.tables.layouts import (
 )
 from framework.tables.table_notes import notes
 
+SETTINGS = "table.yaml"  # overrides of the stored tables; exists only with overrides
 
-def write_tables(directory: Path) -> str:
-    """Write table.md, table.tex and table.csv of the runs below `directory` into it, and return the Markdown text.
 
-    table.csv is the data frame of the runs in the table (`load_runs`). Raises DataError if no run is complete, and
-    ConfigError for an invalid table.
+def write_tables(directory: Path, overrides: Sequence[str] = ()) -> str:
+    """Write table.md, table.tex and table.csv of the runs below a folder, and return the Markdown text.
+
+    table.tex is for a paper. table.csv is the data frame of the runs in the table (`load_runs`).
+
+    Args:
+        directory: The folder. The runs are in this folder and its subfolders.
+        overrides: Changed settings of the table, such as table.base=chain. They are stored in table.yaml.
+
+    Raises:
+        DataError: No run is complete.
+        ConfigError: The table is invalid.
     """
-    tables = rendered_tables(directory)
+    tables = rendered_tables(directory, overrides)
     for name, content in tables.items():
         with atomic_write(directory / name) as temporary:
             temporary.write_text(content, "utf-8")
+    if overrides:
+        with atomic_write(directory / SETTINGS) as temporary:
+            OmegaConf.save({"overrides": list(overrides)}, temporary)
+    else:
+        (directory / SETTINGS).unlink(missing_ok=True)
     return tables["table.md"]
 
 
-def rendered_tables(directory: Path) -> dict[str, str]:
+def rendered_tables(directory: Path, overrides: Sequence[str] = ()) -> dict[str, str]:
     """Return the contents of table.md, table.tex and table.csv as in `write_tables`, by file name."""
-    comparison = ComparisonTable.below(directory)
-    grids = list(_grids(comparison))
+    comparison = ComparisonTable.below(directory, overrides)
+    grids = dict(_grids(comparison))
     explained = list(notes(comparison))
     bullets = "\n".join(f"- {note}" for note in explained)
-    text = "\n\n".join([f"# {comparison.title}", *map(markdown_grid, grids), bullets]) + "\n"
-    latex = "\n".join([*(f"% {note}" for note in explained), *(line for grid in grids for line in latex_grid(grid))])
+    text = "\n\n".join([f"# {comparison.title}", *map(markdown_grid, grids.values()), bullets]) + "\n"
+    latex = latex_file([_latex_table(comparison, name, grid) for name, grid in grids.items()], explained)
     runs = sorted(comparison.records, key=lambda record: record.directory)
     separated = data_frame(runs, directory).to_csv(index=False, lineterminator="\n")
     return {"table.md": text, "table.tex": latex, "table.csv": separated}
@@ -54,10 +72,19 @@ LAYOUTS: dict[str, tuple[Callable[[ComparisonTable], TextTable], Callable[[Compa
 """Functions for the table of values and the table of differences from the base, by TableChoice.layout."""
 
 
-def _grids(comparison: ComparisonTable) -> Iterator[TextTable]:
+def _grids(comparison: ComparisonTable) -> Iterator[tuple[str, TextTable]]:
+    """Yield the tables, each with a key of CAPTIONS."""
     figures, differences = LAYOUTS[comparison.choice.layout]
-    yield figures(comparison)
+    yield VALUES, figures(comparison)
     if comparison.compared:
-        yield differences(comparison)
+        yield DIFFERENCES, differences(comparison)
     if comparison.statistics.tested:
-        yield statistics_grid(comparison)
+        yield STATISTICS, statistics_grid(comparison)
+
+
+def _latex_table(comparison: ComparisonTable, name: str, grid: TextTable) -> LatexTable:
+    choice = comparison.choice
+    label = choice.label or latex_label(comparison.title)
+    if name != VALUES:
+        return LatexTable(grid, CAPTIONS[name](comparison), f"{label}-{name}", choice.page_columns)
+    return LatexTable(grid, choice.caption or CAPTIONS[name](comparison), label, choice.page_columns)

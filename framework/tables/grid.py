@@ -1,10 +1,12 @@
-"""Text tables in Markdown and LaTeX, and number formats."""
+"""Text tables in Markdown, and number formats."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from framework.tables.metric_columns import Direction
 
 
 @dataclass(frozen=True)
@@ -16,6 +18,7 @@ class TextTable:
     label_columns: int = 1  # number of left-aligned columns; the remaining columns contain numbers
     bold: frozenset[tuple[int, int]] = frozenset()  # (line, column) of each bold cell
     groups: frozenset[int] = frozenset()  # index of the first line of each group
+    directions: Mapping[int, Direction] = field(default_factory=dict)  # by column; none = no direction of better values
 
 
 def decimals(values: Iterable[float]) -> int:
@@ -40,37 +43,3 @@ def markdown_grid(grid: TextTable) -> str:
     adjust = [str.ljust if k < grid.label_columns else str.rjust for k in range(len(widths))]
     padded = ([pad(cell, w) for pad, cell, w in zip(adjust, line, widths, strict=True)] for line in cells)
     return "\n".join("| " + " | ".join(line) + " |" for line in padded)
-
-
-def latex_grid(grid: TextTable) -> list[str]:
-    """Return the lines of a LaTeX tabular for the package booktabs."""
-    alignment = "l" * grid.label_columns + "r" * (len(grid.heads) - grid.label_columns)
-    lines = [f"\\begin{{tabular}}{{{alignment}}}", "\\toprule", _latex_line(map(_escaped, grid.heads)), "\\midrule"]
-    for k, cells in enumerate(grid.body):
-        if k in grid.groups:
-            lines.append("\\midrule")
-        marked = (
-            f"\\textbf{{{_escaped(cell)}}}" if (k, column) in grid.bold else _escaped(cell)
-            for column, cell in enumerate(cells)
-        )
-        lines.append(_latex_line(marked))
-    return [*lines, "\\bottomrule", "\\end{tabular}", ""]
-
-
-_LATEX = str.maketrans(
-    {
-        **{mark: f"\\{mark}" for mark in "&%$#_{}"},
-        **{"\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}"},
-        **{"±": "$\\pm$", "–": "--", "|": "\\textbar{}", "<": "\\textless{}", ">": "\\textgreater{}"},
-    }
-)
-
-
-def _escaped(cell: str) -> str:
-    return " ".join(cell.split()).translate(_LATEX)
-
-
-def _latex_line(cells: Iterable[str]) -> str:
-    line = " & ".join(cells) + " \\\\"
-    # Without {}, LaTeX would interpret the star or bracket as an argument of the row end or rule before it.
-    return f"{{}}{line}" if line.startswith(("*", "[")) else line

@@ -35,7 +35,7 @@ def row_grid(comparison: ComparisonTable) -> TextTable:
         lines.append([published_name(one), NOTHING, *cells, one.poses, one.annotation])
     if not comparison.judged:
         lines = [line[:-1] for line in lines]
-    return TextTable(lines[0], lines[1:], groups=frozenset({len(comparison.rows)}))
+    return TextTable(lines[0], lines[1:], groups=frozenset({len(comparison.rows)}), directions=_directions(keys, 2))
 
 
 def difference_grid(comparison: ComparisonTable) -> TextTable:
@@ -51,7 +51,13 @@ def difference_grid(comparison: ComparisonTable) -> TextTable:
             significant = comparison.statistics.results[row.name, key].is_significant
             cells.append(_of(_difference(means[key][k], digits[key], significant), means[key][k].count, pairs))
         body.append([comparison.called(row), str(pairs), *cells])
-    return TextTable([f"minus {comparison.base_called}", "pairs", *map(head, keys)], body)
+    heads = [f"minus {comparison.base_called}", "pairs", *map(head, keys)]
+    return TextTable(heads, body, directions=_directions(keys, 2))
+
+
+def _directions(keys: Sequence[str], first: int) -> dict[int, Direction]:
+    """Return the direction of each metric by its column; the metrics begin in the column `first`."""
+    return {first + k: direction(key) for k, key in enumerate(keys)}
 
 
 _Cell = tuple[str, float]  # text and compared value; NaN = not compared
@@ -152,7 +158,9 @@ def by_grid(comparison: ComparisonTable) -> TextTable:
         [replace(line, labels=[title if k == 0 else "", *line.labels]) for k, line in enumerate(section)]
         for title, section in sections.items()
     ]
-    return _grid([comparison.noun, *_labels(comparison, "system"), *map(head, keys)], titled, figures)
+    labels = [comparison.noun, *_labels(comparison, "system")]
+    grid = _grid([*labels, *map(head, keys)], titled, figures)
+    return replace(grid, directions=_directions(keys, len(labels)))
 
 
 def difference_across_grid(comparison: ComparisonTable) -> TextTable:

@@ -51,6 +51,8 @@ DIRECTIONS = {
 }
 """Directions by prefix of the key. The longest prefix applies. Other metrics have no direction."""
 
+IN_WORDS = {Direction.HIGHER: " (higher is better)", Direction.LOWER: " (lower is better)", Direction.NONE: ""}
+
 
 def head(key: str) -> str:
     """Return the column heading of a metric, with its unit."""
@@ -62,6 +64,11 @@ def head(key: str) -> str:
     if parts[0] == "instances" and parts[1] in CLASS_HEADS:
         return SCENENN_NAMES.get(parts[2], parts[2]) + CLASS_HEADS[parts[1]]
     return key
+
+
+def described(key: str) -> str:
+    """Return the heading of a metric with the direction of better values in words."""
+    return head(key) + IN_WORDS[direction(key)]
 
 
 def direction(key: str) -> Direction:

@@ -8,7 +8,8 @@ from itertools import groupby
 from pathlib import Path
 
 from framework.files.atomic_write import read_text
-from framework.tables.experiment_tables import rendered_tables
+from framework.runs.stored_runs import read_yaml
+from framework.tables.experiment_tables import SETTINGS, rendered_tables
 
 TABLE_FORMATS = (".md", ".tex", ".csv")
 
@@ -18,7 +19,8 @@ Grid = list[list[str]]  # cells of each line of a table; the first line contains
 def changed_tables(directory: Path) -> Iterator[str]:
     """Yield one message for each table cell that differs from the stored runs.
 
-    The tables are table.md, table.tex and table.csv. Captions and notes are not compared.
+    A table with different rows or columns has a single message. The tables are table.md, table.tex and table.csv.
+    Captions and notes are not compared.
 
     Args:
         directory: The folder of the tables. The runs are in this folder and its subfolders.
@@ -30,12 +32,13 @@ def changed_tables(directory: Path) -> Iterator[str]:
     stored = [path for path in (directory / f"table{suffix}" for suffix in TABLE_FORMATS) if path.exists()]
     if not stored:
         return
-    rendered = rendered_tables(directory)
+    settings = read_yaml(directory / SETTINGS) if (directory / SETTINGS).exists() else {}
+    rendered = rendered_tables(directory, list(map(str, settings.get("overrides") or ())))
     for path in stored:
         expected, found = (_grids(path.suffix, text) for text in (rendered[path.name], read_text(path)))
         if _shape(expected) != _shape(found):
             rewrite = f"run instancemap tables {directory}"
-            yield f"{path}: expected the rows and columns of the runs' table, got others; {rewrite}"
+            yield f"{path}: expected the rows and columns of the runs' table, got different ones; {rewrite}"
             continue
         for grid, stored_grid in zip(expected, found, strict=True):
             for line, stored_line in zip(grid, stored_grid, strict=True):

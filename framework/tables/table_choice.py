@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from typing import Any
 
 from framework.config.renamed_keys import new_name
-from framework.config.validation import checked_block
+from framework.config.validation import check_known, check_page_columns, checked_block
 from framework.errors import ConfigError
 from framework.runs.provenance import leaves
 from framework.runs.run_rows import value_of
@@ -16,6 +16,7 @@ from framework.runs.stored_runs import Record
 from framework.runs.timings_file import current_key
 from framework.tables.published import read_published
 
+LABEL = re.compile(r"[A-Za-z0-9:._/-]*")  # labels for \ref
 PLAIN = (
     *("instances.ap50", "instances.ap50_agnostic", "instances.ap25", "instances.ap", "instances.mean_iou"),
     *("instances.count", "trajectory.ate_rmse_m", "frames_lost", "fps"),
@@ -46,6 +47,10 @@ class TableChoice:
     columns: list[str] = field(default_factory=list)
     names: dict[str, str] = field(default_factory=dict)  # display names by row
     published: str | None = None  # section of published.yaml, if all runs use the original SceneNN data; None = none
+    caption: str = ""  # caption of table.tex, LaTeX; "" = generated from the runs
+    label: str = ""  # label of table.tex; "" = tab: and the name of the folder
+    # width of table.tex in columns of the page, 1 or 2; None = 1 for tables of up to 5 columns, otherwise 2
+    page_columns: int | None = None
 
     def __post_init__(self) -> None:
         for name in ("average_over", "columns"):
@@ -67,6 +72,12 @@ class TableChoice:
         for key in self.pair_by:
             if key not in self.averaged:
                 raise ConfigError(f"table.pair_by: expected one of {', '.join(self.averaged)}, got {key}")
+        if not LABEL.fullmatch(self.label):
+            raise ConfigError(
+                f"table.label: expected letters, digits, ':', '.', '_', '/' or '-', got {self.label!r}; set "
+                "table.label=tab:results, for example"
+            )
+        check_page_columns("table.page_columns", self.page_columns)
         if self.published and read_published(self.published).layout != self.layout:
             raise ConfigError(
                 f"table.published: expected a section for the layout {self.layout}, got {self.published} for the "
@@ -122,9 +133,10 @@ class TableChoice:
             node = {(new_name(f"table.{key}") or f"table.{key}").removeprefix("table."): node[key] for key in node}
         return cls.of_sweep(node)
 
-    def unknown(self, known: Collection[str]) -> list[tuple[str, str]]:
-        """Return the settings whose keys are not in `known`, as (setting, key) pairs."""
-        return [(name, key) for name, key in self._keys() if key not in known]
+    @property
+    def keys(self) -> list[tuple[str, str]]:
+        """The settings with a KEY, as (setting, KEY) pairs."""
+        return [(f"table.{name}", key) for name, key in self._keys()]
 
     def _keys(self) -> Iterator[tuple[str, str]]:
         for name in ("average_over", "columns_by", "group_by", "pair_by"):
@@ -136,11 +148,8 @@ class TableChoice:
         yield from (("base", key) for key, equals, _ in (part.partition("=") for part in parts) if equals)
 
     def check_keys(self, known: Collection[str]) -> None:
-        """Raise ConfigError for a key that is not in `known`."""
-        for name, key in self.unknown(known):
-            close = get_close_matches(key, known, n=1)
-            fix = f"did you mean {close[0]}?" if close else "set a group such as dataset, or a parameter of all runs"
-            raise ConfigError(f"table.{name}: expected a group of options or a parameter, got {key}; {fix}")
+        """Raise ConfigError for a KEY that is not in `known`."""
+        check_known(self.keys, known)
 
     def check_base(self, rows: Collection[str]) -> None:
         """Raise ConfigError for a base that is not one of the experiment's `rows`, or KEY=VALUE in another sweep."""

@@ -42,7 +42,7 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
         yield f"Command line: {' '.join(comparison.command_line)}."
     mapped = [record for record in comparison.records if not record.is_imported]
     yield from _imported(comparison)
-    if fixed := _same(mapped):
+    if fixed := common_options(mapped):
         yield f"Common to all runs{'' if len(mapped) == len(comparison.records) else ' of InstanceMap'}: {fixed}."
     yield from _protocol(comparison)
     yield from _published(comparison)
@@ -232,7 +232,7 @@ def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
     return "; ".join(" ".join(f"{key}={value}" for key, value in pairs) for pairs in versions)
 
 
-def _same(records: Sequence[Record]) -> str:
+def common_options(records: Sequence[Record]) -> str:
     """Return the config options that all runs have in common, as stage=option."""
     chosen = {stage: {record.choices.get(stage) for record in records} for stage in STAGES}
     agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}

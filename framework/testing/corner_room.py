@@ -131,7 +131,7 @@ def exact_clusters(frame: Frame) -> PointClusters:
 
 
 def bleeding_clusters(frame: Frame) -> PointClusters:
-    """Return the point clusters of both spheres, lifted with masks that extend 3 px onto the wall."""
+    """Return the point clusters of both spheres, lifted with masks that extend 3 px to the right."""
     exact = spheres_in(frame)
     masks = exact.masks | np.roll(exact.masks, 3, axis=2)
     return lift(replace(exact, masks=masks), frame, Pose(pose_at(frame.index)))

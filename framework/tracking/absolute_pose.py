@@ -24,7 +24,7 @@ class AbsolutePose:
     """A camera pose and its inliers."""
 
     T_world_camera: Float64  # (4, 4)
-    inliers: Bool  # (M,) True for matches that are inliers
+    inliers: Bool  # (M,) True for the inliers among the matches
 
 
 @dataclass

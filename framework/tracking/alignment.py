@@ -13,7 +13,7 @@ noise. Beyond the depth FAR, depth errors are correlated over whole image region
 standard deviation is increased. Beyond RANGE, the maximum depth of structured-light cameras, standard deviations and
 gates are proportional to depth.
 
-`LinearWeights` replaces Tukey's weights by those in the published code of VoxelHashing, for residuals in m and in [0,
+`LinearWeights` replaces Tukey's weights with those in the published code of VoxelHashing, for residuals in m and in [0,
 1]. They depend on the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:
 
     w_i = max(0, ((1 - d / max_distance) + (1 - z / max_depth)) / 2)
@@ -132,17 +132,17 @@ class NormalEquations(NamedTuple):
     The twist xi is in m and rad.
     """
 
-    A: Float64  # (6, 6) J^T W J of the weighted residuals
+    A: Float64  # (6, 6) J^T W J for the residuals r with the weights W
     b: Float64  # (6,) J^T W r
     visible: int  # number of points on a mapped part of the view
     matched: int  # number of visible points with a nonzero weight
     close: int  # number of visible points at a depth that agrees with the model
     behind: int  # number of visible points clearly behind the model, which should occlude them
     A_color: Float64  # (6, 6) part of A from the photometric term; 0 for LinearWeights
-    energy: float  # sum of w r^2 over the residuals r of the geometric term
-    color_energy: float  # sum of v r^2 over the residuals r of the photometric term
+    energy: float  # sum of w r^2 over the residuals r of the geometric term; of both terms for LinearWeights
+    color_energy: float  # sum of v r^2 over the residuals r of the photometric term; 0 for LinearWeights
     matched_colors: int  # number of visible points with a nonzero photometric weight
-    brightness: float  # mean of frame minus model intensity; nonzero after a change of exposure
+    brightness: float  # mean of frame minus model intensity; nonzero after a change in exposure
 
 
 def linearize(
@@ -158,7 +158,7 @@ def linearize(
             mapped.
         T_view_camera: The current pose (4, 4) of the frame in the view.
         weights: The weights and limits.
-        brightness: The mean difference of frame and model intensity, which is compensated.
+        brightness: The mean of frame minus model intensity, which is compensated.
         linear: The limits of the linear weights, or None for Tukey's weights.
     """
     sums = np.empty((CHUNKS, TERMS))

@@ -188,7 +188,7 @@ def _add_geometry(model, R, weights, linear, noise_model, points, J):
         distance2 = ex * ex + ey * ey + ez * ez
         z = points[DEPTH + n]
         growth = max(one, z * inv_range)
-        if linear is None:  # numba compiles only the branch for the type of `linear`
+        if linear is None:  # Numba compiles only the branch for the type of `linear`
             near = mapped & (distance2 <= max_distance2 * growth * growth)
         else:
             near = mapped & (distance2 <= max_distance2)
@@ -349,7 +349,7 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, line
         weights: The weights and limits, a Weights.
         linear: The limits of the linear weights, or None for Tukey's weights.
         noise_model: The noise parameters of the depth sensor.
-        brightness: The mean difference of frame and model intensity.
+        brightness: The mean of frame minus model intensity.
         sums: The output (CHUNKS, TERMS).
     """
     height, width = frame.depth.shape

@@ -34,7 +34,7 @@ WIDTH = 320  # px, width of the compared images
 MAX_GRADIENT = 200.0  # Sobel units; stronger gradients are clipped, so that lamps do not dominate
 MIN_EDGES, MAX_EDGES = 100, 1500  # minimum and maximum number of edge points of a compared frame
 MIN_SPEED = 0.125  # minimum image motion of a compared frame, image widths per s
-DENSE_COMPARISONS, LATER_STRIDE = 60, 8  # number of comparisons of successive frames; later, every 8th is compared
+DENSE_COMPARISONS, LATER_STRIDE = 60, 8  # number of comparisons of successive frames; later, every 8th frame
 MIN_COMPARISONS, MAX_COMPARISONS = 16, 512  # minimum and maximum number of recent comparisons for an estimate
 PERIOD = 4  # number of comparisons from one estimate to the next
 BLOCKS = 8  # number of blocks of the jackknife
@@ -60,7 +60,7 @@ class _Tracked(NamedTuple):
 
 
 class DelayEstimator:
-    """Online estimator of the delay of color relative to depth with equal timestamps.
+    """Online estimator of the delay of color relative to depth at equal timestamps.
 
     The delay is positive if color is captured later.
     """
@@ -170,7 +170,7 @@ def poses_at(times: Float64, poses: Float64, at: Float64) -> Float64:
 
 
 def regress(comparisons: Float64, start: float) -> DelayEstimate:
-    """Return the estimated delay by robust regression.
+    """Return the delay, estimated by robust regression.
 
     Args:
         comparisons: The delay, s, and the image motion (x, y), image widths / s, of each compared frame (K, 3).

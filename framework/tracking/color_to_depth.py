@@ -40,7 +40,8 @@ class RegisteredFrame(NamedTuple):
 
     frame: Frame  # color is registered to the depth pixels
     T_world_color: Float64  # (4, 4) pose of the color camera at the time of the color image
-    color_pixels: Int32 | None = None  # (H, W) flat index of the color pixel of each reading, -1 = none; None = same
+    # (H, W) flat index of the color pixel of each reading, -1 = none; None = color and depth have the same pixels
+    color_pixels: Int32 | None = None
 
 
 class ColorToDepth:
@@ -132,8 +133,8 @@ def register(frame: Frame, T_color_depth: Float64) -> tuple[UInt8, Int32]:
     """Return the nearest color (H, W, 3) of each depth pixel, and its flat index (H, W).
 
     The index is -1 outside the color image and without a depth reading. These pixels get the color of the nearest color
-    pixel. Pixels without a reading are projected at the median depth. `T_color_depth` is the motion (4, 4) from the
-    depth to the color camera.
+    pixel. Pixels without a reading are projected at the median depth. `T_color_depth` (4, 4) transforms points
+    from the depth camera to the color camera.
     """
     color, pixels = np.empty_like(frame.color), np.empty(frame.camera.shape, np.int32)
     readings = frame.depth[::STRIDE, ::STRIDE]

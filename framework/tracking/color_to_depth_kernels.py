@@ -17,7 +17,7 @@ def register_colors(depth, otherwise, intrinsics, T_color_depth, color, register
         depth: The depth image (H, W), m, 0 = no reading.
         otherwise: The assumed depth of pixels without a reading, m.
         intrinsics: The intrinsics fx, fy, cx, cy, px.
-        T_color_depth: The motion (3, 4) from the depth to the color camera.
+        T_color_depth: The transform (3, 4) of points from the depth camera to the color camera.
         color: The color image (H, W, 3).
         registered: The output (H, W, 3). Outside the color image, the color of its border is used.
         pixels: The output (H, W), the flat index of the color pixel, -1 = no reading or outside the color image.

@@ -29,8 +29,13 @@ class DepthScale:
 
     @property
     def growth(self) -> float:
-        """Factor of limits in m, >= 1."""
+        """Factor for limits in m, >= 1."""
         return max(1.0, self.depth / RANGE)
+
+    @property
+    def units(self) -> Float64:
+        """The units (6,) of a twist without units: the typical depth, m, for translations, and 1 rad for rotations."""
+        return np.array([self.depth] * 3 + [1.0] * 3)
 
     def length(self, xi: Float64) -> float:
         """Return the largest absolute entry of a twist (6,), m and rad, with translations divided by `growth`."""
@@ -50,5 +55,4 @@ class DepthScale:
 
     def without_units(self, A: Float64) -> Float64:
         """Return the information matrix (6, 6) with translations in units of the typical depth."""
-        units = np.array([self.depth] * 3 + [1.0] * 3)
-        return A * np.outer(units, units)
+        return A * np.outer(self.units, self.units)

@@ -53,15 +53,15 @@ class Keyframes:
     """A bounded database of keyframes.
 
     Call `add` for every frame with a reliable pose. Features of new views are extracted in a background thread. A view
-    is new if distance / min_distance + angle / min_angle >= 1 for all keyframes. All other methods wait for the thread
-    first, so that results do not depend on timing.
+    is new if distance / min_distance + angle / min_angle >= 1 for all keyframes. Methods that use the keyframes wait
+    for the thread first, so that results do not depend on timing.
     """
 
     max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is removed
     min_distance: float = 0.25  # minimum distance of a new view without rotation, m, > 0
     min_angle: float = 0.3  # minimum angle of a new view without translation, rad, > 0
     max_features: int = 800  # maximum number of features of a frame, >= 1
-    min_features: int = 30  # minimum number of features with depth of a keyframe, >= 4
+    min_features: int = 30  # minimum number of features with depth in a keyframe, >= 4
     candidates: int = 6  # maximum number of keyframes matched with a frame, >= 1
     max_ratio: float = 0.8  # maximum ratio of best to second-best descriptor distance (Lowe's ratio test), in (0, 1]
     max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0
@@ -115,7 +115,10 @@ class Keyframes:
             DataError: If the arrays are invalid.
         """
         if not arrays:
-            raise ConfigError("resume_from or localize_in: expected a run with stored keyframes, got no keyframes")
+            raise ConfigError(
+                "resume_from or localize_in: expected a run with stored keyframes, got no keyframes; map again with a "
+                "tracker that stores keyframes, such as tracker=voxel_hashing_icp"
+            )
         if set(arrays) != set(SAVED):
             raise DataError(f"keyframes: expected the arrays {list(SAVED)}, got {list(arrays)}")
         for name, (shape, kind) in SAVED.items():
@@ -125,8 +128,8 @@ class Keyframes:
         total = len(points) if len(points) == len(descriptors) else -1
         if len(counts) != len(poses) or counts.min(initial=0) < 0 or counts.sum() != total:
             raise DataError(
-                f"keyframe counts: expected {len(poses)} counts >= 0 with the sum {len(points)} (number of points) and "
-                f"{len(descriptors)} (number of descriptors), got {counts.tolist()!s:.60}"
+                f"keyframe counts: expected {len(poses)} counts >= 0 whose sum equals the numbers of points "
+                f"({len(points)}) and descriptors ({len(descriptors)}), got {counts.tolist()!s:.60}"
             )
         self._settle()
         for k, end in enumerate(np.cumsum(counts)):
@@ -140,7 +143,8 @@ class Keyframes:
     def add(self, frame: Frame, T_world_camera: Float64) -> None:
         """Add the frame as a keyframe if its view is new and has enough features.
 
-        Features are extracted in a background thread. The next method that waits for this thread raises its exceptions.
+        Features are extracted in a background thread. The next method that waits for this thread raises the exceptions
+        of the thread.
         """
         if self._offered is not None and self._is_retry(self._offered[0], T_world_camera):
             return  # too close to the frame under construction, even if that frame has too few features for a keyframe
@@ -288,7 +292,7 @@ def write_keyframes(path: Path, keyframes: Mapping[str, Array]) -> None:
 
 
 def read_keyframes(path: Path) -> dict[str, Array]:
-    """Return the arrays in a file of `write_keyframes`.
+    """Return the arrays in a file written by `write_keyframes`.
 
     The result is empty if there is no file.
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
 
-from framework.data import Camera, Float32, SurfaceView, UInt8
+from framework.data import Camera, Float32, Frame, SurfaceView, UInt8
 from framework.sensors.noise_models import SensorKind
 from framework.tracking.pyramid_kernels import compute_normals, find_distinct, halve, halve_mapped
 
@@ -15,6 +17,9 @@ SAMPLED = 4  # stride of the depth readings for the quantization estimate, px
 FEWEST_VALUES = 16  # minimum number of distinct depths for the quantization estimate
 SCATTERED = 0.15  # minimum fraction of missing neighbors of readings in scattered depth; a Kinect has at most 0.02
 COARSE = 2.5  # maximum step between depth values of fine depth, in standard deviations of the sensor
+NORMALS = "normals"  # key in Frame.depth_cache
+
+_normals_lock = threading.Lock()  # one lock for all frames, because frames are pickled and kernels use all cores
 
 
 def intrinsics(camera: Camera) -> tuple[np.float32, np.float32, np.float32, np.float32]:
@@ -29,7 +34,7 @@ class PyramidLevel:
     camera: Camera
     depth: Float32  # (H, W) m, 0 = no reading
     intensity: Float32  # (H, W) in [0, 1]
-    normals: Float32  # (3, H, W) surface normals towards the camera, in the camera frame; 0 at edges
+    normals: Float32  # (3, H, W) surface normals toward the camera, in the camera frame; 0 at edges
     sensor: SensorKind = SensorKind.KINECT_V1  # kind of the depth sensor
 
 
@@ -54,15 +59,34 @@ def build_pyramid(
     least = camera.width * finest
     while True:
         if camera.width <= least:
-            normals = np.empty((3, *camera.shape), np.float32)
-            compute_normals(depth, intrinsics(camera), normals)
-            pyramid.append(PyramidLevel(camera, depth, intensity, normals, sensor))
+            pyramid.append(PyramidLevel(camera, depth, intensity, _normals(depth, camera), sensor))
             if len(pyramid) == levels:
                 return pyramid
         camera = _halved(camera)
         half_depth, half_intensity = np.empty(camera.shape, np.float32), np.empty(camera.shape, np.float32)
         halve(depth, intensity, half_depth, half_intensity)
         depth, intensity = half_depth, half_intensity
+
+
+def normals_of(frame: Frame) -> Float32:
+    """Return the surface normals of a frame, from the depth of the four neighbors of each pixel.
+
+    The normals are computed once per frame and shared by all stages. This function is thread-safe.
+
+    Args:
+        frame: The frame.
+
+    Returns:
+        The normals (H, W, 3) in the camera frame, a read-only view that is not contiguous: unit vectors toward the
+        camera, and 0 where unknown. A normal is unknown at the image border, without depth at the pixel or at one of
+        its neighbors, and at jumps of more than 5 % of the depth.
+    """
+    with _normals_lock:
+        if NORMALS not in frame.depth_cache:
+            normals = np.moveaxis(_normals(frame.depth, frame.camera), 0, -1)
+            normals.flags.writeable = False
+            frame.depth_cache[NORMALS] = normals
+        return cast(Float32, frame.depth_cache[NORMALS])
 
 
 def is_coarse(depth: Float32, otherwise: bool, sensor: SensorKind = SensorKind.KINECT_V1) -> bool:
@@ -97,6 +121,13 @@ def _distinct(depth: Float32) -> Float32:
     table = np.zeros(1 << (2 * bits.size).bit_length(), np.int32)
     found = np.empty(bits.size, np.int32)
     return np.sort(found[: find_distinct(bits.ravel(), table, found)].view(np.float32))
+
+
+def _normals(depth: Float32, camera: Camera) -> Float32:
+    """Return the normals (3, H, W) of depth (H, W), m; see `PyramidLevel`."""
+    normals = np.empty((3, *camera.shape), np.float32)
+    compute_normals(depth, intrinsics(camera), normals)
+    return normals
 
 
 def _halved(camera: Camera) -> Camera:

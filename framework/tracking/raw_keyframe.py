@@ -2,13 +2,13 @@
 
 The map smooths structure below its voxel size, which biases each alignment. Because the map is updated at the biased
 poses, the estimated pose of a stationary camera drifts. A raw keyframe has no such bias. Its normal equations are added
-to those of the map. The adjoint Ad of T_key_view converts them to a twist of the view:
+to those of the map. The adjoint Ad of T_key_view converts them to a left twist of T_view_camera:
 
     A <- A + w Ad^T A_key Ad,    b <- b + w Ad^T b_key
 
 The keyframe is compared at half the finest resolution, which is less noisy and faster. At the finest level, w = 4
 compensates for the smaller number of points. The coarsest level uses the map alone. The weight decreases with the
-distance from the keyframe, so that sparse frames are aligned to the map alone.
+distance from the keyframe and reaches 0 at USED_DISTANCE. Beyond it, frames are aligned to the map alone.
 """
 
 from __future__ import annotations
@@ -79,14 +79,14 @@ class KeyframeTerm(NamedTuple):
         self, levels: Sequence[PyramidLevel], level: int, T_view_camera: Float64, weights: Weights, brightness: float,
         linear: LinearWeights | None,
     ) -> NormalEquations:  # fmt: skip
-        """Return the weighted normal equations of the keyframe for a twist of the view.
+        """Return the weighted normal equations of the keyframe for a left twist of T_view_camera.
 
         Args:
             levels: The image pyramid of the frame, finest level first.
             level: The level of the alignment, at most COMPARED.
             T_view_camera: The current pose (4, 4) of the frame in the view.
             weights: The weights and limits.
-            brightness: The mean difference of frame and model intensity.
+            brightness: The mean of frame minus model intensity.
             linear: The limits of the linear weights, or None for Tukey's weights.
         """
         own = linearize(

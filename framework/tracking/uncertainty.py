@@ -24,7 +24,9 @@ MIN_VARIANCE = 1e-18  # minimum variance of a motion, m^2 and rad^2, for data wi
 
 
 def pose_covariance(terms: Sequence[NormalEquations], T_view_camera: Float64) -> Float64:
-    """Return the covariance (6, 6) of a pose, as defined by `Pose.covariance`.
+    """Return the covariance (6, 6) of the pose error, a twist (translation, m, rotation, rad) in the camera frame.
+
+    The true pose is T_world_camera exp(twist), as for `Pose.covariance`.
 
     Args:
         terms: The normal equations of the map and, if used, of the keyframe.

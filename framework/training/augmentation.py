@@ -20,12 +20,12 @@ BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # fractions of blurred, noisy and gray im
 def augmented(example: Example, rng: np.random.Generator) -> Example:
     """Apply random mirroring, zoom, color changes, blur and noise to a training image.
 
-    Small and mostly cropped objects are removed.
+    Small objects and mostly cropped objects are removed.
     """
     color, masks = example.color, example.masks
     if rng.uniform() < 0.5:
         color, masks = color[:, ::-1], masks[:, :, ::-1]
-    areas = masks.sum(axis=(1, 2))
+    areas = masks.sum(axis=(1, 2)).astype(np.float64)
     if rng.uniform() < ZOOMED:
         color, masks, scale = _zoomed(color, masks, rng)
         areas = areas * scale

@@ -36,11 +36,11 @@ WIDTH, HEIGHT = 320, 240  # size of the images, px
 FOCAL = (0.7, 1.0)  # range of the focal length, in image widths
 EYE_HEIGHT = (0.9, 1.75)  # m, range of the camera height
 CLEAR = 0.35  # m, minimum distance of the camera to furniture and walls
-TINT = 0.5  # logarithm of the maximum factor for the colors of a surface
+TINT = 0.5  # logarithm of the maximum brightness factor of a material, and of each of its color channels
 TINTED = 0.7  # fraction of the images with changed colors
-STUDIOS = 0.5  # probability of a studio (RoomKind.STUDIO); some classes occur only in studios
+STUDIOS = 0.5  # probability of RoomKind.STUDIO before a uniform choice among all kinds; some classes occur only there
 QUALITY = 93  # JPEG quality of the images
-MIN_PIXELS = 100  # px, minimum area of objects in an image
+MIN_PIXELS = 100  # px, minimum total area of the objects in an image
 TRIES = 20  # maximum number of candidate views for each image
 
 
@@ -136,7 +136,7 @@ def _centers(room: Room, ids: Sequence[int]) -> Float64:
 
 
 def _view(room: Room, centers: Sequence[Float64], rng: np.random.Generator) -> Float64:
-    """Return a random camera pose (4, 4) above free floor, roughly towards a random object.
+    """Return a random pose T_world_camera (4, 4) above free floor, facing roughly towards a random object.
 
     `centers` contains the centers (N, 3), m, of the objects of each class.
     """

@@ -94,7 +94,7 @@ class Trainer:
     def run(self) -> None:
         """Run the remaining training steps.
 
-        If interrupted, the steps after the last checkpoint are lost.
+        If training is interrupted, the steps after the last checkpoint are lost.
         """
         with tqdm(total=self.schedule.steps, initial=self.step, desc="training", unit="step", disable=None) as bar:
             while self.step < self.schedule.steps:

@@ -25,7 +25,7 @@ _SAMPLES: dict[str, tuple[tuple[int, int, int], ...]] = {
 }  # samples of each name in sRGB, 0..255: saturated, muted and dark colors
 
 COLOR_NAMES = tuple(_SAMPLES)
-CONFUSED = 12.0  # CIELAB distance at which two names are interchangeable under changing light
+CONFUSED = 12.0  # CIELAB, standard deviation of the score; closer names are easily confused under changing light
 OTHER_SPELLINGS = {"grey": "gray", "violet": "purple", "turquoise": "blue", "teal": "blue", "navy": "blue"}
 
 

@@ -117,7 +117,7 @@ def to_coco(labels: Sequence[str], key: str = "detector.label_space") -> LabelMa
     unknown = [label for label, key in zip(labels, keys, strict=True) if key not in MEANINGS]
     if unknown:
         raise ConfigError(
-            f"{key}: expected names of a label space, got {len(unknown)} unknown names in {len(labels)} labels: "
+            f"{key}: expected names of a label space, got unknown labels ({len(unknown)} of {len(labels)}): "
             f"{', '.join(map(repr, unknown))}; add them to framework/vocabulary/{Path(__file__).stem}.yaml"
         )
     meanings = [MEANINGS[key] for key in keys]

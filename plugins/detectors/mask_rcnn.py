@@ -37,7 +37,7 @@ class MaskRCNNDetector(Detector):
     or converted with this project.
 
     The class distribution of a detection is the softmax over the class scores, renormalized without the background. The
-    score of a detection is the probability of its class, including the background. Non-maximum suppression across
+    score of a detection is the probability of its class before this normalization. Non-maximum suppression across
     classes removes duplicates of ambiguous objects. After construction, `weights` is the path of the file, and `domain`
     is the domain of its training images.
     """

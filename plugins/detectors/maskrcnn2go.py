@@ -44,7 +44,7 @@ from framework.files.search_paths import candidates
 from framework.interfaces import Detector
 from framework.vocabulary.label_spaces import COCO
 
-LARGEST_FILE = 2**26  # maximum file size, bytes; the published files have 3 MB
+LARGEST_FILE = 2**26  # maximum file size, bytes; the published files have at most 3 MB
 SHA256 = {
     "graph.json": "e2b06acc9c26fdd62292100ea2a5495f9fd1bd3607276916bdb8440562f401ef",
     "maskrcnn2go_coco_int8.npz": "a79197eba054bdf4e4b1136a3dffbfea951f442682464357d91b2a1abd0d21c9",
@@ -52,7 +52,7 @@ SHA256 = {
 STRIDE = 16  # side of a cell of the feature map, px of the resized image
 BINS = 6  # number of bins of RoIAlign per side
 PRE_NMS_PROPOSALS = 3000  # number of anchors that are decoded, best first, as in the graph
-EXTENT = 1.0  # extent of the boxes; see framework.detection.masks.boxes
+EXTENT = 1.0  # box convention: x2 is the last pixel inside, so that the width is x2 - x1 + 1 px
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +65,7 @@ class MaskRCNN2Go(Detector):
     with 8-bit integers, in one thread per frame. On other devices, it computes in floating point with the same weights.
 
     The class distribution of a detection is the softmax over the class scores of 80 classes, renormalized without the
-    background. The score of a detection is the probability of its class, including the background. Non-maximum
+    background. The score of a detection is the probability of its class before this normalization. Non-maximum
     suppression across classes removes duplicates of ambiguous objects.
     """
 

@@ -25,9 +25,9 @@ SOURCE = "yolox_nano.onnx (3.7 MB, COCO, Apache-2.0) is at https://github.com/Me
 class OnnxBoxes(Detector):
     """YOLO or SSD in an ONNX file, with masks from depth; needs the extra `onnx`.
 
-    The class scores of a detection are multiplied by its objectness. Its class distribution is their normalized
-    product, and its score is the largest product. The mask is the connected foreground in the box; see
-    `framework.detection.masks.masks_from_boxes`. Boxes with too few depth readings are dropped and counted in
+    Each class score of a detection is multiplied by its objectness. The class distribution consists of the normalized
+    products, and the score of the detection is the largest product. The mask is the connected foreground in the box;
+    see `framework.detection.masks.masks_from_boxes`. Boxes with too few depth readings are dropped and counted in
     `boxes_without_depth`. The defaults are for YOLOX.
     """
 
@@ -95,7 +95,7 @@ class OnnxBoxes(Detector):
         self.boxes_without_depth += missing
         log.log(
             level,
-            "frame %d: dropped %d of %d boxes with too few depth readings for a mask, %d so far",
+            "frame %d: %d of %d boxes dropped because of too few depth readings for a mask; %d dropped so far",
             frame.index,
             missing,
             len(found),

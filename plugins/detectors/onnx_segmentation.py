@@ -102,7 +102,7 @@ class OnnxSegmentation(Detector):
         """Log if the network reports one class per detection, or if its class names differ from `label_space`."""
         if self._layout.suppressed:
             log.info(
-                "detector.class_spread: %s reports one class per detection; the other classes get %g of 1 - score",
+                "detector.class_spread: %s reports one class per detection; the other classes share %g * (1 - score)",
                 self.weights.name,
                 self.class_spread,
             )

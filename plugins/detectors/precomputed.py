@@ -1,4 +1,4 @@
-"""Detections of other programs, read from files."""
+"""Detections from other programs, read from files."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ class Precomputed(Detector):
     other classes share the rest equally. Labels are mapped to COCO names by `label_spaces.yaml`. A detection is dropped
     if its best label has no COCO name.
 
-    A frame without an entry has no detections. If none of the requested frames has an entry, the detector raises
-    DataError, because the file belongs to another sequence.
+    A frame without an entry has no detections. If a frame after the last entry is requested before any frame with an
+    entry, the detector raises DataError, because the file belongs to another sequence.
     """
 
     # COCO results file (e.g. from `instancemap detect`), or folder with NNNNNN.png and NNNNNN.json
@@ -78,7 +78,7 @@ class Precomputed(Detector):
             )
         if not known.all():
             lost = sorted({one.label for one, is_known in zip(stored, known, strict=True) if not is_known})
-            log.info("%s: dropped %d of %d detections of classes without a COCO name: %s",
+            log.info("%s: %d of %d detections dropped because their classes have no COCO name: %s",
                      self.path, int((~known).sum()), len(stored), ", ".join(lost))  # fmt: skip
         self._frames = {one.frame for one in stored}
         self._of_frame: dict[int, list[tuple[StoredDetection, Float32]]] = defaultdict(list)

@@ -92,7 +92,8 @@ class Candidate:
 class SimulatedDetector(Detector):
     """The ground truth with the errors of a mid-quality detector.
 
-    Each error has a parameter. If all are 0, the detections are the ground truth. The errors are applied in this order:
+    Each error has a parameter. Without errors, the detections are the ground truth. The errors are applied in this
+    order:
 
     - Objects of unknown class are detected as an arbitrary class (`clutter_rate`).
     - The mask of an object includes a touching object of unknown class, e.g. the cupboard of a sink (`attach_rate`).
@@ -101,7 +102,7 @@ class SimulatedDetector(Detector):
       nearly always missed, and others never (`miss_spread`).
     - Objects are split in two (`split_rate`).
     - Masks are shifted, extend beyond the object, have a noisy border and have a coarse resolution.
-    - The class distribution is random, with similar classes more likely (`confusion`). In a fraction of the frames, an
+    - The class distribution is random, with similar classes more likely (`confusion`). In a fraction of its frames, an
       object has the same distribution (`confusion_consistency`).
     - The score depends on the quality of the mask and the certainty of the class.
     - False detections occur, some of them repeatedly at the same locations (`recurring_fraction`, needs poses).
@@ -126,7 +127,7 @@ class SimulatedDetector(Detector):
     bleed: float = 2.0  # offset of the mask border from the object border, px; positive = outside, negative = inside
     boundary_noise: float = 2.5  # standard deviation of the displacement of the mask border, px, >= 0
     boundary_scale: float = 12.0  # correlation length of the displacement along the mask border, px, >= 2
-    mask_grid: int = 28  # number of cells per side of a mask, >= 4; 0 = full resolution
+    mask_grid: int = 28  # number of cells per side of a mask, 0 or >= 4; 0 = full resolution
     confusion: float = 0.25  # mean total probability of the wrong classes, in [0, 1)
     # concentration of the Dirichlet distribution of classes, > 0; small values give confident but often wrong classes
     confusion_concentration: float = 3.0
@@ -392,7 +393,7 @@ def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: flo
 
 
 def _dirichlet(random: np.random.Generator, alpha: Float64) -> Float64:
-    """Return a sample (C,) of a Dirichlet distribution.
+    """Return a sample (C,) from a Dirichlet distribution.
 
     The result is its mean if the sampled weights are all 0.
     """
@@ -423,7 +424,7 @@ def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
 
 
 def _placed(crop: Bool, x: int, y: int, shape: tuple[int, int]) -> Bool:
-    """Return an empty mask of the given shape with `crop` at (x, y)."""
+    """Return a mask of the given shape with `crop` at (x, y), False elsewhere."""
     image = np.zeros(shape, np.bool_)
     height, width = shape
     top, left = max(0, -y), max(0, -x)

@@ -99,7 +99,7 @@ class TransformersSegmentation(Detector):
         with errors_of("detector.model"):
             self._preprocessing = Preprocessing.parse(read_json(path), str(path))
         if short:
-            require(self._family.any_size, "detector.short_side", short, "0, because this model has a fixed input size")
+            require(self._family.any_size, "detector.short_side", short, "0 (this model has a fixed input size)")
             size = {"shortest_edge": short, "longest_edge": long}
             self._preprocessing = replace(self._preprocessing, size=size)
         self._mapping = to_coco(checkpoint.labels, "detector.model")
@@ -151,7 +151,10 @@ def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]
         labels: The number of labels C.
     """
     if logits.shape[1] not in (labels, labels + 1):
-        raise DataError(f"detector.model: expected {labels} class logits (as in config.json), got {logits.shape[1]}")
+        raise DataError(
+            f"detector.model: expected {labels} or {labels + 1} class logits ({labels} labels in config.json), got "
+            f"{logits.shape[1]}; choose another model"
+        )
     # Softmax without "no object". For independent sigmoids p_c, the distribution with exactly one true label is
     # P(c) ~ p_c prod_{j != c} (1 - p_j) ~ p_c / (1 - p_c) = exp(logit_c).
     objects = logits[:, :labels]
@@ -202,9 +205,9 @@ class Preprocessing:
 
     size: Mapping[str, int] | None  # target size, px, with the keys in the file; None = original size
     divisor: int  # px; sides are rounded up to multiples of it
-    pad_to: tuple[int, int] | None  # padded (height, width) px, black at the right and bottom; None = no padding
+    pad_to: tuple[int, int] | None  # padded (height, width), px, black at the right and bottom; None = no padding
     mode: str  # interpolation mode: bilinear or bicubic
-    factor: float  # factor of the values 0..255
+    factor: float  # factor for the values 0..255
     mean: tuple[float, ...]  # RGB, subtracted after the factor is applied
     std: tuple[float, ...]  # RGB, divides the difference
 
@@ -227,7 +230,10 @@ class Preprocessing:
         if content.get("pad_size"):
             raise DataError(f"{where}: pad_size: expected no value, got {content['pad_size']}; choose another model")
         if content.get("resample", 2) not in RESAMPLING:
-            raise DataError(f"{where}: resample: expected one of {[*RESAMPLING]}, got {content['resample']}")
+            raise DataError(
+                f"{where}: resample: expected 2 (bilinear) or 3 (bicubic), got {content['resample']}; choose another "
+                "model"
+            )
         size = content.get("size") if content.get("do_resize", True) else None
         if isinstance(size, int):  # files before 2023
             size = {"shortest_edge": size, "longest_edge": content.get("max_size", size)}
@@ -236,7 +242,7 @@ class Preprocessing:
         if content.get("do_resize", True) and keys not in known:
             raise DataError(
                 f"{where}: size: expected height and width, max_height and max_width, or shortest_edge and "
-                f"longest_edge, got {size}"
+                f"longest_edge, got {size}; choose another model"
             )
         normalizes = content.get("do_normalize", True)
         pads = content.get("do_pad") and str(content.get("image_processor_type", "")).startswith("Eomt")
@@ -268,7 +274,7 @@ class Preprocessing:
     def __call__(self, color: UInt8, device: torch.device) -> tuple[Tensor, tuple[float, float]]:
         """Return the network input (1, 3, H, W) for an image (h, w, 3).
 
-        The second result is the fractions of H and W that the image covers.
+        The second result contains the fractions of H and W that the image covers.
         """
         pixels = torch.from_numpy(color).to(device).permute(2, 0, 1)[None].float()
         height, width = self.resized((color.shape[0], color.shape[1]))
@@ -339,7 +345,7 @@ class Checkpoint:
         if missing:
             raise DataError(
                 f"detector.model: {self.folder}: expected a checkpoint for segmentation, got no weights for "
-                f"{len(missing)} of the network's tensors ({', '.join(missing[:3])}, ...)"
+                f"{len(missing)} of the network's tensors ({', '.join(missing[:3])}, ...); choose another model"
             )
         module: torch.nn.Module = network.float().eval()
         return module

@@ -59,7 +59,7 @@ class LabelVote(MapFuser):
         with timer("update"):
             weights = np.ones(len(clusters), np.float32)
             if self.vote is Vote.MAX_SCORE:
-                weights = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # a score of 0 would be no evidence
+                weights = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # a score of 0 would not be evidence
             evidence = vote_for_best(clusters, weights)
             measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULES[self.vote])
             self.scene.labels.update(seen, measurement)

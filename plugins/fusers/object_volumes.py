@@ -31,8 +31,8 @@ def existence(record: InstanceRecord) -> float:
 class ObjectVolumes(MapFuser):
     """One TSDF with foreground probabilities per object, and one TSDF of the whole scene.
 
-    A detection is matched with the object of largest overlap. If several detections match one object, the union of
-    their masks is used. The defaults are the rule of Fusion++. For the rule of MaskFusion, set `overlap_rule=CLUSTER
+    A detection is matched with the object with the largest overlap. If several detections match one object, the union
+    of their masks is used. The defaults are the rule of Fusion++. For the rule of MaskFusion, set `overlap_rule=CLUSTER
     min_overlap=0.05 require_same_class=true`. See `framework/baselines/object_map.py` for the differences from the
     original systems.
     """
@@ -84,7 +84,7 @@ class ObjectVolumes(MapFuser):
         return count_overlaps(points, seen, stride)
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Matches:
-        """Match each cluster with the object of largest overlap, and create new objects for other clusters."""
+        """Match each cluster with the object with the largest overlap, and create objects for other clusters."""
         ratios = overlaps.by(self.overlap_rule, self.create_points)
         ratios[~self._agree(clusters, overlaps.instance_ids)] = 0
         instance_ids = np.zeros(len(clusters), np.int32)

@@ -26,7 +26,8 @@ class Connected(ClusterRefiner):
 
     max_gap: float = 0.1  # maximum depth step between connected pixels at depth 0, m, >= 0
     gap_per_depth: float = 0.02  # increase of the maximum depth step with depth, m per m, >= 0
-    connection_radius: int = 2  # maximum distance between connected pixels, px, >= 1; 2 bridges single missing readings
+    # maximum distance between connected pixels, px, in [1, 16]; 2 bridges single missing readings
+    connection_radius: int = 2
     # minimum ratio of a component's number of pixels to that of the largest component, in [0, 1]; smaller components
     # are dropped
     min_piece_ratio: float = 0.05

@@ -32,7 +32,7 @@ class GmmEm(ClusterRefiner):
 
     object_components: int = 3  # number of Gaussians of the object, >= 1; about one per visible face
     background_components: int = 6  # number of Gaussians of the background, >= 0; 0 = no background model
-    # number of k-means iterations for the initialization, >= 1; 1 = groups of equal size, ordered by depth
+    # number of k-means iterations for the initialization, >= 1; starts from groups of equal size, ordered by depth
     start_iterations: int = 5
     max_iterations: int = 8  # maximum number of EM iterations, >= 1
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point, >= 0

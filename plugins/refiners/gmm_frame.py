@@ -40,7 +40,7 @@ class GmmFrame(ClusterRefiner):
     the hierarchy. The levels, the number of children (Eckart et al., CVPR 2016) and the initialization are our choice.
     """
 
-    levels: int = 2  # number of levels of hierarchical EM, >= 1; 1 = flat mixture; 2 is our choice
+    levels: int = 2  # number of levels of hierarchical EM, in [1, 8]; 1 = flat mixture; 2 is our choice
     # number of children of a node: 2, 4 or 8; 8 is our interpretation of section 3.2.2
     children: int = 8
     # number of level-1 Gaussians per mask, >= 1; section 3.2.2 has one group for each of K classes; 1 per mask is our
@@ -50,13 +50,16 @@ class GmmFrame(ClusterRefiner):
     # treatment of points whose most probable Gaussian belongs to another mask: MOVE to that mask (our interpretation of
     # section 3.2.2), DROP or STAY
     foreign_points: ForeignPoints = ForeignPoints.MOVE
-    max_iterations: int = 10  # maximum number of EM iterations in a node, >= 1
-    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
+    max_iterations: int = 10  # maximum number of EM iterations in a node, >= 1; our choice
+    # minimum increase of the mean log-likelihood per EM iteration, nats per point, >= 0; our choice
+    tolerance: float = 1e-3
     std_floor: float = 0.005  # minimum standard deviation of a Gaussian along any axis, m, in [0.0001, 1]; our choice
     # minimum fraction of the frame's points in a Gaussian, in [0, 1); smaller Gaussians are dropped; our choice
     min_support: float = 1e-4
-    min_points: int = 30  # minimum number of points of a refined cluster, >= 1; smaller clusters are dropped
-    max_points: int = 20_000  # maximum number of points of a frame for the fit, >= 100; all points are assigned
+    # minimum number of points of a refined cluster, >= 1; smaller clusters are dropped; our choice
+    min_points: int = 30
+    # maximum number of points of a frame for the fit, >= 100; all points are assigned; our choice, for speed
+    max_points: int = 20_000
 
     def __post_init__(self) -> None:
         check_bounds(

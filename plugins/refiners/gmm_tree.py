@@ -29,7 +29,7 @@ class GmmTree(ClusterRefiner):
     with too few points in the mask or the ring are not changed.
     """
 
-    levels: int = 2  # number of levels of the tree, >= 1
+    levels: int = 2  # number of levels of the tree, in [1, 8]
     children: int = 8  # number of children of a node, >= 2; J of Eckart et al. 2016
     max_iterations: int = 8  # maximum number of EM iterations in a node, >= 1
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point, >= 0

@@ -25,7 +25,8 @@ class LargestComponent(ClusterRefiner):
 
     max_gap: float = 0.03  # maximum depth step between connected pixels at depth 0, m, >= 0
     gap_per_depth: float = 0.02  # increase of the maximum depth step with depth, m per m, >= 0
-    connection_radius: int = 2  # maximum distance between connected pixels, px, >= 1; 2 bridges single missing readings
+    # maximum distance between connected pixels, px, in [1, 16]; 2 bridges single missing readings
+    connection_radius: int = 2
 
     def __post_init__(self) -> None:
         check_bounds(self, max_gap=(0.0, np.inf), gap_per_depth=(0.0, np.inf), connection_radius=(1, 16))

@@ -50,7 +50,7 @@ class PycolmapPnp(PoseTracker):
             found = self._keyframes.locate(frame, features, self._keyframes.alike(features))
         if found is None:
             T_world_last = np.eye(4) if self._T_world_last is None else self._T_world_last
-            reason = f"fewer than {self.min_inliers} of the frame's {len(features)} features match the keyframes"
+            reason = f"too few of the frame's {len(features)} features match the keyframes"
             return Pose(T_world_last, lost=True, reason=reason)
         self._T_world_last = found.T_world_camera
         self._keyframes.add_with(frame, features, found.T_world_camera)

@@ -1,4 +1,4 @@
-"""Poses of another SLAM system, read from a file."""
+"""Poses from another SLAM system, read from a file."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class TrajectoryFile(PoseTracker):
 
     Each frame gets the pose nearest in time. Frames without such a pose are skipped. By default, the trajectory is
     moved rigidly, so that the first frame with a pose defines the world frame. `world_frame=FILE` keeps the world frame
-    of the file. The ground-truth poses of the sequence are then invalid. The tracker raises DataError if a pose is not
-    finite or not rigid, or if timestamps do not increase.
+    of the file. The ground-truth poses of the sequence are then invalid, because they have another world frame. The
+    tracker raises DataError if a pose is not finite or not rigid, or if timestamps do not increase.
     """
 
     path: Path  # trajectory in TUM format

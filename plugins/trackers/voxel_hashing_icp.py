@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.config.validation import check_bounds, require
-from framework.data import Array, Camera, Float64, Frame, Pose
+from framework.data import Array, Bool, Camera, Float64, Frame, Pose
 from framework.errors import DataError
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
@@ -38,6 +38,8 @@ STEADY = 5  # minimum number of consecutive frames with a correct prediction in 
 VISITED = 64  # number of visited poses that are tried for a lost camera, one per frame
 VISITED_SEPARATION = 0.1  # minimum separation of these poses, m and rad
 RECOVERY_INFORMATION = 2.0  # factor of min_information for a lost camera
+# factor of min_information below which odometry determines the motion, because noise of normals simulates information
+ODOMETRY_INFORMATION = 5.0
 
 
 class ResidualWeights(Enum):
@@ -71,6 +73,13 @@ class Alignment(NamedTuple):
         return not (self.reason or self.doubt)
 
 
+class Directions(NamedTuple):
+    """Principal directions of motion, with translations in units of the typical depth."""
+
+    vectors: Float64  # (6, 6) orthonormal columns
+    determined: Bool  # (6,) True = the points determine the motion along the column of `vectors`
+
+
 @dataclass
 class VoxelHashingIcp(PoseTracker):
     """Coarse-to-fine ICP with color against a view of the map, as in VoxelHashing and ElasticFusion.
@@ -78,6 +87,9 @@ class VoxelHashingIcp(PoseTracker):
     The tracker detects lost poses. A pose is accepted if most points agree with the map. Near the predicted pose of a
     steady motion, less agreement is sufficient. Because wrong poses can also agree with the map
     (docs/guides/trackers.md), all other poses are compared with the pose from features, if there is one.
+
+    The prediction is the motion measured by odometry, if the frames have odometry, and otherwise constant velocity. A
+    frame near the prediction of odometry may determine only a part of the motion. Odometry determines the rest.
 
     A frame is always lost if too few points match, if the motion is implausible, or if the points do not determine the
     motion. All other checks are our additions. Set min_agreement=0 and max_occluded=1 to disable the checks of
@@ -137,6 +149,7 @@ class VoxelHashingIcp(PoseTracker):
         self._weights = Weights(*(np.float32(getattr(self, name)) for name in Weights._fields))
         self._T_world_last: Float64 | None = None  # last reliable pose
         self._T_last_next = np.eye(4)  # motion to the next frame under constant velocity
+        self._T_world_odom: Float64 | None = None  # odometry frame at the last reliable frame with odometry
         self._lost_frames = 0  # number of consecutive lost frames
         self._steady_frames = 0  # number of consecutive frames with a correct prediction
         self._keyframes = Keyframes(seed=self.seed)
@@ -156,11 +169,14 @@ class VoxelHashingIcp(PoseTracker):
         if self._T_world_last is None or scene.statistics.voxels == 0:
             return self._initialize(seen, scene)
         levels = self._pyramid(frame)
-        T_world_predicted = self._T_world_last @ self._T_last_next
+        T_world_odometry = self._predicted_by_odometry(frame)
+        T_world_predicted = self._T_world_last @ self._T_last_next if T_world_odometry is None else T_world_odometry
         if self._lost_frames:
-            alignment = self._align_lost(levels, scene)
+            alignment = self._align_lost(levels, scene, T_world_odometry)
+        elif T_world_odometry is None:
+            alignment = self._align_predicted(levels, scene, T_world_predicted, self._T_world_last)
         else:
-            alignment = self._align_predicted(levels, scene, T_world_predicted)
+            alignment = self._align_odometry(levels, scene, T_world_odometry)
         if not (alignment.reliable and self._steady_frames >= STEADY) and levels[0].depth.any():
             alignment = self._relocalized(alignment, seen, levels, scene)
             if not self._scale.near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
@@ -240,13 +256,36 @@ class VoxelHashingIcp(PoseTracker):
         self._stored_scene = None
         return self._accept(seen, alignment.T_world_camera, alignment.covariance)
 
-    def _align_predicted(self, levels: list[PyramidLevel], scene: SceneMap, T_world_predicted: Float64) -> Alignment:
-        """Return the alignment that starts at the predicted pose.
+    def _predicted_by_odometry(self, frame: Frame) -> Float64 | None:
+        """Return the pose (4, 4) that the motion by odometry predicts; None = odometry is unknown."""
+        if self._T_world_odom is None or frame.T_odom_camera is None:
+            return None
+        return self._T_world_odom @ frame.T_odom_camera
 
-        Near the prediction, less agreement with the map is sufficient.
+    def _align_odometry(self, levels: list[PyramidLevel], scene: SceneMap, T_world_odometry: Float64) -> Alignment:
+        """Return the alignment that starts at the pose predicted by odometry.
+
+        If it is not reliable, start at the prediction of constant velocity, whose result needs confirmation.
         """
         assert self._T_world_last is not None
-        alignment = self._align(levels, scene, T_world_predicted, self._T_world_last)
+        alignment = self._align_predicted(levels, scene, T_world_odometry, T_world_odometry, completed=True)
+        if alignment.reliable:
+            return alignment
+        again = self._align(levels, scene, self._T_world_last @ self._T_last_next, self._T_world_last)
+        if not again.reliable:
+            return alignment
+        self._steady_frames = 0
+        return again
+
+    def _align_predicted(
+        self, levels: list[PyramidLevel], scene: SceneMap, T_world_predicted: Float64, T_world_from: Float64,
+        completed: bool = False,
+    ) -> Alignment:  # fmt: skip
+        """Return the alignment that starts at the predicted pose.
+
+        Near the prediction, less agreement with the map is sufficient. See `_align` for the other arguments.
+        """
+        alignment = self._align(levels, scene, T_world_predicted, T_world_from, completed)
         if not self._scale.near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
             self._steady_frames = 0
             return alignment
@@ -258,9 +297,18 @@ class VoxelHashingIcp(PoseTracker):
             return alignment._replace(doubt="")
         return alignment
 
-    def _align_lost(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
-        """Return the alignment that starts at the last reliable pose, or at the unconfirmed pose of the last frame."""
+    def _align_lost(
+        self, levels: list[PyramidLevel], scene: SceneMap, T_world_odometry: Float64 | None
+    ) -> Alignment:  # fmt: skip
+        """Return the alignment that starts at the prediction of odometry, the last pose or the unconfirmed pose.
+
+        The unconfirmed pose is that of the last frame, if only its confirmation failed.
+        """
         assert self._T_world_last is not None
+        if T_world_odometry is not None:
+            alignment = self._align_twice(levels, scene, T_world_odometry)
+            if alignment.reliable:
+                return alignment
         alignment = self._align_twice(levels, scene, self._T_world_last)
         if alignment.reliable or self._T_world_doubted is None:
             return alignment
@@ -299,6 +347,8 @@ class VoxelHashingIcp(PoseTracker):
 
     def _accept(self, seen: FrameFeatures, T_world_camera: Float64, covariance: Float64 | None) -> Pose:
         self._T_world_last = T_world_camera
+        if seen.frame.T_odom_camera is not None:
+            self._T_world_odom = T_world_camera @ inverse(seen.frame.T_odom_camera)
         self._T_world_doubted = None
         self._lost_frames = 0
         if self.relocalize:
@@ -375,8 +425,9 @@ class VoxelHashingIcp(PoseTracker):
         return again
 
     def _align(
-        self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64
-    ) -> Alignment:
+        self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64,
+        completed: bool = False,
+    ) -> Alignment:  # fmt: skip
         """Return the alignment of a frame to a view of the map, computed coarse to fine.
 
         Args:
@@ -384,6 +435,7 @@ class VoxelHashingIcp(PoseTracker):
             scene: The map.
             T_world_view: The pose (4, 4) of the view, where the alignment starts.
             T_world_from: The pose (4, 4) relative to which the motion is limited.
+            completed: True = T_world_view determines the motion that the points do not determine.
         """
         view = scene.render_near(levels[0].camera, T_world_view, levels[0].depth, levels[0].sensor)
         model, intensities = model_view(view), model_intensities(view, LEVELS)
@@ -405,6 +457,8 @@ class VoxelHashingIcp(PoseTracker):
                     key_brightness = own.brightness if linear is None else 0.0
                     A, b = A + own.A, b + own.b
                 xi = _solved(A, b)
+                if completed:
+                    xi = self._determined_part(xi, self._directions(equations, ODOMETRY_INFORMATION))
                 T_view_camera = exp_se3(xi) @ T_view_camera
                 if self._scale.length(xi) < CONVERGED * 4**level:
                     break
@@ -417,8 +471,10 @@ class VoxelHashingIcp(PoseTracker):
         # until many frames are mapped, the view of the map is empty where depth is scattered
         if self._scattered_depth and term is not None and own.visible > equations.visible:
             equations, compared = own, levels[COMPARED]
-        # linear weights are not inverse variances
-        covariance = pose_covariance(terms, T_view_camera) if linear is None else None
+        factor = ODOMETRY_INFORMATION if completed else RECOVERY_INFORMATION if self._lost_frames else 1.0
+        determined = self._directions(equations, factor).determined.all()
+        # linear weights are not inverse variances, and the accuracy of odometry is unknown
+        covariance = pose_covariance(terms, T_view_camera) if linear is None and determined else None
         T_world_camera = T_world_view @ T_view_camera
         # products of poses and of their inverses amplify rounding errors exponentially
         T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])
@@ -427,6 +483,8 @@ class VoxelHashingIcp(PoseTracker):
         )
         agreement_in_front = equations.close / max(equations.visible - equations.behind, 1)
         reason = self._rejection(compared, equations, inverse(T_world_from) @ T_world_camera)
+        if not (reason or determined or completed):
+            reason = "the visible surface does not determine the motion"
         doubt = ""
         if agreement < self.min_agreement or behind > self.max_occluded:
             doubt = f"{agreement:.0%} of the visible points agree with the map, {behind:.1%} lie behind it"
@@ -475,18 +533,25 @@ class VoxelHashingIcp(PoseTracker):
         if self._is_jump(T_from_camera):
             step, turn = np.linalg.norm(T_from_camera[:3, 3]), rotation_angle(T_from_camera[:3, :3])
             return f"implausible step of {step:.2f} m and {np.degrees(turn):.0f} deg"
-        if not self._is_determined(equations):
-            return "the visible surface does not determine the motion"
         return ""
 
-    def _is_determined(self, equations: NormalEquations) -> bool:
-        """Return True if the points determine the motion in all six degrees of freedom."""
+    def _directions(self, equations: NormalEquations, factor: float) -> Directions:
+        """Return the principal directions of motion, and those with `factor` times the minimum information or more."""
         # The photometric term is not multiplied by lambda, because only the geometric term contains false information
         # from noisy normals.
         color = (1 / self.color_weight - 1) * equations.A_color if self.color_weight > 0 else 0.0
-        information = np.linalg.eigvalsh(self._scale.without_units(equations.A + color))
-        least = self.min_information * (RECOVERY_INFORMATION if self._lost_frames else 1.0)
-        return bool(information[0] >= least * information.mean())
+        information, directions = np.linalg.eigh(self._scale.without_units(equations.A + color))
+        return Directions(directions, information >= factor * self.min_information * information.mean())
+
+    def _determined_part(self, xi: Float64, directions: Directions) -> Float64:
+        """Return the part of a step xi (6,), m and rad, along the determined directions.
+
+        Method: solution remapping of Zhang, Kaess and Singh, ICRA 2016.
+        """
+        if directions.determined.all():
+            return xi
+        kept = directions.vectors[:, directions.determined]
+        return np.asarray(self._scale.units * (kept @ (kept.T @ (xi / self._scale.units))))
 
 
 def _solved(A: Float64, b: Float64) -> Float64:

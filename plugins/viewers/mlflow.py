@@ -34,7 +34,7 @@ class MLflowViewer(Viewer):
         check_package("viewer", "mlflow", extra="mlflow")
 
     def begin_run(self, directory: Path, config: Mapping[str, Any]) -> None:
-        os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")  # MLflow sends statistics of its use by default
+        os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")  # MLflow sends usage statistics by default
         from mlflow import MlflowClient
         from mlflow.entities import Param
 

@@ -29,7 +29,7 @@ from framework.live_view.sealed_page import SealedPage
 log = logging.getLogger(__name__)
 
 RECORDING = "recording.rrd"
-FLUSH_S = 0.2  # maximum duration of the data that are lost if a run is killed, s
+FLUSH_S = 0.2  # maximum duration of data lost by a killed run, s
 
 
 class Mode(Enum):
@@ -48,7 +48,7 @@ class RerunViewer(Viewer):
     """
 
     mode: Mode = Mode.RECORD  # output: RECORD (file), WINDOW (rerun's viewer) or BROWSER (local web page)
-    # path of the .rrd file; "" = recording.rrd in the run directory for RECORD, no file for the other modes
+    # path of the .rrd file, relative to the run directory; "" = recording.rrd for RECORD, no file for the other modes
     file: str = ""
     frame_interval: int = 3  # interval between logged images, in frames, >= 1; 1 = every frame
     mesh_interval: float = 2.0  # minimum interval between mesh snapshots, s, in [0.1, 3600]

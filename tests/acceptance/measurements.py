@@ -32,7 +32,7 @@ def mapped(*overrides: str) -> dict[str, Any]:
 
 
 def failures(*arguments: str, **variables: str) -> Measured:
-    """Run pytest with arguments and return its exit status, which is 0 if all tests pass."""
+    """Run pytest with `arguments`, and return its exit status and whether it is 0, i.e. all tests pass."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", *arguments]
     status = subprocess.run(command, cwd=CHECKOUT, env=os.environ | variables, check=False).returncode
     return status, status == 0

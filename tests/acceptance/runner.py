@@ -36,7 +36,7 @@ MEASUREMENTS: dict[str, Measurement] = {}
 
 
 def measurement(bound: str, *paths: str) -> Callable[[Callable[[], Measured]], Callable[[], Measured]]:
-    """Register a function as the acceptance measurement `name`."""
+    """Return a decorator that registers a function as an acceptance measurement with the name of the function."""
 
     def register(measure: Callable[[], Measured]) -> Callable[[], Measured]:
         MEASUREMENTS[measure.__name__] = Measurement(measure.__name__, bound, paths, measure)

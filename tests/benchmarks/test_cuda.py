@@ -134,7 +134,7 @@ def run(detector: Any, frames: Sequence[Frame]) -> tuple[list[float], list[Detec
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_cuda_detector_speed_and_agreement(
+def test_cuda_detector_reports_speed_and_agreement(
     benchmark: BenchmarkFixture, images: Callable[[str], list[Frame]], tables_of_detectors: tuple[Table, Table],
     shared: Path, tmp_path: Path, name: str,
 ) -> None:  # fmt: skip

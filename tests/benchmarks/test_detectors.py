@@ -153,7 +153,7 @@ def table(tables: list[Table]) -> Table:
 
 
 @pytest.mark.parametrize("name", [*registered.names("detector"), *RANDOM])
-def test_detectors_time_and_memory(
+def test_detectors_report_time_and_memory(
     benchmark: BenchmarkFixture, table: Table, frames: list[Frame], tmp_path: Path, name: str
 ) -> None:
     option, made = RANDOM.get(name, (name, None))

@@ -142,7 +142,7 @@ def test_slam_long_path_has_constant_speed(benchmark, tables) -> None:
             )
 
     def begin_frame() -> tuple[tuple[Frame, Detections], dict[str, Any]]:
-        """Load the next frame for our loop. At the beginning of a turn, run Open3D on the frames of the turn."""
+        """Load the next frame for the long loop. After the second start, also map a frame with the short loop."""
         record_frame()
         k = len(long.poses)
         if k >= SECOND_START:
@@ -236,7 +236,7 @@ ACCURACY = {("redkitchen", "voxel_hashing_icp"): "ATE <= 25", ("room without noi
 
 @pytest.mark.parametrize("tracker", TRACKERS)
 @pytest.mark.parametrize("video", ["redkitchen", "room without noise"])
-def test_slam_trajectory_error(benchmark, videos, trajectories, video: str, tracker: str) -> None:
+def test_slam_reports_trajectory_error(benchmark, videos, trajectories, video: str, tracker: str) -> None:
     frames = videos[video]
     slam = TRACKERS[tracker](frames[0])
     nothing = Detections.none(frames[0].camera.shape, ("thing",))
@@ -272,7 +272,7 @@ class AlternatingRuns:
         self._frame = -1
 
     def begin_frame(self) -> tuple[tuple[Frame, Detections], dict[str, Any]]:
-        """Load the next frame for our loop at the beginning of its turn."""
+        """Load the next frame for our loop. At the beginning of a turn, run Open3D on the frames of the turn."""
         if self._frame >= 0:
             self.finish_frame()
         self._frame += 1

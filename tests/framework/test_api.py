@@ -20,6 +20,7 @@ from framework.api import Mapper, load_map
 from framework.config.composition import composed
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
+from framework.geometry import exp_se3
 from framework.interfaces import MapFuser
 from framework.pipeline import Pipeline
 from framework.refinement.lifting import lift
@@ -28,6 +29,7 @@ from framework.runs.metrics import room_metrics
 from framework.sensors.noise_models import SensorKind
 from tests.support import registered
 from tests.support.scenes.analytic_scene import Scene
+from tests.support.scenes.analytic_scene import room as analytic_room
 from tests.support.scenes.corner_room import CornerRoom, pose_at
 
 pytestmark = pytest.mark.integration
@@ -82,6 +84,21 @@ def test_mapper_add_keeps_and_logs_sensor(room: CornerRoom, caplog: pytest.LogCa
         "depth sensor: KINECT_V1, standard deviation of depth 1.9 mm at 1 m, 14.0 mm at 3 m",
         "depth sensor: PHONE_LIDAR, standard deviation of depth 10.0 mm at 1 m, 10.0 mm at 3 m",
     ]
+
+
+def test_mapper_odometry_predicts_motion() -> None:
+    """The camera turns by 23 degrees between frames; the odometry frame is not the world frame."""
+    poses = [exp_se3(np.array([0.1, 0, 0, 0, 0.4, 0]) * k) for k in range(3)]
+    start = exp_se3(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+    stages = ("detector=none", "tracker.finest_scale=1", "tracker.relocalize=false", "fuser.voxel_size=0.02")
+    without, mapper = Mapper(*stages), Mapper(*stages)
+    frames = [analytic_room().frame(T, k) for k, T in enumerate(poses)]
+    lost = [without.add(frame.color, frame.depth, camera=frame.camera).lost for frame in frames]
+    assert lost == [False, True, True]
+    for frame, T in zip(frames, poses, strict=True):
+        found = mapper.add(frame.color, frame.depth, camera=frame.camera, odometry=start @ T)
+        assert not found.lost, found.reason
+        np.testing.assert_allclose(found.T_world_camera, T, atol=0.01)
 
 
 @pytest.mark.parametrize("fuser", ["bayesian_tsdf", "open3d_vbg", "object_volumes", "class_only_fusion"])

@@ -184,7 +184,12 @@ def test_command_misspelled_name_suggests_nearest_name(tmp_path: Path) -> None:
     done = words("tabels", "outputs", directory=tmp_path)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == "error: command: expected a known command, got 'tabels'; did you mean tables?\n"
-    assert "expected one of tables, figures" in words("xyz", directory=tmp_path).stderr
+
+
+def test_command_unknown_name_suggests_run(tmp_path: Path) -> None:
+    error = words("run", directory=tmp_path).stderr
+    assert error.startswith("error: command: expected one of tables, figures, ")
+    assert error.endswith(", got 'run'; omit the command to start a run: python -m framework KEY=VALUE ...\n")
 
 
 FAULTY = {

@@ -1,4 +1,4 @@
-"""Tests of the lock files in constraints/."""
+"""Tests for the lock files in constraints/."""
 
 from __future__ import annotations
 

@@ -24,6 +24,7 @@ EXECUTED = [
     "for frame in frames:",
     "class ColorBlobs",
     'load_runs("outputs/ablation_refiner',
+    "normals_of(",
 ]  # executed in test_readme.py
 CONTRACT = block("python", "class TestMyRefiner")
 PARSED = [line for line in LINES if line.startswith("python -m framework ") and line.split()[3] in main.COMMANDS]

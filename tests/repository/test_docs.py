@@ -93,12 +93,15 @@ def test_configuration_reference_has_all_parameters(built: Path) -> None:
     assert "seed of all random numbers of a run" in (built / "configuration.html").read_text()
 
 
+OF_TUTORIALS = {"color_blobs", "nearby", "my_refiner", "nearest_points", "saturated_regions"}  # plugins of the reader
+
+
 def test_page_plugins_and_parameters_exist(built: Path) -> None:
     """Options `fuser=NAME` and parameters `fuser.parameter` must be in the configuration reference."""
     text = "\n".join(PAGES.values())
     for stage in GROUPS:
         reference = (built / "configuration" / f"{stage}.html").read_text()
-        chosen = set(re.findall(rf"(?<![\w.@]){stage}=([a-z]\w*)", text)) - {"color_blobs", "nearby", "my_refiner"}
+        chosen = set(re.findall(rf"(?<![\w.@]){stage}=([a-z]\w*)", text)) - OF_TUTORIALS
         assert len(chosen) > (0 if stage == "viewer" else 2)
         assert not [name for name in chosen if f'id="{stage}-{name.replace("_", "-")}"' not in reference]
         given = set(re.findall(rf"(?<![\w./:(]){stage}\.([a-z]\w*)\b(?![.(])", text)) - {"hue", "scene"}

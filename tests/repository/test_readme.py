@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from framework.pipeline import Pipeline
 from framework.refinement.lifting import lift
 from framework.registry import STAGES, build
 from framework.runs.mesh_file import read_mesh
+from framework.testing.corner_room import exact_clusters, frame_at
 from tests.support import stored_experiments
 from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
 from tests.support.recordings.phone_exports import room_frames, write_stray_scanner
@@ -129,6 +131,16 @@ def test_tutorial_detector_runs_by_option_name(my_plugins: Path) -> None:
     assert (my_plugins / "run" / "metrics.json").exists()
 
 
+def test_tutorial_normals_of_points_are_unit_vectors() -> None:
+    frame = frame_at(0)
+    names: dict[str, Any] = {"frame": frame, "clusters": exact_clusters(frame)}
+    exec(block("python", "normals_of("), names)
+    lengths = np.linalg.norm(names["of_points"], axis=1)
+    assert len(lengths) > 100
+    np.testing.assert_allclose(lengths[lengths > 0], 1, atol=1e-5)
+    assert (lengths > 0).mean() > 0.5
+
+
 OWN_PLUGIN = "python -m framework --config-dir my_conf detector=color_blobs detector.hue=120"
 FAKES = {"dataset": "CornerRoom", "tracker": "GivenPose", "refiner": "KeepAll", "fuser": "GridFuser"}
 
@@ -179,6 +191,7 @@ RUNNABLE = {  # arguments that reduce the run time of each command to seconds
     "python -m framework dataset=rgbd_folder dataset.root=DIR tracker=trajectory_file tracker.path=FILE": [
         "hydra.run.dir=own"
     ],
+    "python -m framework dataset=rgbd_folder dataset.root=DIR dataset.odometry=FILE": ["hydra.run.dir=with_odometry"],
     "python -m framework tables outputs/table3_map": [],  # folder of the sweep above
     "python -m framework evaluate outputs/table3_map": [],
     "python -m framework export outputs/demo --to glb usd ply obj": [],
@@ -192,7 +205,7 @@ EXPECTED_FILES = [
     "detections.json",
     "refinement.png",
     "instancemap-my-refiner/pyproject.toml",
-    *(f"{run}/metrics.json" for run in ("outputs/demo", "imported", "coarse", "own")),
+    *(f"{run}/metrics.json" for run in ("outputs/demo", "imported", "coarse", "own", "with_odometry")),
     *(f"outputs/demo/export/{name}" for name in ("scene.glb", "scene.usdc", "map.yaml", "scene_graph.json")),
 ]
 RUN = """

@@ -29,7 +29,7 @@ def block(language: str, containing: str) -> str:
 
 LINES = list(
     dict.fromkeys(
-        re.sub(r"^instancemap ", "python -m framework ", line)  # continuation of the same command
+        re.sub(r"^instancemap ", "python -m framework ", line)
         for code in blocks("console")
         for line in code.splitlines()
     )

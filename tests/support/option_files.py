@@ -1,4 +1,4 @@
-"""Small input files for options that require files of the user. The contract tests use these files."""
+"""Small input files for options that require user files. The contract tests use these files."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ OPTIONS = [*OPTION]
 
 
 def names(stage: str, kind: type = object) -> list[str]:
-    """Return the names of the options of a stage whose class is a subclass of `kind`."""
+    """Return the names of the options of a stage with a class derived from `kind`."""
     return [
         option.name
         for option in OPTION.values()

@@ -26,13 +26,13 @@ class TrackedRun:
 
     @property
     def tracking_ms(self) -> list[float]:
-        """The tracking time of each frame, ms, rounded to 0.001."""
+        """Return the tracking time of each frame, ms, rounded to 0.001."""
         with (self.directory / "timings.csv").open() as file:
             return [float(row["milliseconds"]) for row in csv.DictReader(file) if row["stage"] == "tracking"]
 
     @property
     def numbers(self) -> dict[str, float]:
-        """The numbers in the metrics file, with the prefix of logged values."""
+        """Return the numbers in the metrics file, keyed by name with the prefix of logged values."""
         [file] = self.directory.glob("metrics*.json")
         return {f"run/{key}": value for key, value in json.loads(file.read_text()).items() if is_number(value)}
 

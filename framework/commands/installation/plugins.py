@@ -49,7 +49,7 @@ class Option:
     stage: str
     name: str
     target: str
-    provider: str  # provider of the file in Hydra's search path: main, or the name of a third-party package
+    provider: str  # of the file in Hydra's search path: main, command-line (--config-dir) or a third-party package
     # first paragraph of the class docstring and the change of a variant, or the error of an unusable option
     documentation: str
     parameters: tuple[Parameter, ...]

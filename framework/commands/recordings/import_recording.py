@@ -7,7 +7,7 @@ from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.importing.bags.ros_topics import Topics
-from framework.importing.folder_writer import LONGER_SIDE, Writing, check_new, write_folder
+from framework.importing.folder_writer import LONGER_SIDE, ODOMETRY, Writing, check_new, write_folder
 from framework.importing.formats import FORMATS, open_source
 from framework.importing.phones.image_rotation import QUARTER, upright
 
@@ -42,11 +42,16 @@ def main() -> None:
         'contains "optical", otherwise ROS axes with x forward)'
     )
     add("--poses", metavar="TOPIC", default="", help=poses)
+    odometry = (
+        f"odometry of the same message types, written to {ODOMETRY} for dataset.odometry, as poses of the camera if "
+        "/tf_static contains its transform; default: none"
+    )
+    add("--odometry", metavar="TOPIC", default="", help=odometry)
     parsed = arguments(parser)
     with one_line_errors():
         writing = Writing(parsed.width, parsed.stride, parsed.confidence, parsed.rotate)
         check_new(parsed.directory)
-        topics = Topics(parsed.color, parsed.depth, parsed.camera_info, parsed.poses)
+        topics = Topics(parsed.color, parsed.depth, parsed.camera_info, parsed.poses, parsed.odometry)
         source = open_source(parsed.source, topics)
         written = write_folder(source, parsed.directory, writing)
         root = parsed.directory.resolve()
@@ -56,4 +61,5 @@ def main() -> None:
             degrees = QUARTER * best.quarters
             print(f"the images are not upright, which reduces detection accuracy; import again with --rotate {degrees}")
         print(f"check it: instancemap check dataset=rgbd_folder dataset.root={root}")
-        print(f"map it: instancemap dataset=rgbd_folder dataset.root={root}")
+        prior = f" dataset.odometry={root / ODOMETRY}" if source.odometry else ""
+        print(f"map it: instancemap dataset=rgbd_folder dataset.root={root}{prior}")

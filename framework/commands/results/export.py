@@ -27,7 +27,7 @@ def main() -> None:
     add("--min-confidence", metavar="P", type=float, default=0.3, help=least)
     up = "up direction in the world frame; default: up direction of the run"
     add("--up", metavar=("X", "Y", "Z"), nargs=3, type=float, help=up)
-    floor = "floor height along the up direction, m; default: floor height of the run"
+    floor = "floor height along the up direction, m; default: floor height of the run, or unknown with --up"
     add("--floor", metavar="M", type=float, help=floor)
     add = parser.add_argument_group("surfaces").add_argument
     most = "maximum number of triangles of the scene and of each object file, >= 4; default: no limit"

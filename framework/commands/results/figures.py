@@ -1,4 +1,4 @@
-"""`instancemap figures DIR...`: draw the figures of an experiment. Works during a sweep."""
+"""`instancemap figures DIR... [figure.KEY=VALUE ...]`: draw the figure of the runs in DIR. Works during a sweep."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from framework.figures.experiment_figure import write_figure
 def main() -> None:
     """Run the command `instancemap figures`."""
     print_for_directories(
-        "Write figure.png and figure.pdf of the experiment in DIR.",
-        "output folder of an experiment",
-        lambda directory: "\n".join(map(str, write_figure(directory))),
+        "Write figure.png and figure.pdf of the runs in DIR and its subfolders.",
+        "folder of a sweep or of several runs",
+        "figure",
+        lambda directory, overrides: "\n".join(map(str, write_figure(directory, overrides))),
     )

@@ -138,6 +138,8 @@ def _run_again(record: Record, overrides: Sequence[str], directory: Path) -> Non
         try:
             config.merge_with_dotlist([override])
         except OmegaConfBaseException as error:
-            expected = "KEY=VALUE with a key and a type of the run's config"
-            raise ConfigError(f"{override}: expected {expected}, got another key or type") from error
+            raise ConfigError(
+                f"{override}: expected KEY=VALUE with a key and a type of the run's config, got an unknown key or a "
+                "value of another type"
+            ) from error
     run(config, directory, record.choices)

@@ -1,4 +1,4 @@
-"""`instancemap tables DIR...`: write the tables of the runs in a directory. Works during a sweep."""
+"""`instancemap tables DIR... [table.KEY=VALUE ...]`: write the tables of the runs in DIR. Works during a sweep."""
 
 from __future__ import annotations
 
@@ -11,5 +11,6 @@ def main() -> None:
     print_for_directories(
         "Write table.md, table.tex and table.csv of the runs in DIR and its subfolders to DIR, and print table.md.",
         "folder of a sweep or of several runs",
+        "table",
         write_tables,
     )

@@ -19,7 +19,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from framework.config.composition import config_loader
-from framework.config.validation import checked_rows
+from framework.config.validation import check_known, checked_rows
 from framework.errors import ConfigError
 from framework.runs.provenance import OF_SPEED, leaves, relevant
 from framework.runs.stored_runs import GROUPS
@@ -76,29 +76,32 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
     return prod(runs.values())
 
 
-def check_table(config: DictConfig, overrides: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
-    """Check the `table` of a sweep.
+def check_outputs(config: DictConfig, overrides: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
+    """Check the `table` and the `figure` of a sweep.
 
     Some keys exist only with one of the swept options or rows. These configs are composed if a key is not found
     otherwise.
 
     Raises:
-        ConfigError: The table is invalid, for example because a key is unknown.
+        ConfigError: The table or the figure is invalid, for example because a key is unknown.
     """
-    table = config.get("table")
-    if table is None:
-        return
+    from framework.figures.figure_choice import FigureChoice
     from framework.tables.table_choice import TableChoice
 
-    choice = TableChoice.of_sweep(OmegaConf.to_container(table) if OmegaConf.is_config(table) else table)
-    choice.check_base(rows)
+    keys: list[tuple[str, str]] = []
+    if (table := config.get("table")) is not None:
+        choice = TableChoice.of_sweep(OmegaConf.to_container(table) if OmegaConf.is_config(table) else table)
+        choice.check_base(rows)
+        keys += choice.keys
+    if (figure := config.get("figure")) is not None:
+        keys += FigureChoice.of(figure).keys
     known = {*_keys_of(config), *swept_keys(overrides), *GROUPS, *(["row"] if rows else [])}
     for alternative in _alternatives(overrides, rows):
-        if not choice.unknown(known):
+        if all(key in known for _, key in keys):
             break
         with suppress(HydraException), config_loader() as loader:  # its job reports the error
             known |= _keys_of(loader.compose([*single_run(overrides), *alternative]))
-    choice.check_keys(known)
+    check_known(keys, known)
 
 
 def _keys_of(config: DictConfig) -> set[str]:

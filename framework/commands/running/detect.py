@@ -92,8 +92,8 @@ def file_of_job(out: object, folder: Path) -> Path:
     name = checked_path("out", out).name
     if name != out:
         raise ConfigError(
-            f"out: expected a file name without a folder in a sweep, got {out}; each job writes it to its own folder "
-            "below hydra.sweep.dir"
+            f"out: expected a file name without a folder in a sweep, got {out}; set out={name} (each job writes its "
+            "own file below hydra.sweep.dir)"
         )
     folder.mkdir(parents=True, exist_ok=True)
     return folder / name

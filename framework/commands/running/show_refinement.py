@@ -95,7 +95,7 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
         if best is None or len(found) > len(best[2]):
             best = k, frame, found
     if best is None:
-        fix = "set frame to the number of a usable frame"
+        fix = "set frame=K to the index of a usable frame"
         raise DataError(f"{sequence.name}: expected a usable frame, got none among {len(tried)} candidates; {fix}")
     return best
 

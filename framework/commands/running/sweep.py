@@ -19,7 +19,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.commands.running.choices import check_table, checked_sweep, of_tables, swept_keys
+from framework.commands.running.choices import check_outputs, checked_sweep, of_tables, swept_keys
 from framework.config.composition import one_line
 from framework.config.validation import checked_rows
 from framework.errors import ConfigError, InstanceMapError
@@ -120,7 +120,7 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
     overrides, rows = overrides_of(own), checked_rows(config.get("rows"))
     runs = checked_sweep(overrides, rows)
     if with_table:
-        check_table(config, overrides, rows)
+        check_outputs(config, overrides, rows)
     if not objective_keys(config.objective) and str(own.sweeper._target_).endswith(WITH_OBJECTIVE):
         raise ConfigError(
             "objective: expected a metric to optimize, got none; set objective=instances.ap50, for example"

@@ -41,7 +41,7 @@ def read_json_object(path: Path, most: int = MAX_TEXT) -> dict[str, Any]:
         most: The maximum size of the file, bytes.
 
     Raises:
-        DataError: The file is too large or contains no JSON object.
+        DataError: The file cannot be read, is too large or contains no JSON object.
     """
     found = read_json(path, most)
     if not isinstance(found, dict):
@@ -84,7 +84,10 @@ def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tu
 def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Camera:
     """Return a pinhole camera.
 
-    The image size and the intrinsics are in px. DataError names `where` if they are invalid.
+    The image size and the intrinsics are in px.
+
+    Raises:
+        DataError: The image size or the intrinsics are invalid. The message contains `where`.
     """
     if width != int(width) or height != int(height):
         raise DataError(f"{where}: width, height: expected whole numbers of px, got {width:g}x{height:g}")

@@ -41,7 +41,7 @@ class Distortion:
             raise DataError(f"distortion (k1, k2, p1, p2, k3): expected finite coefficients, got {astuple(self)}")
 
     def distorted(self, camera: Camera, pixels: Float64) -> Float64:
-        """Return the positions (N, 2), px, of pixels of the pinhole camera in the recorded image.
+        """Map pixels of the pinhole camera to positions (N, 2), px, in the recorded image.
 
         Args:
             camera: The pinhole camera.

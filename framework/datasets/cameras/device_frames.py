@@ -123,7 +123,7 @@ class DepthCamera(LiveVideo):
         try:
             self.start()
         except self.errors as error:
-            which = f"device {self.serial}" if self.serial else "device"
+            which = f"device {self.serial}" if self.serial else "a device"
             mode = f"{self.width}x{self.height} at {self.fps} Hz"
             raise DataError(
                 f"{self.brand}: expected {which} with {mode}, got an error ({in_one_line(error)}); check the "

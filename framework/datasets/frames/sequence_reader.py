@@ -35,6 +35,8 @@ from framework.datasets.frames.conventions import (
     PoseReading,
     color_delay_of,
 )
+from framework.datasets.frames.odometry import KEY as ODOMETRY_KEY
+from framework.datasets.frames.odometry import Odometry, OdometryFile
 from framework.datasets.ground_truth.labeled_mesh import unseen
 from framework.datasets.ground_truth.named_truth import KEY, NamedTruth, read_named_truth
 from framework.errors import ConfigError, DataError, FrameError
@@ -81,6 +83,11 @@ class RecordedFrame:
     up: Float64 | None = None  # (3,) unit up vector in the camera frame, from a sensor; None = unknown
     color_timestamp: float | None = None  # s, of the color image; None = `timestamp`
     depth_timestamp: float | None = None  # s, of the depth image; None = `timestamp`
+
+    @property
+    def depth_time(self) -> float:
+        """Timestamp of the depth image, s."""
+        return self.timestamp if self.depth_timestamp is None else self.depth_timestamp
 
     @classmethod
     def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
@@ -136,6 +143,7 @@ class Recording(RGBDSequence):
     # delay of color relative to depth at equal timestamps, s, in [-0.2, 0.2]; positive = color captured later; AUTO =
     # estimated during the run, 0 until then
     color_delay: str = AUTO
+    odometry_file: OdometryFile = field(default_factory=OdometryFile)
 
     def __post_init__(self) -> None:
         check_selection(self.start, self.stop, self.stride, self.frame_fraction)
@@ -161,6 +169,9 @@ class Recording(RGBDSequence):
         )
         self.chosen = choose_frames(len(frames), self.start, self.stop, self.stride, self.frame_fraction, self.seed)
         self._check_first_image()
+        self.odometry = self.odometry_file.read()
+        if self.odometry is not None:
+            self._check_odometry(self.odometry)
         if self.named_truth is not None:
             self.annotation = self.named_truth.name
             self._check_truth_poses(self.named_truth)
@@ -229,6 +240,7 @@ class Recording(RGBDSequence):
             color_timestamp=recorded.color_timestamp,
             depth_timestamp=recorded.depth_timestamp,
             sensor=self.sensor_kind,
+            T_odom_camera=None if self.odometry is None else self.odometry.at(recorded.depth_time),
         )
 
     def metric_depth(self, index: int) -> Float32:
@@ -267,6 +279,19 @@ class Recording(RGBDSequence):
             raise ConfigError(f"{KEY}: {expected}; add poses, or set {KEY} to a run directory of this recording")
         expected = "expected a run of this recording, got a run without a pose at the time of any selected frame"
         raise ConfigError(f"{KEY}: {expected}; set another run, or select other frames")
+
+    def _check_odometry(self, odometry: Odometry) -> None:
+        """Log the number of selected frames without odometry. Raise DataError if no frame has odometry."""
+        times = np.array([self.contents.frames[index].depth_time for index in self.chosen])
+        missing = int(np.count_nonzero(~odometry.covers(times)))
+        if missing == len(times):
+            begin, end = odometry.timestamps[[0, -1]]
+            raise DataError(
+                f"{ODOMETRY_KEY}: expected poses at the times of the frames ({times[0]:.3f} to {times[-1]:.3f} s), got "
+                f"poses from {begin:.3f} to {end:.3f} s; convert the timestamps to s on the clock of the frames"
+            )
+        if missing:
+            log.warning("%s: %d of %d frames have no odometry", self.name, missing, len(times))
 
     def _check_first_image(self) -> None:
         """Raise FrameError if the images of the first selected frame have the wrong size."""

@@ -61,7 +61,7 @@ class LabeledMesh:
 
 
 def unseen(camera: Camera, why: str) -> FrameTruth:
-    """Return the ground truth of a frame that cannot be rendered.
+    """Return a placeholder for the ground truth of a frame without a pose.
 
     Accessing the instance ids raises NoPoseError with the message `why`.
     """

@@ -20,10 +20,12 @@ log = logging.getLogger(__name__)
 class LabeledRecording(Recording):
     """A recording with an optional labeled mesh as ground truth.
 
-    The subclass loads the mesh in `open`.
+    Subclasses load the mesh in `open`.
     """
 
-    frame_ground_truth: bool = False  # ground truth per frame for simulated detectors, rendered from the mesh
+    # True = render the ground-truth instances of each frame, for simulated detectors; always rendered if ground_truth
+    # is set
+    frame_ground_truth: bool = False
 
     def __post_init__(self) -> None:
         self.mesh: LabeledMesh | None = None
@@ -45,10 +47,10 @@ class LabeledRecording(Recording):
         if not missing:
             self.mesh = read(*files)
         elif self.frame_ground_truth:
-            expected = f"expected the labeled mesh {missing[0]}, got no such file"
+            expected = f"expected the file {missing[0]} of the labeled mesh, got none"
             raise DataError(f"dataset.frame_ground_truth: {expected}; add the file, or set this key to false")
         elif len(missing) < len(files):
-            log.warning("%s: expected a file of ground-truth instances, got none; instances not evaluated", missing[0])
+            log.warning("%s: expected a file of the labeled mesh, got none; instances are not evaluated", missing[0])
 
     def truth_in(self, index: int) -> FrameTruth | None:
         T_world_camera = self.contents.frames[index].T_world_camera

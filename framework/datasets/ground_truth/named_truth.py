@@ -145,7 +145,7 @@ def _labels_of(path: Path, ply: PlyMesh) -> Int32:
         raise DataError(f"{path}: expected an integer vertex property {LABELS!r}, got {found}; label the mesh")
     if not len(ply.triangles):
         raise DataError(f"{path}: expected faces to render masks from, got none; set {KEY} to a mesh with faces")
-    if labels.min() < 0 or labels.max() > LARGEST_ID:
+    if int(labels.min()) < 0 or int(labels.max()) > LARGEST_ID:
         raise DataError(f"{path}: {LABELS}: expected values in [0, {LARGEST_ID}], got {labels.min()} to {labels.max()}")
     return labels.astype(np.int32)
 

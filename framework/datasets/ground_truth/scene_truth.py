@@ -35,9 +35,9 @@ def fuse_scene_truth(
 ) -> SceneTruth:
     """Fuse labeled depth images into a point cloud with one labeled point per voxel.
 
-    Each pixel votes for its instance id in its voxel. The id with the most votes is selected, and the smaller id in a
-    tie. The point of a voxel is the mean of the points with the selected id. The points are in the order of first
-    observation.
+    Each pixel votes for its instance id in its voxel. The id with the most votes is selected; in a tie, the smaller id.
+    The point of a voxel is the mean of the points with the selected id. The points are in the order of the first
+    observation of their voxels.
 
     Args:
         views: The labeled depth images.

@@ -74,7 +74,7 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
         raise DataError(
             f"{aggregation}: expected labels from {LABEL_TABLE}, got "
             f"{', '.join(f'{label!r:.60}' for label in strange)}; add a line for each of them, or put "
-            f"{FIRST_LABEL_TABLE} next to it for annotations of ScanNet's first release"
+            f"{FIRST_LABEL_TABLE} next to this table for annotations of ScanNet's first release"
         )
     unlabeled = max((group.object_id + 2 for group in groups), default=1)
     instance_of_segment = np.full(len(present), unlabeled, np.int32)

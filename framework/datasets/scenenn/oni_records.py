@@ -48,11 +48,11 @@ class Stream(IntEnum):
 
 @dataclass
 class Images:
-    """The complete images of a stream."""
+    """Node and image counts of a stream."""
 
     node: int  # node id of this stream's records
-    count: int = 0
-    last: int = 0  # number of the last image, from 1
+    count: int = 0  # number of complete images
+    last: int = 0  # number of the last complete image, from 1
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def playable(contents: OniContents, scratch: Path) -> Iterator[Path]:
         copy = Path(folder) / "repaired.oni"
         shutil.copyfile(contents.path, copy)
         with copy.open("r+b") as file:
-            file.seek(LARGEST_NODE_AT)  # missing in the header if the recorder was killed
+            file.seek(LARGEST_NODE_AT)  # missing from the header if the recorder was killed
             file.write(struct.pack("<I", contents.largest_node))
             for note in contents.table_notes:
                 file.seek(note)

@@ -56,7 +56,7 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
     A frame with two different poses is unusable. A truncated last frame is unusable too.
 
     Raises:
-        DataError: Another line is invalid.
+        DataError: A line is invalid for another reason.
     """
     content = read_bytes(path, MAX_TEXT).removeprefix(BOM_UTF8)
     numbered = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))

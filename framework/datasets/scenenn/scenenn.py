@@ -114,7 +114,7 @@ def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, tuple[flo
     if not without:
         return times
     message = (
-        "%s: expected timestamps of all images, got none for %d of %d images, first %d; using a frame rate of %g Hz"
+        "%s: expected timestamps of all images, got none for %d of %d images (first: %d); using a frame rate of %g Hz"
     )
     log.warning(message, path, len(without), len(images), without[0], FRAME_RATE)
     return {}  # recorded timestamps are not mixed with those of a constant frame rate
@@ -134,13 +134,16 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
     labels = ply.properties.get("label")
     if labels is None or labels.dtype.kind not in "iu":
         raise DataError(f"{mesh}: expected an integer vertex property 'label', got {found_property(ply, labels)}")
-    if len(labels) and (labels.min() < 0 or labels.max() > LARGEST_ID):
+    if len(labels) and (int(labels.min()) < 0 or int(labels.max()) > LARGEST_ID):
         raise DataError(f"{mesh}: label: expected values in [0, {LARGEST_ID}], got {labels.min()} to {labels.max()}")
     names = {one.id: one for one in read_annotation(annotation)}
     present, inverse = np.unique(labels.astype(np.int32), return_inverse=True)
     unlisted = set(present.tolist()) - names.keys() - {0}
     if unlisted:
-        message = "%s: expected an entry in %s for each label, got none for %d labels, such as %d; ignored these labels"
+        message = (
+            "%s: expected an entry in %s for each label, got none for %d labels, such as %d; these labels are not "
+            "evaluated"
+        )
         log.warning(message, mesh, annotation.name, len(unlisted), min(unlisted))
     class_names: dict[int, str | None] = {}
     ids = np.zeros(len(present), np.int32)

@@ -53,7 +53,8 @@ def find_model(model: str, revision: str, more: Sequence[str] = ()) -> Path:
         cached = _cached(model, revision, more)
     if cached is None:
         raise DataError(
-            f"detector.model: expected a complete cache after the download of {model}, got missing files; run again"
+            f"detector.model: expected a complete cache after the download of {model}, got an incomplete cache; run "
+            "the command again"
         )
     return cached
 
@@ -170,7 +171,7 @@ def imported_transformers() -> Any:
     Raises:
         ConfigError: transformers is not installed.
     """
-    return import_optional("transformers", "loads models of huggingface.co", "transformers")
+    return import_optional("transformers", "loads models from huggingface.co", "transformers")
 
 
 def read_part(parameter: str, folder: Path, what: str, auto_class: Any, **options: Any) -> Any:

@@ -154,7 +154,7 @@ def _space(folder: Path, model: str) -> str:
 def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundings: float = 1.0) -> UInt8:
     """Return square crops (N, side, side, 4) of an image around masks, with RGB and mask (0 or 255).
 
-    The crop of an empty mask is black. The part of a crop outside of the image is black.
+    The crop of an empty mask is black. Pixels of a crop outside the image are treated as black surroundings.
 
     Args:
         color: The image (H, W, 3), RGB.

@@ -30,7 +30,8 @@ SAM_FAMILY = {
     "edgetam": ("EdgeTamModel", True),
     "edgetam_video": ("EdgeTamModel", True),
 }
-"""Class by `model_type`, and True if the image is stretched to the square input; otherwise it is padded with black."""
+"""Class by `model_type`, and True if the image is stretched to the square input; otherwise, the normalized image is
+padded with zeros."""
 
 
 class TextPromptedBoxes:

@@ -50,7 +50,7 @@ NAMES = (  # detectron2 name, name in this project
     (r"roi_heads\.mask_head\.predictor\.(\w+)", r"roi_heads.mask_predictor.mask_fcn_logits.\1"),
 )
 COUNTED_FROM = {"layer": 1, "inner_blocks": 2, "layer_blocks": 2, "mask_head": 1}
-"""First index in detectron2: res2 is layer1, fpn_lateral2 is inner block 0, mask_fcn1 is layer 0."""
+"""Index in detectron2 minus index here: res2 is layer1, fpn_lateral2 is inner block 0, mask_fcn1 is mask layer 0."""
 
 NOT_WEIGHTS = r"(pixel_mean|pixel_std|.*\.cell_anchors\.\d+|.*\.num_batches_tracked)"
 

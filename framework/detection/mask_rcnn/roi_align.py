@@ -85,7 +85,7 @@ class Samples:
         return Samples(start, size, counts, windows, self.bins, self.cells)
 
     def weights(self) -> tuple[Tensor, Tensor]:
-        """Return the nonzero weights (N, bins, window) of feature cells in each bin, and the first cell (N, bins)."""
+        """Return the first cell (N, bins) of the window of each bin, and the weights (N, bins, window) of its cells."""
         most, window = (int(array.max()) if len(array) else 1 for array in (self.counts, self.windows))
         k = torch.arange(most, device=self.start.device)
         counts = self.counts[:, None, None]

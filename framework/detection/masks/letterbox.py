@@ -30,8 +30,8 @@ class Letterbox:
 
     input_shape: tuple[int, int]  # (height, width) px of the network's input
     resized: tuple[int, int]  # (height, width) px of the resized image
-    top: int  # px
-    left: int  # px
+    top: int  # px, offset of the resized image from the top of the input
+    left: int  # px, offset of the resized image from the left side of the input
     scale_x: float  # px of the input per px of the image
     scale_y: float  # px of the input per px of the image
 

@@ -6,7 +6,7 @@ For each box:
    border. Log depth is used because noise and depth steps grow with depth.
 2. Select the nearest mode of the histogram with at least `significance` of the total weight as foreground. Thin objects
    in front have less weight, and the background is farther. Neighboring modes are separated by valleys, i.e. bins
-   below VALLEY of the peak.
+   below the fraction VALLEY of the peak.
 3. Connect neighboring foreground pixels with similar depths. The limit of the depth step is z tan(max_slant) / f, the
    step of a slanted surface, plus the sensor noise. The component with the largest weight is the object.
 4. Close holes that have no readings or are small.

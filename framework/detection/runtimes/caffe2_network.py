@@ -112,9 +112,9 @@ def network_between(
 ) -> Network:
     """Build the part of a network that computes some blobs from others.
 
-    In an integer network, linear channels between blocks and outputs, means, fully connected layers and transposed
-    convolutions are not rounded. Rounding errors in the linear channels would accumulate (Sandler et al.,
-    "MobileNetV2", 2018).
+    In an integer network, these results are not rounded to 8 bits: linear convolutions between blocks, means, sums,
+    fully connected layers, transposed convolutions, and outputs. Rounding errors of the linear convolutions would
+    accumulate (Sandler et al., "MobileNetV2", 2018).
 
     Args:
         graph: The operators of the complete network.
@@ -168,7 +168,7 @@ def _in_float(operator: Operator, tensors: Tensors) -> Run:
         return lambda x: x
     if kind not in OPERATORS:
         raise DataError(
-            f"graph.json: expected an operator out of {', '.join(OPERATORS)}, got {kind}; use another network"
+            f"graph.json: expected one of the operators {', '.join(OPERATORS)}, got {kind}; use another network"
         )
     weight, bias = _weights(operator, tensors)
     if kind == "Int8FC":

@@ -42,7 +42,7 @@ def ready(network: Any, device: torch.device, half_precision: bool) -> Any:
 def one_torch_thread() -> Iterator[None]:
     """Limit torch to one thread within a context.
 
-    Short operations end before other threads wake up. Several threads can use this context at the same time.
+    Waking other threads takes longer than a short operation. Several threads can use this context at the same time.
     """
     # torch stores the number of threads per thread; a thread's first query returns the latest number set by any thread,
     # so each thread queries the number before setting it

@@ -111,7 +111,8 @@ class ImageNetwork:
             DataError: The file is missing or damaged, has another hash, or cannot be run.
         """
         path, device, black, white = detector.weights, detector.device, detector.black_level, detector.white_level
-        require(len(detector.sha256) in (0, 64), "detector.sha256", detector.sha256, "64 hexadecimal digits, or empty")
+        digits = "64 hexadecimal digits or an empty string"
+        require(len(detector.sha256) in (0, 64), "detector.sha256", detector.sha256, digits)
         allowed = f"0 (size of the network) or a value in [1, {LONGEST_SIDE}] px"
         require(0 <= detector.input_size <= LONGEST_SIDE, "detector.input_size", detector.input_size, allowed)
         require(0 <= detector.padding <= 255, "detector.padding", detector.padding, "a value in [0, 255]")

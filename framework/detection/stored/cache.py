@@ -62,7 +62,7 @@ class Fingerprinted(Protocol):
     def fingerprint(self) -> str:
         """Return a hash of everything that determines the detections, except the frame.
 
-        The hash must include `fingerprint(self)`.
+        The hash must include the result of `framework.detection.stored.fingerprint.fingerprint(self)`.
         """
 
 
@@ -70,9 +70,9 @@ class Fingerprinted(Protocol):
 class CachedDetector(Detector):
     """A detector that stores its detections on disk and reuses them for equal frames.
 
-    The key of an entry is a hash of the detector and of the frame's data. Equal images in different videos share an
-    entry. Several processes may share a folder. A damaged entry is logged and computed again. You can delete entries at
-    any time.
+    The key of an entry is a hash of the detector and of the frame fields that the detector reads. Frames that are equal
+    in these fields share an entry, even if they are from different videos. Several processes may share a folder. A
+    damaged entry is logged and computed again. You can delete entries at any time.
     """
 
     # not concurrent, because concurrent equal frames would each count as a miss

@@ -24,12 +24,13 @@ NOT_GIVEN = Path()  # value of an empty path in a config
 def fingerprint(detector: object) -> str:
     """Return the SHA-256 of the code and parameters of a detector.
 
-    The code includes the modules of the class and its base classes, framework.detection, and the versions of numerical
-    libraries. Paths are replaced by the contents of their files. The number of threads is not included.
+    The code includes the modules of the class and its base classes, framework.detection, the label spaces, and the
+    versions of numerical libraries. Paths are replaced by the contents of their files. The number of threads is not
+    included.
 
     Raises:
-        ConfigError: A path does not exist, or the class has no source file, for example in a notebook. Such a class
-            must define a method `fingerprint`.
+        ConfigError: A path does not exist, the detector is not a dataclass, or its class has no source file, for
+            example in a notebook. Such a detector must define a method `fingerprint`.
     """
     kind = type(detector)
     digest = hashlib.sha256()
@@ -44,8 +45,8 @@ def _code(kind: type) -> Iterator[str]:
         source = getattr(sys.modules.get(module), "__file__", None)
         if source is None:
             raise ConfigError(
-                f"{kind.__qualname__}: expected a class defined in a source file, got one without; define a method "
-                "fingerprint()"
+                f"{kind.__qualname__}: expected a class defined in a source file, got the module {module} without a "
+                "file; define a method fingerprint()"
             )
         yield path_hash(Path(source))
     framework = Path(__file__).resolve().parents[2]
@@ -61,7 +62,7 @@ def _code(kind: type) -> Iterator[str]:
 def _parameters(detector: object) -> Iterator[str]:
     if not dataclasses.is_dataclass(detector):
         raise ConfigError(
-            f"{type(detector).__qualname__}: expected a dataclass, got another class; make it a dataclass "
+            f"{type(detector).__qualname__}: expected a dataclass, got a plain class; make it a dataclass "
             "or implement fingerprint()"
         )
     for field in dataclasses.fields(detector):

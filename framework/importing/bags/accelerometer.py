@@ -16,7 +16,7 @@ import numpy as np
 from framework.data import Float64
 from framework.errors import DataError, FrameError
 from framework.importing.bags.ros_messages import IMU, RosBag
-from framework.importing.bags.ros_transforms import REALSENSE, static_rotation, stream_motion
+from framework.importing.bags.ros_transforms import REALSENSE, static_motion, stream_motion
 
 NEAR = 0.05  # s, averaging window before and after a frame, which reduces the effect of hand tremor
 GRAVITY = 9.81  # m/s^2
@@ -95,7 +95,8 @@ def _rotation(bag: RosBag, topic: str, frame_id: str, color: str) -> Float64 | N
             return None
         return np.asarray(T_color_reference[:3, :3] @ T_imu_reference[:3, :3].T)
     image = bag.first(color)
-    return None if image is None else static_rotation(bag, image.header.frame_id, frame_id)
+    T_camera_imu = None if image is None else static_motion(bag, image.header.frame_id, frame_id)
+    return None if T_camera_imu is None else T_camera_imu[:3, :3]
 
 
 def _read(bag: RosBag, topic: str) -> tuple[Float64, Float64, str]:

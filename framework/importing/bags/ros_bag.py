@@ -35,9 +35,9 @@ from framework.files.tum_trajectory import TumLine
 from framework.importing.bags.accelerometer import Accelerometer, find_accelerometer
 from framework.importing.bags.ros_messages import ODOMETRY, Message, RosBag, color_of, depth_of
 from framework.importing.bags.ros_topics import Topics, camera_info_of, found_topics
-from framework.importing.bags.ros_transforms import REALSENSE, stream_motion
+from framework.importing.bags.ros_transforms import REALSENSE, static_motion, stream_motion
 from framework.importing.depth_resampling import DepthRegistration
-from framework.importing.source import DeviceFrame, Format, Source, StoredFrame
+from framework.importing.source import DeviceFrame, Format, Source, StoredFrame, StoredOdometry
 from framework.sensors.noise_models import kind_of_device
 
 MAX_PAIR_INTERVAL = 0.02  # s, maximum time between a color image and its depth image
@@ -79,7 +79,15 @@ def open_source(path: Path, given: Topics) -> Source:
     device = Device(bag, topics, camera, registration, unit, accelerometer, *_trajectory(bag, topics.poses))
     name = f"a ROS bag (color {topics.color}, depth {topics.depth}, poses {topics.poses or 'none'})"
     sensor = kind_of_device(f"{topics.depth} {topics.color}")
-    return Source(name, _frames(device, pairs), len(pairs), bool(topics.poses), _distortion(topics, info), sensor)
+    return Source(
+        name,
+        _frames(device, pairs),
+        len(pairs),
+        posed=bool(topics.poses),
+        distortion=_distortion(topics, info),
+        sensor=sensor,
+        odometry=_odometry(bag, topics) if topics.odometry else None,
+    )
 
 
 @dataclass(frozen=True)
@@ -138,7 +146,7 @@ class Device:
 def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
     """Associate color and depth images by time.
 
-    Header timestamps are used, unless they give less than half as many pairs as the recording times.
+    Header timestamps are used, unless they give fewer than half as many pairs as the recording times.
     """
     sensed: dict[str, list[float]] = {topics.color: [], topics.depth: []}
     stored: dict[str, list[float]] = {topics.color: [], topics.depth: []}
@@ -208,8 +216,36 @@ def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading
     """Return the poses of a topic, if any, and their convention."""
     if not topic:
         return None, PoseReading()
+    lines, frame_id = _pose_lines(bag, topic)
+    axes = CameraAxes.OPENCV if frame_id is None or "optical" in frame_id else CameraAxes.ROS
+    if axes is CameraAxes.ROS:
+        log.warning("%s: poses of frame %r are used as camera poses, with x forward and z up", topic, frame_id)
+    return Trajectory.of(bag.path, lines, MAX_POSE_INTERVAL), PoseReading(camera_axes=axes)
+
+
+def _odometry(bag: RosBag, topics: Topics) -> StoredOdometry:
+    """Return the odometry as camera poses, or as poses of its frame if /tf_static does not contain the camera.
+
+    Raises DataError for a topic without messages, or with an invalid pose.
+    """
+    lines, frame_id = _pose_lines(bag, topics.odometry)
+    trajectory = Trajectory.of(bag.path, lines, MAX_POSE_INTERVAL)
+    image = bag.first(topics.color)
+    T_base_camera = np.eye(4) if frame_id is None else static_motion(bag, frame_id, image.header.frame_id)
+    if T_base_camera is None:
+        expected = f"expected the transform from {frame_id} to {image.header.frame_id} in /tf_static, got none"
+        log.warning("%s: %s; set dataset.odometry_camera to the pose of the camera", topics.odometry, expected)
+    poses = [line.pose() if T_base_camera is None else line.pose() @ T_base_camera for line in trajectory.lines]
+    return StoredOdometry(trajectory.timestamps, poses, of_camera=T_base_camera is not None)
+
+
+def _pose_lines(bag: RosBag, topic: str) -> tuple[list[TumLine], str | None]:
+    """Return the poses of a topic and the name of their moving frame; None = unknown.
+
+    Raises DataError if the topic has no messages.
+    """
     lines = []
-    frame_id = "optical"
+    frame_id = None
     for number, message in enumerate(bag.messages([topic]), start=1):
         try:
             content = bag.decoded(message)
@@ -223,10 +259,7 @@ def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading
         lines.append(TumLine(bag.path, number, bag.sensed_at(message), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)))
     if not lines:
         raise DataError(f"{bag.path}: {topic}: expected at least one message, got none")
-    axes = CameraAxes.OPENCV if "optical" in frame_id else CameraAxes.ROS
-    if axes is CameraAxes.ROS:
-        log.warning("%s: poses of frame %r are used as camera poses, with x forward and z up", topic, frame_id)
-    return Trajectory.of(bag.path, lines, MAX_POSE_INTERVAL), PoseReading(camera_axes=axes)
+    return lines, frame_id
 
 
 def _registration(bag: RosBag, topics: Topics, color: Camera) -> DepthRegistration | None:

@@ -15,9 +15,15 @@ COLOR = re.compile("color|rgb", re.IGNORECASE)
 DEPTH = re.compile("depth", re.IGNORECASE)
 NEITHER = re.compile("infra|(^|/|_)ir(/|_|$)|disparity|confidence|mask|label|fisheye|theora|points", re.IGNORECASE)
 REGISTERED = re.compile("aligned|registered|to_color|to_rgb", re.IGNORECASE)  # depth in the color camera
-OPTIONS = {"color": "--color", "depth": "--depth", "camera_info": "--camera-info", "poses": "--poses"}
+OPTIONS = {
+    "color": "--color",
+    "depth": "--depth",
+    "camera_info": "--camera-info",
+    "poses": "--poses",
+    "odometry": "--odometry",
+}
 IMAGES, POSES = (IMAGE, COMPRESSED), (ODOMETRY, POSE)
-KINDS = {"color": IMAGES, "depth": IMAGES, "camera_info": (CAMERA_INFO,), "poses": POSES}
+KINDS = {"color": IMAGES, "depth": IMAGES, "camera_info": (CAMERA_INFO,), "poses": POSES, "odometry": POSES}
 
 
 @dataclass(frozen=True)
@@ -31,6 +37,7 @@ class Topics:
     depth: str = ""
     camera_info: str = ""  # of color
     poses: str = ""  # optional; "" after the selection = no poses
+    odometry: str = ""  # optional; never selected by type; "" = no odometry
 
     @property
     def given(self) -> list[str]:
@@ -57,7 +64,7 @@ def found_topics(bag: RosBag, given: Topics) -> Topics:
     if not info:
         expected = f"expected a {CAMERA_INFO} topic next to {color}"
         raise DataError(f"{bag.path}: {expected}, got none{_choice(bag, 'camera_info')}")
-    posed = bag.topics(*POSES)
+    posed = [topic for topic in bag.topics(*POSES) if topic != given.odometry]
     if len(posed) > 1 and not given.poses:
         raise ConfigError(
             f"{bag.path}: expected one topic with poses, got {', '.join(posed)}; set --poses to one of them"

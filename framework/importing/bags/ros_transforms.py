@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Float64
 from framework.errors import DataError
+from framework.geometry import inverse
 from framework.importing.bags.ros_messages import TRANSFORMS, RosBag
 
 REALSENSE = "/device_"  # prefix of topics of RealSense's recorder
@@ -39,8 +40,8 @@ def stream_motion(bag: RosBag, stream: str) -> Float64 | None:
     return T_stream_reference
 
 
-def static_rotation(bag: RosBag, to: str, of: str) -> Float64 | None:
-    """Return the rotation (3, 3) between two frames from /tf_static, or None if unknown.
+def static_motion(bag: RosBag, to: str, of: str) -> Float64 | None:
+    """Return the transform T_to_of (4, 4) between two frames from /tf_static, or None if unknown.
 
     Args:
         bag: The bag.
@@ -51,19 +52,30 @@ def static_rotation(bag: RosBag, to: str, of: str) -> Float64 | None:
     for message in bag.messages([topic for topic in bag.topics(TRANSFORMS) if topic.endswith("tf_static")]):
         for stored in bag.decoded(message).transforms:
             parent, child = stored.header.frame_id.lstrip("/"), stored.child_frame_id.lstrip("/")
-            R_parent_child = _rotation(stored.transform.rotation)
-            if R_parent_child is not None:
-                neighbors[parent][child], neighbors[child][parent] = R_parent_child, R_parent_child.T
+            T_parent_child = _motion(stored.transform)
+            if T_parent_child is not None:
+                neighbors[parent][child], neighbors[child][parent] = T_parent_child, inverse(T_parent_child)
     start = to.lstrip("/")
-    R_to: dict[str, Float64] = {start: np.eye(3)}  # rotation of each reached frame
+    T_to: dict[str, Float64] = {start: np.eye(4)}  # pose of each reached frame
     waiting = [start]
     while waiting:
         reached = waiting.pop()
-        for name, R_reached_name in neighbors[reached].items():
-            if name not in R_to:
-                R_to[name] = R_to[reached] @ R_reached_name
+        for name, T_reached_name in neighbors[reached].items():
+            if name not in T_to:
+                T_to[name] = T_to[reached] @ T_reached_name
                 waiting.append(name)
-    return R_to.get(of.lstrip("/"))
+    return T_to.get(of.lstrip("/"))
+
+
+def _motion(stored: Any) -> Float64 | None:
+    """Return the rigid transform (4, 4) of a Transform message, or None if it is invalid."""
+    R = _rotation(stored.rotation)
+    translation = [getattr(stored.translation, name) for name in "xyz"]
+    if R is None or not np.isfinite(translation).all():
+        return None
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, translation
+    return T
 
 
 def _rotation(quaternion: Any) -> Float64 | None:

@@ -164,7 +164,7 @@ class Video:
             FrameError: The frame cannot be decoded, or it is before the last frame that was read.
         """
         if number < self._next - 1:
-            raise FrameError(f"{self.path}: expected increasing frames, got {number} after {self._next - 1}")
+            raise FrameError(f"{self.path}: expected increasing frame numbers, got {number} after {self._next - 1}")
         while self._next <= number:
             if not self._capture.grab():
                 raise FrameError(f"{self.path}: expected frame {number}, got the end of the readable video")

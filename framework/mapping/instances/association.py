@@ -204,7 +204,8 @@ def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding
 class Association:
     """Association of clusters with instances, and merging of instances that are parts of one object."""
 
-    # source of the instances that clusters are compared with
+    # source of the instances that clusters are compared with: SURFACE_LOOKUP (voxels at the depth readings) or RAYCAST
+    # (rendered view)
     association: InstanceSource = InstanceSource.SURFACE_LOOKUP
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # denominator of the overlap
@@ -214,7 +215,9 @@ class Association:
     create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; no minimum for updates
     # minimum number of points of a cluster to create an instance, >= 1; also the minimum denominator of the overlap
     create_points: int = 50
-    split_instances: bool = True  # True = create an instance for the second of two clusters that match an instance
+    # True = create an instance for the second of two clusters that match the same instance; False = ignore the second
+    # cluster
+    split_instances: bool = True
     # minimum overlap of two instances with one cluster to merge them, in [0, 1]; 1 = no merging
     merge_overlap: float = 1.0
     # minimum number of frames in which two instances share a cluster, minus the frames in which they match separate

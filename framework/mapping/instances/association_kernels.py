@@ -63,7 +63,7 @@ def find_seen(instance_ids, seen):
 
 @device
 def _add_run(count, list_id, label, offsets, clusters, column, votes):
-    """Add `count` pixels with one list and one instance to the votes (N + 1, M + 1)."""
+    """Add `count` pixels with the same cluster list and the same instance to the votes (N + 1, M + 1)."""
     votes[votes.shape[0] - 1, column[label]] += count
     for entry in range(offsets[list_id], offsets[list_id + 1]):
         votes[clusters[entry], column[label]] += count

@@ -39,7 +39,8 @@ class Confirmation:
     """
 
     min_observations: int = 3  # minimum number of frames with a detection to confirm an instance, >= 1
-    min_confidence: float = 0.05  # minimum InstanceRecord.confidence to confirm an instance, in [0, 1]
+    # minimum confidence to confirm an instance (mean score times detection rate while visible), in [0, 1]
+    min_confidence: float = 0.05
     min_area: float = 0.01  # minimum surface area of a confirmed instance, m^2, >= 0; voxel_size^2 per mesh vertex
 
     def __post_init__(self) -> None:
@@ -56,14 +57,11 @@ class Confirmation:
         return cls(saved.whole("min_observations"), saved.number("min_confidence"), saved.number("min_area"))
 
     def is_met(self, record: InstanceRecord) -> bool:
-        """Return True if an instance meets all conditions except the minimum area."""
+        """Return True if an instance meets all conditions but the minimum area."""
         return record.observations >= self.min_observations and record.confidence >= self.min_confidence
 
     def counts(self, table: InstanceTable) -> Bool:
-        """Return a Boolean array (last id + 1,), True for the instances that meet all conditions.
-
-        The minimum area is ignored.
-        """
+        """Return a Boolean array (last id + 1,), True for instances that meet all conditions but the minimum area."""
         counts = np.zeros(table.last_id + 1, np.bool_)
         for record in table.records.values():
             counts[record.id] = self.is_met(record)

@@ -109,7 +109,9 @@ def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, d
         return "", {}
     space = plain.values[SPACE]
     if not isinstance(space, str) or not 0 < len(space) <= LONGEST_SPACE:
-        raise DataError(f"{plain.name}.{SPACE}: expected 1 to {LONGEST_SPACE} characters, got {space!r:.60}")
+        raise DataError(
+            f"{plain.name}.{SPACE}: expected a string of 1 to {LONGEST_SPACE} characters, got {space!r:.60}"
+        )
     missing = [name for name in ARRAYS if name not in arrays]
     if missing:
         raise DataError(f"expected the arrays {', '.join(missing)} for the embedding space {space}, got none")

@@ -144,7 +144,7 @@ def label_new(grid, seen, evidence, measurement, list_bits, row_bits, new, free_
         free_classes: The class ids (T,) in the slots of a voxel without evidence.
         evicted: The number of evicted labels (A,) of each block, modified in place.
     """
-    row_of = grid.label_row  # numba 0.68 loses assignments to an element of a tuple's array within prange
+    row_of = grid.label_row  # Numba 0.68 loses assignments to an element of a tuple's array within prange
     list_ids = measurement.list_ids.ravel()
     for a in prange(seen.blocks.shape[0]):
         voxel, row = new.starts[a], new.rows[a]

@@ -62,9 +62,9 @@ class Measurement(NamedTuple):
     instance_log_odds: Float32  # (N,) log-odds of that instance over any other instance
     absence: np.float32  # log-odds, <= 0, of a matched instance in voxels outside its mask
     matched: Bool  # (ids + 1,) indexed by id, True where an instance was matched in this frame
-    class_scores: Integers  # (N, NO_CLASS + 1) int32, in exact storage int64; see pack_class_scores()
+    class_scores: Integers  # (N, NO_CLASS + 1) quantized class scores with named bits; int32, in exact storage int64
     named_classes: UInt8  # (N, NEW_CLASSES) most likely classes of each cluster
-    combine: int  # value of Combine
+    combine: int  # rule for combining new and old evidence, a value of Combine
     max_score: int  # maximum quantized score of a class in a voxel
 
 
@@ -76,7 +76,7 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
 
     Args:
         evidence: The class evidence (N, C) of the clusters.
-        logarithmic: True if the evidence is log-likelihoods.
+        logarithmic: True if the evidence consists of log-likelihoods.
 
     Returns:
         The relative evidence (N, C).
@@ -92,7 +92,7 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
         if c > names:
             np.put_along_axis(unnamed, named, 0, axis=1)
             mean = unnamed.sum(axis=1, keepdims=True) / (c - names)
-        else:  # all classes are named; a term common to all classes is no evidence
+        else:  # all classes are named; a term common to all classes is not evidence
             mean = unnamed.min(axis=1, keepdims=True, initial=1.0)
         relative = evidence - np.log(np.maximum(mean, 1e-6))
     bits = np.zeros((len(evidence), NO_CLASS + 1), np.uint8)

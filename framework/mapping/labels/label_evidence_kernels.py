@@ -77,8 +77,8 @@ def best_class(evidence, voxel):
 def add_evidence(labels, values, free, label, added, combine, limit):
     """Add evidence for one label to the slots of a voxel.
 
-    If all slots are used, the label replaces the least likely label with less evidence. Returns 1 if a label was
-    evicted or not stored, otherwise 0.
+    If all slots are used, the label replaces the least likely label, unless that label has at least as much evidence.
+    Returns 1 if a label was evicted or not stored, otherwise 0.
 
     Args:
         labels: The labels (S,) in the slots, modified in place.
@@ -139,7 +139,10 @@ def best_class_first(classes, scores):
 
 @device
 def sum_classes(classes, scores, measurement, k):
-    """Add the class scores of cluster k to the slots of a voxel, and return the number of classes not kept."""
+    """Add the class scores of cluster k to the slots of a voxel.
+
+    Returns the number of classes that were evicted or not stored.
+    """
     limit, cluster_scores = measurement.max_score, measurement.class_scores[k]
     known, filled, excess = add_scores(classes, scores, cluster_scores, limit)
     for s in range(filled if excess > 0 else 0):  # subtracting preserves the differences between scores

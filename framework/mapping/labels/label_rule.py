@@ -36,7 +36,7 @@ class LabelRule(NamedTuple):
     """Rule for combining the evidence for labels."""
 
     combine: Combine  # rule for combining new evidence with old evidence
-    logarithmic: bool  # True = evidence is log-likelihoods; False = proportional to probability, such as votes
+    logarithmic: bool  # True = log-likelihoods; False = evidence proportional to probability, such as votes
     score_scale: int = 64  # quantized class score for evidence of 1 in compact storage
 
     def quantization(self, storage: Storage) -> int:
@@ -84,8 +84,11 @@ class LabeledVoxels:
     support_overlap: float = 0.6
     # True = clusters without a matched instance also update the class distributions of voxels
     update_unmatched: bool = False
-    instance_class: InstanceClass = InstanceClass.DETECTIONS  # source of an instance's class
-    storage: Storage = Storage.COMPACT  # labels stored per voxel: COMPACT = top few labels, EXACT = all labels
+    # source of an instance's class: DETECTIONS (its matched detections) or VOXELS (sum of the class evidence of its
+    # voxels)
+    instance_class: InstanceClass = InstanceClass.DETECTIONS
+    # labels stored per voxel: COMPACT (top few labels) or EXACT (all labels, for comparison)
+    storage: Storage = Storage.COMPACT
 
     def __post_init__(self) -> None:
         check_bounds(self, occlusion_area_ratio=(0.0, 1.0), support_overlap=(0.0, 1.0))
@@ -104,7 +107,8 @@ class LabeledVoxels:
         """
         if not isinstance(scene, InstanceMap):
             raise ConfigError(
-                f"fuser: expected a stored InstanceMap, got {type(scene).__name__}; choose the fuser that made the map"
+                f"fuser: expected a stored map of this fuser, got a map of type {type(scene).__name__}; choose the "
+                "fuser that made the map"
             )
         own = self.new_map(rule)
         parameters: dict[str, tuple[object, object]] = {
@@ -170,7 +174,7 @@ class LabeledVoxels:
     def supported_instances(self, table: InstanceTable, matches: Matches) -> Bool:
         """Return a Boolean array (N, ids + 1), True where the object of a cluster supports an instance.
 
-        For example, a table supports a book. The mask of the table may cover the book, but is no evidence for its
+        For example, a table supports a book. The mask of the table may cover the book, but is not evidence for its
         voxels. The supported instance is confirmed, has another class, is much smaller and is mostly inside the mask.
         """
         overlaps, clusters = matches.overlaps, matches.clusters

@@ -9,7 +9,7 @@ its list. The example has two overlapping masks of clusters 0 and 1 (* = both):
     . 1 1        0 3 3                2      0, 1        1
                                       3      1           3           offsets[4] = 4
 
-The number of pixels shared by two clusters determines the occlusion order and duplicate detections.
+The pixel counts of the lists give the sizes of the clusters, which determine the occlusion order.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> P
     Args:
         points: The lists of clusters at the pixels.
         instance_ids: The instance (N,) of each cluster, 0 = none.
-        area_ratio: The minimum area ratio of the smallest cluster at a pixel and any other cluster that is kept.
+        area_ratio: The minimum ratio of the area of the smallest cluster at a pixel to that of any other kept cluster.
     """
     offsets, kept = np.empty_like(points.offsets), np.empty_like(points.clusters)
     keep_smallest(points.pixel_counts, points.offsets, points.clusters, instance_ids, area_ratio, offsets, kept)

@@ -83,7 +83,10 @@ def write_lists(head, parent, offsets, clusters):
 
 @njit(cache=True, nogil=True)
 def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kept_offsets, kept):
-    """Write the reduced lists of keep_on_top() to `kept_offsets` (L + 1,) and `kept`."""
+    """Remove from each list the clusters without an instance and those much larger than its smallest cluster.
+
+    The reduced lists are written to `kept_offsets` (L + 1,) and `kept`. The other arguments are those of keep_on_top().
+    """
     sizes = np.zeros(instance_ids.shape[0], np.float64)
     for i in range(pixel_counts.shape[0]):
         for entry in range(offsets[i], offsets[i + 1]):

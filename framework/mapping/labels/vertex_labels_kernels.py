@@ -97,7 +97,7 @@ def _elect(grid, evidence, counts, blocks, voxels, weights, ids):
 def color_of(color, voxel, out):
     """Write the color of a voxel to `out` (3,), RGB.
 
-    The voxel is numbered as in an UnlabeledMesh.
+    The voxel is given as block * 512 + index in the block.
     """
     red, green, blue = unpack_color(color[voxel // BLOCK_VOXELS, voxel % BLOCK_VOXELS])
     out[0], out[1], out[2] = red / 4, green / 4, blue / 4
@@ -107,7 +107,7 @@ def color_of(color, voxel, out):
 def color_vertices(color, voxels, colors):
     """Fill the colors (V, 3), RGB, of voxels (V,).
 
-    The voxels are numbered as in an UnlabeledMesh.
+    A voxel is given as block * 512 + index in the block.
     """
     for v in prange(len(voxels)):
         color_of(color, voxels[v], colors[v])

@@ -23,7 +23,7 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.storage.map_header import LARGEST_COUNT, MapHeader, whole
 from framework.mapping.voxels.voxel_grid_kernels import FARTHEST_BLOCK
 
-DEFLATE_LEVEL = 1  # zlib level; files are at most a tenth larger than at level 6 and take half the time
+DEFLATE_LEVEL = 1  # zlib level; files are at most a tenth larger than at level 6, and writing takes half the time
 
 HEADER = "header"  # name of the array with the JSON header
 LARGEST_HEADER = 2**28  # maximum size of the header, bytes; an hour of mapping with thousands of instances takes 10 MB
@@ -60,7 +60,7 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
     Array sizes are checked against the file and the available memory before allocation.
 
     Raises:
-        DataError: If the file is no map file, has another format or is damaged.
+        DataError: If the file is not a map file, has another format or is damaged.
     """
     with map_file_errors(path), _opened(path) as archive:
         header = _header(archive)
@@ -90,7 +90,7 @@ def read_format(path: Path | str) -> str:
     """Return the format of a map file.
 
     Raises:
-        DataError: If the file is no map file.
+        DataError: If the file is not a map file.
     """
     with map_file_errors(path), _opened(path) as archive:
         return str(_header(archive).values.get("format"))

@@ -44,7 +44,7 @@ class Allocator:
 
         Raises:
             MapFullError: If the map needs too many blocks.
-            FrameError: If the pose is outside the range of block coordinates.
+            FrameError: If the measured surface may be outside the range of block coordinates.
         """
         self._frames += 1
         found = self.allocate(frame.camera, frame.depth, T_world_camera)
@@ -66,7 +66,7 @@ class Allocator:
 
         Raises:
             MapFullError: If the map needs too many blocks.
-            FrameError: If the pose is outside the range of block coordinates.
+            FrameError: If the measured surface may be outside the range of block coordinates.
         """
         return self.voxels.allocate(self._surface_coords(camera, depth, T_world_camera))
 

@@ -13,7 +13,7 @@ from framework.mapping.voxels.voxel_walk import ray_direction
 CHUNKS = 32  # fixed number of chunks of image rows, so that block order does not depend on the number of threads
 WORD = 64  # number of bits of a word
 RECENT = 1024  # number of recent block keys that a chunk caches, so that most blocks are listed once
-PROBES = 4  # number of probed pixels along each side of a block in the image, to detect free space behind it
+PROBES = 4  # number of probed pixels along each side of a block in the image, to detect readings behind it
 
 
 @device
@@ -60,7 +60,7 @@ def surface_blocks(depth, view, sensor, block_size, stride, samples, found, coun
     Args:
         depth: The depth image (H, W), m. Every stride-th pixel of every stride-th row is used.
         view: The camera with the pose T_world_camera.
-        sensor: The parameters of the volume.
+        sensor: The integration parameters.
         block_size: The side of a block, m.
         stride: The distance between the used pixels, px.
         samples: The number of samples along a truncation band.
@@ -208,9 +208,9 @@ def choose_blocks(grid, found, region_count, depth, camera, sensor, stamp, frame
         region_count: The number of regions.
         depth: The depth image (H, W), m.
         camera: The camera with the pose T_camera_world.
-        sensor: The parameters of the volume.
-        stamp: The last frame (B,) in which each block was active.
-        frame: The current frame.
+        sensor: The integration parameters.
+        stamp: The number (B,) of the last frame in which each block was active, modified in place.
+        frame: The number of the current frame.
         active: The output.
     """
     n = 0

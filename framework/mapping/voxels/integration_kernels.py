@@ -68,7 +68,7 @@ def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
 
 @device
 def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_band, scratch):
-    """Update the running averages of the distances and weights (512,) of a block.
+    """Update the weights and the running averages of the distances (512,) of a block.
 
     Returns the number of voxels with a new color, and the number of voxels near the surface.
 
@@ -77,7 +77,7 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         weight: The weights (512,), modified in place.
         voxel: The voxel size, m.
         to_units: The stored distance units per m.
-        sensor: The parameters of the volume.
+        sensor: The integration parameters.
         rounding: The offset in [0, 1) before rounding down.
         near_band: The maximum distance of near voxels from the surface, m.
         scratch: The depth of each voxel, then the depth reading of each voxel, m. They are replaced by the distance to
@@ -189,7 +189,7 @@ def integrate(grid, seen, depth, color, camera, sensor, rounding, near_band):
         depth: The depth image (H, W), m.
         color: The RGBA bytes (H, W) of the color image.
         camera: The camera with the pose T_camera_world.
-        sensor: The parameters of the volume.
+        sensor: The integration parameters.
         rounding: The offset in [0, 1) before values are rounded down to integers.
         near_band: The maximum distance of near voxels from the surface, m.
     """

@@ -1,7 +1,7 @@
 """Surface extraction by surface nets (Gibson, 1998).
 
 A cell is the cube between eight neighboring voxels. If the signs of its corners differ, the cell has one vertex, at the
-mean of the zero crossings on its edges. Each edge with a sign change connects the vertices of its four cells to a quad.
+mean of the zero crossings on its edges. The vertices of the four cells around each edge with a sign change form a quad.
 Compared with marching cubes, surface nets have half the vertices and better triangle shapes.
 
 The search for cells tests 64 voxels at once as bits of a word. The index of a vertex is the number of set bits before

@@ -44,7 +44,7 @@ def pack(tsdf, blocks, inside, seen):
 
 @njit(cache=True, nogil=True, parallel=True)
 def mark_stale(grid, changed, stale):
-    """Mark the blocks with a cell whose corner is in a changed block, in `stale` (B,)."""
+    """Set `stale` (B,) to True for blocks with a cell that has a corner in a changed block."""
     for b in prange(len(changed)):
         before = np.empty(8, np.int32)
         _blocks_before(grid, changed[b], before)
@@ -79,7 +79,7 @@ def _cell_corners(tsdf, around, x, y, z, corners):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_cells(grid, blocks, inside, seen, most_jump, cells):
-    """Find the cells of blocks that have a vertex, as bits (B + 1, 8).
+    """Find the cells with a vertex in the given blocks, as bits (B + 1, 8).
 
     A cell has no vertex if its distances differ by more than `most_jump`, in stored units.
     """
@@ -155,7 +155,7 @@ def place_vertices(grid, stale, cells, starts, old_starts, old, vertices, voxels
         old_starts: The indices (B, 8) in the old surface.
         old: The old surface.
         vertices: The output (V, 3) in the world frame, m.
-        voxels: The output (V,), the voxel nearest to each vertex; see UnlabeledMesh.
+        voxels: The output (V,), the voxel nearest to each vertex, as block * 512 + index in the block.
     """
     tsdf, block_coords, voxel_size = grid.tsdf, grid.block_coords, grid.voxel_size
     half = np.float32(0.5)

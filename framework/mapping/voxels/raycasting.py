@@ -1,8 +1,9 @@
 """Ray casting of camera views, from coarse to fine.
 
-1. The blocks in view are projected to image tiles. This bounds the depth range of the rays in each tile. 2. A coarse
-grid of rays is cast by sphere tracing. Rays skip empty regions and blocks in one step. 3. Depths between neighboring
-rays on one surface are interpolated and refined by Newton's method. If this fails, the pixel is searched individually.
+1. The blocks in view are projected to image tiles. This bounds the depth range of the rays in each tile.
+2. A coarse grid of rays is cast by sphere tracing. Rays skip empty regions and blocks in one step.
+3. Depths between neighboring rays on one surface are interpolated and refined by Newton's method. If this fails, the
+   pixel is searched individually.
 
 The spacing of the coarse rays is smaller than the details of the map, so that interpolation misses no surface. Where
 the spacing is larger, all pixels are searched.
@@ -55,13 +56,13 @@ def cast_view(
     voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None,
     kind: SensorKind = SensorKind.KINECT_V1,
 ) -> tuple[Float32, Float32]:  # fmt: skip
-    """Return the depth (H, W), m, and the normals (H, W, 3) of the visible surface.
+    """Return the depth (H, W), m, and the world-frame normals (H, W, 3) of the visible surface.
 
     The depth is 0 where there is no surface.
 
     Args:
         voxels: The voxel grid.
-        sensor: The parameters of the volume.
+        sensor: The integration parameters.
         camera: The camera of the view.
         T_world_camera: The camera pose (4, 4).
         readings: The depth image (H, W), m, of a sensor at this pose. If given, only the surface near or in front of

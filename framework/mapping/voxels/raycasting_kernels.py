@@ -237,7 +237,7 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
         stride: The spacing of the coarse rays, px.
         coarse: The depths of the coarse rays, from cast_coarse() or cast_near().
         depth: The output (H, W), m, 0 = no surface.
-        normals: The output (H, W, 3) in the world frame, the normalized gradients of the field.
+        normals: The output (H, W, 3) in the world frame, the normalized gradients of the signed distance.
     """
     height, width = depth.shape
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -289,7 +289,7 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
 def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, depth):
     """Cast the rays of cast_coarse(), starting at the depth readings of a sensor.
 
-    Pixels with a limit of 0 are not searched. Their depth is -1.
+    Rays with a limit of 0 are not searched.
 
     Args:
         grid: The voxel grid.
@@ -300,7 +300,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, 
         stride: The spacing of the rays, px.
         readings: The depth readings (H, W), m.
         noise: The depth noise parameters of the sensor.
-        depth: The output, as in cast_coarse().
+        depth: The output, at the rays of cast_coarse(), m, 0 = no surface, -1 = not searched.
     """
     height, width = readings.shape
     zero, one = np.float32(0.0), np.float32(1.0)

@@ -68,11 +68,11 @@ class TsdfVolume:
         return seen
 
     def renew_colors(self) -> None:
-        """Replace the color of each voxel by its next observation."""
+        """Mark all colors, so that the next observation of each voxel replaces its color."""
         mark_outdated(self.voxels.grid.color, self.voxels.block_count)
 
     def changed(self, blocks: Int32 | None = None) -> None:
-        """Invalidate the cached surface after a change of voxels in the given blocks, None = any block."""
+        """Invalidate the cached surface after a change to voxels in the given blocks, None = any block."""
         self._mesh = self._gravity = None
         if blocks is None:
             self._nets = None

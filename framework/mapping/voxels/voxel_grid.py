@@ -38,7 +38,7 @@ FIRST_RESERVED = 1024  # initial capacity, blocks or voxels
 
 
 class Grid(NamedTuple):
-    """The arrays of a VoxelGrid.
+    """The arrays of a voxel grid.
 
     B and S are the capacities for blocks and regions. Only the first entries are in use.
     """
@@ -74,7 +74,7 @@ def _free_blocks(count: int) -> dict[str, Any]:
 
 
 def reserved(most: int, make: Callable[[int], Made]) -> Made:
-    """Return make(most), which should allocate uninitialized arrays with enough rows to never grow.
+    """Return the uninitialized arrays of make(most), which have enough rows to never grow.
 
     Uninitialized arrays take no memory until they are written. If the address space is limited (Windows, `ulimit -v`),
     return smaller arrays, which can grow.

@@ -43,7 +43,7 @@ def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to_density(x: Float32, y: Float32, z: Float32, row: Float32, values: Float32) -> None:
-    """Raise each value to the weighted log density of one Gaussian at the point, if larger."""
+    """Raise each value to at least the weighted log density of one Gaussian at its point."""
     c, mx, my, mz = row[0], row[1], row[2], row[3]
     w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
@@ -93,7 +93,7 @@ def constant_exponential(log_density: np.float32, largest: Float32, evidence: Fl
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int) -> None:
-    """Replace the first `n` log densities by exp(densities - largest), and add them to `evidence`."""
+    """Replace the first `n` log densities with exp(densities - largest), and add them to `evidence`."""
     for i in range(n):
         densities[i] = _exp(densities[i] - largest[i])
         evidence[i] += densities[i]
@@ -127,7 +127,7 @@ def _product(values: Float32) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def invert(values: Float32, others: Float32, n: int) -> float:
-    """Replace the first `n` values by 1 / values, and return the sum of others / values."""
+    """Replace the first `n` values with 1 / values, and return the sum of others / values."""
     total = np.float32(0.0)
     for i in range(n):
         values[i] = np.float32(1.0) / values[i]

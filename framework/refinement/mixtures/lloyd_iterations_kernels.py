@@ -53,7 +53,7 @@ def nearest(point: Float32, centers: Float64) -> int:
 
 @njit(cache=True, nogil=True, parallel=True)
 def nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) -> Int32:
-    """Return the labels of nearest_centers()."""
+    """Return the index (S,) of the center nearest to each point, -1 = the point is in no set."""
     labels = np.full(len(points), -1, np.int32)
     for k in range(len(begins)):
         for i in prange(begins[k], ends[k]):
@@ -63,7 +63,7 @@ def nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) -
 
 @njit(cache=True, nogil=True, parallel=True)
 def group_depths(points: Float32, starts: Int64, groups: int) -> Float64:
-    """Return the means of depth_groups()."""
+    """Return the means (N, groups, 3), m, of groups of points at different depths."""
     means = np.zeros((len(starts) - 1, groups, 3))
     for k in prange(len(starts) - 1):
         means[k] = depth_groups_of(points[starts[k] : starts[k + 1]], groups)
@@ -72,7 +72,7 @@ def group_depths(points: Float32, starts: Int64, groups: int) -> Float64:
 
 @njit(cache=True, nogil=True)
 def depth_groups_of(points: Float32, groups: int) -> Float64:
-    """Return the means (groups, 3), m, of depth_groups() for one set."""
+    """Return the means (groups, 3), m, of groups of points of one set at different depths."""
     n, means = len(points), np.zeros((groups, 3))
     if n == 0:
         return means

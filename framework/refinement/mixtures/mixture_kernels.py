@@ -27,7 +27,7 @@ from framework.refinement.mixtures.gaussian import (
 
 MIN_SUPPORT = 4.0  # minimum number of points of a component; with fewer, it has no 3D covariance and is dropped
 BLOCK = 256  # number of points that a kernel processes at once; their densities fit into the L1 cache
-MARGIN = 1e-3  # bound of the rounding error of log densities in single precision, nats
+MARGIN = 1e-3  # bound on the rounding error of log densities in single precision, nats
 
 
 class EmSettings(NamedTuple):

@@ -59,10 +59,10 @@ class MixtureTree:
         """Return the best node (S,) of level k for each point.
 
         The best node of a point is the child of its current node with the largest weighted density. The result is -1 if
-        the uniform component is more likely.
+        the uniform component is more likely, or if the current node is a leaf.
 
         Args:
-            k: The level.
+            k: The index of the level.
             points: The points (S, 3), sorted by their node in the level above, m.
             starts: The start (Q + 1,) of the points of each node in the level above.
         """
@@ -78,7 +78,7 @@ class MixtureTree:
         The posterior is 0 if the node of the point in the level above is a leaf.
 
         Args:
-            k: The level.
+            k: The index of the level.
             points: The points (S, 3), sorted by their node in the level above, m.
             starts: The start (Q + 1,) of the points of each node in the level above.
             ratios: The object fraction (M,) of the density of each node.

@@ -161,7 +161,7 @@ def _add_scaled(densities: Float32, scale: np.float32, values: Float32) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def set_own_ratios(log_odds: Float32, starts: Int64, above_points: float, ratios: Float32) -> None:
-    """Replace the object fractions (M,) of the parents by those of the nodes.
+    """Replace the object fractions (M,) of the parents with those of the nodes.
 
     See own_ratios().
     """

@@ -26,7 +26,7 @@ class Noise(NamedTuple):
 
     factor: float  # depth difference that counts as noise, standard deviations
     min_noise: float  # minimum standard deviation of depth, m
-    least: float  # coefficients of the DepthNoise of the sensor
+    least: float  # coefficients least, near and growth of the depth noise of the sensor
     near: float
     growth: float
 
@@ -219,7 +219,8 @@ def count_edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: floa
         pinhole: The intrinsics fx, fy, cx, cy, in cells.
         noise: The noise limits.
         max_angle: The maximum angle of a concave bend, rad.
-        normal_sigma_1m: The result of normal_sigma() per depth noise, rad/m.
+        normal_sigma_1m: The standard deviation of the angle between two fitted normals at a depth of 1 m, rad per m of
+            depth noise.
     """
     _, rows, columns = planes.shape
     surface = np.empty((9, rows, columns), np.float32)
@@ -280,7 +281,7 @@ def _set_surface(
 def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool) -> None:
     """Mark the cells whose opposite neighbors are on different surfaces or form a concave crease.
 
-    `spacing` is the distance of the neighbors at a depth of 1 m, m.
+    `spacing` is the distance between the neighbors at a depth of 1 m, m.
     """
     zero = np.float32(0)
     ax, ay, az, ad, apx, apy, apz, gate, min_cosine = one

@@ -62,7 +62,7 @@ def find_planes(frame: Frame, distance: float, noise: float, min_area: float) ->
 
     Args:
         frame: The frame.
-        distance: The maximum rms distance of the readings of a cell to the plane, m, in addition to the noise.
+        distance: The maximum rms distance of the readings of a cell from the plane, m, in addition to the noise.
         noise: The noise of inverse depth for KINECT_V1, 1/m. It is scaled up for sensors with more noise.
         min_area: The minimum visible area of a plane, m^2. At least a quarter of it must be connected.
     """
@@ -84,7 +84,7 @@ def find_planes(frame: Frame, distance: float, noise: float, min_area: float) ->
 
 
 def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
-    """Return 1 + the index of the nearest plane (H, W) for each depth reading, 0 = none.
+    """Return 1 + the index of the nearest plane for each depth reading (H, W), 0 = none.
 
     A reading is on a plane if its distance to the plane is at most `distance`, m, plus three standard deviations.
     """
@@ -105,13 +105,13 @@ def off_planes(clusters: PointClusters, on_plane: UInt8, planes: int, max_own: f
 
     Args:
         clusters: The clusters.
-        on_plane: The plane (H, W) of each pixel, from plane_image().
+        on_plane: 1 + the index (H, W) of the plane at each pixel, 0 = none.
         planes: The number of planes.
         max_own: The maximum fraction of the readings of a plane that is removed from a cluster.
 
     Returns:
         A Boolean array (P,), True for points to keep.
-        A Boolean array (H, W), True for pixels on planes without kept points.
+        A Boolean array (H, W), True for pixels on planes, except the pixels of kept points.
     """
     structure = on_plane > 0
     rows = len(clusters) + 1  # the last row is for points of no cluster

@@ -139,11 +139,11 @@ def find_plane_cells(
         columns: The number of cells per row.
         seeds: The cells that can start a plane, flattest first.
         free: The cells (C,) that belong to no plane, modified in place.
-        distance: The maximum rms distance of a cell to the plane, m, in addition to the noise.
+        distance: The maximum rms distance of a cell from the plane, m, in addition to the noise.
         noise: The noise of inverse depth for KINECT_V1, 1/m.
         sensor: The noise parameters of the sensor.
         min_area: The minimum visible area of a plane, m^2.
-        spacing: The distance of neighboring readings at a depth of 1 m, m.
+        spacing: The distance between neighboring readings at a depth of 1 m, m.
         found: The output (MAX_PLANES, 7): m (3), deviation, area, fraction and behind, as in Planes.
     """
     m, total = np.zeros(3), np.zeros(10)

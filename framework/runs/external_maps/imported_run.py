@@ -62,11 +62,9 @@ class MappedData:
             raise ConfigError(f"import-map: expected dataset=NAME, got only {', '.join(overrides)}; add dataset=NAME")
         config, choices = composed_with_choices(*overrides)
         plain = resolved(config)
-        return (
-            cls(plain["dataset"], choices["dataset"], plain["seed"])
-            if "dataset" in keys
-            else cls({}, None, plain["seed"])
-        )
+        if "dataset" not in keys:
+            return cls({}, None, plain["seed"])
+        return cls(plain["dataset"], choices["dataset"], plain["seed"])
 
 
 def write_imported_run(

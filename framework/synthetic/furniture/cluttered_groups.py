@@ -71,7 +71,7 @@ def cluttered_couch(rng: Rng) -> Group:
 
 
 def _in_leather(couch: Furniture, rng: Rng) -> Furniture:
-    """Replace the fabric of a couch by black leather."""
+    """Replace the fabric of a couch with black leather."""
     hide = paints.leather(rng)
     parts = [(solid, hide if material.texture is Texture.FABRIC else material) for solid, material in couch.parts]
     return Furniture(couch.kind, couch.class_name, parts)

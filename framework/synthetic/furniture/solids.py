@@ -18,7 +18,7 @@ import numpy as np
 from framework.data import Float64, Int32
 
 SPACING = 0.07  # m, vertex spacing on flat faces, the resolution of baked shadows
-WELD = 1e-6  # m, rounding of vertex positions for the test whether they are equal
+WELD = 1e-6  # m, rounding of vertex positions before they are compared
 
 
 @dataclass(frozen=True)

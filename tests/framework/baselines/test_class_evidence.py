@@ -73,7 +73,7 @@ def test_class_evidence_of_later_class_includes_earlier_masks() -> None:
     np.testing.assert_allclose(sums(evidence, 14), log_ratios.sum(axis=0), atol=1e-4)
 
 
-def test_class_evidence_full_voxel_evicts_least_likely_class() -> None:
+def test_class_evidence_full_voxel_evicts_least_likely_classes() -> None:
     message = np.full((3, 40), -5.0)
     message[0, :8], message[1, 8:16], message[2, 16:24] = 1.0, 2.0, 9.0
     masks, evidence = masks_of(message), one_voxel(40)

@@ -244,7 +244,7 @@ def test_recording_check_accepts_single_frame_or_missing_poses() -> None:
     assert verdicts(Part(20)) == fine | dict.fromkeys(("motion", "color and depth"), Verdict.FINE)
 
 
-def test_recording_check_reports_defects_of_single_frame() -> None:
+def test_recording_check_reports_defective_images() -> None:
     def blurred(frame: Frame) -> Frame:
         return replace(frame, color=cv2.GaussianBlur(frame.color, (0, 0), 12))
 

@@ -1,4 +1,4 @@
-"""Tests for the directory names of sweeps and of the exit of commands."""
+"""Tests for the directory names of sweeps, the exit of commands, and config directories."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -30,16 +31,18 @@ def test_directory_name_of_long_overrides_is_short_and_unique() -> None:
 def test_print_for_directories_continues_after_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def write(directory: Path) -> str:
+    def write(directory: Path, overrides: Sequence[str]) -> str:
         if directory.name == "empty":
             raise DataError("there is nothing")
-        return directory.name
+        return " ".join([directory.name, *overrides])
 
-    monkeypatch.setattr(sys, "argv", ["command", *(str(tmp_path / name) for name in ("a", "empty", "b"))])
+    monkeypatch.setattr(
+        sys, "argv", ["command", *(str(tmp_path / name) for name in ("a", "empty", "b")), "table.base=x"]
+    )
     with pytest.raises(SystemExit) as ended:
-        print_for_directories("", "", write)
+        print_for_directories("", "", "table", write)
     assert ended.value.code == 1
-    assert capsys.readouterr() == ("a\nb\n", "error: there is nothing\n")
+    assert capsys.readouterr() == ("a table.base=x\nb table.base=x\n", "error: there is nothing\n")
 
 
 @pytest.mark.parametrize("command", ["tables", "figures", "evaluate", "plugins"])

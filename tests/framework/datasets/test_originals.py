@@ -330,7 +330,7 @@ def test_tum_run_in_motion_capture_gap_raises_one_line_error(originals: Path, tm
 
 
 def test_scannet_first_release_names_are_known(shared_data: Path) -> None:
-    """The label table has `trash can` and `dish rack` with a space. Both have no class in COCO."""
+    """The label table has `trash can` and `dish rack` with a space. Neither has a class in COCO."""
     root = shared_data / "scannet_scene0000"
     if not root.is_dir():
         pytest.skip(f"{root} does not exist")

@@ -574,7 +574,7 @@ def test_recording_depth_delay_discards_image_timestamps(folder):
     assert frame.color_time == frame.depth_time == frame.timestamp
 
 
-def test_recording_color_delay_is_given_or_estimated(folder):
+def test_recording_color_delay_parameter_is_read_or_raises(folder):
     assert RgbdFolder(folder).constant_color_delay() is None
     assert RgbdFolder(folder, color_delay="0.02").constant_color_delay() == 0.02
     for wrong in ("0.3", "soon", "nan"):

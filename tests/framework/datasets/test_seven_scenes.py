@@ -92,7 +92,7 @@ def test_seven_scenes_registered_depth_matches_projection() -> None:
         assert abs(rows[0] - v) <= 0.501
 
 
-def test_seven_scenes_registration_keeps_nearest_and_holes() -> None:
+def test_seven_scenes_register_keeps_nearest_depth_and_holes() -> None:
     raw = np.full(DEPTH_CAMERA.shape, 4000, np.uint16)
     raw[:, 300:340] = 1000
     raw[:100] = 65535

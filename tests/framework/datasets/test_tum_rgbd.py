@@ -42,7 +42,7 @@ def write_poses(folder: Path, lines: list[str]) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a recording of a wall at z = 2 m. The camera moves at 1 m/s along x, and poses have 100 Hz."""
+    """Return a recording of a wall at z = 2 m. The camera moves at 1 m/s along x, and poses are stored at 100 Hz."""
     folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
     color = [color_time(k) for k in range(FRAMES)]
     depth = [time + DEPTH_DELAY for time in color]
@@ -144,7 +144,7 @@ def test_tum_rgbd_published_camera_overrides_camera_json(folder: Path) -> None:
 
 
 def test_tum_rgbd_association_is_closest_first_and_one_to_one() -> None:
-    """Both color images are nearest to the depth image at 0.015 s. The closer one gets it."""
+    """At first, the depth image at 0.015 s is nearest to both color images. The closer color image gets it."""
     assert associate([0.0, 0.02], [0.015, 0.19], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, 0.035], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, -0.01], 0.02) == [(0, 1), (1, 0)]
@@ -187,7 +187,7 @@ def test_tum_rgbd_duplicate_image_timestamps_keep_first(folder: Path, caplog: py
 
 
 def test_tum_rgbd_recording_without_image_pairs_raises(folder: Path) -> None:
-    with pytest.raises(DataError, match=r"within dataset\.max_time_difference \(0\.01 s\), got none"):
+    with pytest.raises(DataError, match=r"within dataset\.max_time_difference \(0\.01 s\) of each other, got none"):
         TumRgbd(folder, max_time_difference=0.01)
 
 

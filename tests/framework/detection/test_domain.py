@@ -1,4 +1,4 @@
-"""Tests for the warning that a detector was trained on another kind of images."""
+"""Tests for the warning that a detector was trained on another kind of image."""
 
 from __future__ import annotations
 
@@ -75,7 +75,9 @@ def test_domain_mismatch_in_detection_commands_warns(tmp_path: Path, caplog: pyt
 
 
 @pytest.mark.parametrize(("choice", "lines"), [(["detector=mask_rcnn_rooms"], 1), ([], 0)])
-def test_domain_of_mapper_frames_unknown_warns(choice: list[str], lines: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_domain_unknown_for_mapper_frames_warns(
+    choice: list[str], lines: int, caplog: pytest.LogCaptureFixture
+) -> None:
     mapper = Mapper(*choice, "device=cpu", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
     for frame in CornerRoom(frames=2):
         mapper.add(frame)

@@ -155,7 +155,7 @@ def test_evaluate_ignores_prediction_of_unannotated_class():
 
 
 def test_evaluate_keeps_prediction_with_evaluated_match():
-    """The prediction matches the chair at IoU 0.25, although it covers an unknown instance even more."""
+    """The prediction matches the chair at IoU 0.25, although it covers more of an unknown instance."""
     truth = scene([(1, 100), (2, 150)], {1: "chair", 2: None})
     result = evaluate(prediction(truth, [(5, 250)], {5: ("chair", 0.5)}), truth)
     assert result.by_class[0.25]["chair"].ap == 1.0

@@ -75,7 +75,7 @@ def _slabs(points: np.ndarray, ids: np.ndarray, borders: np.ndarray) -> np.ndarr
 
 
 def clear(points: np.ndarray, targets: np.ndarray) -> bool:
-    """Return True if the nearest points and their distance limits do not depend on rounding."""
+    """Return True if rounding changes neither the nearest points nor whether they are within the distance limit."""
     distances = np.sort(np.linalg.norm(points[None].astype(np.float64) - targets[:, None], axis=2), axis=1)
     return bool(
         (distances[:, 1] - distances[:, 0] > CLEAR).all() and (np.abs(distances[:, 0] - MAX_DISTANCE) > CLEAR).all()

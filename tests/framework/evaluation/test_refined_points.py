@@ -131,7 +131,7 @@ class Counting(ClusterRefiner):
 
 
 @pytest.mark.parametrize("truth", [True, False])
-def test_refinement_times_refiner_on_lifted_detections(truth: bool) -> None:
+def test_refinement_measures_refiner_on_lifted_detections(truth: bool) -> None:
     seen = CornerRoom()[2]
     found: Detections = SphereDetector().detect(seen)
     if not truth:

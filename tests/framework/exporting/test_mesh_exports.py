@@ -234,7 +234,7 @@ def test_usd_export_without_usd_core_error_names_extra(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
-    with pytest.raises(DataError, match=r"pip install instancemap\[usd\]"):
+    with pytest.raises(DataError, match=r"pip install 'instancemap\[usd\]'"):
         export(run, [ExportFormat.GLB, ExportFormat.USD], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -401,7 +401,7 @@ def test_export_invalid_selection_raises(run: Path, tmp_path: Path) -> None:
         export(tmp_path, [ExportFormat.GLB])
     with pytest.raises(DataError, match="object: expected an id or class of this run, got 'cub'; did you mean 'cube'"):
         export(run, [ExportFormat.GLB], tmp_path, Chosen(("cub",)))
-    with pytest.raises(DataError, match=r"object: expected a confidence >= 0.9 of 'cube', got at most 0.80"):
+    with pytest.raises(DataError, match=r"object: expected a confidence >= 0.9 for 'cube', got at most 0.80"):
         export(run, [ExportFormat.GLB], tmp_path, Chosen(("cube",), min_confidence=0.9))
     assert export(run, [ExportFormat.GLB], tmp_path, Chosen(("2",), min_confidence=0.9)) == [
         tmp_path / "objects/cube_2.glb"

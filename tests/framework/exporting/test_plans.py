@@ -132,7 +132,7 @@ def test_plan_looked_through_excludes_occluded_points(room: UprightRoom) -> None
     pose[:3, 3] = (0.4, 1.35, 0.85)
     places = np.array([(0.8, 1.35, 0.85), (1.15, 1.35, 0.85), (1.35, 1.35, 0.85), (1.8, 1.35, 0.85), (0.2, 1.35, 0.85)])
     seen = looked_through(replace(room, poses=pose[None]), places)
-    # two points in front of the cube; in the cube, behind the cube, behind the camera
+    # two points in front of the cube, one in it, one behind it, and one behind the camera
     assert seen.tolist() == [True, True, False, False, False]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,16 +19,18 @@ from framework.commands.results import figures
 from framework.commands.running.sweep import sweep_in
 from framework.errors import ConfigError, DataError, InstanceMapError
 from framework.figures import map_figure
-from framework.figures.experiment_figure import DRAWN, Pictured, write_figure
+from framework.figures.experiment_figure import DRAWN, write_figure
 from framework.figures.figure_choice import FigureChoice
+from framework.figures.figure_runs import Pictured
 from framework.files.tum_trajectory import write_tum
 from framework.runs.mesh_file import write_mesh
 from framework.runs.provenance import config_hash
+from tests.support.metric_runs import check_layout
 from tests.support.scenes.boxes_room import furnished, walk
 
 pytestmark = pytest.mark.usefixtures("fakes_registered")
 STAGE_MS = (("tracking", 20), ("refinement", 10), ("update", 10), ("integration", 20))
-ROWS = {"part": ["dataset.stop=8"], "whole": []}
+ROWS: Mapping[str, list[str]] = {"part": ["dataset.stop=8"], "whole": []}
 
 
 @pytest.fixture(autouse=True)
@@ -67,9 +70,9 @@ def run(root: Path, row: str, scene: str, frames: int = 20) -> Path:
     return directory
 
 
-def experiment(root: Path, **figure: Any) -> Path:
+def experiment(root: Path, rows: Mapping[str, list[str]] = ROWS, **figure: Any) -> Path:
     root.mkdir()
-    config = {"rows": ROWS, "figure": figure, "table": {"columns": ["fps"]}}
+    config = {"rows": rows, "figure": figure, "table": {"columns": ["fps"]}}
     (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     return root
 
@@ -155,7 +158,7 @@ def test_map_figure_inconsistent_objects_are_not_drawn(
 ) -> None:
     list_objects(maps / "dataset.scene=011,row=part,seed=0", "bed", vertices)
     texts(maps)
-    assert "the files are from different runs, repeat the run" in caplog.text
+    assert "repeat the run, because the files are from different runs" in caplog.text
 
 
 def test_map_figure_has_one_line_per_seed(tmp_path: Path) -> None:
@@ -210,9 +213,9 @@ def test_stage_times_figure_averages_sequences(tmp_path: Path, caplog: pytest.Lo
 @pytest.mark.parametrize(
     ("figure", "message"),
     [
-        ({"kind": "pie"}, r"figure\.kind: expected one of stage_times, maps, got 'pie'"),
+        ({"kind": "pie"}, r"figure\.kind: expected one of stage_times, maps, bar, .*, got 'pie'"),
         ({"kind": "stage_times", "zoom": True}, r"figure\.kind: expected maps with figure\.zoom=true, got stage_times"),
-        ({"colour": "red"}, "figure: expected one of kind, sequences, names, zoom, got 'colour'"),
+        ({"colour": "red"}, "figure: expected one of kind, sequences, names, zoom, .*, got 'colour'"),
         ("maps", "figure: expected keys and values"),
     ],
 )
@@ -225,10 +228,10 @@ def test_figure_choice_invalid_settings_raise_one_line_error(figure: Any, messag
 def test_write_figure_without_data_raises_one_line_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected a folder of runs, got no folder"):
         write_figure(tmp_path / "nowhere")
-    with pytest.raises(DataError, match=r"expected the folder of an experiment, got a folder without multirun\.yaml"):
+    with pytest.raises(DataError, match=r"expected a sweep with a figure, got none; add figure\.kind=bar"):
         write_figure(tmp_path)
     root = experiment(tmp_path / "none")
-    with pytest.raises(DataError, match="expected a block `figure:`, got none"):
+    with pytest.raises(DataError, match="expected a sweep with a figure, got none"):
         write_figure(root)
     for kind, name in (("maps", "mesh.ply"), ("stage_times", "timings.csv")):
         root = experiment(tmp_path / kind, kind=kind)
@@ -264,17 +267,13 @@ def test_sweep_writes_figure_except_after_ctrl_c(
     assert len(list(maps.glob("figure.*"))) == (0 if isinstance(error, KeyboardInterrupt) else 2)
 
 
-def test_map_figure_long_names_fit_on_page(tmp_path: Path) -> None:
-    root = experiment(tmp_path / "figure4", kind="maps", names={"part": "in progress"})
+@pytest.mark.parametrize("count", [2, 5])
+def test_map_figure_long_names_do_not_overlap(tmp_path: Path, count: int) -> None:
+    rows = [f"final map without plane_removal, gmm_em_and_connected_components_{k}" for k in range(count)]
+    root = experiment(tmp_path / "figure4", rows={row: [] for row in rows}, kind="maps")
     name = "rgbd_dataset_freiburg3_long_office_household_validation"
-    for row in ROWS:
+    for row in rows:
         run(root, row, name)
+    run(root, rows[0], "011", frames=8)
     pictured = Pictured.below(root)
-    figure = DRAWN[pictured.choice.kind](pictured).figure
-    figure.canvas.draw()
-    for text in figure.texts:
-        box = text.get_window_extent()
-        assert box.x0 >= 0, text.get_text()
-        assert box.y0 >= 0, text.get_text()
-        assert box.x1 <= figure.bbox.width, text.get_text()
-        assert box.y1 <= figure.bbox.height, text.get_text()
+    check_layout(DRAWN[pictured.choice.kind](pictured))

@@ -116,7 +116,7 @@ def test_cluster_marks_keep_colors_and_add_colors_for_parts() -> None:
     many = ClusterMarks.before(refined(frame, [a] * 100, [a] * 100)).colors.astype(int)
     assert many.shape == (100, 3)
     apart = np.abs(many - np.array(DROPPED)).sum(axis=1)
-    assert apart.min() > 100, "expected no pixel with the mark of dropped points"
+    assert apart.min() > 100, "expected cluster colors that differ from the mark of dropped points"
 
 
 def test_refinement_image_is_tinted_and_hatched() -> None:

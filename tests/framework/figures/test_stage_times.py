@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from framework.figures.stage_times import COLUMNS, MeanTimes, running_median, spread, stage_times_figure
+from framework.figures.stage_times import COLUMNS, MeanTimes, running_median, stage_times_figure
 from framework.runs.timings_file import StageTimes
 
 STAGES = [stage for stages in COLUMNS.values() for stage in stages]
@@ -28,21 +28,6 @@ def test_running_median_matches_slow_reference(values: list[float], window: int)
         around = [one for one in values[max(0, k - window // 2) : k + window // 2 + 1] if not np.isnan(one)]
         slow.append(np.nan if np.isnan(value) else float(np.median(around)))
     np.testing.assert_array_equal(running_median(np.array(values), window), slow)
-
-
-@settings(derandomize=True, deadline=None, max_examples=100)
-@given(st.lists(st.floats(-5, 5), max_size=8), st.floats(0.01, 1))
-def test_spread_keeps_label_order_distance_and_mean(places: list[float], gap: float) -> None:
-    found = spread(places, gap)
-    order = np.argsort(places, kind="stable")
-    assert (np.diff(np.array(found)[order]) >= gap - 1e-9).all()
-    if places:
-        assert np.mean(found) == pytest.approx(np.mean(places), abs=1e-9)  # the sum of least-squares offsets is 0
-    assert np.abs(np.array(spread(found, gap)) - found).max(initial=0) < 1e-9, "expected distant labels at their places"
-
-
-def test_spread_moves_overlapping_labels_equally() -> None:
-    assert spread([1.0, 5.0, 1.2], 1.0) == pytest.approx([0.6, 5.0, 1.6])
 
 
 def test_mean_times_end_with_shortest_sequence() -> None:

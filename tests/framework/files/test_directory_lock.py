@@ -24,7 +24,8 @@ def test_directory_lock_second_lock_error_names_holder(tmp_path: Path) -> None:
     with (
         locked(place),
         pytest.raises(
-            DataError, match=rf"sweep: expected an unlocked directory, got one in use by process {os.getpid()} on "
+            DataError,
+            match=rf"sweep: expected an unlocked directory, got a directory in use by process {os.getpid()} on ",
         ),
         locked(place),
     ):

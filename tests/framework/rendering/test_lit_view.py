@@ -24,7 +24,7 @@ def quad(left: float, right: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def view() -> LitView:
-    """Return a view of two rectangles. Each is 10 columns wide, and 10 columns at both sides are empty."""
+    """Return a view of two rectangles. Each is 10 columns wide, and the 10 columns on each side are empty."""
     triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
     return LitView(Surface(np.concatenate([quad(-0.5, 0), quad(0, 0.5)]), triangles), CAMERA, np.eye(4))
 
@@ -32,7 +32,7 @@ def view() -> LitView:
 COLORS = np.repeat([[90, 120, 150], [200, 100, 0]], 4, axis=0).astype(np.uint8)
 
 
-def test_lit_view_in_colors_is_shaded_on_paper_background(view: LitView) -> None:
+def test_lit_view_in_colors_is_shaded_on_plain_background(view: LitView) -> None:
     image = view.in_colors(COLORS)
     assert image.dtype == np.uint8
     assert image.shape == (20, 40, 3)

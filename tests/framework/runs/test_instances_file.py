@@ -33,7 +33,7 @@ def mapped() -> GridMap:
 
 
 def nearly_equal(found: dict[int, Instance]) -> dict[int, Instance]:
-    """Return the instances with a change in the last bit of the confidences and probabilities."""
+    """Return the instances with confidences and class probabilities that differ only in the last bit."""
     confidences = {1: 1 / 3, 2: np.nextafter(1 / 3, 1)}
     even = np.float32(0.5)
     likely = np.array([np.nextafter(even, np.float32(0)), np.nextafter(even, np.float32(1))], np.float32)
@@ -159,7 +159,7 @@ SCHEMA = json.loads((Path(instances_file.__file__).parent / "instances.schema.js
 
 
 def test_instances_schema_accepts_written_files(tmp_path: Path, room: CornerRoom) -> None:
-    """The first map has upright boxes, the second map has only the required values."""
+    """The first map has upright boxes, and the second map has only the required values."""
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     mapper = Mapper("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
     for frame in room:

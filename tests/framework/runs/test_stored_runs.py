@@ -183,7 +183,7 @@ MACHINE = {"environment.processor": "a", "environment.cpus": 4}
 
 
 def record_of(directory: Path, config: dict[str, object], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write a complete directory of a run with this config on this machine."""
+    """Write a complete directory of a run with this config on the machine MACHINE."""
     monkeypatch.setattr(stored_runs, "environment", lambda: MACHINE)
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     write(directory, config_hash=config_hash(config), inputs_sha256=inputs_sha256(config), **MACHINE)

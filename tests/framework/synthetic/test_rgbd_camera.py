@@ -87,7 +87,7 @@ def test_depth_sensor_box_casts_projector_shadow_on_left():
     assert 0.2 < missing[199:201].mean() < 0.8  # at the right edge, depth is dropped at random
 
 
-def test_depth_sensor_edge_on_surface_has_no_reading():
+def test_depth_sensor_surface_seen_edge_on_has_no_reading():
     assert not measure(np.full(FRONT.shape, 2.0), np.full(FRONT.shape, 0.01, np.float32)).any()
 
 

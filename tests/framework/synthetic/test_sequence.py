@@ -64,7 +64,7 @@ def test_synthetic_frames_are_independent_of_order_and_threads(bedroom):
     assert one_by_one == at_once
 
 
-def test_synthetic_frame_fraction_keeps_remaining_frames(bedroom):
+def test_synthetic_frame_fraction_does_not_change_frames(bedroom):
     share = Synthetic(seed=1, frame_fraction=0.1, **SMALL)
     assert len(share) == 24
     indices = [share[k].index for k in (0, 9, 23)]

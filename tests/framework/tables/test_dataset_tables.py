@@ -162,7 +162,7 @@ def test_table_pairs_by_key_without_common_seeds(sweep: Path) -> None:
 
 
 def test_table_statistics_have_units_of_pairs(sweep: Path) -> None:
-    """With pairs by dataset, columns, differences and tests are by dataset."""
+    """If pairs are formed by dataset, the columns, differences and tests are also by dataset."""
     run(sweep, "hall", "chain", 0, 0.7)
     for dataset, ap in (("desk", 0.2), ("rooms", 0.4), ("hall", 0.3)):
         for seed in (5, 6):

@@ -80,10 +80,10 @@ def test_write_tables_values_match_manual_result(sweep: Path) -> None:
     ("name", "before", "after", "message"),
     [
         ("table.md", "0.700 ±", "0.900 ±", "chain: AP50: expected 0.700 ± 0.265 as in the runs, got 0.900 ± 0.265"),
-        ("table.tex", "0.700", "0.900", "chain: AP50: expected 0.700 $\\pm$ 0.265 as in the runs, got 0.900 $\\pm$"),
+        ("table.tex", "0.700", "0.900", "chain: AP50 $\\uparrow$: expected 0.700 $\\pm$ 0.265 as in the runs, got 0.9"),
         ("table.csv", ",0.6,", ",0.61,", "row=chain,seed=1: instances.ap50: expected 0.6 as in the runs, got 0.61"),
         ("table.md", "| identity | 3 | -", "| x | 3 | -", "minus chain: expected identity as in the runs, got x"),
-        ("table.md", " poses ", " x | poses ", "expected the rows and columns of the runs' table, got others"),
+        ("table.md", " poses ", " x | poses ", "expected the rows and columns of the runs' table, got different ones"),
     ],
 )
 def test_changed_tables_name_edited_cell(sweep: Path, name: str, before: str, after: str, message: str) -> None:
@@ -94,6 +94,16 @@ def test_changed_tables_name_edited_cell(sweep: Path, name: str, before: str, af
     assert before in content
     (sweep / name).write_text(content.replace(before, after))
     assert any(message in change for change in changed_tables(sweep)), list(changed_tables(sweep))
+
+
+def test_changed_tables_uses_overrides_of_stored_tables(sweep: Path) -> None:
+    write_tables(sweep, ["table.base=identity", "table.columns=[instances.ap50]"])
+    assert list(changed_tables(sweep)) == []
+    (sweep / "table.yaml").unlink()
+    assert list(changed_tables(sweep)) != []
+    write_tables(sweep, ["table.base=identity"])
+    write_tables(sweep)
+    assert not (sweep / "table.yaml").exists()
 
 
 def test_table_csv_is_data_frame_of_its_runs(sweep: Path) -> None:
@@ -238,7 +248,7 @@ def test_table_on_scenenn_has_published_run_times(sweep: Path, annotation: str |
     ("dataset", "annotation", "only"),
     [
         ("scenenn", BenchmarkSettings().release, ""),
-        # one row is on synthetic rooms, the others are on real data
+        # one row is on synthetic rooms, and the others are on real data
         ("scenenn", BenchmarkSettings().release, "chain"),
         ("scannet", "ScanNet v2", ""),
         ("synthetic", None, ""),

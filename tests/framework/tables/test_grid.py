@@ -1,12 +1,10 @@
-"""Tests for table cells in Markdown and LaTeX."""
+"""Tests for table cells in Markdown."""
 
 from __future__ import annotations
 
 import math
 
-import pytest
-
-from framework.tables.grid import TextTable, decimals, figure, latex_grid, markdown_grid
+from framework.tables.grid import TextTable, decimals, figure, markdown_grid
 
 GRID = TextTable(
     heads=["scene", "a_b", "x"],
@@ -26,31 +24,9 @@ def test_markdown_grid_is_padded_and_aligned() -> None:
     ]
 
 
-@pytest.mark.parametrize("name", ["*star", "[optional]"])
-def test_latex_grid_protects_leading_star_and_bracket(name: str) -> None:
-    """After a line break or a rule, LaTeX reads a star or bracket as an argument."""
-    assert f"{{}}{name} & 1 \\\\" in latex_grid(TextTable(["row", "x"], [[name, "1"]]))
-
-
 def test_grid_replaces_line_breaks_in_cells() -> None:
     grid = TextTable(["row", "x"], [["a\nb", "1"]])
-    assert "a b & 1 \\\\" in latex_grid(grid)
     assert "| a b | 1 |" in markdown_grid(grid)
-
-
-def test_latex_grid_escapes_cells_and_separates_groups() -> None:
-    assert latex_grid(GRID) == [
-        "\\begin{tabular}{llr}",
-        "\\toprule",
-        "scene & a\\_b & x \\\\",
-        "\\midrule",
-        "011 & y\\textbar{}z & \\textbf{0.5 $\\pm$ 0.1} \\\\",
-        "\\midrule",
-        " & 50\\% & -- \\\\",
-        "\\bottomrule",
-        "\\end{tabular}",
-        "",
-    ]
 
 
 def test_grid_decimals_depend_on_largest_value() -> None:

@@ -124,6 +124,14 @@ class Boasting(Cheating):
 
 
 @dataclass
+class Following(PoseTracker):
+    """Tracker that returns the pose of odometry as the pose in the world frame."""
+
+    def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        return Pose(np.eye(4) if frame.T_odom_camera is None else frame.T_odom_camera)
+
+
+@dataclass
 class Erasing(PoseTracker):
     """Tracker that removes distant depth readings in place."""
 
@@ -186,6 +194,7 @@ class Backwards(CornerRoom):
         (TrackerContract, Cheating, "test_tracker_pose_source_is_correct"),
         (TrackerContract, partial(Cheating, fraction=1e-4), "test_tracker_pose_source_is_correct"),
         (TrackerContract, partial(Boasting, fraction=0.5), "test_tracker_pose_source_is_correct"),
+        (TrackerContract, Following, "test_tracker_does_not_depend_on_odometry_frame"),
         (TrackerContract, Erasing, "test_tracker_returns_poses_without_changing_map"),
         (FuserContract, Careless, "test_fuser_map_rejects_invalid_poses"),
         (FuserContract, Relocating, "test_fuser_does_not_depend_on_ground_truth"),

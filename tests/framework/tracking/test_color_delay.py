@@ -84,7 +84,7 @@ def test_delay_estimator_gap_in_time_restarts_history() -> None:
     gaps, steady = DelayEstimator(), DelayEstimator()
     for frame, pose in delayed_frames(0.02, count=30):
         steady.add(frame, pose)
-        pause = 10.0 * (frame.index // 5)  # s, gap before every fifth frame
+        pause = 10.0 * (frame.index // 5)  # s; a gap of 10 s before every fifth frame
         gaps.add(Frame(frame.index, frame.timestamp + pause, frame.color, frame.depth, CAMERA), pose)
     assert steady.estimate.frames > 0
     assert gaps.estimate == UNKNOWN

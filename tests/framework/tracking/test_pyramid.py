@@ -1,14 +1,20 @@
 """Tests for the image pyramid."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from framework.data import Camera
+from framework.data import Camera, Frame
 from framework.geometry import back_project
 from framework.sensors.noise_models import SensorKind
-from framework.tracking.pyramid import build_pyramid, is_coarse, is_scattered, model_intensities
+from framework.tracking import pyramid
+from framework.tracking.pyramid import build_pyramid, is_coarse, is_scattered, model_intensities, normals_of
+
+CAMERA = Camera(32, 24, 30.0, 31.0, 15.2, 11.7)
 
 
 def test_pyramid_depth_does_not_mix_surfaces_or_holes() -> None:
@@ -86,3 +92,67 @@ def test_is_scattered_detects_single_missing_pixels(missing: float, expected: bo
     depth[np.random.default_rng(0).random(depth.shape) < missing] = 0
     assert is_scattered(depth) == expected
     assert not is_scattered(np.zeros_like(depth))
+
+
+def plane_frame(n: np.ndarray, d: float) -> Frame:
+    """Return a frame of the plane n . p = d (m) in the camera frame."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(CAMERA.shape)], axis=-1)
+    return Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), (d / (rays @ n)).astype(np.float32), CAMERA)
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.3, -0.2, 1.0), (-0.5, 0.4, 0.8)])
+def test_normals_of_plane_are_exact(direction: tuple[float, float, float]) -> None:
+    n = np.array(direction) / np.linalg.norm(direction)
+    normals = normals_of(plane_frame(n, 1.5))
+    assert normals.shape == (*CAMERA.shape, 3)
+    np.testing.assert_allclose(normals[1:-1, 1:-1], np.broadcast_to(-n, (22, 30, 3)), atol=1e-4)
+    for border in (normals[0], normals[-1], normals[:, 0], normals[:, -1]):
+        assert not border.any()
+
+
+def slow_normals(frame: Frame) -> np.ndarray:
+    """Return the normals (H, W, 3) as cross products of the differences between neighboring points."""
+    height, width = frame.depth.shape
+    v, u = np.mgrid[:height, :width].reshape(2, -1).astype(np.int32)
+    points = back_project(CAMERA, np.stack([u, v], axis=1), frame.depth.ravel()).reshape(height, width, 3)
+    normals = np.zeros((height, width, 3))
+    for v in range(1, height - 1):
+        for u in range(1, width - 1):
+            z = frame.depth[v, u]
+            around = frame.depth[[v - 1, v + 1, v, v], [u, u, u - 1, u + 1]]
+            if (around > 0).all() and (np.abs(around - z) <= 0.05 * z).all():
+                n = np.cross(points[v + 1, u] - points[v - 1, u], points[v, u + 1] - points[v, u - 1])
+                normals[v, u] = n / np.linalg.norm(n)
+    return normals
+
+
+def test_normals_of_frame_match_slow_reference() -> None:
+    rng = np.random.default_rng(0)
+    frame = plane_frame(np.array([0.1, 0.2, 0.97]), 1.5)
+    noisy = frame.depth + rng.normal(0, 0.02, CAMERA.shape)  # some jumps exceed 5 % of the depth
+    noisy[rng.random(CAMERA.shape) < 0.05] = 0
+    frame = replace(frame, depth=noisy.astype(np.float32))
+    expected = slow_normals(frame)
+    assert 0.2 < expected.any(axis=-1).mean() < 0.8, "expected both known and unknown normals"
+    np.testing.assert_allclose(normals_of(frame), expected, atol=1e-4)
+
+
+def test_normals_of_frame_are_computed_once_for_all_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def compute(depth: np.ndarray, camera: Camera) -> np.ndarray:
+        calls.append(depth)
+        time.sleep(0.05)
+        return np.zeros((3, *camera.shape), np.float32)
+
+    monkeypatch.setattr(pyramid, "_normals", compute)
+    frame = plane_frame(np.array([0.0, 0.0, 1.0]), 1.0)
+    recolored = frame.with_color(np.full_like(frame.color, 255))
+    with ThreadPoolExecutor(4) as threads:
+        found = list(threads.map(normals_of, [frame, recolored] * 4))
+    assert len(calls) == 1
+    assert all(normals is found[0] for normals in found)
+    assert not found[0].flags.writeable
+    normals_of(replace(frame, depth=frame.depth + np.float32(1)))
+    assert len(calls) == 2, "expected new normals for another depth image"

@@ -126,7 +126,9 @@ def test_onnx_boxes_without_depth_are_dropped_and_logged_once(tmp_path, caplog):
         assert len(detector.detect(blind)) == 0
         assert detector.boxes_without_depth == dropped
     assert len(detector.detect(frame())) == 1
-    assert caplog.messages == ["frame 7: dropped 1 of 1 boxes with too few depth readings for a mask, 1 so far"]
+    assert caplog.messages == [
+        "frame 7: 1 of 1 boxes dropped because of too few depth readings for a mask; 1 dropped so far"
+    ]
 
 
 def test_onnx_boxes_nms_keeps_better_of_overlapping_boxes(tmp_path):

@@ -137,7 +137,7 @@ def test_precomputed_foreign_labels_map_to_coco_or_are_dropped(
         found = detected(tmp_path, *entries, label_space="nyu40")
     assert [found.classes[k] for k in found.class_probabilities.argmax(axis=1)] == ["couch"]
     assert found.class_probabilities.max() == pytest.approx(0.9)
-    assert "dropped 1 of 2 detections of classes without a COCO name: wall" in caplog.text
+    assert "1 of 2 detections dropped because their classes have no COCO name: wall" in caplog.text
 
 
 def test_precomputed_sorts_and_filters_detections_by_score(tmp_path: Path) -> None:

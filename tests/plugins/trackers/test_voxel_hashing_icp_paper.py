@@ -156,7 +156,7 @@ def test_paper_tracker_frame_with_few_matching_points_is_lost() -> None:
     assert all(pose.lost for pose in poses[1:])
 
 
-def test_paper_tracker_frame_after_implausible_step_is_lost() -> None:
+def test_paper_tracker_frame_with_implausible_step_is_lost() -> None:
     frames = walked(8)
     assert not run(paper_tracker(), [frames[0], frames[4]])[1].lost
     poses = run(paper_tracker("tracker.max_translation=0.002"), [frames[0], frames[4]])

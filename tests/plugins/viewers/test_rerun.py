@@ -192,7 +192,7 @@ def build_viewer(name: str, *overrides: str) -> Any:
     return registered.built("viewer", name, *overrides)
 
 
-def test_rerun_recording_of_killed_run_has_last_second(tmp_path: Path) -> None:
+def test_rerun_recording_of_killed_run_lacks_at_most_1_5_s(tmp_path: Path) -> None:
     """The last time in the recording is compared with the time of the last fused frame."""
     endless = ("dataset.frames=100000", "dataset.slow_s=0.03", "fuser.capacity=100000", "fuser.note=note")
     line = [

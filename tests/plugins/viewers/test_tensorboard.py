@@ -58,7 +58,7 @@ def test_tensorboard_reads_reason_for_partial_run(tmp_path: Path) -> None:
     assert status_of(events).startswith("fuser.capacity: expected at most 1 frames")
 
 
-def test_tensorboard_missing_package_names_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tensorboard_missing_package_error_names_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    with pytest.raises(ConfigError, match=r"^viewer: expected the package tensorboard, .*instancemap\[tensorboard\]$"):
+    with pytest.raises(ConfigError, match=r"^viewer: expected the package tensorboard, .*'instancemap\[tensorboard]'$"):
         plugin.TensorBoardViewer()

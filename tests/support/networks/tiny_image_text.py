@@ -31,7 +31,7 @@ TEXT = {
 
 
 def write_image_text(folder: Path, kind: str = "siglip") -> Path:
-    """Write a model of type `model_type` with its tokenizer and its preprocessing."""
+    """Write a model of type `kind` with its tokenizer and its preprocessing."""
     import transformers
 
     torch.manual_seed(5)

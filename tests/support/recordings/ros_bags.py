@@ -219,7 +219,7 @@ def add_camera_of_ros(bag: BagWriter, depth: str = "aligned_depth_to_color") -> 
 
 
 def add_realsense(bag: BagWriter, depth_camera: Camera, unit: float = 0.0001) -> None:
-    """Add the topics of the RealSense recorder. Depth is in `unit` (m) and not registered to color."""
+    """Add the topics of the RealSense recorder. Depth is in units of `unit` m and not registered to color."""
     color_topic, depth_topic = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
     bag.add_camera(START, f"{color_topic}/info/camera_info", ROOM)
     bag.add_camera(START, f"{depth_topic}/info/camera_info", depth_camera, "Brown Conrady")

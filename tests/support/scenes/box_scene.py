@@ -72,7 +72,7 @@ def bled(mask: np.ndarray, px: int) -> np.ndarray:
 
 
 def detected(masks: list[np.ndarray], class_ids: list[int]) -> Detections:
-    """Return detections with score 0.8. The probability of the class is 0.6, and that of the others 0.2."""
+    """Return detections with score 0.8. The probability of the class is 0.6, and that of each other class is 0.2."""
     n = len(masks)
     probabilities = np.full((n, len(CLASSES)), 0.2, np.float32)
     probabilities[np.arange(n), class_ids] = 0.6

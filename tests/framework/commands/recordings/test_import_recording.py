@@ -13,10 +13,11 @@ from framework.checking.recording_check import check
 from framework.commands.recordings import import_recording
 from framework.config.composition import composed
 from framework.datasets.rgbd_folder import RgbdFolder
+from framework.geometry import inverse
 from framework.interfaces import RGBDSequence
 from framework.registry import build
 from tests.support.recordings.phone_exports import room_frames, seen_by_phone, write_stray_scanner
-from tests.support.scenes.corner_room import look
+from tests.support.scenes.corner_room import look, pose_at
 
 pytestmark = pytest.mark.integration
 
@@ -40,6 +41,28 @@ def test_import_prints_written_frames_and_next_commands(
     ]
     assert err == ""
     assert RgbdFolder(tmp_path / "out").camera.width == 160
+
+
+def test_import_odometry_is_used_by_printed_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rosbags")
+    from tests.support.recordings.ros_bags import COUNT, BagWriter, add_camera_of_ros, time_of
+
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    for k in range(COUNT + 1):
+        bag.add_pose(time_of(k), "/odometry", pose_at(k))
+    command(monkeypatch, bag.write(tmp_path / "bag"), tmp_path / "out", "--odometry", "/odometry", "--rotate", "90")
+    overrides = capsys.readouterr().out.splitlines()[-1].partition("instancemap ")[2].split()
+    assert overrides[-1] == f"dataset.odometry={tmp_path}/out/odometry.txt"
+    sequence = build(RGBDSequence, composed(*overrides).dataset)
+    first, last = (sequence[k].T_odom_camera for k in (0, COUNT - 1))
+    assert first is not None
+    assert last is not None
+    R_turned_camera = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    moved = pose_at(COUNT - 1)[:3, 3] - pose_at(0)[:3, 3]
+    np.testing.assert_allclose((inverse(first) @ last)[:3, 3], R_turned_camera @ moved, atol=1e-3)
 
 
 def test_import_rotated_images_have_rotated_poses(
@@ -68,7 +91,7 @@ def test_import_existing_output_raises_before_reading(
         command(monkeypatch, tmp_path / "nothing", tmp_path / "out")
     assert ended.value.code == 1
     expected = "expected a new or empty folder, got a file or non-empty folder"
-    assert capsys.readouterr().err == f"error: {tmp_path}/out: {expected}; remove it or set another\n"
+    assert capsys.readouterr().err == f"error: {tmp_path}/out: {expected}; remove it or set another folder\n"
 
 
 @pytest.mark.acceptance

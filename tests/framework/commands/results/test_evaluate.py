@@ -103,7 +103,7 @@ def test_evaluate_replaces_only_evaluation_metrics(stored: Path, command) -> Non
     assert metrics_of(stored) == true | CODE | {"fps": 3.0, "trajectory.ate_rmse_m": 0.25}
 
 
-def test_evaluate_transfer_to_map_is_printed(stored: Path, command) -> None:
+def test_evaluate_prints_metrics_of_chosen_transfer(stored: Path, command) -> None:
     true = metrics_of(stored)
     write_metrics(stored, true | {"instances.ap50": 0.125, "instances.to_map.ap25": 0.25})
     assert command(stored, "--transfer", "to_map", "--dry-run")[1].startswith(
@@ -235,7 +235,7 @@ def test_evaluate_runs_with_same_truth_load_truth_once(stored: Path, command, mo
     assert sorted(made) == [3, 4]
 
 
-def test_evaluate_run_restarted_during_evaluation_is_unchanged(
+def test_evaluate_run_restarted_during_evaluation_is_rejected(
     stored: Path, command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def begins_again(self: CornerRoom) -> None:
@@ -281,7 +281,7 @@ def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
     with locked(stored):
         status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert f"refused: {stored}: expected an unlocked directory, got one in use by process {os.getpid()}" in err
+    assert f"refused: {stored}: expected an unlocked directory, got a directory in use by process {os.getpid()}" in err
     assert (stored / "metrics.json").read_bytes() == before
     assert command(stored)[0] == 0
 

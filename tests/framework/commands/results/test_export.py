@@ -42,7 +42,7 @@ def test_export_prints_written_files(
     assert "resolution: 0.1" in (tmp_path / "map.yaml").read_text()
 
 
-def test_export_objects_default_to_run_folder(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_writes_objects_to_run_folder_by_default(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     exported(monkeypatch, run, "--to", "obj", "--object", "cube", "--object", 1, "--triangles", 100)
     found = sorted((run / "export").rglob("*.obj"))
     assert [path.name for path in found] == ["cube_2.obj", "dining_table_1.obj"]

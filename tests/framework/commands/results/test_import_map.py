@@ -184,7 +184,7 @@ def test_map_without_dataset_is_not_evaluated(folder: Path, command) -> None:
     assert (status, "expected a dataset to compare with, got none" in err) == (1, True)
     shutil.rmtree(folder / "ours")
     assert "| other |    1 |" in write_tables(folder)
-    assert "the map was imported" not in write_reports([other])[0].read_text()
+    assert "This is an imported map" in write_reports([other])[0].read_text()
 
 
 def test_table_shows_imported_map_as_named_row(folder: Path, command) -> None:

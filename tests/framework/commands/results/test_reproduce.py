@@ -124,7 +124,7 @@ def test_reproduce_changed_plugin_names_package_frame_and_stage(runs: Path, run:
     assert "run: first difference: frame 0, refinement; different files: " in done.stdout
 
 
-def test_reproduce_override_of_unknown_key_raises(runs: Path, run: Path) -> None:
+def test_reproduce_override_of_unknown_key_is_rejected(runs: Path, run: Path) -> None:
     done = reproduce(runs, run, "dataset.nothing=3")
     assert done.returncode == 1
     assert "dataset.nothing=3: expected KEY=VALUE with a key and a type of the run's config" in done.stderr
@@ -149,7 +149,7 @@ def test_bundle_with_plugin_is_reproduced_without_package(runs: Path, run: Path,
     assert (done.returncode, done.stdout) == (0, "run: byte-identical\n"), done.stderr
 
 
-def test_bundle_of_edited_run_raises(runs: Path, run: Path, tmp_path: Path) -> None:
+def test_bundle_of_edited_run_is_rejected(runs: Path, run: Path, tmp_path: Path) -> None:
     (run / "trajectory.txt").write_text("")
     done = command(tmp_path, "bundle", "sweep", path=runs / "package")
     assert done.returncode == 1

@@ -1,4 +1,4 @@
-"""Test of docs/tutorials/research_project.md: plugins, an experiment over datasets and detectors, and its bundle."""
+"""Tests for docs/tutorials/research_project.md: plugins, an experiment over datasets and detectors, and its bundle."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from instancemap import load_runs
 from tests.support import option_files
 from tests.support.doc_pages import PAGES, blocks
 from tests.support.fresh_environment import CHECKOUT, OFFLINE, PIP, build_wheels, create_environment, run_in
+from tests.support.latex import log_of_paper, requires_pdflatex
 from tests.support.table_text import grids
 
 pytestmark = pytest.mark.acceptance
@@ -67,7 +68,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_workflow_data_frame_has_run_of_each_combination(folder: Path) -> None:
+def test_workflow_data_frame_has_one_run_per_combination(folder: Path) -> None:
     runs = load_runs(folder / EXPERIMENT)
     combinations = runs[["dataset", "detector", "row"]].itertuples(index=False, name=None)
     assert sorted(combinations) == sorted((d, n, row) for d in DATASETS for n in DETECTORS for row in ROWS)
@@ -97,15 +98,12 @@ def test_workflow_writes_figure(folder: Path) -> None:
     assert (outputs / "figure.pdf").read_bytes().startswith(b"%PDF")
 
 
-@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="requires pdflatex")
+@requires_pdflatex
 def test_workflow_table_compiles_in_latex(folder: Path, tmp_path: Path) -> None:
     table = (folder / EXPERIMENT / "table.tex").read_text()
-    document = f"\\documentclass{{article}}\n\\usepackage{{booktabs}}\n\\begin{{document}}\n{table}\\end{{document}}\n"
-    (tmp_path / "paper.tex").write_text(document)
-    line = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
-    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stdout[-4000:]
-    assert (tmp_path / "paper.pdf").exists()
+    log = log_of_paper(tmp_path, table, "tab:nearest-points", "tab:nearest-points-differences")
+    assert "Overfull" not in log
+    assert "undefined" not in log
 
 
 def test_workflow_bundle_is_reproduced_in_new_environment(folder: Path, tmp_path: Path) -> None:

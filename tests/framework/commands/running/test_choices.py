@@ -2,7 +2,7 @@
 
 import pytest
 
-from framework.commands.running.choices import GLOB_COUNT, check_table, checked_sweep, of_tables, single_run
+from framework.commands.running.choices import GLOB_COUNT, check_outputs, checked_sweep, of_tables, single_run
 from framework.config.composition import composed
 from framework.config.validation import checked_rows
 from framework.errors import ConfigError
@@ -52,13 +52,13 @@ def test_single_run_takes_first_value_of_each_sweep() -> None:
 
 
 def check(*overrides: str, swept: tuple[str, ...] = ()) -> None:
-    """Check the table of a sweep like `instancemap -m`."""
+    """Check the table and the figure of a sweep like `instancemap -m`."""
     config = composed(*overrides)
-    check_table(config, [*overrides, *swept], checked_rows(config.get("rows")))
+    check_outputs(config, [*overrides, *swept], checked_rows(config.get("rows")))
 
 
 @pytest.mark.parametrize(
-    "table",
+    "output",
     [
         "+table.average_over=[seed,dataset]",
         "+table.group_by=detector",
@@ -66,14 +66,15 @@ def check(*overrides: str, swept: tuple[str, ...] = ()) -> None:
         "+table.where.dataset.scene=[a,b]",
         "+table={where:{threads:1},group_by:preset}",
         "+table.base='refiner=identity, fuser.voxel_size=0.02'",
+        "+figure={kind:bar,by:refiner,color_by:fuser.voxel_size}",
     ],
 )
-def test_check_table_accepts_options_and_parameters(table: str) -> None:
-    check(table)
+def test_check_outputs_accepts_options_and_parameters(output: str) -> None:
+    check(output)
 
 
 @pytest.mark.parametrize(
-    ("table", "message"),
+    ("output", "message"),
     [
         ("+table.over=[seed]", "table.over: expected a known key, got over; set table.average_over (new name of "),
         ("+table.baseline=x", "table.baseline: expected a known key, got baseline; set table.base (new name of "),
@@ -88,15 +89,18 @@ def test_check_table_accepts_options_and_parameters(table: str) -> None:
         ("+table.base='refner=identity'", "table.base: expected a group of options or a parameter, got refner"),
         ("+table.colums=[fps]", "table: expected one of average_over, "),
         ("+table=rows", "table: expected keys and values, got 'rows'"),
+        ("+figure={kind:bar,by:refner}", "figure.by: expected a group of options or a parameter, got refner; did you"),
+        ("+figure={kind:curve,x:dataset.sotp}", "figure.x: expected a group of options or a parameter, got"),
+        ("+figure.kind=pie", "figure.kind: expected one of stage_times, maps, bar, box, "),
     ],
 )
-def test_check_table_invalid_settings_raise(table: str, message: str) -> None:
+def test_check_outputs_invalid_settings_raise(output: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        check(table)
+        check(output)
     assert str(caught.value).startswith(message)
 
 
-def test_check_table_finds_keys_of_swept_options_and_rows() -> None:
+def test_check_outputs_finds_keys_of_swept_options_and_rows() -> None:
     check("+table.group_by=dataset.kind", swept=("dataset=desk,synthetic",))
     check("+table.group_by=detector.new", swept=("+detector.new=1,2",))
     with pytest.raises(ConfigError, match=r"table\.group_by: .*, got dataset\.kind"):
@@ -104,7 +108,7 @@ def test_check_table_finds_keys_of_swept_options_and_rows() -> None:
     check("experiment=ablation_refiner", "+table.where.refiner.object_centers=2", swept=("row=kmeans,gmm_em",))
 
 
-def test_check_table_experiment_base_is_row() -> None:
+def test_check_outputs_experiment_base_is_row() -> None:
     check("experiment=ablation_refiner", "table.base=kmeans")
     with pytest.raises(ConfigError, match=r"table\.base: expected one of chain, .*, got kmean"):
         check("experiment=ablation_refiner", "table.base=kmean")

@@ -120,7 +120,7 @@ def test_detect_errors_are_one_line(tmp_path: Path, overrides: list[str], messag
     assert not list(tmp_path.iterdir())
 
 
-def test_detect_failing_detector_leaves_no_file(tmp_path: Path) -> None:
+def test_detect_failure_keeps_existing_file(tmp_path: Path) -> None:
     (tmp_path / "found.json").write_text("before")
     with pytest.raises(DataError, match="expected ground-truth instances"):
         write_detections(tmp_path / "found.json", SphereDetector(), CornerRoom(truth=False))

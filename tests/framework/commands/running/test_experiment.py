@@ -274,7 +274,7 @@ def test_sweep_errors_are_reported_before_first_run(tmp_path: Path, arguments: l
     assert not list(tmp_path.rglob("config.yaml"))
 
 
-def test_run_without_experiment_is_unchanged() -> None:
+def test_run_without_experiment_has_no_experiment_settings() -> None:
     config, choices = composed(["refiner=kmeans"])
     assert "row" not in config
     assert not config.get("skip_completed")

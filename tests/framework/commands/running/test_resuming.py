@@ -191,7 +191,7 @@ def test_resumed_map_of_two_recordings_round_trips(tmp_path: Path, room: CornerR
     assert list(load_map(tmp_path / "again.npz").instances()) == list(again.instances())
 
 
-def test_localize_in_places_new_map_in_stored_world(tmp_path: Path) -> None:
+def test_localize_in_gives_new_map_in_stored_world_frame(tmp_path: Path) -> None:
     """Neither recording has ground-truth poses. The second one is tracked in the world frame of the first one."""
     unposed = [replace(DESK[k], T_world_camera=None) for k in range(40)]
     first, poses = mapped(unposed[:25], *TRACKED)

@@ -254,7 +254,9 @@ def test_run_in_locked_folder_changes_nothing(tmp_path: Path) -> None:
     with locked(place):
         status, stderr = end(begin(tmp_path, "seed=2", f"hydra.run.dir={place}"))
     assert (status, len(stderr.splitlines())) == (1, 1)
-    assert f"error: {place}: expected an unlocked directory, got one in use by process {os.getpid()} on " in stderr
+    assert (
+        f"error: {place}: expected an unlocked directory, got a directory in use by process {os.getpid()} on " in stderr
+    )
     assert {path: path.read_bytes() for path in before} == before
     assert {path for path in place.rglob("*") if path.is_file()} - set(before) == {place / ".lock_holder"}
 
@@ -307,7 +309,7 @@ def test_run_removes_leftover_partial_files(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_run_viewer_is_called_from_start_to_outputs(
+def test_run_calls_viewer_from_begin_run_to_end_run(
     tmp_path: Path, overrides: list[str], status: int, frames: int, outcome: list[object]
 ) -> None:
     process = begin(tmp_path, "viewer=noted", "seed=3", "hydra.run.dir=run", *overrides)

@@ -46,8 +46,8 @@ def begin(directory: Path, *arguments: str, sweep: str = "experiment=fake_ablati
     clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
     environment = clean | {
         "PYTHONPATH": str(CHECKOUT),
-        "RAY_AUTH_MODE": "disabled",
-    }  # otherwise Ray writes into the home directory
+        "RAY_AUTH_MODE": "disabled",  # otherwise Ray writes into the home directory
+    }
     return subprocess.Popen(
         [sys.executable, "-m", "framework", *fakes, *arguments],
         cwd=directory,
@@ -179,7 +179,10 @@ def test_sweep_without_experiment_reports_failures(tmp_path: Path) -> None:
 
 
 def swept(directory: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, int]]:
-    """Run a sweep without an experiment in `folder`, and return the process and the completion times."""
+    """Run a sweep without an experiment in `directory`.
+
+    Return the process, and the completion time of each run, ns, keyed by the varying part of the directory name.
+    """
     done = end(begin(directory, *FAKES, "dataset.frames=3", "hydra.sweep.dir=s", *arguments, sweep="-m"))
     assert done.returncode == 0, done.stderr
     runs = (directory / "s").glob("*/metrics.json")
@@ -359,7 +362,7 @@ def test_sweep_in_locked_folder_is_rejected(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (1, "")
     assert len(done.stderr.splitlines()) == 1
     assert (
-        f"error: {tmp_path / PLACE}: expected an unlocked directory, got one in use by process {os.getpid()} on "
+        f"error: {tmp_path / PLACE}: expected an unlocked directory, got a directory in use by process {os.getpid()} "
         in done.stderr
     )
     assert not (tmp_path / PLACE / "multirun.yaml").exists()
@@ -396,7 +399,7 @@ def test_cluster_launchers_run_locally(tmp_path: Path, package: str, arguments: 
 
 def test_launcher_missing_error_names_extra() -> None:
     error = MissingConfigException("?", missing_cfg_file="hydra/launcher/submitit_slurm", options=["basic"])
-    assert one_line(error).endswith("pip install instancemap[slurm]")
+    assert one_line(error).endswith("pip install 'instancemap[slurm]'")
 
 
 @pytest.mark.parametrize(("threads", "jobs"), [(1, 12), (5, 2), (12, 1), (13, 1), (0, 1)])

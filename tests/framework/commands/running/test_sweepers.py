@@ -131,4 +131,4 @@ def test_optuna_without_known_metric_reports_error(tmp_path: Path, arguments: li
 @pytest.mark.parametrize("name", ["optuna", "ax"])
 def test_missing_sweeper_error_names_extra(name: str) -> None:
     error = MissingConfigException("?", missing_cfg_file=f"hydra/sweeper/{name}", options=["basic"])
-    assert one_line(error).endswith("pip install instancemap[sweepers]")
+    assert one_line(error).endswith("pip install 'instancemap[sweepers]'")

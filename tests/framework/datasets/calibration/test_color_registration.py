@@ -26,7 +26,7 @@ def test_color_registration_matches_viewing_direction() -> None:
     assert (
         np.abs(found[2:-2, 2:-2] - ramp(DEPTH)[2:-2, 2:-2]).max() < 1.2
     )  # gray levels; a shift by one pixel changes the color by 2.8
-    both = (found + (255.0 - negative)) / 2  # OpenCV rounds 0.5 up, without effect on the difference
+    both = (found + (255.0 - negative)) / 2  # OpenCV rounds 0.5 up; the mean of both cancels the bias
     assert np.abs((both - ramp(DEPTH))[2:-2, 2:-2].mean(axis=(0, 1))).max() < 0.02
 
 

@@ -60,7 +60,7 @@ def test_undistortion_view_matches_pinhole_view() -> None:
     after = np.abs(undistortion.smooth(color).astype(int) - true_color)[kept].mean()
     assert after < 1 < before
     off, was = (np.abs(z - true_depth)[kept] for z in (undistortion.exact(depth), depth))
-    assert np.percentile(off, 90) < np.percentile(was, 90) / 4  # the nearest pixel is up to half a pixel away
+    assert np.percentile(off, 90) < np.percentile(was, 90) / 4  # `exact` uses the nearest pixel
 
 
 def test_undistortion_exact_mode_does_not_mix_labels() -> None:

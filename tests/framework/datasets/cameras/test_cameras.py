@@ -121,7 +121,7 @@ def test_camera_missing_package_raises_one_line_error(brand: Brand, monkeypatch:
     monkeypatch.setitem(sys.modules, brand.library, None)
     with pytest.raises(
         ConfigError,
-        match=rf"^{brand.library}: expected an installed package .*, .* pip install instancemap\[{brand.name}\]$",
+        match=rf"^{brand.library}: expected an installed package .*, .* pip install 'instancemap\[{brand.name}\]'$",
     ):
         next(brand.video().frames())
 
@@ -134,7 +134,7 @@ def test_camera_missing_device_raises_one_line_error(brand: Brand, device: FakeC
 
 @pytest.mark.parametrize(
     ("parameters", "message"),
-    [({"serial": "999"}, "expected device 999 with 96x72"), ({"width": 640}, "expected device with 640x72")],
+    [({"serial": "999"}, "expected device 999 with 96x72"), ({"width": 640}, "expected a device with 640x72")],
 )
 def test_camera_unsupported_request_raises_one_line_error(
     brand: Brand, device: FakeCamera, parameters: dict[str, object], message: str
@@ -145,7 +145,7 @@ def test_camera_unsupported_request_raises_one_line_error(
     assert not device.running
 
 
-def test_camera_disconnected_device_error_stops_stream(
+def test_camera_disconnect_raises_and_stops_stream(
     brand: Brand, device: FakeCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device.unplugged_at = 2

@@ -115,7 +115,7 @@ def test_named_truth_renders_masks_from_mesh(folder: Path, mesh: Path) -> None:
     assert [detections.classes[c] for c in detections.class_probabilities.argmax(axis=1)] == ["chair"]
 
 
-def test_named_truth_scene_is_mesh_in_world_of_poses(folder: Path, mesh: Path) -> None:
+def test_named_truth_scene_is_mesh_in_world_frame_of_poses(folder: Path, mesh: Path) -> None:
     video = RgbdFolder(folder, ground_truth=mesh, stop=1)
     truth = video.scene_truth()
     assert truth is not None

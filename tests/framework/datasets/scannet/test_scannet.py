@@ -286,7 +286,7 @@ def test_scannet_incomplete_truth_files_give_no_truth(tmp_path: Path, caplog: py
     sequence = ScanNet(tmp_path, SCENE)
     assert sequence.scene_truth() is None
     assert sequence.annotation == ""
-    assert f"{SCENE}.aggregation.json: expected a file of ground-truth instances, got none" in caplog.text
+    assert f"{SCENE}.aggregation.json: expected a file of the labeled mesh, got none" in caplog.text
     with pytest.raises(DataError, match=r"dataset\.frame_ground_truth: .*aggregation"):
         ScanNet(tmp_path, SCENE, frame_ground_truth=True)
 

@@ -119,7 +119,7 @@ def test_scannet_label_table_missing_names_are_listed(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_scannet_label_table_name_spellings_are_equivalent() -> None:
+def test_scannet_name_spellings_have_same_class() -> None:
     """Names may be written without spaces and punctuation."""
     meanings: dict[str, set[str | None]] = {}
     for name, meaning in MEANINGS.items():

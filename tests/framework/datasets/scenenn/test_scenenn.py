@@ -23,7 +23,7 @@ WALL = 2.0  # distance of the mesh from the first camera, m
 
 
 def labels() -> list[Annotated]:
-    """Return the labels in random order, like in the dataset."""
+    """Return the labels, which are not sorted, like in the dataset."""
     named = ((CHAIR, "chair1", "chair"), (NAMELESS, "thing", ""), (CABINET, "cabinet", "cabinet"), (SOFA, "s", "Sofa"))
     return [Annotated(i, text, nyu, (10, 20, 30), None, None) for i, text, nyu in named]
 
@@ -119,7 +119,7 @@ def test_scenenn_empty_annotation_raises(root: Path) -> None:
         SceneNN(root, "016")
 
 
-def test_scenenn_label_without_known_class_is_not_evaluated(root: Path) -> None:
+def test_scenenn_label_without_known_class_has_no_class(root: Path) -> None:
     changed = [
         Annotated(CHAIR, "", "chair", (0, 0, 0), None, None),
         Annotated(SOFA, "sofa", "unknown", (0, 0, 0), None, None),

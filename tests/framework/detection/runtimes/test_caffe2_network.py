@@ -94,7 +94,7 @@ def test_caffe2_network_runs_only_operators_for_outputs():
     ]
     (z,) = network_between(graph, tensors, ("x",), ("z",))(torch.full((1, 1, 2, 2), 3.0))
     assert (z == 6).all()
-    with pytest.raises(DataError, match=r"graph\.json: expected an operator out of Int8Conv, .*, got Unknown; use"):
+    with pytest.raises(DataError, match=r"graph\.json: expected one of the operators Int8Conv, .*, got Unknown; use"):
         network_between(graph, tensors, ("x",), ("elsewhere",))
 
 

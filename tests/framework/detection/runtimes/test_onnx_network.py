@@ -56,9 +56,9 @@ def test_onnx_network_dynamic_input_requires_size(tmp_path):
         OnnxNetwork(fixed, "", "cpu", 32)
 
 
-def test_onnx_network_without_onnxruntime_names_package(tmp_path, monkeypatch):
+def test_onnx_network_without_onnxruntime_error_names_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ConfigError, match=r"pip install instancemap\[onnx\]"):
+    with pytest.raises(ConfigError, match=r"pip install 'instancemap\[onnx\]'"):
         OnnxNetwork(doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8)), "", "cpu", 0)
 
 
@@ -117,7 +117,7 @@ def test_onnx_file_missing_or_invalid_raises(tmp_path):
         OnnxNetwork(path, "", "cpu", 0)
 
 
-def test_onnx_network_rejected_by_onnxruntime_names_file(tmp_path):
+def test_onnx_network_rejected_by_onnxruntime_error_names_file(tmp_path):
     image = helper.make_tensor_value_info("images", TensorProto.FLOAT, (1, 3, 8, 8))
     node = helper.make_node("NoSuchThing", ["images"], ["y"], domain="unknown")
     graph = helper.make_graph(

@@ -143,7 +143,7 @@ def test_cache_with_other_detector_misses(room: CornerRoom, tmp_path: Path, chan
 
 @dataclass
 class Named(Noise):
-    """Detector that resolves the name of its weights and declares its fingerprint."""
+    """Detector whose fingerprint includes the revision of its weights."""
 
     revision: str = "main"
 
@@ -153,7 +153,7 @@ class Named(Noise):
 
 @dataclass
 class OldNamed(Noise):
-    """Detector for an older interface with the method `fingerprint`."""
+    """Detector for an older interface, in which the base class has a method `fingerprint`."""
 
     def fingerprint(self) -> str:
         return f"{super().fingerprint()} main"  # type: ignore[misc]

@@ -106,7 +106,7 @@ def test_fingerprint_covers_all_detection_modules(monkeypatch: pytest.MonkeyPatc
 
 def test_fingerprint_without_source_file_raises() -> None:
     notebook = type("Mine", (), {"__module__": "a_notebook"})
-    with pytest.raises(ConfigError, match="Mine: expected a class defined in a source file, got one without"):
+    with pytest.raises(ConfigError, match="Mine: expected a class defined in a source file, got the module a_notebook"):
         fingerprint(dataclass(notebook)())
 
 

@@ -17,9 +17,11 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("rosbags")
 
 from framework.data import Camera
+from framework.datasets.frames.odometry import OdometryFile
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError
-from framework.geometry import exp_se3
+from framework.files.tum_trajectory import read_tum
+from framework.geometry import exp_se3, interpolate, inverse
 from framework.importing.bags.ros_topics import Topics
 from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.formats import open_source
@@ -99,6 +101,45 @@ def test_ros_bag_odometry_is_read_in_axes_of_child_frame(
         bag.add_odometry(time_of(k), "/odom", pose_at(k) @ T_camera_child, child)
     assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
     check_room(tmp_path / "out")
+
+
+T_BASE_CAMERA = (
+    exp_se3(np.array([0.2, -0.1, 0.5, 0, 0, 0])) @ T_CAMERA_ROS.T
+)  # the camera looks along the x axis of the base
+
+
+def add_odometry_of_base(bag: BagWriter) -> None:
+    for k in range(COUNT + 1):
+        bag.add_odometry(time_of(k), "/odom", pose_at(k) @ inverse(T_BASE_CAMERA), "base_link")
+
+
+def test_ros_bag_odometry_of_base_is_written_for_camera(tmp_path: Path) -> None:
+    """The transforms lead from the base over the mast to the camera. Odometry is not used as ground truth."""
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_odometry_of_base(bag)
+    T_base_mast = exp_se3(np.array([0.1, 0.2, 0.3, 0.1, 0.2, 0.3]))
+    T_mast_camera = inverse(T_base_mast) @ T_BASE_CAMERA
+    bag.add_static(("base_link", "mast", T_base_mast), ("mast", "camera_color_optical_frame", T_mast_camera))
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out", odometry="/odom")
+    check_room(tmp_path / "out", posed=False)
+    sequence = RgbdFolder(tmp_path / "out", odometry_file=OdometryFile(tmp_path / "out/odometry.txt"))
+    for k, frame in enumerate(sequence):
+        assert frame.T_world_camera is None
+        assert frame.T_odom_camera is not None
+        fraction = (frame.depth_time - time_of(k)) / (time_of(k + 1) - time_of(k))
+        expected = interpolate(pose_at(k), pose_at(k + 1), fraction)
+        np.testing.assert_allclose(frame.T_odom_camera, expected, atol=1e-5)
+
+
+def test_ros_bag_odometry_without_transform_is_of_base(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_odometry_of_base(bag)
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out", odometry="/odom")
+    assert "expected the transform from base_link to camera_color_optical_frame in /tf_static, got none" in caplog.text
+    _, poses = read_tum(tmp_path / "out/odometry.txt")
+    np.testing.assert_allclose(poses[2], pose_at(2) @ inverse(T_BASE_CAMERA), atol=1e-6)
 
 
 def test_ros_bag_poses_are_interpolated(tmp_path: Path) -> None:

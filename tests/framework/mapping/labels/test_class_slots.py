@@ -26,7 +26,7 @@ def least_likely_slot(scores):
 
 
 def voxel(seed: int, largest: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the classes and scores of a voxel with `filled` slots and scores in [-largest, largest]."""
+    """Return the classes and scores of a voxel with randomly many filled slots and scores in [-largest, largest]."""
     rng = np.random.default_rng(seed)
     filled = rng.integers(0, CLASS_SLOTS + 1)
     classes = np.full(CLASS_SLOTS, NO_CLASS, np.uint8)

@@ -112,7 +112,7 @@ def test_evidence_rows_allocate_only_labeled_voxels() -> None:
 
 
 @pytest.mark.parametrize(("blocks", "frames", "max_blocks"), [(4, 40, 4), (4, 40, 400), (3 * GROUP + 5, 8, 400)])
-def test_evidence_update_of_many_blocks_matches_voxelwise(
+def test_evidence_update_of_many_blocks_matches_reference(
     blocks: int, frames: int, max_blocks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each pixel has any number of clusters, with or without an instance. Some updates need new slots."""

@@ -274,7 +274,7 @@ def test_integration_averages_noise() -> None:
     assert np.std(np.concatenate(errors)) == pytest.approx(0.01 / np.sqrt(40), rel=0.15)
 
 
-def test_integration_removes_objects_seen_through() -> None:
+def test_integration_removes_object_from_observed_free_space() -> None:
     """A sphere is removed from the scene, and the camera then observes the wall behind the sphere."""
     scene, empty = room(), room()
     empty.spheres = []
