@@ -13,7 +13,7 @@ from framework.figures.figure_choice import OF_RUNS, FigureChoice
 from framework.runs.run_rows import Run, RunRow, is_below, natural, rows_of, value_of
 from framework.runs.stored_runs import Incomplete, Record, completed_runs
 from framework.runs.sweep_file import asked_keys, command_line, read_sweep, requested_runs
-from framework.tables.table_notes import counted, data, machine
+from framework.tables.table_notes import counted, data, machines
 
 BLOCK = "figure"  # name of the config block
 
@@ -119,7 +119,8 @@ class Pictured:
         chosen = f" Command line: {' '.join(self.command_line)}." if self.command_line else ""
         runs = self.records
         code = counted(record.commit for record in runs)
-        return f"Data: {data(runs)}.{chosen} {counted(map(machine, runs))}; code {code}."
+        origin = "; ".join(filter(None, (machines(runs), f"code {code}")))
+        return f"Data: {data(runs)}.{chosen} {origin}."
 
     def called(self, run: Run) -> str:
         """Return the name of the run's sequence, with the seed if the runs have several seeds."""

@@ -10,7 +10,7 @@ from framework.tables.comparison import ComparisonTable
 from framework.tables.latex_table import escaped
 from framework.tables.metric_columns import described
 from framework.tables.statistics import ALPHA
-from framework.tables.table_notes import common_options, counted, machine
+from framework.tables.table_notes import common_options, machines
 
 VALUES, DIFFERENCES, STATISTICS = "values", "differences", "statistics"  # the tables of a comparison
 OTHERWISE_NAMED = {*STAGES, "row", "seed", "threads"}  # keys that other parts of a caption contain
@@ -71,4 +71,5 @@ def _constants(comparison: ComparisonTable) -> Iterator[str]:
     yield f"{len(seeds)} seeds" if len(seeds) > MOST_SEEDS else f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}"
     counts = sorted({len(row.records) for row in comparison.rows})
     yield f"n = {' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} runs per row"
-    yield counted(map(machine, records))
+    if used := machines(records):
+        yield used

@@ -40,17 +40,17 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
         yield f"Overrides of each row: {'; '.join(changes)}."
     if comparison.command_line:
         yield f"Command line: {' '.join(comparison.command_line)}."
-    mapped = [record for record in comparison.records if not record.is_imported]
     yield from _imported(comparison)
-    if fixed := common_options(mapped):
-        yield f"Common to all runs{'' if len(mapped) == len(comparison.records) else ' of InstanceMap'}: {fixed}."
+    if fixed := common_options(comparison.records):
+        has_imported = any(record.is_imported for record in comparison.records)
+        yield f"Common to all runs{' of InstanceMap' if has_imported else ''}: {fixed}."
     yield from _protocol(comparison)
     yield from _published(comparison)
     yield f"Data: {data(comparison.records)}."
     yield f"Code: {counted(record.code for record in comparison.records)}."
     yield from _mixed_code(comparison)
-    if mapped:
-        yield f"Machine: {counted(machine(record) for record in mapped)}."
+    if used := machines(comparison.records):
+        yield f"Machine: {used}."
     yield f"Config: config.yaml of each run; SHA-256 of all config hashes: {digest(comparison.records)}."
     yield from _missing(comparison)
 
@@ -233,8 +233,9 @@ def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
 
 
 def common_options(records: Sequence[Record]) -> str:
-    """Return the config options that all runs have in common, as stage=option."""
-    chosen = {stage: {record.choices.get(stage) for record in records} for stage in STAGES}
+    """Return the config options that all runs have in common, as stage=option. Imported maps are ignored."""
+    mapped = [record for record in records if not record.is_imported]
+    chosen = {stage: {record.choices.get(stage) for record in mapped} for stage in STAGES}
     agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}
     return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
 
@@ -255,6 +256,12 @@ def data(records: Sequence[Record]) -> str:
     frames = sorted(number for record in records if is_number(number := record.metrics.get("frames")))
     lengths = dict.fromkeys(f"{number:g}" for number in frames[:1] + frames[-1:])
     return "; ".join(parts + ([f"{' to '.join(lengths)} frames per run"] if frames else []))
+
+
+def machines(records: Sequence[Record]) -> str:
+    """Return the machines of the runs, or "" if all are imported maps, whose machines are unknown."""
+    mapped = [machine(record) for record in records if not record.is_imported]
+    return counted(mapped) if mapped else ""
 
 
 def machine(record: Record) -> str:

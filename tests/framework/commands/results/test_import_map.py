@@ -197,7 +197,7 @@ def test_table_shows_imported_map_as_named_row(folder: Path, command) -> None:
     assert {cells["Other system"][head] for head in ("Hz", "integration (ms)", "ATE (m)")} == {"–"}
     assert (cells["Other system"]["poses"], cells["InstanceMap"]["poses"]) == ("external", "ground_truth")
     assert f"Other system from {folder / 'ours' / 'mesh.ply'}" in text
-    assert "None cores" not in text
+    assert "None cores" not in text + (folder / "table.tex").read_text()
 
 
 def test_load_runs_contains_imported_map(folder: Path, command) -> None:
