@@ -37,7 +37,6 @@ class EditedMap:
     def __init__(self, scene: InstanceMap) -> None:
         """Take over a map, which is modified."""
         self.scene = scene
-        self.min_vertices = scene.confirmation.min_vertices(scene.volume.voxel_size)  # of a part of an instance
         kept = [*scene.instances()]
         self._used = set(kept)  # ids that a new instance cannot have
         self._keep_most_likely(kept)
@@ -136,7 +135,7 @@ class EditedMap:
         """Split an instance, and return the ids of the new instances."""
         table = self.scene.table
         part = self.scene.mesh().of(self.scene.instances()[edit.id])
-        part_ids = parts_of(part, edit.by, self.min_vertices, self.scene.volume.voxel_size)
+        part_ids = parts_of(part, edit.by, self.scene.volume.voxel_size)
         kept = part_ids >= 0
         voxels = np.flatnonzero(self._voxels_of(edit.id)).astype(np.int32)
         _, nearest = KDTree(part.vertices[kept]).query(self._positions()[voxels])

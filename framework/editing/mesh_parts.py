@@ -9,29 +9,30 @@ from scipy.sparse.csgraph import connected_components
 from framework.data import InstanceMesh, Int32
 from framework.editing.edits import SplitBy
 from framework.errors import DataError
+from framework.mapping.instances.instance_list import Confirmation, vertices_of_area
 
+MIN_AREA = Confirmation.min_area  # minimum surface area of a part, m^2
 PLANE_DISTANCE = 1.5  # maximum distance of a vertex from the dominant plane, voxels
 PLANE_SAMPLES = 1000  # number of RANSAC iterations
 
 
-def parts_of(mesh: InstanceMesh, by: SplitBy, min_vertices: int, voxel_size: float) -> Int32:
+def parts_of(mesh: InstanceMesh, by: SplitBy, voxel_size: float) -> Int32:
     """Return the part (V,) of each vertex, in descending order of size from 0; -1 = in a part that is too small.
 
     Args:
         mesh: The mesh of an instance.
         by: The criterion.
-        min_vertices: The minimum number of vertices of a part.
         voxel_size: The voxel size of the map, m.
 
     Raises:
         DataError: The mesh has fewer than two parts.
     """
     labels = _connected(mesh) if by is SplitBy.PARTS else _on_plane(mesh, PLANE_DISTANCE * voxel_size)
-    sizes = np.bincount(labels)
+    sizes, min_vertices = np.bincount(labels), vertices_of_area(MIN_AREA, voxel_size)
     order = np.argsort(-sizes, kind="stable")
     large = order[sizes[order] >= min_vertices]
     if len(large) < 2:
-        expected = f"at least two parts with {min_vertices} or more vertices"
+        expected = f"at least two parts with {min_vertices} or more vertices ({MIN_AREA} m^2)"
         shown = ", ".join(map(str, sizes[order][:3]))
         raise DataError(f"expected {expected}, got parts with {shown} vertices; split by another criterion")
     number = np.full(len(sizes), -1, np.int32)
