@@ -147,8 +147,8 @@ def check_empty(out: Path) -> None:
 
 def default_directory(run: Path) -> Path:
     """Return the default directory of the edited run, next to the stored run."""
-    place = run.absolute()
-    return place.with_name(f"{place.name}_edited")
+    named = run if run.name not in ("", "..") else run.resolve()
+    return named.with_name(f"{named.name}_edited")
 
 
 def _state(title: str, scene: InstanceMap) -> InstanceState:

@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from PIL import Image
 
 import instancemap
+from framework.commands.results.diff import in_world
 from framework.commands.results.reproduce import reproduce_all
+from framework.commands.running.run import run as write_run
 from framework.config import composition
 from framework.datasets.ground_truth.named_truth import read_named_truth
 from framework.editing.edited_run import EditedRun
@@ -130,7 +133,15 @@ def test_completed_runs_omit_edited_runs(run: Path, edited: Path) -> None:
         reproduce_all(edited, [], None, None)
 
 
-def test_edit_of_changed_run_raises_data_error(run: Path, tmp_path: Path) -> None:
+def test_diff_of_edited_run_has_same_world_frame(tmp_path: Path) -> None:
+    for name, source in (("run", {}), ("edited", {"edited_from": str(tmp_path / "run")})):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metrics.json").write_text(json.dumps({"pose_source": "tracked", **source}))
+    assert in_world(tmp_path / "edited", tmp_path / "run")
+    assert not in_world(tmp_path / "run", tmp_path / "edited")
+
+
+def test_edit_of_changed_run_raises_data_error(tmp_path: Path) -> None:
     reported_run.write_run(tmp_path / "run")
     reported_run.rename_class(tmp_path / "run", "sphere")
     with pytest.raises(DataError, match=r"instances.json: expected the SHA-256 .*; repeat the run"):
@@ -141,6 +152,13 @@ def test_edit_error_names_the_edit(run: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r'^edit 2, {"rename": \[1, "chair"\]}: expected an instance out of 2, got 1'):
         instancemap.edit(run, [{"delete": [1]}, {"rename": [1, "chair"]}], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_edit_of_map_without_voxel_labels_raises_data_error(tmp_path: Path) -> None:
+    config = reported_run.CONFIG | {"fuser": {"_target_": "plugins.fusers.object_volumes.ObjectVolumes"}}
+    write_run(OmegaConf.create(config), tmp_path / "run", {})
+    with pytest.raises(DataError, match=r"map.npz: expected map format \d+, got .*; map with a fuser that stores"):
+        EditedRun.of(tmp_path / "run", [])
 
 
 def test_edit_into_existing_run_raises_config_error(run: Path, edited: Path) -> None:
