@@ -134,7 +134,7 @@ class EditedRun:
             return Reevaluation.of(
                 replace(self.record, directory=out, metrics=metrics), Truth.of(self.record.dataset)
             ).metrics
-        except InstanceMapError as error:
+        except (InstanceMapError, OSError) as error:
             log.warning("instances are not evaluated: %s", error)
             return metrics
 

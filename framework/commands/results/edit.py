@@ -39,7 +39,7 @@ def main() -> None:
     add_edit("--delete", "ID", "+", "change instances to background")
     add_edit("--edits", "FILE", None, "apply the edits in a JSON file, such as edits.json of an edited run")
     add("--out", metavar="DIR", type=Path, help="new run directory; default: RUN_edited, next to RUN")
-    preview = "write only the preview image, to OUT.png; without edits, it shows the instances and their ids"
+    preview = "write only the preview image, to OUT.png; without edits, show and list the instances with their ids"
     add("--preview", action="store_true", help=preview)
     parsed = arguments(parser)
     if not parsed.edits and not parsed.preview:
@@ -60,8 +60,7 @@ def main() -> None:
         if not parsed.preview:
             check_empty(out)  # before the slow steps
         edited = EditedRun.of(parsed.run, edits)
-        for change in edited.changes:
-            print(change)
+        print("\n".join(edited.changes or edited.before.names.values()))
         if parsed.preview:
             image = out.with_name(f"{out.name}.png")
             edited.write_preview(image)

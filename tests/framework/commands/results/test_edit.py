@@ -94,17 +94,20 @@ def test_edit_applies_options_in_order(
     assert [(one.id, one.class_name) for one in read_instances(tmp_path / "out" / "instances.json")] == [(3, "couch")]
 
 
-@pytest.mark.parametrize(("words", "panels"), [((), 1), (("--delete", "1"), 2)])
+@pytest.mark.parametrize(
+    ("words", "lines", "panels"), [((), ["1 chair", "2 couch"], 1), (("--delete", "1"), ["delete 1"], 2)]
+)
 def test_edit_preview_writes_only_image(
     run: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     words: tuple[str, ...],
+    lines: list[str],
     panels: int,
 ) -> None:
     edited(monkeypatch, run, "--preview", *words, "--out", tmp_path / "out")
-    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "out.png")
+    assert capsys.readouterr().out.splitlines() == [*lines, str(tmp_path / "out.png")]
     assert [path.name for path in tmp_path.iterdir()] == ["out.png"]
     with Image.open(tmp_path / "out.png") as image:
         assert image.width == 960 * panels
