@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
+from scipy.spatial import KDTree
 
 from framework.commands.running.run import run
 from framework.config import composition
@@ -79,6 +80,7 @@ def test_edited_map_removes_tentative_instances(scene: InstanceMap) -> None:
     EditedMap(scene)
     np.testing.assert_array_equal(ids_of(scene), before)
     assert [*scene.instances()] == [*scene.table.records] == [COUCH]
+    assert set(np.unique(scene.labels.in_use().instance_ids).tolist()) == {0, COUCH}
 
 
 def test_delete_changes_instance_to_background(scene: InstanceMap) -> None:
@@ -117,7 +119,17 @@ def test_split_id_is_smallest_unused_id(scene: InstanceMap) -> None:
     edited.apply(Merge((COUCH, CHAIR)))
     edited.apply(Split(COUCH))
     assert [*scene.instances()] == [2, 3]
+    edited.apply(Merge((COUCH, 3)))
+    edited.apply(Split(COUCH))
+    assert [*scene.instances()] == [2, 4]
     assert scene.table.last_id == 9
+
+
+def test_voxel_positions_are_near_surface(scene: InstanceMap) -> None:
+    """Fusers label voxels up to 2 voxels from the measured surface."""
+    edited = EditedMap(scene)
+    distances, _ = KDTree(scene.mesh().vertices).query(edited._positions())
+    assert distances.max() < 4 * scene.volume.voxel_size
 
 
 @pytest.mark.parametrize(("key", "name"), [(CHAIR, "couch"), (COUCH, "chair")])
