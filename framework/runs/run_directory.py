@@ -132,7 +132,7 @@ class RunRecord:
         figures |= attempt(trajectory_metrics, result) or {}
         title = headline({"sequence": video.name, **figures})
         if found is not None:
-            labels = _labels(found[1], scene.classes)
+            labels = likely_labels(found[1], scene.classes)
             attempt(write_overview, self.directory / "overview.png", found[0], labels, poses, title)
         if attempt.error is None:
             attempt(write_json, self.directory / METRICS, self._metrics(video, figures))
@@ -215,7 +215,7 @@ def _from_here(path: Path) -> Path:
     return place.relative_to(here) if place.is_relative_to(here) else place
 
 
-def _labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -> dict[int, tuple[str, float]]:
+def likely_labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -> dict[int, tuple[str, float]]:
     """Return the class name and the confidence of each likely instance, by id."""
     return {
         key: (class_name(instance, classes) or "object", instance.confidence)
