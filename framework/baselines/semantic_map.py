@@ -27,7 +27,7 @@ from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
-MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of missed, min_area and smoothness
+ABSENCE, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds
 SWEEPS = 20  # maximum number of sweeps of the regularization
 FORMAT = "semantic 4"  # format of the map file; increment it when the meaning of the contents changes
 
@@ -35,7 +35,7 @@ FORMAT = "semantic 4"  # format of the map file; increment it when the meaning o
 class Elections(NamedTuple):
     """Parameters for the classes and instances of the mesh."""
 
-    missed: float  # likelihood ratio P(no mask | any class) / P(no mask | background)
+    absence_likelihood_ratio: float  # likelihood ratio P(no mask | any class) / P(no mask | background)
     min_area: float  # minimum surface area of an instance, m^2
     smoothness: float  # log-odds for each neighboring vertex of the same class
 
@@ -88,7 +88,7 @@ class SemanticMap(SceneMap):
 
     @property
     def _log_missed(self) -> np.float32:
-        return np.float32(np.log(self.elections.missed))
+        return np.float32(np.log(self.elections.absence_likelihood_ratio))
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         """Return the view with classes.
@@ -182,7 +182,7 @@ class SemanticMap(SceneMap):
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *ClassEvidence._fields))
         with map_file_errors(path):
             volume = TsdfVolume.load(header, arrays, len(arrays["rest"]))
-            bounds = {"missed": MISSED, "min_area": AREA, "smoothness": SMOOTHNESS}
+            bounds = {"absence_likelihood_ratio": ABSENCE, "min_area": AREA, "smoothness": SMOOTHNESS}
             scene = cls(volume, Elections(**{name: header.number(name, limits) for name, limits in bounds.items()}))
             classes = header.classes()
             scene.begin(classes)

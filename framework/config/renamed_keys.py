@@ -32,6 +32,7 @@ RENAMED = {
     "fuser.absence": "fuser.absence_likelihood",
     "fuser.class_gate": "fuser.min_class_agreement",
     "fuser.lying_on": "fuser.support_overlap",
+    "fuser.missed": "fuser.absence_likelihood_ratio",
     "fuser.on_top": "fuser.occlusion_area_ratio",
     "fuser.overlap": "fuser.min_overlap",
     "fuser.same_class": "fuser.require_same_class",

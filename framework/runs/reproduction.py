@@ -37,7 +37,7 @@ ORDER = (*STAGES, FUSION)  # order of the stages within a frame
 
 
 def causes(record: Record) -> list[str]:
-    """Return one message for each change since a run that may affect its results.
+    """Return the changes since a run that may make its repetition differ, one message each.
 
     The changes are in stored files, parameters, input files, plugin code, the commit and the versions of numerical
     packages.

@@ -8,7 +8,7 @@ to those of the map. The adjoint Ad of T_key_view converts them to a left twist 
 
 The keyframe is compared at half the finest resolution, which is less noisy and faster. At the finest level, w = 4
 compensates for the smaller number of points. The coarsest level uses the map alone. The weight decreases with the
-distance from the keyframe, so that sparse frames are aligned to the map alone.
+distance from the keyframe and reaches 0 at USED_DISTANCE. Beyond it, frames are aligned to the map alone.
 """
 
 from __future__ import annotations

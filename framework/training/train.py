@@ -60,7 +60,7 @@ def train(config: DictConfig, folder: Path) -> AveragePrecision:
     rooms = Path(wanted.folder or Path(platformdirs.user_cache_dir("instancemap")) / "rooms")
     processes = wanted.processes or available_cores()
     render_rooms(rooms, 0, wanted.rooms, wanted.views, processes)
-    render_rooms(rooms, HELD_OUT, wanted.held_out, wanted.held_out_views, processes)
+    render_rooms(rooms, HELD_OUT, wanted.held_out_rooms, wanted.held_out_views, processes)
 
     device = str(torch_device(config.device, "device"))
     pictures = RoomPictures(rooms, 0, wanted.rooms)
@@ -82,13 +82,13 @@ def train(config: DictConfig, folder: Path) -> AveragePrecision:
     node = {"_target_": DETECTOR, "weights": str(weights.absolute()), "device": device}
     detector = build(Detector, OmegaConf.create(node))
     precision = detection_ap(
-        _detected(detector, RoomPictures(rooms, HELD_OUT, wanted.held_out)), detector.classes, MIN_PIXELS
+        _detected(detector, RoomPictures(rooms, HELD_OUT, wanted.held_out_rooms)), detector.classes, MIN_PIXELS
     ).masks
-    card |= _known({"held_out_rooms": wanted.held_out, "mask_ap50": precision.ap50, "mask_ap": precision.ap})
+    card |= _known({"held_out_rooms": wanted.held_out_rooms, "mask_ap50": precision.ap50, "mask_ap": precision.ap})
     save_network(trainer.trained(), weights, card, half=True)
     with atomic_write(folder / PRECISION) as path:
         path.write_text(json.dumps(_known(asdict(precision)), indent=1))
-    log.info("mask AP50 %.3f, AP %.3f on %d held-out rooms", precision.ap50, precision.ap, wanted.held_out)
+    log.info("mask AP50 %.3f, AP %.3f on %d held-out rooms", precision.ap50, precision.ap, wanted.held_out_rooms)
     return precision
 
 

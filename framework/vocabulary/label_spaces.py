@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 class ClassNames(Enum):
     """Class names of a detector."""
 
-    AUTO = "COCO names; the names of the label space if one of them is in no known label space"
+    AUTO = "COCO names for the names of known label spaces, otherwise the names of the label space"
     COCO = "COCO names; classes without a COCO name are removed"
     OWN = "the names of the label space"
 
@@ -127,7 +127,8 @@ def to_class_names(labels: Sequence[str], class_names: ClassNames, key: str = "d
         ConfigError: No label is an object class, or the class names are COCO and a label is unknown.
     """
     unknown = [] if class_names is ClassNames.OWN else _unknown(labels)
-    if class_names is ClassNames.COCO or (class_names is ClassNames.AUTO and not unknown):
+    in_coco = any(MEANINGS.get(_key(label)) for label in labels)
+    if class_names is ClassNames.COCO or (class_names is ClassNames.AUTO and in_coco and not unknown):
         return to_coco(labels, key)
     if unknown:
         message = "%s: all names are kept, because %d of %d are in no known label space: %s"
@@ -169,7 +170,7 @@ def to_coco(labels: Sequence[str], key: str = "detector.label_space") -> LabelMa
     """
     if unknown := _unknown(labels):
         raise ConfigError(
-            f"{key}: expected names of a label space, got {len(unknown)} unknown names in {len(labels)} labels: "
+            f"{key}: expected names of a label space, got unknown labels ({len(unknown)} of {len(labels)}): "
             f"{', '.join(map(repr, unknown))}; set detector.class_names=OWN to keep all names"
         )
     meanings = [MEANINGS[_key(label)] for label in labels]

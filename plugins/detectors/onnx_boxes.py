@@ -35,8 +35,7 @@ class OnnxBoxes(Detector):
     sha256: str = ""  # expected SHA-256 of the file; "" = not checked
     # class names: a label space such as coco, or a text file with one name per line (n/a = unused index)
     label_space: str = "coco"
-    # names of the classes: COCO; OWN (names of the label space); AUTO = OWN if a name is in no known label space, else
-    # COCO
+    # class names: COCO, OWN (those of the label space) or AUTO (COCO for names of known label spaces, otherwise OWN)
     class_names: ClassNames = ClassNames.AUTO
     layout: OutputLayout = OutputLayout.yolox  # layout of the outputs
     # minimum score of a detection, in (0, 1); low, because low-score detections can update existing instances

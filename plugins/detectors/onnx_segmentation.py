@@ -39,8 +39,7 @@ class OnnxSegmentation(Detector):
     sha256: str = ""  # expected SHA-256 of the file; "" = not checked
     # class names: a label space such as coco, or a text file with one name per line (n/a = unused index)
     label_space: str = "coco"
-    # names of the classes: COCO; OWN (names of the label space); AUTO = OWN if a name is in no known label space, else
-    # COCO
+    # class names: COCO, OWN (those of the label space) or AUTO (COCO for names of known label spaces, otherwise OWN)
     class_names: ClassNames = ClassNames.AUTO
     objectness: bool = False  # True = an objectness score precedes the class scores in the outputs, as in YOLOv5
     box_format: BoxKind = BoxKind.AUTO  # box format: CENTER, CORNER or AUTO (detected)

@@ -48,8 +48,7 @@ class Precomputed(Detector):
     path: Path
     # class names: a label space (coco, nyu40, scenenn, ...), or a text file with one name per line
     label_space: str = "coco"
-    # names of the classes: COCO; OWN (names of the label space); AUTO = OWN if a name is in no known label space, else
-    # COCO
+    # class names: COCO, OWN (those of the label space) or AUTO (COCO for names of known label spaces, otherwise OWN)
     class_names: ClassNames = ClassNames.AUTO
     category_ids: CategoryIds = CategoryIds.COCO_91  # numbering of category_id
     score_threshold: float = 0.0  # minimum score of a detection, in [0, 1]

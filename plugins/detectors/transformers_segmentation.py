@@ -74,8 +74,7 @@ class TransformersSegmentation(Detector):
 
     model: str = "facebook/mask2former-swin-tiny-coco-instance"  # model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model repository
-    # names of the classes: COCO; OWN (names of the model); AUTO = OWN if a name is in no known label space, else
-    # COCO
+    # class names: COCO, OWN (those of the model) or AUTO (COCO for names of known label spaces, otherwise OWN)
     class_names: ClassNames = ClassNames.AUTO
     # minimum score of a detection, in [0, 1); low, because low-score detections can update existing instances
     score_threshold: float = 0.1

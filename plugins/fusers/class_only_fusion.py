@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from framework.baselines.class_evidence import mask_classes
-from framework.baselines.semantic_map import AREA, MISSED, SMOOTHNESS, Elections, SemanticMap
+from framework.baselines.semantic_map import ABSENCE, AREA, SMOOTHNESS, Elections, SemanticMap
 from framework.config.validation import check_bounds
 from framework.data import Float64, Frame, PointClusters, Pose
 from framework.interfaces import MapFuser, StageTimer, untimed
@@ -24,9 +24,9 @@ class ClassOnlyFusion(MapFuser):
     touching objects of one class become one instance.
 
     The original systems label every pixel. Here, a pixel gets the distribution of the mask with the highest score. A
-    pixel outside all masks is evidence for the background. This evidence is limited by `missed`, because the detector
-    may have missed an object. The original systems regularize with a CRF. Here, `smoothness` is the weight of a Potts
-    model over the mesh. It is off by default, because it did not improve AP50.
+    pixel outside all masks is evidence for the background. This evidence is limited by `absence_likelihood_ratio`,
+    because the detector may have missed an object. The original systems regularize with a CRF. Here, `smoothness` is
+    the weight of a Potts model over the mesh. It is off by default, because it did not improve AP50.
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
@@ -34,12 +34,13 @@ class ClassOnlyFusion(MapFuser):
     class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
     # likelihood ratio for a pixel without a mask, P(no mask | any class) / P(no mask | background), in (0, 1]; 1 = no
     # evidence of absence
-    missed: float = 0.7
+    absence_likelihood_ratio: float = 0.7
     smoothness: float = 0.0  # log-odds added per neighboring vertex of the same class, >= 0; 0 = no regularization
 
     def __post_init__(self) -> None:
-        check_bounds(self, class_floor=(1e-6, 0.999), missed=MISSED, min_area=AREA, smoothness=SMOOTHNESS)
-        elections = Elections(self.missed, self.min_area, self.smoothness)
+        check_bounds(self, class_floor=(1e-6, 0.999), absence_likelihood_ratio=ABSENCE)
+        check_bounds(self, min_area=AREA, smoothness=SMOOTHNESS)
+        elections = Elections(self.absence_likelihood_ratio, self.min_area, self.smoothness)
         self.scene: SemanticMap = SemanticMap(self.hashing.new_volume(), elections)
 
     def renew_colors(self) -> None:

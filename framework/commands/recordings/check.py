@@ -42,7 +42,7 @@ def job(config: DictConfig) -> None:
     if found.errors:
         settings = " ".join(dict.fromkeys(finding.setting for finding in found.errors if finding.setting))
         count = f"{len(found.errors)} error{'s' * (len(found.errors) > 1)} (listed above)"
-        raise DataError(f"dataset: expected a usable recording, got {count}{f'; set {settings}' if settings else ''}")
+        raise DataError(f"dataset: expected a usable sequence, got {count}{f'; set {settings}' if settings else ''}")
 
 
 def main() -> None:

@@ -28,7 +28,8 @@ def config(folder: Path, *overrides: str) -> DictConfig:
             "train_detector",
             overrides=[
                 "device=cpu", "network.width=8", "network.fpn_channels=8", "network.head_features=16",
-                f"pictures.folder={folder}", "pictures.rooms=1", "pictures.held_out=1", "schedule.batch=2", *overrides,
+                f"pictures.folder={folder}", "pictures.rooms=1", "pictures.held_out_rooms=1",
+                "schedule.batch=2", *overrides,
             ],
         )  # fmt: skip
 

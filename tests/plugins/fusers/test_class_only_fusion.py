@@ -104,8 +104,8 @@ def test_class_only_single_false_detection_is_removed(frames: list[Frame], when:
     assert (class_ids >= 0).sum() < 0.01 * masks_of(frames[5])[0].sum(), "expected only points at the silhouette"
 
 
-def test_class_only_missed_of_one_ignores_unmasked_frames(frames: list[Frame]) -> None:
-    fuser = new_fuser(missed=1.0)
+def test_class_only_absence_ratio_of_one_ignores_unmasked_frames(frames: list[Frame]) -> None:
+    fuser = new_fuser(absence_likelihood_ratio=1.0)
     for k, frame in enumerate(frames):
         found = [masks_of(frame)[0]] if k == 0 else []
         fuse_masks(fuser, frame, found, [0.6] * len(found))
@@ -149,14 +149,14 @@ def test_class_only_voxel_evidence_matches_reference(mapped: SemanticMap, frames
                 log += np.log(0.9 * np.array(p) + 0.1 / 3)
                 masked += 1
             else:
-                log += np.log([fuser.missed, fuser.missed, 1])
+                log += np.log([fuser.absence_likelihood_ratio, fuser.absence_likelihood_ratio, 1])
                 unmasked += 1
         row = grid.label_row[block]
         held = np.zeros(2)
         for label, ratio in zip(evidence.class_ids[row, n], evidence.log_ratio[row, n], strict=True):
             if label < 2:
                 held[label] = ratio
-        held += np.log(fuser.missed) * evidence.unmasked[block, n]
+        held += np.log(fuser.absence_likelihood_ratio) * evidence.unmasked[block, n]
         seen += masked > 0
         same = (evidence.masked[row, n], evidence.unmasked[block, n]) == (masked, unmasked)
         differing += not (same and np.allclose(held, log[:2] - log[2], atol=1e-3))
@@ -181,7 +181,7 @@ def test_class_only_instance_attributes_match_voxel_reference(mapped: SemanticMa
             for label, ratio in zip(evidence.class_ids[row, n], evidence.log_ratio[row, n], strict=True):
                 if label < 2:
                     log[label] = ratio
-            log[:2] += np.log(mapped.elections.missed) * evidence.unmasked[block, n]
+            log[:2] += np.log(mapped.elections.absence_likelihood_ratio) * evidence.unmasked[block, n]
             posteriors.append((np.exp(log) / np.exp(log).sum())[:2])
             counts.append(evidence.masked[row, n])
             firsts += [evidence.first_frame[row, n]] if counts[-1] else []
@@ -278,7 +278,7 @@ def test_class_only_different_label_space_raises(frames: list[Frame]) -> None:
 
 def test_class_only_invalid_parameter_raises() -> None:
     for wrong in (
-        {"missed": 0.0},
+        {"absence_likelihood_ratio": 0.0},
         {"class_floor": 1.0},
         {"smoothness": -1.0},
         {"max_weight": 256.0},
@@ -308,7 +308,8 @@ def slowly_smoothed(scene: SemanticMap, smoothness: float) -> Int32:
     while class_ids != before:
         before = list(class_ids)
         for v, (block, n) in enumerate(divmod(int(voxel), 512) for voxel in surface.voxels):
-            row, absent = grid.label_row[block], np.log(scene.elections.missed) * evidence.unmasked[block, n]
+            row = grid.label_row[block]
+            absent = np.log(scene.elections.absence_likelihood_ratio) * evidence.unmasked[block, n]
             log = [absent + (evidence.rest[row, n] if row >= 0 else 0)] * 2 + [0.0]  # two classes, background
             for label, ratio in zip(evidence.class_ids[row, n], evidence.log_ratio[row, n], strict=True):
                 if row >= 0 and label < 2:

@@ -89,7 +89,7 @@ def test_open3d_odometry_empty_map_is_lost_with_reason(frames: list[Frame]) -> N
     assert "\n" not in pose.reason
 
 
-def test_open3d_odometry_covered_video_starts_at_first_depth(frames: list[Frame]) -> None:
+def test_open3d_odometry_starts_at_first_frame_with_depth(frames: list[Frame]) -> None:
     covered = replace(frames[0], depth=np.zeros(CAMERA.shape, np.float32))
     poses = run(Open3dOdometry(), [covered, *frames[1:4]])
     assert [pose.lost for pose in poses] == [True, False, False, False]

@@ -34,7 +34,7 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
     assert "WRONG  poses: stored as T_camera_world" in done.stdout
     assert "; set dataset.pose_kind=T_CAMERA_WORLD" in done.stdout
     assert (
-        "ERROR   dataset: expected a usable recording, got 1 error (listed above); set dataset.pose_kind=T_CAMERA_WORLD"
+        "ERROR   dataset: expected a usable sequence, got 1 error (listed above); set dataset.pose_kind=T_CAMERA_WORLD"
         in done.stderr
     )
     assert "Traceback" not in done.stderr
