@@ -63,8 +63,8 @@ class TransformersSegmentation(Detector):
 
     A model that is not in the cache of huggingface_hub is downloaded, unless HF_HUB_OFFLINE=1. Use checkpoints for
     instance or panoptic segmentation, because semantic checkpoints have one mask for all objects of a class. Labels are
-    mapped to COCO names (framework/vocabulary/label_spaces.yaml). Detections of other labels, such as walls, are
-    dropped.
+    mapped to COCO names (framework/vocabulary/label_spaces.yaml), and detections of other labels, such as walls, are
+    dropped. `class_names` changes this.
 
     The class distribution of a detection is the softmax over the logits of the labels, without "no object". For
     networks with independent sigmoids, it is the distribution under the condition that exactly one label is true. The
