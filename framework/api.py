@@ -140,7 +140,9 @@ def scene_of(key: str, run: Path) -> SceneMap:
         DataError: The map is missing or cannot be read.
     """
     if not (run / MAP).is_file():
-        raise DataError(f"{key}: expected a run directory, got {run} without {MAP}")
+        raise DataError(
+            f"{key}: expected a run directory with {MAP}, got {run} without it (imported maps have only a mesh)"
+        )
     return load_scene(run / MAP)
 
 

@@ -38,9 +38,28 @@ def composed(*overrides: str) -> DictConfig:
     Raises:
         ConfigError: A name is unknown or a value is invalid.
     """
+    return composed_with_choices(*overrides)[0]
+
+
+def composed_with_choices(*overrides: str) -> tuple[DictConfig, dict[str, str | None]]:
+    """Return the main config with overrides, and the chosen option of each config group.
+
+    Raises:
+        ConfigError: A name is unknown or a value is invalid.
+    """
+    with _config_errors(), config_loader() as loader:
+        config = loader.load_configuration("config", [*overrides], RunMode.RUN, from_shell=False)
+        choices = {str(group): option for group, option in config.hydra.runtime.choices.items()}
+        with open_dict(config):
+            del config["hydra"]
+        return config, choices
+
+
+@contextmanager
+def _config_errors() -> Iterator[None]:
+    """Convert errors of Hydra and OmegaConf in the `with` body to ConfigError."""
     try:
-        with config_loader() as loader:
-            return loader.compose([*overrides])
+        yield
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra raises ValueError for some errors
         raise ConfigError(one_line(error)) from error
 

@@ -7,7 +7,7 @@ malformed files. plyfile has a GPL license.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
@@ -33,6 +33,7 @@ class PlyMesh:
     triangles: Int32  # (F, 3) vertex indices
     properties: Mapping[str, Array]  # by name: other scalar properties (V,) of the vertices, in the type of the file
     comments: tuple[str, ...]  # comments of the header, in file order
+    triangle_properties: Mapping[str, Array] = field(default_factory=dict)  # (F,) scalar properties of the faces
 
 
 def found_property(mesh: PlyMesh, values: Array | None) -> str:
@@ -57,9 +58,13 @@ def read_ply(path: Path) -> PlyMesh:
     if "vertex" not in elements:
         raise DataError(f"{path}, line {header.lines}: expected an element 'vertex' in the header, got none")
     vertices = _vertices(path, elements["vertex"])
-    triangles = _triangles(path, elements["face"], len(vertices)) if "face" in elements else np.empty((0, 3), np.int32)
+    triangles, of_triangles = np.empty((0, 3), np.int32), {}
+    if "face" in elements:
+        triangles, lengths = _triangles(path, elements["face"], len(vertices))
+        scalars = elements["face"].scalars
+        of_triangles = {name: np.repeat(values, lengths - 2) for name, values in scalars.items()}
     properties = {name: values for name, values in elements["vertex"].scalars.items() if name not in AXES}
-    return PlyMesh(vertices, triangles, properties, header.comments)
+    return PlyMesh(vertices, triangles, properties, header.comments, of_triangles)
 
 
 def write_ply(
@@ -119,7 +124,8 @@ def _vertices(path: Path, rows: Element) -> Float32:
     return vertices
 
 
-def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
+def _triangles(path: Path, rows: Element, vertices: int) -> tuple[Int32, Int64]:
+    """Return the triangles (F, 3) and the number of corners (P,) of each face."""
     name = next((name for name in INDICES if name in rows.lists), None)
     if name is None:
         raise DataError(f"{path}: element 'face': expected a list property {' or '.join(INDICES)}, got none")
@@ -135,7 +141,7 @@ def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
         k = int(np.searchsorted(np.cumsum(lengths), wrong, side="right"))
         expected = f"expected vertex indices in [0, {vertices})"
         raise DataError(f"{path}, {rows.place(k)}: face {k}: {expected}, got {corners[wrong]}")
-    return _fans(corners.astype(np.int32, copy=False), lengths)
+    return _fans(corners.astype(np.int32, copy=False), lengths), lengths
 
 
 def _fans(corners: Int32, lengths: Int64) -> Int32:

@@ -9,9 +9,10 @@ Both maps must share one world frame. Map the second visit with `localize_in=` o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Protocol
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -20,7 +21,6 @@ from scipy.spatial import KDTree
 from framework.data import Bool, Camera, Float32, Float64, Instance, InstanceMesh, Int32
 from framework.errors import DataError
 from framework.geometry import inverse, project, transform
-from framework.interfaces import SceneMap
 
 LOOKS = 60  # number of evenly spaced poses for rendering the map of a visit
 EYE = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)  # assumed camera of a visit: half the resolution of a Kinect
@@ -57,11 +57,39 @@ class Change:
     distance: float = 0.0  # m, displacement of a moved object
 
 
+class ObservedView(Protocol):
+    """A view of a map."""
+
+    @property
+    def depth(self) -> Float32:
+        """Depth (H, W), m along z, 0 = no surface."""
+
+
+class ObservedMap(Protocol):
+    """The members of a map that are compared: those of SceneMap, or a LabeledSurface."""
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the columns of the class probabilities."""
+
+    def mesh(self) -> InstanceMesh:
+        """Return the surface."""
+
+    def instances(self) -> Mapping[int, Instance]:
+        """Return the objects by id."""
+
+    def render(self, camera: Camera, T_world_camera: Float64) -> ObservedView:
+        """Return the view from `camera` at T_world_camera (4, 4)."""
+
+
 @dataclass(frozen=True)
 class Visit:
-    """A map with the camera poses of its frames."""
+    """A map with the camera poses of its frames.
 
-    scene: SceneMap
+    An imported map has no poses. It is rendered from the poses of the other visit.
+    """
+
+    scene: ObservedMap
     poses: Float64  # (F, 4, 4) T_world_camera
 
     def __post_init__(self) -> None:

@@ -17,7 +17,7 @@ from framework.rendering.labels import draw_labels, place_labels, text_size
 from framework.rendering.lit_view import LitView
 from framework.rendering.palette import FAINT_INK, INK, PAPER, instance_colors
 from framework.rendering.surface import Surface
-from framework.rendering.viewpoint import best_view
+from framework.rendering.viewpoint import best_view, surrounding_poses
 
 PANEL_WIDTH, PANEL_HEIGHT = 960, 760  # px, size of each of the two images
 TITLE_HEIGHT = 56  # px, height of the title bar
@@ -37,7 +37,12 @@ class InstanceState:
 
 
 def write_overview(
-    path: Path, mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], poses: Float64, title: str
+    path: Path,
+    mesh: InstanceMesh,
+    instances: Mapping[int, tuple[str, float]],
+    poses: Float64,
+    title: str,
+    up: Float64 | None = None,
 ) -> None:
     """Write the overview image of a map as a PNG file.
 
@@ -45,15 +50,22 @@ def write_overview(
         path: The output file.
         mesh: The mesh of the map.
         instances: The class name and confidence of each instance by id. All other ids are background.
-        poses: The camera poses (F, 4, 4) of the mapped frames.
+        poses: The camera poses (F, 4, 4) of the mapped frames; F = 0 for a map without a trajectory.
         title: The title above the images.
+        up: The up direction (3,) of a map without a trajectory; None = the z axis.
     """
-    image = overview(mesh, instances, poses, title)
+    image = overview(mesh, instances, poses, title, up)
     with atomic_write(path) as temporary:
         Image.fromarray(image).save(temporary, compress_level=PNG_LEVEL)
 
 
-def overview(mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], poses: Float64, title: str) -> UInt8:
+def overview(
+    mesh: InstanceMesh,
+    instances: Mapping[int, tuple[str, float]],
+    poses: Float64,
+    title: str,
+    up: Float64 | None = None,
+) -> UInt8:
     """Return the overview image (H, W, 3), RGB.
 
     See `write_overview` for the arguments.
@@ -62,10 +74,12 @@ def overview(mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], pos
     shown = [key for key in sorted(instances) if (ids == key).any()]
     centroids = np.array([mesh.vertices[ids == key].mean(axis=0) for key in shown], np.float64).reshape(-1, 3)
     colors = dict(zip(shown, instance_colors(centroids), strict=True))
-    if len(mesh.triangles) and len(poses):
-        panels = _panels(mesh, ids, {key: instances[key][0] for key in shown}, colors, poses)
+    if len(mesh.triangles):
+        views = poses if len(poses) else surrounding_poses(mesh.vertices, up)
+        panels = _panels(mesh, ids, {key: instances[key][0] for key in shown}, colors, views, poses)
     else:
-        panels = _text_panel("empty map", PANEL_HEIGHT, PANEL_WIDTH, FAINT_INK, "mm")
+        note = f"point cloud without triangles: {len(mesh.vertices)} points" if len(mesh.vertices) else "empty map"
+        panels = _text_panel(note, PANEL_HEIGHT, PANEL_WIDTH, FAINT_INK, "mm")
     legend = _legend([(colors[key], *instances[key]) for key in shown])
     return np.concatenate([_text_panel(title, TITLE_HEIGHT, 24, INK, "lm"), panels, legend])
 
@@ -98,15 +112,22 @@ def write_comparison(path: Path, mesh: InstanceMesh, states: Sequence[InstanceSt
 
 
 def _panels(
-    mesh: InstanceMesh, ids: Int32, names: Mapping[int, str], colors: Mapping[int, UInt8], poses: Float64
+    mesh: InstanceMesh,
+    ids: Int32,
+    names: Mapping[int, str],
+    colors: Mapping[int, UInt8],
+    views: Float64,
+    path: Float64,
 ) -> UInt8:
-    surface = Surface.seen_from(mesh.vertices, mesh.triangles, poses)
-    camera, T_world_camera = best_view(surface, ids, poses, PANEL_WIDTH, PANEL_HEIGHT)
+    """Return both images. `views` (N, 4, 4) are poses with a view of the map, `path` (F, 4, 4) are drawn."""
+    surface = Surface.seen_from(mesh.vertices, mesh.triangles, views)
+    camera, T_world_camera = best_view(surface, ids, views, PANEL_WIDTH, PANEL_HEIGHT)
     view = LitView(surface, camera, T_world_camera)
-    path = ProjectedPath.of(poses, camera, T_world_camera, view.hits)
     left = Image.fromarray(view.in_colors(mesh.colors))
-    path.draw(left)
-    return np.concatenate([np.asarray(left), _instance_panel(view, mesh, ids, names, colors, path)], axis=1)
+    projected = ProjectedPath.of(path, camera, T_world_camera, view.hits) if len(path) else None
+    if projected is not None:
+        projected.draw(left)
+    return np.concatenate([np.asarray(left), _instance_panel(view, mesh, ids, names, colors, projected)], axis=1)
 
 
 def _instance_panel(

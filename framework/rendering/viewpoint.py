@@ -14,10 +14,39 @@ from framework.rendering.viewpoint_kernels import draw_fronts, sum_level_normals
 FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical field of view; narrow, for a weak perspective
 ELEVATIONS_RAD = np.deg2rad([38.0, 52.0])  # candidate angles of the camera above the horizontal
 AZIMUTHS = 16  # number of candidate directions around the up direction
+EYE_HEIGHT = 0.8  # height of virtual cameras in the map, relative to the height of the map
+VIRTUAL_ELEVATIONS_RAD = np.deg2rad([10.0, 45.0])  # angles of virtual cameras below the horizontal
 MARGIN = 1.04  # size of the view relative to its content
 TRIAL_WIDTH, TRIAL_HEIGHT = 96, 72  # px, size of candidate images
 TRIAL_POINTS = 60000  # approximate maximum number of vertices in candidate images
 LEVEL_CONE_RAD = np.deg2rad(30)  # largest angle between floor normals and the mean up direction of the cameras
+
+
+def surrounding_poses(vertices: Float32, up: Float64 | None = None) -> Float64:
+    """Return virtual camera poses (N, 4, 4) for a map without a trajectory.
+
+    The cameras are above the center of the map, and look slightly and steeply down in all directions.
+
+    Args:
+        vertices: The vertices (V, 3), m.
+        up: The up direction (3,), a unit vector; None = the z axis.
+    """
+    up = np.array([0.0, 0.0, 1.0]) if up is None else up
+    points = _without_strays(vertices).astype(np.float64)
+    heights = points @ up
+    center = (points.min(axis=0) + points.max(axis=0)) / 2
+    eye = center + (heights.min() + EYE_HEIGHT * np.ptp(heights) - center @ up) * up
+    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    side /= np.linalg.norm(side)
+    poses = []
+    for elevation in VIRTUAL_ELEVATIONS_RAD:
+        for azimuth in 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS:
+            level = np.cos(azimuth) * side + np.sin(azimuth) * np.cross(up, side)
+            pose = np.eye(4)
+            pose[:3, :3] = looking(np.cos(elevation) * level - np.sin(elevation) * up, up)
+            pose[:3, 3] = eye
+            poses.append(pose)
+    return np.array(poses)
 
 
 def upward(poses: Float64, surface: Surface) -> Float64:

@@ -122,11 +122,9 @@ class Comparison:
             "sameWorld": len(sequences) == 1,
             "maps": [{"name": name, **scene.data()} for name, scene in shown],
         }
-        metrics = [run.record.metrics for run in self.runs]
-        choices = [", ".join(filter(None, (one.get("choice.detector"), one.get("choice.fuser")))) for one in metrics]
         context = {
             "heading": heading,
-            "runs": list(zip(self.names, self.links, choices, strict=True)),
+            "runs": list(zip(self.names, self.links, map(_system, self.runs), strict=True)),
             "run_colors": len(RUN_COLORS),
             "notices": self._notices(),
             "shown": [name for name, _ in shown],
@@ -236,6 +234,14 @@ def short_names(directories: Sequence[Path]) -> list[str]:
     resolved = [path.resolve() for path in directories]
     common = Path(os.path.commonpath([path.parent for path in resolved]))
     return [str(path.relative_to(common)) for path in resolved]
+
+
+def _system(run: RunContents) -> str:
+    """Return the detector and the fuser of a run, or the name of the row of an imported map."""
+    if run.record.is_imported:
+        return run.record.row
+    metrics = run.record.metrics
+    return ", ".join(filter(None, (metrics.get("choice.detector"), metrics.get("choice.fuser"))))
 
 
 def _target(node: Any) -> str:

@@ -65,17 +65,17 @@ class MapScene:
             footage: Images of the sequence; may be empty.
             fraction: Fraction of the size limits, in (0, 1].
         """
-        if contents.mesh is None or not len(contents.poses):
+        if contents.mesh is None or not len(contents.viewpoints):
             return None
         mesh = replace(contents.mesh, instance_ids=contents.instance_ids(contents.mesh))
         mesh = with_finer_objects(mesh, int(fraction * MAX_TRIANGLES))
         mesh = light_enough(mesh, int(fraction * MAX_BYTES))
         if not len(mesh.triangles):
             return None
-        surface = Surface.seen_from(mesh.vertices, mesh.triangles, contents.poses)
+        surface = Surface.seen_from(mesh.vertices, mesh.triangles, contents.viewpoints)
         mesh = replace(mesh, triangles=surface.triangles)
-        up = contents.up if contents.up is not None else upward(contents.poses, surface)
-        seen = sightings(mesh, mesh.instance_ids, contents.poses, footage.camera, footage.clarity)
+        up = contents.up if contents.up is not None else upward(contents.viewpoints, surface)
+        seen = sightings(mesh, mesh.instance_ids, contents.viewpoints, footage.camera, footage.clarity)
         return cls(contents, mesh, surface, seen, up)
 
     def glb(self) -> str:
@@ -95,7 +95,7 @@ class MapScene:
     @cached_property
     def view(self) -> tuple[Camera, Float64]:
         """Camera and camera pose (4, 4) of the initial view."""
-        return best_view(self.surface, self.likely_labels, self.contents.poses, VIEW_WIDTH, VIEW_HEIGHT)
+        return best_view(self.surface, self.likely_labels, self.contents.viewpoints, VIEW_WIDTH, VIEW_HEIGHT)
 
     def data(self) -> dict[str, Any]:
         """Return the data for viewer.js that the GLB file does not contain, as JSON values."""
@@ -112,7 +112,7 @@ class MapScene:
             "target": _rounded(eye + max(distance, 0.1) * forward),
             "fov": float(np.rad2deg(FIELD_OF_VIEW_RAD)),
             "path": [_rounded(poses[k][:3, 3]) for k in spread_out(len(poses), PATH_POINTS)],
-            "frames": [numbers[k] for k in self.sightings.chosen],
+            "frames": [numbers[k] for k in self.sightings.chosen] if len(poses) else [],
             "objects": [
                 {
                     "id": one.id,

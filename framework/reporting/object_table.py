@@ -68,7 +68,9 @@ def object_data(
     one: StoredInstance, contents: RunContents, picture: Picture | None, match_result: MatchResult | None
 ) -> dict[str, Any]:
     """Return the data of an object for the panel next to the map, as JSON values."""
-    likeliest = sorted(one.class_probabilities.items(), key=lambda entry: (-entry[1], entry[0]))[:SHOWN_CLASSES]
+    imported = contents.record.is_imported  # class distributions and frames are unknown
+    known = {} if imported else one.class_probabilities
+    likeliest = sorted(known.items(), key=lambda entry: (-entry[1], entry[0]))[:SHOWN_CLASSES]
     height = _height_above_floor(one, contents)
     return {
         "id": one.id,
@@ -79,7 +81,7 @@ def object_data(
         "place": ", ".join(_position(one).split()) + " m",
         "height": None if height is None else f"{max(height, 0.0):.2f} m above the floor",
         "observations": one.observations,
-        "frames": f"{one.first_frame} to {one.last_frame}",
+        "frames": "" if imported else f"{one.first_frame} to {one.last_frame}",
         "vertices": one.vertices,
         "source": picture.source if picture else "",
         "truth": _truth(match_result) + (f", IoU {match_result.iou:.2f}" if match_result and match_result.iou else ""),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from framework.data import UNIT_TOLERANCE, Float64, InstanceMesh, Int32
 from framework.errors import DataError
 from framework.files.atomic_write import path_exists
 from framework.files.tum_trajectory import read_tum
+from framework.rendering.viewpoint import surrounding_poses
 from framework.runs.instances_file import StoredInstance, read_instances
 from framework.runs.mesh_file import read_mesh
 from framework.runs.stored_map import read_objects
@@ -83,6 +85,13 @@ class RunContents:
         up = np.array([value if is_number(value) else np.nan for value in values], np.float64)
         length = np.linalg.norm(up)
         return np.asarray(up / length) if abs(length - 1) < UNIT_TOLERANCE else None  # false for NaN
+
+    @cached_property
+    def viewpoints(self) -> Float64:
+        """Camera poses (N, 4, 4) with views of the map: `poses`, or virtual poses for an imported map with a mesh."""
+        if self.mesh is not None and self.record.is_imported:
+            return surrounding_poses(self.mesh.vertices, self.up)
+        return self.poses
 
     @property
     def tracked_frames(self) -> tuple[int, ...]:

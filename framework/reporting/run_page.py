@@ -74,7 +74,7 @@ class RunReport:
         scene = MapScene.of(contents, footage)
         photographer, pictures = None, {}
         if scene is not None:
-            photographer = Photographer(scene.mesh, scene.surface, contents.poses, footage)
+            photographer = Photographer(scene.mesh, scene.surface, contents.viewpoints, footage)
             colors = colors_by_id(contents.objects)
             pictures = photographer.pictures(scene.mesh.instance_ids, scene.sightings.best, colors)
         truth, why = source.scene_truth()
@@ -84,7 +84,7 @@ class RunReport:
 
     def html(self) -> str:
         """Return the HTML page. The result is deterministic."""
-        contents, metrics = self.contents, self.contents.record.metrics
+        contents = self.contents
         match_results = self.check.match_results if self.check else {}
         data: dict[str, Any] = {
             "likely": LIKELY,
@@ -96,11 +96,12 @@ class RunReport:
         }
         context = {
             "name": contents.name,
-            "stages": [name for group in STAGES if (name := metrics.get(f"choice.{group}"))],
+            "stages": stage_names(contents),
             "numbers": headline_numbers(contents),
             "notices": self._notices(),
             "likely": LIKELY,
             "mapped": self.scene is not None,
+            "imported": contents.record.is_imported,
             "still": overview_url(contents.record.directory / "overview.png") if self.scene is not None else "",
             "checked": self.check is not None,
             "objects": object_rows(contents, self.pictures, match_results),
@@ -115,10 +116,15 @@ class RunReport:
         return page("run.html", f"{contents.name} · InstanceMap", context, data, maps)
 
     def _notices(self) -> list[str]:
-        notices = []
+        notices, metrics = [], self.contents.record.metrics
         if self.contents.partial:
             notices.append(f"This run is partial: {self.contents.partial}. The page shows the map up to that point.")
-        if self.source.why_not:
+        if self.contents.record.is_imported:
+            notices.append(
+                f"This is an imported map ({metrics.get('external.mesh')}). It has no trajectory and no run times. "
+                "Images are rendered from virtual cameras."
+            )
+        elif self.source.why_not:
             notices.append(
                 f"The sequence could not be read ({self.source.why_not}). Object images are rendered from the map, "
                 "and the ground-truth path is unknown."
@@ -189,6 +195,14 @@ class RunReport:
         first = [one.first_frame for one in contents.objects if one.id in likely]
         chart = growth(frames, scene.sightings.growth, first, contents.tracked_frames[-1])
         return {"chart": chart, "pictures": scene.progress_pictures()}
+
+
+def stage_names(contents: RunContents) -> list[str]:
+    """Return the chosen options of the stages. For an imported map, they are the dataset and the name of its row."""
+    metrics = contents.record.metrics
+    if contents.record.is_imported:
+        return [*filter(None, [metrics.get("choice.dataset")]), contents.record.row]
+    return [name for group in STAGES if (name := metrics.get(f"choice.{group}"))]
 
 
 def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:

@@ -35,6 +35,8 @@ class RunSource:
     def of(cls, contents: RunContents) -> RunSource:
         """Open the sequence of a run from its config. If it is unreadable, `video` is None."""
         dataset = contents.record.dataset
+        if not dataset:
+            return cls(contents, None, "the map was imported without a dataset")
         if any("${" in str(value) for _, value in leaves({"dataset": dataset})):
             return cls(contents, None, "the interpolations in the config of the run are not resolved")
         try:
@@ -89,6 +91,8 @@ class RunSource:
             return None, "the dataset no longer has ground-truth instances" if expected else ""
         if expected is not None and truth_sha256(truth) != expected:
             return None, "the ground-truth instances differ from those used in the run"
+        if self.contents.record.is_imported:
+            return truth, ""
         try:
             return in_map_world(truth, self.contents.timestamps, self.contents.poses), ""
         except DataError as error:

@@ -100,7 +100,7 @@ class TruthCheck:
         if scene is not None and photographer is not None and missed:
             true_ids = transfer_labels(truth.points_world, truth.instance_ids, scene.mesh.vertices, MAX_DISTANCE)
             labels = np.where(np.isin(true_ids, list(missed)), true_ids, 0).astype(np.int32)
-            best = sightings(scene.mesh, labels, contents.poses, footage.camera, footage.clarity).best
+            best = sightings(scene.mesh, labels, contents.viewpoints, footage.camera, footage.clarity).best
             color: UInt8 = np.array(TRUE_COLOR, np.uint8)
             pictures = photographer.pictures(labels, best, dict.fromkeys(best, color))
         cards = []

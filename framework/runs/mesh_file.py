@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -49,17 +50,22 @@ def read_mesh(path: Path) -> InstanceMesh:
                 f"{path}: expected {np.dtype(kind)} for the vertex property {name!r}, got {got}; "
                 "use the mesh.ply of a run"
             )
-    class_lines = [comment for comment in ply.comments if f"{comment} ".startswith(CLASSES)]
-    if len(class_lines) != 1:
+    class_lists = listed_classes(ply.comments)
+    if len(class_lists) != 1:
         raise DataError(
-            f"{path}: expected one line 'comment {CLASSES}...', got {len(class_lines)} lines; use the mesh.ply of a run"
+            f"{path}: expected one line 'comment {CLASSES}...', got {len(class_lists)} lines; use the mesh.ply of a run"
         )
-    names = class_lines[0][len(CLASSES) :]
     return InstanceMesh(
         vertices=ply.vertices,
         triangles=ply.triangles,
         colors=np.stack([ply.properties[channel] for channel in CHANNELS], axis=1).astype(np.uint8),
         instance_ids=ply.properties["instance"].astype(np.int32),
         class_ids=ply.properties["class"].astype(np.int32),
-        classes=tuple(names.split(",")) if names else (),
+        classes=class_lists[0],
     )
+
+
+def listed_classes(comments: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return the class names in each comment of `write_mesh` with classes."""
+    lists = [comment[len(CLASSES) :] for comment in comments if f"{comment} ".startswith(CLASSES)]
+    return [tuple(names.split(",")) if names else () for names in lists]

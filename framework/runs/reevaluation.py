@@ -43,6 +43,10 @@ class Truth:
         Raises:
             InstanceMapError: The config contains an interpolation, or the dataset cannot be read.
         """
+        if "_target_" not in dataset:
+            raise DataError(
+                f"{CONFIG}: expected a dataset to compare with, got none; import the map again with dataset=NAME"
+            )
         for key, value in leaves({"dataset": dataset}):
             if "${" in str(value):
                 raise DataError(f"{key}: expected a resolved value in the run's {CONFIG}, got {value}; repeat the run")
@@ -53,9 +57,13 @@ class Truth:
     def in_world_of(self, record: Record) -> SceneTruth | None:
         """Return the ground truth in the world frame of a run, or None for an unlabeled dataset.
 
+        An imported map is in the world frame of the ground truth.
+
         Raises:
             DataError: The trajectory of the run cannot be read, or has no time in common with the ground truth.
         """
+        if record.is_imported:
+            return self.scene
         return self.scene and in_map_world(self.scene, *read_tum(record.directory / TRAJECTORY))
 
 

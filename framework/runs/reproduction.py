@@ -46,8 +46,11 @@ def causes(record: Record) -> list[str]:
         DataError: The manifest is missing or damaged.
     """
     manifest = Manifest.read(record.directory)
+    changed_files = manifest.changed_files(record.directory, optional=LARGE)
+    if record.is_imported:  # not made from its config by this code
+        return changed_files
     return [
-        *manifest.changed_files(record.directory, optional=LARGE),
+        *changed_files,
         *_changed_parameters(manifest.parameters, record),
         *_changed_inputs(manifest.inputs, input_hashes(record.config), record.config),
         *(f"plugin code of {change}" for change in changed_code(record.metrics, plugin_code(record.config))),

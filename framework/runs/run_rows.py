@@ -18,6 +18,7 @@ ANNOTATION = "annotation"  # name of the ground-truth release in the variant of 
 CONFIDENCE = 0.95  # level of confidence intervals
 PRESET_STAGES = ("tracker", "refiner", "fuser")  # stages set by preset=NAME
 
+OURS = "InstanceMap"  # name of runs without other settings, next to the rows of imported maps
 ABSENT = "–"  # text for a key that a run does not have
 
 Run = tuple[str, ...]  # values of the averaged keys, e.g. ("3",) for seed 3
@@ -166,11 +167,12 @@ def rows_of(
     place = {name: k for k, name in enumerate(overrides)}
     # the parts of a split row stay together
     order = sorted(rows, key=lambda key: (place.get(key[0], len(place)), key))
-    return [_row(system, variant, rows[system, variant]) for system, variant in order]
+    unnamed = "all runs" if len(rows) == 1 else OURS
+    return [_row(system, variant, rows[system, variant], unnamed) for system, variant in order]
 
 
-def _row(system: str, variant: tuple[str, ...], records: Mapping[Run, Record]) -> RunRow:
-    name = ", ".join([system, *variant] if system else variant) or "all runs"
+def _row(system: str, variant: tuple[str, ...], records: Mapping[Run, Record], unnamed: str) -> RunRow:
+    name = ", ".join([system, *variant] if system else variant) or unnamed
     return RunRow(name, dict(sorted(records.items(), key=lambda item: natural(item[0]))), system, variant)
 
 
@@ -211,7 +213,8 @@ class _Variant:
 
     @classmethod
     def of(cls, record: Record, over: Sequence[str]) -> _Variant:
-        choices = {stage: option for stage, option in record.choices.items() if stage in STAGES}
+        stages = ("dataset",) if record.is_imported else STAGES
+        choices = {stage: option for stage, option in record.choices.items() if stage in stages}
         choices[ANNOTATION] = record.annotation or "unknown"
         return cls(record, record.row, tuple(value_of(record, key) for key in over), choices, record.parameters)
 

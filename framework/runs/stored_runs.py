@@ -57,6 +57,7 @@ EVALUATION = "evaluation."  # prefix of keys about the last re-evaluation
 GROUND_TRUTH = EVALUATION + "ground_truth"  # key of the last re-evaluated `dataset.ground_truth`; optional
 EDITED_FROM = "edited_from"  # key with the path of the run that `instancemap edit` has edited; optional
 
+EXTERNAL = "external"  # value of `pose_source` and of the chosen stages of an imported map
 CHOICE = "choice."  # prefix of the chosen options in metrics.json
 GROUPS = (*STAGES, "preset", "sequences")  # config groups whose chosen option is stored
 FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # prefixes of numeric metrics
@@ -104,8 +105,13 @@ class Record:
         return f"edited map of {self.metrics[EDITED_FROM]}" if EDITED_FROM in self.metrics else ""
 
     @property
+    def is_imported(self) -> bool:
+        """True for the map of another system, which has no trajectory, run times or map.npz."""
+        return self.metrics.get("pose_source") == EXTERNAL
+
+    @property
     def row(self) -> str:
-        """Name of the row in an experiment, or "" without an experiment."""
+        """Name of the row in an experiment or of an imported map, or "" for another run."""
         row = self.config.get("row")
         return "" if row is None else str(row)
 

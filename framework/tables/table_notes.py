@@ -40,16 +40,30 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
         yield f"Overrides of each row: {'; '.join(changes)}."
     if comparison.command_line:
         yield f"Command line: {' '.join(comparison.command_line)}."
-    if fixed := common_options(comparison.records):
-        yield f"Common to all runs: {fixed}."
+    mapped = [record for record in comparison.records if not record.is_imported]
+    yield from _imported(comparison)
+    if fixed := common_options(mapped):
+        yield f"Common to all runs{'' if len(mapped) == len(comparison.records) else ' of InstanceMap'}: {fixed}."
     yield from _protocol(comparison)
     yield from _published(comparison)
     yield f"Data: {data(comparison.records)}."
     yield f"Code: {counted(record.code for record in comparison.records)}."
     yield from _mixed_code(comparison)
-    yield f"Machine: {counted(machine(record) for record in comparison.records)}."
+    if mapped:
+        yield f"Machine: {counted(machine(record) for record in mapped)}."
     yield f"Config: config.yaml of each run; SHA-256 of all config hashes: {digest(comparison.records)}."
     yield from _missing(comparison)
+
+
+def _imported(comparison: ComparisonTable) -> Iterator[str]:
+    """Yield a note about the rows of imported maps."""
+    rows = [row for row in comparison.rows if any(record.is_imported for record in row.records.values())]
+    if rows:
+        names = "; ".join(
+            f"{row.name} from {counted(str(record.metrics.get('external.mesh')) for record in row.records.values())}"
+            for row in rows
+        )
+        yield f"Imported maps of other systems, without run times and trajectories: {names}."
 
 
 def _averaging(comparison: ComparisonTable) -> Iterator[str]:

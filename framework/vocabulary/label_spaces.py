@@ -85,11 +85,12 @@ class LabelMapping:
         return rows.astype(np.float32), known
 
 
-def read_labels(name_or_path: str) -> tuple[str, ...]:
+def read_labels(name_or_path: str, key: str = "detector.label_space") -> tuple[str, ...]:
     """Return the names of a label space, or the lines of a text file with one name per line.
 
     Args:
         name_or_path: The name of a label space, such as "coco" or "nyu40", or the path of a text file.
+        key: The config key or option, for messages.
 
     Raises:
         ConfigError: The label space or file does not exist, or the file is invalid.
@@ -101,17 +102,16 @@ def read_labels(name_or_path: str) -> tuple[str, ...]:
         lines = read_text(path, LARGEST_FILE).rstrip().splitlines()
     except DataError as error:
         raise ConfigError(
-            f"detector.label_space: expected one of {', '.join(SPACES)}, or a text file with one name per line, got "
-            f"{name_or_path}"
+            f"{key}: expected one of {', '.join(SPACES)}, or a text file with one name per line, got {name_or_path}"
         ) from error
     names = tuple(line.strip() for line in lines)
     if "" in names:  # skipping an empty line would shift the following names
         raise ConfigError(
-            f"detector.label_space: {path}, line {names.index('') + 1}: expected a name, got an empty line; write "
+            f"{key}: {path}, line {names.index('') + 1}: expected a name, got an empty line; write "
             f"{NO_CLASS} for an unused index"
         )
     if not names:
-        raise ConfigError(f"detector.label_space: {path}: expected one name per line, got an empty file")
+        raise ConfigError(f"{key}: {path}: expected one name per line, got an empty file")
     return names
 
 

@@ -203,6 +203,7 @@ FAULTY = {
     "edit": ["nowhere", "--delete", "9"],
     "export": ["nowhere", "--to", "glb"],
     "query": ["old", "a red chair"],
+    "import-map": ["nowhere.ply", "new"],
     "evaluate": ["old"],
     "detect": ["dataset=synthetic", "detector=simulated"],
     "show-refinement": ["dataset=synthetic", "detector=simulated"],

@@ -9,12 +9,14 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from framework.commands.command_line import arguments, one_line_errors
+from framework.errors import DataError
 from framework.files.atomic_write import path_exists
 from framework.files.json_file import read_json, write_json
 from framework.files.tum_trajectory import read_tum
 from framework.files.yaml_file import load_yaml
 from framework.queries.changes import Change, Kind, Visit, changes
-from framework.runs.stored_runs import CONFIG, EDITED_FROM, METRICS, TRAJECTORY
+from framework.queries.labeled_surface import LabeledSurface
+from framework.runs.stored_runs import CONFIG, EDITED_FROM, EXTERNAL, METRICS, TRAJECTORY
 
 log = logging.getLogger(__name__)
 
@@ -36,12 +38,9 @@ def main() -> None:
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
         if not in_world(parsed.after, parsed.before):
-            message = (
-                "%s: expected the world frame of %s, got a different or unknown world frame; run it again with "
-                "localize_in=%s, or run both with tracker=ground_truth"
-            )
-            log.warning(message, parsed.after, parsed.before, parsed.before)
-        found = changes(visit_of(parsed.before), visit_of(parsed.after))
+            message = "%s: expected the world frame of %s, got a different or unknown world frame; %s"
+            log.warning(message, parsed.after, parsed.before, world_fix(parsed.before, parsed.after))
+        found = changes(*visits_of(parsed.before, parsed.after))
         if parsed.out is not None:
             write_json(parsed.out, [entry(change) for change in found])
         shown = [change for change in found if parsed.all or change.kind not in UNCHANGED]
@@ -50,22 +49,35 @@ def main() -> None:
         print(f"{rest[Kind.STAYED]} stayed, {rest[Kind.NOT_SEEN]} not observed in the other run")
 
 
-def visit_of(run: Path) -> Visit:
-    """Return the map and trajectory of a stored run.
+def visits_of(*runs: Path) -> list[Visit]:
+    """Return the maps and trajectories of two stored runs. An imported map has the poses of the other run.
 
     Raises:
-        DataError: A file is missing or invalid.
+        DataError: A file is missing or invalid, or both maps are imported.
     """
     from framework.api import scene_of  # slow import: after the arguments are checked
 
-    return Visit(scene_of("diff", run), read_tum(run / TRAJECTORY)[1])
+    scenes = [LabeledSurface.of_run(run) if is_imported(run) else scene_of("diff", run) for run in runs]
+    poses = [read_tum(run / TRAJECTORY)[1] for run in runs if not is_imported(run)]
+    if not poses:
+        raise DataError(
+            f"diff: expected a run with {TRAJECTORY}, whose poses show observed space, got two imported maps; compare "
+            "each with a run"
+        )
+    return [Visit(scene, of_run) for scene, of_run in zip(scenes, [poses[0], poses[-1]], strict=True)]
+
+
+def is_imported(run: Path) -> bool:
+    """Return True for the run directory of an imported map."""
+    metrics = read_json(run / METRICS) if path_exists(run / METRICS) else None
+    return isinstance(metrics, dict) and metrics.get("pose_source") == EXTERNAL
 
 
 def in_world(run: Path, world: Path) -> bool:
     """Return True if two runs are known to have the same world frame.
 
     This is the case if `run` was localized in `world`, resumed it or is an edit of it, or if both used ground-truth
-    poses.
+    poses. Imported maps are in the world frame of these poses.
     """
     config = load_yaml(run / CONFIG) if path_exists(run / CONFIG) else None
     worlds = [config.get(key) for key in ("localize_in", "resume_from")] if isinstance(config, DictConfig) else []
@@ -74,7 +86,15 @@ def in_world(run: Path, world: Path) -> bool:
         worlds.append(records[0].get(EDITED_FROM))
     if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in worlds):
         return True
-    return all(isinstance(record, dict) and record.get("pose_source") == "ground_truth" for record in records)
+    shared = ("ground_truth", EXTERNAL)
+    return all(isinstance(record, dict) and record.get("pose_source") in shared for record in records)
+
+
+def world_fix(before: Path, after: Path) -> str:
+    """Return the fix for two runs with different world frames."""
+    if is_imported(before) or is_imported(after):
+        return "import the map with --transform, or run the other map with tracker=ground_truth"
+    return f"run it again with localize_in={before}, or run both with tracker=ground_truth"
 
 
 def line(change: Change) -> str:

@@ -98,10 +98,13 @@ def reproduce_all(folder: Path, overrides: Sequence[str], row: str | None, out: 
 def _is_different(record: Record, overrides: Sequence[str], repeated: Path | None) -> bool:
     """Run a stored run again in the folder `repeated`, and return True if the results differ.
 
-    Without a folder, the run is not repeated. The result is then True if anything has changed since the run.
+    Without a folder, the run is not repeated. Imported maps are never repeated. The result is then True if anything has
+    changed since the run.
     """
     changed = _print_changes(record)
-    if repeated is None:
+    if record.is_imported:
+        print(f"{record.directory.name}: imported map, not run again")
+    if repeated is None or record.is_imported:
         return changed
     _run_again(record, overrides, repeated)
     found = Reproduction.of(record.directory, repeated)

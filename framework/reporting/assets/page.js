@@ -111,7 +111,7 @@ class Page {
     byId("time").value = thousandths;
     this.viewer.setTime(thousandths >= 1000 ? 1 : thousandths / 1000);
     const step = Math.min(frames.length - 1, Math.floor((thousandths / 1000) * frames.length));
-    byId("time-value").textContent = `frame ${frames[step]}`;
+    byId("time-value").textContent = frames.length ? `frame ${frames[step]}` : "no trajectory";
   }
 
   play() {
@@ -185,18 +185,17 @@ class Page {
       copy.loading = "eager";
       parts.push(copy, made("p", "source", object.source === "map" ? "rendered from the map" : `from ${object.source}`));
     }
-    parts.push(made("h4", "", "Class probabilities"));
     const likely = object.probabilities.filter(([, share], k) => k < 2 || share >= 0.005);
     const bars = likely.flatMap(([name, share]) => [
       made("span", "", name), meter(share), made("span", "", share < 0.005 ? "<0.01" : share.toFixed(2)),
     ]);
-    parts.push(made("div", "bars", ...bars));
+    if (bars.length) parts.push(made("h4", "", "Class probabilities"), made("div", "bars", ...bars));
     const facts = [
       ["Confidence", object.confidence.toFixed(2)],
       ["Size", object.size],
       ["Position", object.place],
       ["Height", object.height],
-      ["Seen in", `${object.observations} frames`],
+      ["Seen in", object.observations && `${object.observations} frames`],
       ["Frames", object.frames],
       ["Truth", object.truth],
     ];

@@ -313,3 +313,13 @@ def test_ply_arrays_do_not_reference_file_buffer(tmp_path):
     for array in (mesh.vertices, mesh.properties["label"]):
         assert array.flags.owndata
         assert array.flags.writeable
+
+
+def test_face_properties_belong_to_all_triangles_of_a_face(tmp_path: Path) -> None:
+    header = TRIANGLE[: TRIANGLE.index(b"end_header")].replace(b"vertex 3", b"vertex 4").replace(b"face 1", b"face 2")
+    rows = b"0 0 0 1\n1 0 0 2\n0 1 0 3\n1 1 0 4\n4 0 1 3 2 7\n3 0 1 2 9\n"
+    (tmp_path / "mesh.ply").write_bytes(header + b"property int object_id\nend_header\n" + rows)
+    mesh = read_ply(tmp_path / "mesh.ply")
+    assert mesh.triangles.tolist() == [[0, 1, 3], [0, 3, 2], [0, 1, 2]]
+    assert mesh.triangle_properties["object_id"].tolist() == [7, 7, 9]
+    assert mesh.properties.keys() == {"label"}

@@ -12,9 +12,10 @@ from framework.data import Camera, InstanceMesh
 from framework.geometry import inverse, project, transform
 from framework.rendering import overview
 from framework.rendering.ambient_occlusion import openness
+from framework.rendering.camera_path import PATH_END, PATH_START
 from framework.rendering.palette import instance_colors
 from framework.rendering.surface import FrontSides, Surface
-from framework.rendering.viewpoint import _visible, best_view, fitted, looking, upward
+from framework.rendering.viewpoint import _visible, best_view, fitted, looking, surrounding_poses, upward
 from tests.support.scenes.boxes_room import Z_UP, furnished, walk
 
 RNG = np.random.default_rng(0)
@@ -177,3 +178,26 @@ def test_comparison_differs_only_in_changed_instance(tmp_path: Path) -> None:
     v, u = np.nonzero(changed)
     box = changed[v.min() : v.max() + 1, u.min() : u.max() + 1]
     assert box.mean() > 0.4, "expected a single changed region"
+
+
+@pytest.mark.parametrize("R", [Z_UP, Y_UP, Y_DOWN], ids=["z-up", "y-up", "y-down"])
+@pytest.mark.parametrize("flipped", [False, True])
+def test_surrounding_poses_see_the_front_of_a_room(R: np.ndarray, flipped: bool) -> None:
+    mesh = furnished(R)
+    poses = surrounding_poses(mesh.vertices, R @ [0.0, 0, 1])
+    triangles = mesh.triangles[:, ::-1] if flipped else mesh.triangles
+    surface = Surface.seen_from(mesh.vertices, triangles, poses)
+    np.testing.assert_array_equal(surface.face_normals, Surface(mesh.vertices, mesh.triangles).face_normals)
+    np.testing.assert_allclose(upward(poses, surface), R @ [0, 0, 1], atol=1e-3)
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    assert ((poses[:, :3, 3] > low) & (poses[:, :3, 3] < high)).all()
+
+
+def test_overview_without_poses_shows_map_without_path() -> None:
+    mesh = furnished()
+    names = {1: ("chair", 0.9)}
+    image = overview.overview(mesh, names, np.zeros((0, 4, 4)), "title")
+    assert image.shape == overview.overview(mesh, names, walk(), "title").shape
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 1000  # not a text panel
+    path = (np.array(PATH_START), np.array(PATH_END))
+    assert not any((image == color).all(axis=-1).any() for color in path)

@@ -238,3 +238,27 @@ def test_rows_share_data_of_equal_sequence_and_ground_truth() -> None:
     assert not of("011").shares_data(of("016"))
     assert not of("011").shares_data(of("011", truth="u"))
     assert not of("011").shares_data(RunRow("", {("1",): record({})}))
+
+
+def imported(name: str, config: dict[str, Any]) -> Record:
+    """Return the record of an imported map, whose stages are "external"."""
+    mapped = record({"row": name, **config}, dataset="desk", detector="external", tracker="external", fuser="external")
+    return replace(mapped, metrics=mapped.metrics | {"pose_source": "external"})
+
+
+def test_imported_map_is_named_row_next_to_unnamed_runs() -> None:
+    ours = [record({"seed": seed}, dataset="desk", detector="mask_rcnn", tracker="icp") for seed in (0, 1)]
+    assert names([*ours, imported("Kimera", {"seed": 0})]) == {"InstanceMap": [("0",), ("1",)], "Kimera": [("0",)]}
+    other = record({"seed": 0}, dataset="desk", detector="yolo", tracker="icp")
+    assert list(names([*ours, other, imported("Kimera", {"seed": 0})])) == [
+        "detector=mask_rcnn",
+        "detector=yolo",
+        "Kimera",
+    ]
+
+
+def test_imported_map_does_not_split_experiment_rows() -> None:
+    choices = {"dataset": "desk", "detector": "mask_rcnn", "tracker": "icp", "fuser": "tsdf"}
+    ours = [record({"row": row, "seed": 0, "dataset": {"root": "data"}}, **choices) for row in ("chain", "identity")]
+    other = imported("Kimera", {"seed": 0, "dataset": {"root": "data"}})
+    assert list(names([*ours, other], "chain", "identity")) == ["chain", "identity", "Kimera"]

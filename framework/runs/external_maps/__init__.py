@@ -1,0 +1,1 @@
+"""Import of maps from other systems: labeled meshes, point clouds and instance masks."""

@@ -1,0 +1,178 @@
+"""Conversion of maps from other systems to instance maps with COCO classes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Float32, Float64, Instance, InstanceMesh, Int32, UInt8, check_rigid
+from framework.errors import DataError
+from framework.files.number_lines import read_matrix
+from framework.files.ply import PlyMesh
+from framework.geometry import transform
+from framework.mapping.instances.instance_list import aligned_box, box_around
+from framework.runs.external_maps.external_map import MAX_COORDINATE, UNLABELED, ExternalInstance, ExternalMap
+from framework.vocabulary.label_spaces import COCO, MEANINGS
+
+GRAY = 180  # RGB value of surfaces without colors
+NO_FRAME = -1  # first and last frame of an imported instance
+CHANNELS = ("red", "green", "blue")
+
+
+@dataclass(frozen=True)
+class MapPlacement:
+    """The transform from the coordinates of a file to the world frame, in meters."""
+
+    scale: float = 1.0  # meters per unit of the file, > 0
+    T_world_map: Float64 = field(default_factory=lambda: np.eye(4))  # (4, 4) from the scaled coordinates
+    up: Float64 | None = None  # (3,) up direction in the world frame, a unit vector; None = unknown
+
+    def __post_init__(self) -> None:
+        if not 0 < self.scale < np.inf:
+            raise DataError(f"--scale: expected a positive number of meters per unit, got {self.scale}")
+        check_rigid("--transform", self.T_world_map)
+
+    def placed(self, vertices: Float32) -> Float32:
+        """Return points (V, 3) of the file in the world frame, m.
+
+        Raises:
+            DataError: A coordinate is too large.
+        """
+        points = transform(self.T_world_map, self.scale * vertices.astype(np.float64))
+        if np.abs(points).max(initial=0) > MAX_COORDINATE:
+            raise DataError(
+                f"map: expected coordinates of at most {MAX_COORDINATE:g} m, got {np.abs(points).max():g} m; set "
+                "--scale to the number of meters per unit"
+            )
+        return points.astype(np.float32)
+
+
+def read_transform(path: Path) -> Float64:
+    """Read a rigid transform (4, 4) from a text file with four lines of four numbers.
+
+    Raises:
+        DataError: The file is invalid, or the transform is not rigid.
+    """
+    return read_matrix(path).pose()
+
+
+@dataclass(frozen=True)
+class ConvertedMap:
+    """A map with COCO classes in the world frame."""
+
+    mesh: InstanceMesh  # a point cloud has no triangles
+    instances: Mapping[int, Instance]
+    remarks: tuple[str, ...]  # changes and assumptions, for the user
+
+    @classmethod
+    def of(cls, external: ExternalMap, placement: MapPlacement) -> ConvertedMap:
+        """Convert the map of another system.
+
+        Instances without a COCO class are left out, except in a map without classes. At a point of several instances,
+        the instance with the highest confidence is kept; of equal confidences, the one with the lowest id. An unknown
+        confidence is 1. Class distributions are unknown, so the class of an instance has the probability 1.
+
+        Raises:
+            DataError: No instance is left, or a coordinate is too large.
+        """
+        remarks = []
+        names = () if all(one.label is None for one in external.instances.values()) else COCO
+        classes = {key: coco_class(one) for key, one in external.instances.items()}
+        kept = {key: one for key, one in external.instances.items() if not names or classes[key] is not None}
+        if remark := _left_out(external.instances, kept):
+            remarks.append(remark)
+        if not kept:
+            found = remarks[0] if remarks else "no instances"
+            raise DataError(f"map: expected an instance with a COCO class, got none ({found})")
+        if unknown := sum(one.confidence is None for one in kept.values()):
+            remarks.append(f"confidence: unknown for {unknown} instances, set to 1; AP ranks equal confidences by id")
+        vertices = placement.placed(external.surface.vertices)
+        ids = _painted(len(vertices), kept)
+        if overlapping := sum(len(one.vertices) for one in kept.values()) - int(np.count_nonzero(ids)):
+            remarks.append(f"overlaps: removed {overlapping} labels at points of several instances")
+        instances = {
+            key: _instance(key, one, names, classes[key], vertices, ids, placement.up)
+            for key, one in sorted(kept.items())
+        }
+        mesh = InstanceMesh(
+            vertices=vertices,
+            triangles=external.surface.triangles,
+            colors=_colors(external.surface),
+            instance_ids=ids,
+            class_ids=_class_ids(ids, instances),
+            classes=names,
+        )
+        return cls(mesh, instances, tuple(remarks))
+
+
+def coco_class(instance: ExternalInstance) -> str | None:
+    """Return the COCO class of an instance, or None without one. Case and text after a comma are ignored."""
+    return None if instance.label is None else MEANINGS.get(instance.label.partition(",")[0].strip().lower())
+
+
+def _left_out(instances: Mapping[int, ExternalInstance], kept: Mapping[int, ExternalInstance]) -> str:
+    counts = Counter(one.label or UNLABELED for key, one in instances.items() if key not in kept)
+    if not counts:
+        return ""
+    listed = ", ".join(f"{name} ({count})" for name, count in counts.most_common(12))
+    rest = f" and {len(counts) - 12} more classes" if len(counts) > 12 else ""
+    return f"left out: {counts.total()} of {len(instances)} instances without a COCO class: {listed}{rest}"
+
+
+def _painted(points: int, instances: Mapping[int, ExternalInstance]) -> Int32:
+    """Return the instance (V,) of each point, 0 = none."""
+    ids = np.zeros(points, np.int32)
+    for key, one in sorted(instances.items(), key=lambda item: (_confidence(item[1]), -item[0])):
+        ids[one.vertices] = key
+    return ids
+
+
+def _confidence(instance: ExternalInstance) -> float:
+    return 1.0 if instance.confidence is None else instance.confidence
+
+
+def _instance(
+    key: int,
+    external: ExternalInstance,
+    names: tuple[str, ...],
+    name: str | None,
+    vertices: Float32,
+    ids: Int32,
+    up: Float64 | None,
+) -> Instance:
+    own = external.vertices[ids[external.vertices] == key]
+    points = vertices[own if len(own) else external.vertices]  # boxes of covered instances contain the whole mask
+    return Instance(
+        id=key,
+        class_probabilities=np.array([other == name for other in names], np.float32),
+        confidence=_confidence(external),
+        observations=0,
+        first_frame=NO_FRAME,
+        last_frame=NO_FRAME,
+        vertices=own,
+        aabb=aligned_box(points),
+        obb=box_around(points, up),
+    )
+
+
+def _class_ids(ids: Int32, instances: Mapping[int, Instance]) -> Int32:
+    """Return the class (V,) of each point, -1 = none."""
+    class_ids = np.full(len(ids), -1, np.int32)
+    for one in instances.values():
+        if len(one.class_probabilities):
+            class_ids[one.vertices] = int(one.class_probabilities.argmax())
+    return class_ids
+
+
+def _colors(surface: PlyMesh) -> UInt8:
+    """Return the colors (V, 3) of a surface, GRAY without colors. Floating-point colors are in [0, 1]."""
+    if not all(channel in surface.properties for channel in CHANNELS):
+        return np.full((len(surface.vertices), 3), GRAY, np.uint8)
+    values = np.stack([surface.properties[channel] for channel in CHANNELS], axis=1)
+    if values.dtype.kind == "f":
+        values = np.rint(255 * values.astype(np.float64))
+    return np.clip(values, 0, 255).astype(np.uint8)

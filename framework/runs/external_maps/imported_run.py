@@ -1,0 +1,148 @@
+"""Writing of a run directory for the map of another system.
+
+The directory contains the mesh, the instances, the overview image, the config of the dataset, the metrics and the
+manifest. It has no trajectory, run times or map.npz.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from framework.config.composition import composed_with_choices, resolved
+from framework.data import Float64
+from framework.errors import ConfigError
+from framework.evaluation.instances import PredictedInstances
+from framework.files.atomic_write import atomic_write
+from framework.files.hashing import path_hash
+from framework.files.json_file import write_json
+from framework.interfaces import RGBDVideo
+from framework.mapping.gravity import floor_height
+from framework.registry import STAGES, build
+from framework.rendering.overview import write_overview
+from framework.runs.external_maps.conversion import ConvertedMap
+from framework.runs.inputs import INPUTS, hash_of, input_hashes
+from framework.runs.instances_file import NO_CLASS, write_instances
+from framework.runs.manifest import Manifest, RunStatus
+from framework.runs.mesh_file import write_mesh
+from framework.runs.metrics import Metrics, class_name, evaluation_metrics
+from framework.runs.provenance import code_version, config_hash, parameters_of
+from framework.runs.run_directory import headline, likely_labels
+from framework.runs.stored_runs import CHOICE, CONFIG, EXTERNAL, INSTANCES, MESH, METRICS, RESULT_FILES
+
+ORIGIN = "external."  # prefix of the import options in metrics.json and manifest.json
+NO_POSES = np.zeros((0, 4, 4))
+
+
+@dataclass(frozen=True)
+class MappedData:
+    """The dataset of the map of another system."""
+
+    dataset: Mapping[str, Any]  # resolved config; empty = unknown dataset
+    option: str | None  # chosen option of the config group `dataset`; None = unknown dataset
+    seed: int  # seed of the runs that are compared in pairs with the map
+
+    @classmethod
+    def of(cls, overrides: Sequence[str]) -> MappedData:
+        """Return the dataset of overrides such as `dataset=rgbd_folder` and `dataset.root=DIR`.
+
+        Raises:
+            ConfigError: An override is invalid, or is not an override of the dataset or the seed.
+        """
+        keys = [word.partition("=")[0].lstrip("+~") for word in overrides]
+        for word, key in zip(overrides, keys, strict=True):
+            if "=" not in word or key.partition(".")[0] not in ("dataset", "seed"):
+                raise ConfigError(f"import-map: expected dataset=NAME, dataset.KEY=VALUE or seed=N, got {word!r:.60}")
+        if any(key.startswith("dataset.") for key in keys) and "dataset" not in keys:
+            raise ConfigError(f"import-map: expected dataset=NAME, got only {', '.join(overrides)}; add dataset=NAME")
+        config, choices = composed_with_choices(*overrides)
+        plain = resolved(config)
+        if "dataset" not in keys:
+            return cls({}, None, plain["seed"])
+        return cls(plain["dataset"], choices["dataset"], plain["seed"])
+
+
+def write_imported_run(
+    directory: Path,
+    name: str,
+    converted: ConvertedMap,
+    data: MappedData,
+    up: Float64 | None,
+    options: Mapping[str, str | Path | float | None],
+) -> str:
+    """Write the run directory of an imported map, and evaluate it if the dataset has ground-truth instances.
+
+    Args:
+        directory: The new run directory.
+        name: Name of the row in tables.
+        converted: The map.
+        data: The dataset of the map.
+        up: Up direction (3,) in the world frame, a unit vector; None = unknown.
+        options: The options of the import by name. The hashes of files are stored.
+
+    Returns:
+        The main metrics as one line of text.
+
+    Raises:
+        InstanceMapError: The dataset cannot be read, or a file cannot be written.
+    """
+    config = {"row": name, "seed": data.seed, **({"dataset": dict(data.dataset)} if data.dataset else {})}
+    video = build(RGBDVideo, OmegaConf.create(dict(data.dataset))) if data.dataset else None
+    given = {f"{ORIGIN}{key}": value for key, value in options.items() if value is not None}
+    files = {key: value for key, value in given.items() if isinstance(value, Path)}
+    inputs = {**input_hashes(config), **{key: path_hash(path) for key, path in files.items()}}
+    found: Metrics = {
+        "sequence": name if video is None else video.name,
+        f"{CHOICE}dataset": data.option,
+        **{f"{CHOICE}{stage}": EXTERNAL for stage in STAGES if stage != "dataset"},
+        "pose_source": EXTERNAL,
+        **_up_metrics(converted, up),
+        "instances.count": len(converted.instances),
+        **({} if video is None else _evaluation(video, converted)),
+        "seed": data.seed,
+        "config_hash": config_hash(config),
+        INPUTS: hash_of(inputs),
+        **{key: value if isinstance(value, int | float) else str(value) for key, value in given.items()},
+        **code_version(),
+    }
+    title = headline({**found, "sequence": f"{name} | {found['sequence']}"} if video else found)
+    directory.mkdir(parents=True, exist_ok=True)
+    with atomic_write(directory / CONFIG) as temporary:
+        OmegaConf.save(OmegaConf.create(config), temporary)
+    mesh, instances = converted.mesh, converted.instances
+    write_mesh(directory / MESH, mesh)
+    write_instances(directory / INSTANCES, mesh, instances, mesh.classes)
+    write_overview(directory / "overview.png", mesh, likely_labels(instances, mesh.classes), NO_POSES, title, up)
+    write_json(directory / METRICS, found)
+    parameters = parameters_of(config) | {key: str(value) for key, value in given.items()}
+    manifest = Manifest(RunStatus.COMPLETE, {}, inputs, parameters)
+    manifest.with_files(directory, [*RESULT_FILES, METRICS]).write(directory)
+    return title
+
+
+def _evaluation(video: RGBDVideo, converted: ConvertedMap) -> Metrics:
+    """Return the instance metrics of a map in the world frame of the ground truth, {} without ground truth."""
+    truth = video.scene_truth()
+    if truth is None:
+        return {}
+    instances = converted.instances
+    predictions = PredictedInstances.on_mesh(
+        converted.mesh,
+        list(instances),
+        [one.confidence for one in instances.values()],
+        [class_name(one, converted.mesh.classes) or NO_CLASS for one in instances.values()],
+    )
+    return evaluation_metrics(predictions, truth, truth, video.annotation)
+
+
+def _up_metrics(converted: ConvertedMap, up: Float64 | None) -> Metrics:
+    if up is None:
+        return {}
+    figures: Metrics = {f"map.up.{axis}": float(value) for axis, value in zip("xyz", up, strict=True)}
+    floor = floor_height(converted.mesh.vertices, converted.mesh.triangles, up)
+    return figures | {"up_from": "option", "map.floor_m": floor}

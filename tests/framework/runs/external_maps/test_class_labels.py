@@ -1,0 +1,73 @@
+"""Tests for label spaces and label files of external maps."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from framework.errors import ConfigError, DataError
+from framework.runs.external_maps.class_labels import ClassNames, InstanceLabel, read_labels_by_id
+
+
+def written(path: Path, content: object) -> Path:
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def test_label_space_ids_start_at_zero_except_nyu40() -> None:
+    assert ClassNames.of("coco").name("x", 0) == "person"
+    assert ClassNames.of("nyu40").name("x", 1) == "wall"
+    assert ClassNames.of("nyu40").name("x", 40) == "otherprop"
+
+
+def test_label_space_file_has_one_name_per_id(tmp_path: Path) -> None:
+    assert ClassNames.of(str(written(tmp_path / "names.txt", "forklift\npallet\n"))).name("x", 1) == "pallet"
+    assert ClassNames.of(str(written(tmp_path / "a.json", ["forklift", "pallet"]))).name("x", 1) == "pallet"
+    assert ClassNames.of(str(written(tmp_path / "b.json", {"1163": "pallet"}))).name("x", 1163) == "pallet"
+
+
+def test_unknown_label_space_names_the_option() -> None:
+    with pytest.raises(ConfigError, match="--label-space: expected one of coco"):
+        ClassNames.of("nyu41")
+
+
+@pytest.mark.parametrize("content", [{"chair": 3}, {"3": 4}, {}, 3])
+def test_invalid_names_are_error(content: object, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="expected a"):
+        ClassNames.of(str(written(tmp_path / "names.json", content)))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        [{"id": 3, "class": "chair", "confidence": 0.5, "vertices": 7}, {"id": 12, "class": "sofa"}],
+        {"3": {"class": "chair", "confidence": 0.5}, "12": "sofa"},
+    ],
+    ids=["list", "object"],
+)
+def test_labels_by_id_are_read(content: object, tmp_path: Path) -> None:
+    found = read_labels_by_id(written(tmp_path / "labels.json", content), None)
+    assert found == {3: InstanceLabel("chair", 0.5), 12: InstanceLabel("sofa", None)}
+
+
+def test_labels_without_classes_have_no_name(tmp_path: Path) -> None:
+    path = written(tmp_path / "labels.csv", "id,confidence\n3,0.5\n")
+    assert read_labels_by_id(path, None) == {3: InstanceLabel(None, 0.5)}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([{"id": 3}, {"id": 3}], "entry 2: id: expected unique ids, got 3 twice"),
+        ([{"class": "chair"}], "entry 1: id: expected an integer, got None"),
+        ([{"id": 3, "confidence": 2}], "entry 1: confidence: expected a number in"),
+        ([{"id": 3, "confidence": True}], "entry 1: confidence: expected a number in"),
+        (["chair"], "entry 1: expected a JSON object"),
+        ("3", "expected a JSON array or object of instances"),
+    ],
+)
+def test_invalid_labels_are_error(content: object, message: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=message):
+        read_labels_by_id(written(tmp_path / "labels.json", content), None)
