@@ -21,8 +21,9 @@
     mesh = scene.mesh()  # vertices, triangles, color, instance and class of each vertex; scene.mesh(it) for one object
     view = scene.view(camera, T_world_camera)  # rendered depth, normals, color and instances
 
-`export("outputs/demo", "glb", "usd")` writes files in standard formats. `query("outputs/demo", "a red chair").objects`
-lists the matching objects, best match first. `load_runs("multirun/sweep")` returns the runs of a sweep as a data frame.
+`export("outputs/demo", "glb", "usd")` writes files in standard formats. `edit("outputs/demo", [{"delete": [9]}])`
+corrects the instances of a run. `query("outputs/demo", "a red chair").objects` lists the matching objects, best match
+first. `load_runs("multirun/sweep")` returns the runs of a sweep as a data frame.
 
 A Mapper is thread-safe; queries wait until the current frame is mapped.
 

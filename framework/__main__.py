@@ -23,6 +23,7 @@ COMMANDS = {
     "import": "convert a phone or sensor recording to an RGB-D folder for dataset=rgbd_folder",
     "check": "validate an RGB-D sequence and suggest parameter fixes",
     "diff": "list objects that appeared, vanished or moved between two runs",
+    "edit": "merge, split, rename and delete instances of a run, for use as ground truth",
     "export": "export a run to standard 3D and map formats: GLB, USD, PLY, OBJ, ROS map, scene graph",
     "bundle": "pack the runs, tables and plugin code of an experiment into a ZIP file",
     "reproduce": "run stored runs or a bundle again and compare the results",
@@ -45,7 +46,7 @@ COMMANDS = {
 FOLDERS = {
     "running": ("run", "detect", "show-refinement"),
     "results": (
-        *("tables", "figures", "raycast", "report", "diff", "export", "query"),
+        *("tables", "figures", "raycast", "report", "diff", "edit", "export", "query"),
         *("import-map", "evaluate", "bundle", "reproduce"),
     ),
     "recordings": ("import", "check", "synthesize", "convert-oni"),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from weakref import finalize
 
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -91,6 +92,7 @@ __all__ = [
     "View",
     "Viewer",
     "configure_process",
+    "edit",
     "export",
     "load_map",
     "load_runs",
@@ -373,6 +375,33 @@ def export(
     kinds = [exports.one_of(exports.ExportFormat, "a format", one) for one in formats]
     chosen = exports.Chosen.named(objects, **choices)
     return exports.export(Path(run), kinds, None if out is None else Path(out), chosen, up, floor)
+
+
+def edit(run: Path | str, edits: Sequence[Mapping[str, Any]] | Path | str, out: Path | str | None = None) -> Path:
+    """Merge, split, rename and delete instances of a run, and write a new run directory with the edited map.
+
+    Example: `edit("outputs/demo", [{"merge": [3, 7]}, {"rename": [4, "chair"]}])`.
+
+    Args:
+        run: The run directory.
+        edits: The edits, in order: entries as in the file format of `instancemap edit --edits`, or such a file.
+        out: The new run directory; None = the run directory with the suffix `_edited`.
+
+    Returns:
+        The new run directory.
+
+    Raises:
+        ConfigError: The new run directory is not empty.
+        DataError: The run cannot be edited, or an edit is invalid.
+    """
+    from framework.editing import edited_run
+    from framework.editing.edits import edits_of, read_edits
+
+    directory = edited_run.default_directory(Path(run)) if out is None else Path(out)
+    edited_run.check_empty(directory)
+    entries = read_edits(Path(edits)) if isinstance(edits, str | Path) else edits_of("edits", edits)
+    edited_run.EditedRun.of(Path(run), entries).write(directory)
+    return directory
 
 
 def query(run: Map | Path | str, words: str, by: str | None = None, model: Path | str | None = None) -> QueryResult:

@@ -12,7 +12,7 @@ This is the format for your own data:
     gravity.txt         optional; x y z, one line per frame: up direction in the camera frame, from a sensor;
                         nan nan nan = unknown
     instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class = a
-                                            COCO name, or null = unknown
+                                            COCO name or another name, null = unknown
 
 The files of a frame have the same number in their names. Numbers may start at any value and have gaps. Names with
 timestamps, such as 1305031102.175304.png, are invalid. Line k of poses.txt, timestamps.txt and gravity.txt belongs to

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib as mpl
@@ -24,6 +25,15 @@ LEGEND_ROW = 30  # px, height of a row of the legend
 LEGEND_COLUMNS, LEGEND_ROWS = 9, 4
 PNG_LEVEL = 3  # zlib level; the default of 6 is much slower for a 3% smaller file
 LABEL_PX, LEGEND_PX, TITLE_PX = 17, 17, 22  # font sizes
+
+
+@dataclass(frozen=True)
+class InstanceState:
+    """The instances of a mesh before or after a change."""
+
+    title: str
+    ids: Int32  # (V,) instance of each vertex, 0 = none
+    names: Mapping[int, str]  # label of each instance in `ids`
 
 
 def write_overview(
@@ -74,6 +84,33 @@ def overview(
     return np.concatenate([_text_panel(title, TITLE_HEIGHT, 24, INK, "lm"), panels, legend])
 
 
+def write_comparison(path: Path, mesh: InstanceMesh, states: Sequence[InstanceState], poses: Float64) -> None:
+    """Write an image of the instances of a mesh in different states, side by side, as a PNG file.
+
+    Instances with the same id have the same color.
+
+    Args:
+        path: The output file.
+        mesh: The mesh of the map, with triangles.
+        states: The states of the instances.
+        poses: The camera poses (F, 4, 4) of the mapped frames.
+    """
+    centroids: dict[int, Float64] = {}
+    for state in states:
+        for key in state.names:
+            centroids.setdefault(key, mesh.vertices[state.ids == key].mean(axis=0, dtype=np.float64))
+    places = np.array([*centroids.values()], np.float64).reshape(-1, 3)
+    colors = dict(zip(centroids, instance_colors(places), strict=True))
+    surface = Surface.seen_from(mesh.vertices, mesh.triangles, poses)
+    view = LitView(surface, *best_view(surface, states[0].ids, poses, PANEL_WIDTH, PANEL_HEIGHT))
+    columns = []
+    for state in states:
+        title = _text_panel(state.title, TITLE_HEIGHT, 24, INK, "lm", PANEL_WIDTH)
+        columns.append(np.concatenate([title, _instance_panel(view, mesh, state.ids, state.names, colors)]))
+    with atomic_write(path) as temporary:
+        Image.fromarray(np.concatenate(columns, axis=1)).save(temporary, "PNG", compress_level=PNG_LEVEL)
+
+
 def _panels(
     mesh: InstanceMesh,
     ids: Int32,
@@ -87,18 +124,33 @@ def _panels(
     camera, T_world_camera = best_view(surface, ids, views, PANEL_WIDTH, PANEL_HEIGHT)
     view = LitView(surface, camera, T_world_camera)
     left = Image.fromarray(view.in_colors(mesh.colors))
-    right = Image.fromarray(view.in_instances(mesh.colors, ids, colors))
-    if len(path):
-        projected = ProjectedPath.of(path, camera, T_world_camera, view.hits)
+    projected = ProjectedPath.of(path, camera, T_world_camera, view.hits) if len(path) else None
+    if projected is not None:
         projected.draw(left)
-        projected.draw(right)
+    return np.concatenate([np.asarray(left), _instance_panel(view, mesh, ids, names, colors, projected)], axis=1)
+
+
+def _instance_panel(
+    view: LitView,
+    mesh: InstanceMesh,
+    ids: Int32,
+    names: Mapping[int, str],
+    colors: Mapping[int, UInt8],
+    path: ProjectedPath | None = None,
+) -> UInt8:
+    """Return the image of a view in instance colors, with names and optionally the camera path."""
+    image = Image.fromarray(view.in_instances(mesh.colors, ids, colors))
+    if path is not None:
+        path.draw(image)
     font = _font(LABEL_PX)
-    draw_labels(right, place_labels(view.hits.nearest(ids), names, lambda text: text_size(text, font)), font)
-    return np.concatenate([np.asarray(left), np.asarray(right)], axis=1)
+    draw_labels(image, place_labels(view.hits.nearest(ids), names, lambda text: text_size(text, font)), font)
+    return np.asarray(image)
 
 
-def _text_panel(text: str, height: int, x: int, ink: tuple[int, int, int], anchor: str) -> UInt8:
-    image = Image.new("RGB", (2 * PANEL_WIDTH, height), PAPER)
+def _text_panel(
+    text: str, height: int, x: int, ink: tuple[int, int, int], anchor: str, width: int = 2 * PANEL_WIDTH
+) -> UInt8:
+    image = Image.new("RGB", (width, height), PAPER)
     ImageDraw.Draw(image).text((x, height / 2), text, ink, _font(TITLE_PX), anchor=anchor)
     return np.asarray(image)
 

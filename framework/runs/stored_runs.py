@@ -55,6 +55,7 @@ RESULT_FILES = (CONFIG, *MAPPED, KEYFRAMES, DIGESTS, ENVIRONMENT)
 
 EVALUATION = "evaluation."  # prefix of keys about the last re-evaluation
 GROUND_TRUTH = EVALUATION + "ground_truth"  # key of the last re-evaluated `dataset.ground_truth`; optional
+EDITED_FROM = "edited_from"  # key with the path of the run that `instancemap edit` has edited; optional
 
 EXTERNAL = "external"  # value of `pose_source` and of the chosen stages of an imported map
 CHOICE = "choice."  # prefix of the chosen options in metrics.json
@@ -97,6 +98,11 @@ class Record:
     def annotation(self) -> str:
         """Release of the ground truth, or "" if unknown."""
         return str(self.metrics.get("annotation_release") or "")
+
+    @property
+    def edited(self) -> str:
+        """Description of an edited run, or "" for an unedited run."""
+        return f"edited map of {self.metrics[EDITED_FROM]}" if EDITED_FROM in self.metrics else ""
 
     @property
     def is_imported(self) -> bool:
@@ -210,17 +216,25 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
 
 
 def completed_runs(root: Path) -> tuple[list[Record], list[Incomplete]]:
-    """Return the completed and the incomplete runs in a folder that contains at least one completed run.
+    """Return the completed and the other runs in a folder that contains at least one completed run.
+
+    Edited runs are among the other runs.
 
     Raises:
         DataError: The folder is missing or contains no completed run.
     """
     if not root.is_dir():
         raise DataError(f"{root}: expected a folder of runs, got no folder")
-    records, incomplete = find_records(root)
+    records, incomplete = without_edited(*find_records(root))
     if not records:
         raise no_run_error(root, incomplete)
     return records, incomplete
+
+
+def without_edited(records: Sequence[Record], others: Sequence[Incomplete]) -> tuple[list[Record], list[Incomplete]]:
+    """Move edited runs to the other runs, because manually corrected maps are no results of a method."""
+    edited = [Incomplete(one.directory, one.edited) for one in records if one.edited]
+    return [one for one in records if not one.edited], [*others, *edited]
 
 
 def no_run_error(root: Path, incomplete: Sequence[Incomplete]) -> DataError:

@@ -1,12 +1,16 @@
-"""Label spaces and their mapping to COCO names.
+"""Label spaces, and the class names of detectors.
 
-Datasets and detectors use COCO names. `label_spaces.yaml` maps the names of other label spaces to COCO names.
+By default, datasets and detectors use COCO names. `label_spaces.yaml` maps the names of other label spaces to COCO
+names. A detector with classes outside of these label spaces keeps its own names.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -41,26 +45,36 @@ SCENENN_TO_COCO = {name: coco for name, coco in _SECTIONS["scenenn"].items() if 
 MEANINGS: Mapping[str, str | None] = {name: coco for names in _SECTIONS.values() for name, coco in names.items()}
 """COCO names by lower-case name in any space; None = no object class of COCO."""
 
+log = logging.getLogger(__name__)
+
+
+class ClassNames(Enum):
+    """Class names of a detector."""
+
+    AUTO = "COCO names for the names of known label spaces, otherwise the names of the label space"
+    COCO = "COCO names; classes without a COCO name are removed"
+    OWN = "the names of the label space"
+
 
 @dataclass(frozen=True)
 class LabelMapping:
-    """Mapping from the C labels of a detector to C' COCO names."""
+    """Mapping from the C labels of a detector to C' class names."""
 
-    classes: tuple[str, ...]  # (C',) COCO names of the labels, in COCO's order
-    meaning: Int32  # (C,) index of each label in `classes`; -1 = no object class of COCO
+    classes: tuple[str, ...]  # (C',) distinct class names
+    meaning: Int32  # (C,) index of each label in `classes`; -1 = none
 
     def apply(self, probabilities: Float32) -> tuple[Float32, Bool]:
-        """Convert label probabilities to distributions over COCO names.
+        """Convert label probabilities to distributions over the class names.
 
-        Probabilities of labels with the same COCO name are added. Labels without a COCO name are removed, and the
+        Probabilities of labels with the same class name are added. Labels without a class name are removed, and the
         result is normalized.
 
         Args:
             probabilities: The probabilities or nonnegative weights (N, C) of the labels.
 
         Returns:
-            The distributions (N, C') over `classes`, and an array (N,) that is True if the best label has a COCO name.
-            A row without COCO names is a uniform distribution.
+            The distributions (N, C') over `classes`, and an array (N,) that is True if the best label has a class name.
+            A row without class names is a uniform distribution.
         """
         has_meaning = self.meaning >= 0
         sums = np.zeros((len(probabilities), len(self.classes)))
@@ -101,6 +115,47 @@ def read_labels(name_or_path: str, key: str = "detector.label_space") -> tuple[s
     return names
 
 
+def to_class_names(labels: Sequence[str], class_names: ClassNames, key: str = "detector.label_space") -> LabelMapping:
+    """Map the labels of a detector to class names.
+
+    Args:
+        labels: The labels.
+        class_names: The kind of class names.
+        key: The config key of the labels, for messages.
+
+    Raises:
+        ConfigError: No label is an object class, or the class names are COCO and a label is unknown.
+    """
+    unknown = [] if class_names is ClassNames.OWN else _unknown(labels)
+    in_coco = any(MEANINGS.get(_key(label)) for label in labels)
+    if class_names is ClassNames.COCO or (class_names is ClassNames.AUTO and in_coco and not unknown):
+        return to_coco(labels, key)
+    if unknown:
+        message = "%s: all names are kept, because %d of %d are in no known label space: %s"
+        log.info(message, key, len(unknown), len(labels), ", ".join(map(with_similar, dict.fromkeys(unknown))))
+    names = [label.strip() for label in labels]
+    classes = tuple(dict.fromkeys(name for name in names if name.lower() != NO_CLASS))
+    if not classes:
+        raise ConfigError(f"{key}: expected at least one class, got none in {len(labels)} labels")
+    index = {name: k for k, name in enumerate(classes)}
+    return LabelMapping(classes, np.array([index.get(name, -1) for name in names], np.int32))
+
+
+def with_similar(name: str) -> str:
+    """Return a quoted name, with the most similar known name if there is one."""
+    close = get_close_matches(_key(name), MEANINGS, n=1, cutoff=0.75)
+    return f"{name!r} (similar to {close[0]!r})" if close else repr(name)
+
+
+def _key(label: str) -> str:
+    """Return a label without case, outer spaces and synonyms after a comma."""
+    return label.partition(",")[0].strip().lower()
+
+
+def _unknown(labels: Sequence[str]) -> list[str]:
+    return [label for label in labels if _key(label) not in MEANINGS]
+
+
 def to_coco(labels: Sequence[str], key: str = "detector.label_space") -> LabelMapping:
     """Map labels to COCO names.
 
@@ -113,14 +168,12 @@ def to_coco(labels: Sequence[str], key: str = "detector.label_space") -> LabelMa
     Raises:
         ConfigError: Labels are unknown, or no label is a COCO class.
     """
-    keys = [label.partition(",")[0].strip().lower() for label in labels]
-    unknown = [label for label, key in zip(labels, keys, strict=True) if key not in MEANINGS]
-    if unknown:
+    if unknown := _unknown(labels):
         raise ConfigError(
             f"{key}: expected names of a label space, got unknown labels ({len(unknown)} of {len(labels)}): "
-            f"{', '.join(map(repr, unknown))}; add them to framework/vocabulary/{Path(__file__).stem}.yaml"
+            f"{', '.join(map(repr, unknown))}; set detector.class_names=OWN to keep all names"
         )
-    meanings = [MEANINGS[key] for key in keys]
+    meanings = [MEANINGS[_key(label)] for label in labels]
     classes = tuple(name for name in COCO if name in meanings)
     if not classes:
         raise ConfigError(f"{key}: expected at least one object class of COCO, got none in {len(labels)} labels")

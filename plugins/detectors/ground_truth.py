@@ -11,7 +11,7 @@ from framework.data import Detections, Frame
 from framework.detection.masks.binary_masks import tight_boxes
 from framework.detection.true_instances import true_instances
 from framework.interfaces import Detector
-from framework.vocabulary.label_spaces import COCO
+from framework.vocabulary.label_spaces import read_labels
 
 
 @dataclass
@@ -24,10 +24,11 @@ class GroundTruthDetector(Detector):
 
     # minimum number of pixels of a detected instance, >= 1; 64 is about the limit of real detectors
     min_pixels: int = 64
+    label_space: str = "coco"  # class names: a label space such as coco, or a text file with one name per line
 
     def __post_init__(self) -> None:
         require(self.min_pixels >= 1, "detector.min_pixels", self.min_pixels, "at least 1 px")
-        self.classes = COCO
+        self.classes = read_labels(self.label_space)
 
     def detect(self, frame: Frame) -> Detections:
         truth = true_instances(frame, self.classes, self.min_pixels)

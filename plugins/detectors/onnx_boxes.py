@@ -14,7 +14,7 @@ from framework.detection.masks.letterbox import Placement
 from framework.detection.masks.masks_from_boxes import masks_in_boxes
 from framework.detection.runtimes.onnx_network import ImageNetwork
 from framework.interfaces import Detector
-from framework.vocabulary.label_spaces import read_labels, to_coco
+from framework.vocabulary.label_spaces import ClassNames, read_labels, to_class_names
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +35,8 @@ class OnnxBoxes(Detector):
     sha256: str = ""  # expected SHA-256 of the file; "" = not checked
     # class names: a label space such as coco, or a text file with one name per line (n/a = unused index)
     label_space: str = "coco"
+    # class names: COCO, OWN (those of the label space) or AUTO (COCO for names of known label spaces, otherwise OWN)
+    class_names: ClassNames = ClassNames.AUTO
     layout: OutputLayout = OutputLayout.yolox  # layout of the outputs
     # minimum score of a detection, in (0, 1); low, because low-score detections can update existing instances
     score_threshold: float = 0.1
@@ -61,7 +63,7 @@ class OnnxBoxes(Detector):
         check_intervals("detector", self, min_foreground_fraction="[0, 1]", max_slant="(0, 90)", min_readings="[0, 1]")
         check_count("detector.max_detections", self.max_detections, MAX_DETECTIONS)
         self._labels = read_labels(self.label_space)
-        self._meaning = to_coco(self._labels)
+        self._meaning = to_class_names(self._labels, self.class_names)
         self.classes = self._meaning.classes
         self.boxes_without_depth = 0  # number of boxes dropped since construction
         self._network = ImageNetwork(self)

@@ -14,7 +14,7 @@ from framework.detection.masks.letterbox import Placement
 from framework.detection.runtimes.onnx_network import ImageNetwork
 from framework.detection.segmentation_output import BoxKind, detect_layout
 from framework.interfaces import Detector
-from framework.vocabulary.label_spaces import read_labels, to_coco
+from framework.vocabulary.label_spaces import ClassNames, read_labels, to_class_names
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +39,8 @@ class OnnxSegmentation(Detector):
     sha256: str = ""  # expected SHA-256 of the file; "" = not checked
     # class names: a label space such as coco, or a text file with one name per line (n/a = unused index)
     label_space: str = "coco"
+    # class names: COCO, OWN (those of the label space) or AUTO (COCO for names of known label spaces, otherwise OWN)
+    class_names: ClassNames = ClassNames.AUTO
     objectness: bool = False  # True = an objectness score precedes the class scores in the outputs, as in YOLOv5
     box_format: BoxKind = BoxKind.AUTO  # box format: CENTER, CORNER or AUTO (detected)
     # fraction of (1 - score) distributed over the other classes, for networks that report one class, in [0, 1]; 0 =
@@ -64,7 +66,7 @@ class OnnxSegmentation(Detector):
         check_intervals("detector", self, class_spread="[0, 1]", mask_threshold="(0, 1)")
         check_count("detector.max_detections", self.max_detections, MAX_DETECTIONS)
         self._labels = read_labels(self.label_space)
-        self._meaning = to_coco(self._labels)
+        self._meaning = to_class_names(self._labels, self.class_names)
         self.classes = self._meaning.classes
         self._network = ImageNetwork(self)
         self._layout = detect_layout(

@@ -21,7 +21,7 @@ from framework.detection.stored.mask_folder import read_mask_folder
 from framework.detection.stored.stored_detection import StoredDetection
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
-from framework.vocabulary.label_spaces import read_labels, to_coco
+from framework.vocabulary.label_spaces import ClassNames, read_labels, to_class_names
 
 log = logging.getLogger(__name__)
 
@@ -38,8 +38,7 @@ class Precomputed(Detector):
 
     Both formats may contain `class_probabilities` over the names in `label_space`. Without them, a detection with the
     score s gets the probability 1 - class_spread * (1 - s) for its class. The minimum is 1 / (number of classes). The
-    other classes share the rest equally. Labels are mapped to COCO names by `label_spaces.yaml`. A detection is dropped
-    if its best label has no COCO name.
+    other classes share the rest equally. Detections whose best label has no class name are dropped; see `class_names`.
 
     A frame without an entry has no detections. If a frame after the last entry is requested before any frame with an
     entry, the detector raises DataError, because the file belongs to another sequence.
@@ -49,6 +48,8 @@ class Precomputed(Detector):
     path: Path
     # class names: a label space (coco, nyu40, scenenn, ...), or a text file with one name per line
     label_space: str = "coco"
+    # class names: COCO, OWN (those of the label space) or AUTO (COCO for names of known label spaces, otherwise OWN)
+    class_names: ClassNames = ClassNames.AUTO
     category_ids: CategoryIds = CategoryIds.COCO_91  # numbering of category_id
     score_threshold: float = 0.0  # minimum score of a detection, in [0, 1]
     # fraction of (1 - score) distributed over the other classes, for detections with one class, in [0, 1]; 0 = certain
@@ -73,7 +74,7 @@ class Precomputed(Detector):
         probabilities, known = self._distributions(stored)
         if not known.any():
             raise DataError(
-                f"{self.path}: expected detections of COCO classes, got none in {len(stored)} detections; check "
+                f"{self.path}: expected detections of known classes, got none in {len(stored)} detections; check "
                 "detector.label_space"
             )
         if not known.all():
@@ -111,16 +112,16 @@ class Precomputed(Detector):
         )
 
     def _distributions(self, stored: Sequence[StoredDetection]) -> tuple[Float32, Bool]:
-        """Return the class distributions (N, C) over COCO names, and set `classes` to these names.
+        """Return the class distributions (N, C), and set `classes` to the names of their columns.
 
-        The second result is a Boolean array (N,), True for detections whose best label has a COCO name.
+        The second result is a Boolean array (N,), True for detections whose best label has a class name.
         """
         index = {name: k for k, name in enumerate(self._labels)}
         one_hot = np.eye(len(index), dtype=np.float32)
         given = np.stack([one_hot[index[one.label]] if one.probabilities is None else one.probabilities
                           for one in stored])  # fmt: skip
         only_label = np.array([one.probabilities is None for one in stored])
-        mapping = to_coco(self._labels)
+        mapping = to_class_names(self._labels, self.class_names)
         self.classes = mapping.classes
         rows, known = mapping.apply(given)
         if self.classes == self._labels:

@@ -25,7 +25,7 @@ from framework.detection.stored.fingerprint import fingerprint
 from framework.errors import DataError, errors_of
 from framework.files.json_file import read_json
 from framework.interfaces import Detector
-from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS, to_coco
+from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS, ClassNames, to_class_names
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # defaults for files without values
 RESAMPLING = {2: "bilinear", 3: "bicubic"}  # by Pillow's constants
@@ -63,8 +63,8 @@ class TransformersSegmentation(Detector):
 
     A model that is not in the cache of huggingface_hub is downloaded, unless HF_HUB_OFFLINE=1. Use checkpoints for
     instance or panoptic segmentation, because semantic checkpoints have one mask for all objects of a class. Labels are
-    mapped to COCO names (framework/vocabulary/label_spaces.yaml). Detections of other labels, such as walls, are
-    dropped.
+    mapped to COCO names (framework/vocabulary/label_spaces.yaml), and detections of other labels, such as walls, are
+    dropped. `class_names` changes this.
 
     The class distribution of a detection is the softmax over the logits of the labels, without "no object". For
     networks with independent sigmoids, it is the distribution under the condition that exactly one label is true. The
@@ -74,6 +74,8 @@ class TransformersSegmentation(Detector):
 
     model: str = "facebook/mask2former-swin-tiny-coco-instance"  # model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model repository
+    # class names: COCO, OWN (those of the model) or AUTO (COCO for names of known label spaces, otherwise OWN)
+    class_names: ClassNames = ClassNames.AUTO
     # minimum score of a detection, in [0, 1); low, because low-score detections can update existing instances
     score_threshold: float = 0.1
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
@@ -102,7 +104,7 @@ class TransformersSegmentation(Detector):
             require(self._family.any_size, "detector.short_side", short, "0 (this model has a fixed input size)")
             size = {"shortest_edge": short, "longest_edge": long}
             self._preprocessing = replace(self._preprocessing, size=size)
-        self._mapping = to_coco(checkpoint.labels, "detector.model")
+        self._mapping = to_class_names(checkpoint.labels, self.class_names, "detector.model")
         self.classes = self._mapping.classes
         self._network = checkpoint.read_network().to(self._device)
         self._commit = commit_of(checkpoint.folder)

@@ -200,6 +200,7 @@ FAULTY = {
     "raycast": ["nowhere"],
     "report": ["nowhere"],
     "diff": ["old", "old"],
+    "edit": ["nowhere", "--delete", "9"],
     "export": ["nowhere", "--to", "glb"],
     "query": ["old", "a red chair"],
     "import-map": ["nowhere.ply", "new"],

@@ -30,7 +30,7 @@ LAYERS = [
     ["evaluation"],
     ["runs", "training"],
     ["queries"],
-    ["tables", "figures", "exporting"],
+    ["tables", "figures", "exporting", "editing"],
     ["reporting"],
     ["api"],
     ["doctor", "commands"],

@@ -16,7 +16,7 @@ from framework.files.tum_trajectory import read_tum
 from framework.files.yaml_file import load_yaml
 from framework.queries.changes import Change, Kind, Visit, changes
 from framework.queries.labeled_surface import LabeledSurface
-from framework.runs.stored_runs import CONFIG, EXTERNAL, METRICS, TRAJECTORY
+from framework.runs.stored_runs import CONFIG, EDITED_FROM, EXTERNAL, METRICS, TRAJECTORY
 
 log = logging.getLogger(__name__)
 
@@ -76,14 +76,16 @@ def is_imported(run: Path) -> bool:
 def in_world(run: Path, world: Path) -> bool:
     """Return True if two runs are known to have the same world frame.
 
-    This is the case if `run` was localized in `world` or resumed it, or if both used ground-truth poses. Imported maps
-    are in the world frame of these poses.
+    This is the case if `run` was localized in `world`, resumed it or is an edit of it, or if both used ground-truth
+    poses. Imported maps are in the world frame of these poses.
     """
     config = load_yaml(run / CONFIG) if path_exists(run / CONFIG) else None
     worlds = [config.get(key) for key in ("localize_in", "resume_from")] if isinstance(config, DictConfig) else []
+    records = [read_json(place / METRICS) if path_exists(place / METRICS) else None for place in (run, world)]
+    if isinstance(records[0], dict):
+        worlds.append(records[0].get(EDITED_FROM))
     if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in worlds):
         return True
-    records = [read_json(place / METRICS) if path_exists(place / METRICS) else None for place in (run, world)]
     shared = ("ground_truth", EXTERNAL)
     return all(isinstance(record, dict) and record.get("pose_source") in shared for record in records)
 

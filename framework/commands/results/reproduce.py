@@ -17,7 +17,7 @@ from framework.commands.command_line import EXIT_FAILED, KNOWN_ERRORS, arguments
 from framework.errors import ConfigError, DataError
 from framework.runs.reproduction import Reproduction, causes
 from framework.runs.run_bundle import opened_bundle
-from framework.runs.stored_runs import METRICS, Record, find_records, no_run_error, read_record
+from framework.runs.stored_runs import METRICS, Record, find_records, no_run_error, read_record, without_edited
 from framework.tables.comparison import ComparisonTable
 from framework.tables.table_check import TABLE_FORMATS, changed_tables
 
@@ -67,8 +67,9 @@ def reproduce_all(folder: Path, overrides: Sequence[str], row: str | None, out: 
     Returns:
         The number of changed tables and different runs.
     """
-    records, incomplete = find_records(folder)
-    edited = [one for one in incomplete if (one.directory / METRICS).exists()]
+    found, invalid = find_records(folder)
+    edited = [one for one in invalid if (one.directory / METRICS).exists()]
+    records, incomplete = without_edited(found, invalid)
     if not records and not edited:
         raise no_run_error(folder, incomplete)
     if records and row is not None:

@@ -1,8 +1,8 @@
 """The ground truth set by `dataset.ground_truth`: a labeled mesh or the map of a run.
 
     DIR/mesh.ply            a PLY file of any name: vertex x y z [m], integer property `instance`, 0 = none; faces
-    DIR/instances.json      next to the mesh or in the parent folder: {"<id>": {"name", "class"}}; class = a COCO name,
-                            or null = unknown
+    DIR/instances.json      next to the mesh or in the parent folder: {"<id>": {"name", "class"}}; class = a COCO name
+                            or another name, null = unknown
     RUN/                    a run directory: mesh.ply, instances.json (a list) and trajectory.txt
 
 A labeled mesh is in the world frame of the recording's poses. The map of a run is in the world frame of the estimated
@@ -11,9 +11,9 @@ trajectory.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +24,19 @@ from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import path_exists
 from framework.files.json_file import read_json
-from framework.files.number_lines import SHOWN
 from framework.files.ply import PlyMesh, found_property, read_ply
 from framework.files.search_paths import candidates
 from framework.files.tum_trajectory import read_tum
-from framework.vocabulary.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO, MEANINGS, with_similar
 
 KEY = "dataset.ground_truth"
 MESH, INSTANCES, TRAJECTORY, METRICS = "mesh.ply", "instances.json", "trajectory.txt", "metrics.json"  # run outputs
 LABELS = "instance"  # name of the vertex property
 LARGEST_ID = np.iinfo(np.int32).max
 MAX_DIGITS = 10  # maximum number of digits of an id, including leading zeros
+LONGEST_NAME = 100  # maximum number of characters of a class name
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -122,19 +124,25 @@ def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
         if int(key) in class_names:
             raise DataError(f"{path}: expected unique instance ids, got {int(key)} twice, the second time as {key!r}")
         class_names[int(key)] = _class_of(f"{path}: instance {key}", entry)
+    if own := sorted({name for name in class_names.values() if name is not None} - set(COCO)):
+        log.info("%s: classes outside of COCO: %s", path, ", ".join(map(with_similar, own)))
     return class_names
 
 
 def _class_of(where: str, entry: Any) -> str | None:
     if not isinstance(entry, dict) or "class" not in entry:
-        expected = 'a JSON object with the key "class" (a COCO name, or null if unknown)'
+        expected = 'a JSON object with the key "class" (a name, or null if unknown)'
         raise DataError(f"{where}: expected {expected}, got {entry!r:.60}")
     name = entry["class"]
-    if name is None or (isinstance(name, str) and name in COCO):
-        return name
-    close = get_close_matches(str(name)[:SHOWN].strip().lower(), COCO, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    raise DataError(f"{where}: class: expected a COCO name, or null if unknown, got {name!r:.60}{hint}")
+    if name is None:
+        return None
+    if not isinstance(name, str) or name != name.strip() or not 0 < len(name) <= LONGEST_NAME:
+        expected = f"a name of at most {LONGEST_NAME} characters without outer spaces, or null if unknown"
+        raise DataError(f"{where}: class: expected {expected}, got {name!r:.60}")
+    coco = MEANINGS.get(name.lower())
+    if coco not in (None, name):
+        raise DataError(f"{where}: class: expected the COCO name {coco!r}, got {name!r}; rename the class")
+    return name
 
 
 def _labels_of(path: Path, ply: PlyMesh) -> Int32:

@@ -164,6 +164,22 @@ def test_instance_colors_of_neighbors_are_distinct() -> None:
     assert np.linalg.norm(colors - colors[nearest], axis=1).min() > 60
 
 
+def test_comparison_differs_only_in_changed_instance(tmp_path: Path) -> None:
+    mesh, poses = furnished(), walk()
+    keys = [k for k in np.unique(mesh.instance_ids).tolist() if k > 0]
+    without_first = np.where(mesh.instance_ids == keys[0], 0, mesh.instance_ids).astype(np.int32)
+    before = overview.InstanceState("instances", mesh.instance_ids, dict.fromkeys(keys, ""))
+    after = overview.InstanceState("instances", without_first, dict.fromkeys(keys[1:], ""))
+    overview.write_comparison(tmp_path / "both.png", mesh, [before, after], poses)
+    with Image.open(tmp_path / "both.png") as image:
+        left, right = np.split(np.asarray(image), 2, axis=1)
+    changed = (left != right).any(axis=2)
+    assert 0 < changed.mean() < 0.2
+    v, u = np.nonzero(changed)
+    box = changed[v.min() : v.max() + 1, u.min() : u.max() + 1]
+    assert box.mean() > 0.4, "expected a single changed region"
+
+
 @pytest.mark.parametrize("R", [Z_UP, Y_UP, Y_DOWN], ids=["z-up", "y-up", "y-down"])
 @pytest.mark.parametrize("flipped", [False, True])
 def test_surrounding_poses_see_the_front_of_a_room(R: np.ndarray, flipped: bool) -> None:

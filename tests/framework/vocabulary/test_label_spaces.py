@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 
 from framework.errors import ConfigError
-from framework.vocabulary.label_spaces import _SECTIONS, COCO, MEANINGS, SCENENN_TO_COCO, SPACES, read_labels, to_coco
+from framework.vocabulary.label_spaces import (
+    _SECTIONS,
+    COCO,
+    MEANINGS,
+    SCENENN_TO_COCO,
+    SPACES,
+    ClassNames,
+    read_labels,
+    to_class_names,
+    to_coco,
+)
 
 
 @pytest.mark.parametrize(
@@ -115,6 +125,25 @@ def test_to_coco_without_object_class_raises():
         to_coco(["wall", "floor"])
     with pytest.raises(ConfigError, match="expected at least one object class of COCO, got none in 0 labels"):
         to_coco([])
+
+
+def test_class_names_of_known_labels_are_coco_by_default():
+    assert to_class_names(["sofa", "wall"], ClassNames.AUTO).classes == ("couch",)
+    assert to_class_names(["sofa", "wall"], ClassNames.OWN).classes == ("sofa", "wall")
+    with pytest.raises(ConfigError, match=r"got unknown labels \(1 of 2\): 'pallet'; set detector.class_names=OWN"):
+        to_class_names(["sofa", "pallet"], ClassNames.COCO)
+
+
+def test_class_names_outside_of_label_spaces_are_kept(caplog):
+    caplog.set_level("INFO")
+    mapping = to_class_names(["n/a", "forklift", "sofa", "chiar", "forklift"], ClassNames.AUTO)
+    assert mapping.classes == ("forklift", "sofa", "chiar")
+    np.testing.assert_array_equal(mapping.meaning, [-1, 0, 1, 2, 0])
+    expected = "because 3 of 5 are in no known label space: 'forklift', 'chiar' (similar to 'chair')"
+    assert f"all names are kept, {expected}" in caplog.text
+    assert to_class_names(["object", "wall"], ClassNames.AUTO).classes == ("object", "wall")
+    with pytest.raises(ConfigError, match="expected at least one class, got none in 1 labels"):
+        to_class_names(["n/a"], ClassNames.OWN)
 
 
 def test_read_labels_from_text_file_checks_lines(tmp_path):

@@ -360,7 +360,7 @@ def test_precomputed_invalid_parameter_raises(tmp_path: Path) -> None:
 
 
 def test_precomputed_unusable_or_duplicate_label_raises(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="expected detections of COCO classes, got none in 1 detections"):
+    with pytest.raises(DataError, match="expected detections of known classes, got none in 1 detections"):
         Precomputed(write(tmp_path, entry(category_name="wall")), label_space="nyu40")
     (tmp_path / "labels.txt").write_text("chair\nchair\n")
     with pytest.raises(ConfigError, match=r"detector\.label_space: expected unique names, got 'chair' twice"):

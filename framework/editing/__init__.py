@@ -1,0 +1,1 @@
+"""Manual correction of the instances of stored runs."""

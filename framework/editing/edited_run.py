@@ -1,0 +1,158 @@
+"""Edited copies of stored runs."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from framework.data import Float64
+from framework.editing.edited_map import EditedMap
+from framework.editing.edits import Edit, write_edits
+from framework.errors import ConfigError, DataError, InstanceMapError
+from framework.files.json_file import write_json
+from framework.files.tum_trajectory import read_tum
+from framework.mapping.instance_map import FORMAT, InstanceMap
+from framework.mapping.storage.map_file import read_format
+from framework.rendering.overview import InstanceState, write_comparison, write_overview
+from framework.runs.instances_file import write_instances
+from framework.runs.manifest import Manifest
+from framework.runs.mesh_file import write_mesh
+from framework.runs.metrics import TRUTH, is_evaluation
+from framework.runs.reevaluation import Reevaluation, Truth
+from framework.runs.run_directory import headline, likely_labels
+from framework.runs.stored_runs import (
+    EDITED_FROM,
+    EVALUATION,
+    INSTANCES,
+    MAP,
+    MESH,
+    METRICS,
+    TRAJECTORY,
+    Record,
+    read_record,
+)
+
+log = logging.getLogger(__name__)
+
+EDITS = "edits.json"
+PREVIEW = "edits.png"
+OVERVIEW = "overview.png"
+REWRITTEN = (INSTANCES, MESH, MAP, OVERVIEW, EDITS, METRICS)  # listed files that depend on the instances
+
+
+@dataclass(frozen=True)
+class EditedRun:
+    """A stored run and its edited map."""
+
+    record: Record
+    manifest: Manifest
+    poses: Float64  # (F, 4, 4) T_world_camera of the mapped frames
+    before: InstanceState
+    scene: InstanceMap
+    edits: tuple[Edit, ...]
+    changes: tuple[str, ...]  # description of the result of each edit
+
+    @classmethod
+    def of(cls, run: Path, edits: Sequence[Edit]) -> EditedRun:
+        """Apply edits in order to the map of a completed run. The stored run is not changed.
+
+        Raises:
+            DataError: The run is incomplete or changed, its map has no label evidence, or an edit is invalid.
+        """
+        record, manifest = read_record(run), Manifest.read(run)
+        if changed := manifest.changed_files(run):
+            raise DataError(f"{changed[0]}; repeat the run")
+        if (found := read_format(run / MAP)) != str(FORMAT):
+            raise DataError(
+                f"{run / MAP}: expected map format {FORMAT}, got {found}; map with a fuser that stores instances in "
+                "voxels, such as fuser=bayesian_tsdf"
+            )
+        scene = InstanceMap.load(run / MAP)
+        if not scene.instances():
+            raise DataError(f"{run}: expected a map with instances, got none")
+        edited = EditedMap(scene)
+        before = _state("before", scene)
+        changes = []
+        for number, edit in enumerate(edits, start=1):
+            try:
+                changes.append(edited.apply(edit))
+            except DataError as error:
+                raise DataError(f"edit {number}, {json.dumps(edit.entry)}: {error}") from error
+        _, poses = read_tum(run / TRAJECTORY)
+        return cls(record, manifest, poses, before, scene, tuple(edits), tuple(changes))
+
+    def write_preview(self, path: Path) -> None:
+        """Write an image of the instances before and after the edits as a PNG file."""
+        states = [self.before, _state("after", self.scene)] if self.edits else [replace(self.before, title="instances")]
+        write_comparison(path, self.scene.mesh(), states, self.poses)
+
+    def write(self, out: Path) -> None:
+        """Write the run directory of the edited map.
+
+        It contains the files of the stored run that do not depend on the instances, such as the trajectory. The metrics
+        of the instances are evaluated again if the stored run was evaluated.
+
+        Raises:
+            ConfigError: The directory is not empty.
+            DataError: A file cannot be read or written.
+        """
+        check_empty(out)
+        out.mkdir(parents=True, exist_ok=True)
+        copied = [name for name in self.manifest.files if name not in REWRITTEN]
+        for name in copied:
+            shutil.copyfile(self.record.directory / name, out / name)
+        mesh, found = self.scene.mesh(), self.scene.instances()
+        write_edits(out / EDITS, self.edits)
+        write_instances(out / INSTANCES, mesh, found, self.scene.classes)
+        write_mesh(out / MESH, mesh)
+        self.scene.save(out / MAP)
+        self.write_preview(out / PREVIEW)
+        metrics = self._metrics(out, len(found))
+        title = f"{headline(metrics)} | edited"
+        write_overview(out / OVERVIEW, mesh, likely_labels(found, self.scene.classes), self.poses, title)
+        write_json(out / METRICS, metrics)
+        self.manifest.with_files(out, [*copied, *REWRITTEN]).write(out)
+
+    def _metrics(self, out: Path, instances: int) -> Mapping[str, Any]:
+        """Return the metrics of the stored run, with the number and the evaluation of the edited instances."""
+        metrics = {
+            key: value
+            for key, value in self.record.metrics.items()
+            if not is_evaluation(key) and not key.startswith(EVALUATION)
+        }
+        metrics |= {"instances.count": instances, EDITED_FROM: str(self.record.directory.resolve())}
+        if TRUTH not in self.record.metrics:
+            return metrics
+        try:
+            return Reevaluation.of(
+                replace(self.record, directory=out, metrics=metrics), Truth.of(self.record.dataset)
+            ).metrics
+        except (InstanceMapError, OSError) as error:
+            log.warning("instances are not evaluated: %s", error)
+            return metrics
+
+
+def check_empty(out: Path) -> None:
+    """Raise ConfigError unless a path is a new or empty folder."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"out: expected a new or empty folder, got {out}; choose another folder")
+
+
+def default_directory(run: Path) -> Path:
+    """Return the default directory of the edited run, next to the stored run."""
+    named = run if run.name not in ("", "..") else run.resolve()
+    return named.with_name(f"{named.name}_edited")
+
+
+def _state(title: str, scene: InstanceMap) -> InstanceState:
+    classes = scene.most_likely_classes()
+    ids = scene.mesh().instance_ids
+    names = {k: f"{k} {scene.classes[classes[k][0]]}" for k in np.unique(ids).tolist() if k > 0}
+    return InstanceState(f"{title}: {len(names)} instances", ids, names)
