@@ -20,14 +20,14 @@ MAX_DIGITS = 10  # maximum number of digits of an id
 
 
 @dataclass(frozen=True)
-class ClassNames:
+class ClassIdNames:
     """The names of class ids."""
 
     names: Mapping[int, str]  # by class id
     source: str  # for messages
 
     @classmethod
-    def of(cls, label_space: str) -> ClassNames:
+    def of(cls, label_space: str) -> ClassIdNames:
         """Return the names of a label space or file.
 
         The ids of a label space or text file start at 0, those of NYU40 at 1. A JSON file contains an object with the
@@ -93,7 +93,7 @@ def read_entries(path: Path) -> list[tuple[str, dict[str, Any]]]:
     return entries
 
 
-def label_of(where: str, entry: Mapping[str, Any], names: ClassNames | None) -> InstanceLabel:
+def label_of(where: str, entry: Mapping[str, Any], names: ClassIdNames | None) -> InstanceLabel:
     """Return the label in an entry with the keys `class` and `confidence`, which are optional.
 
     Args:
@@ -111,7 +111,7 @@ def label_of(where: str, entry: Mapping[str, Any], names: ClassNames | None) -> 
     )
 
 
-def read_labels_by_id(path: Path, names: ClassNames | None) -> dict[int, InstanceLabel]:
+def read_labels_by_id(path: Path, names: ClassIdNames | None) -> dict[int, InstanceLabel]:
     """Read the label of each instance id from a JSON or CSV file.
 
     Raises:
@@ -143,7 +143,7 @@ def checked_confidence(where: str, value: Any) -> float:
     return confidence
 
 
-def class_of_id(where: str, class_id: int, names: ClassNames | None) -> str:
+def class_of_id(where: str, class_id: int, names: ClassIdNames | None) -> str:
     """Return the name of a class id.
 
     Raises:
@@ -155,7 +155,7 @@ def class_of_id(where: str, class_id: int, names: ClassNames | None) -> str:
     return names.name(where, class_id)
 
 
-def _class_name(where: str, value: Any, names: ClassNames | None) -> str:
+def _class_name(where: str, value: Any, names: ClassIdNames | None) -> str:
     class_id = _whole(value)
     if class_id is not None:
         return class_of_id(f"{where}: class", class_id, names)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from framework.runs.external_maps.class_labels import ClassNames, read_labels_by_id
+from framework.runs.external_maps.class_labels import ClassIdNames, read_labels_by_id
 from framework.runs.external_maps.external_map import ExternalMap, read_surface
 from framework.runs.external_maps.mask_predictions import read_mask_predictions
 from framework.runs.external_maps.ply_instances import LabelProperties, read_ply_instances
@@ -29,12 +29,12 @@ def read_external_map(
         DataError: A file is missing or invalid, or the files do not match.
     """
     surface = read_surface(mesh)
-    names = None if label_space is None else ClassNames.of(label_space)
+    names = None if label_space is None else ClassIdNames.of(label_space)
     if labels is not None and (labels.is_dir() or labels.suffix.lower() == ".txt"):
         return read_mask_predictions(mesh, surface, labels, names)
     for in_header in listed_classes(surface.comments):  # a mesh.ply of InstanceMap
         if in_header:
-            names = names or ClassNames(dict(enumerate(in_header)), str(mesh))
+            names = names or ClassIdNames(dict(enumerate(in_header)), str(mesh))
         elif properties.class_ is None:
             properties = replace(properties, class_="")
     by_id = None if labels is None else read_labels_by_id(labels, names)

@@ -25,7 +25,7 @@ from framework.files.ply import PlyMesh
 from framework.runs.external_maps.array_files import read_mask
 from framework.runs.external_maps.class_labels import (
     NYU40,
-    ClassNames,
+    ClassIdNames,
     InstanceLabel,
     class_of_id,
     label_of,
@@ -37,7 +37,7 @@ from framework.runs.external_maps.external_map import ExternalInstance, External
 LISTS = ("instances.json", "instances.csv")  # names of the file with the classes of a mask folder
 
 
-def read_mask_predictions(mesh: Path, surface: PlyMesh, labels: Path, names: ClassNames | None) -> ExternalMap:
+def read_mask_predictions(mesh: Path, surface: PlyMesh, labels: Path, names: ClassIdNames | None) -> ExternalMap:
     """Return the map with the instances of ScanNet predictions or a mask folder.
 
     Instances have the ids 1, 2, ... in the order of the list. Empty masks are left out.
@@ -55,7 +55,7 @@ def read_mask_predictions(mesh: Path, surface: PlyMesh, labels: Path, names: Cla
     listed = next((labels / name for name in LISTS if path_exists(labels / name)), None)
     if listed is None:
         listed = _text_file(mesh, labels)
-        entries = list(_scannet_entries(listed, names or ClassNames.of(NYU40)))
+        entries = list(_scannet_entries(listed, names or ClassIdNames.of(NYU40)))
     else:
         entries = list(_folder_entries(listed, names))
     if not entries:
@@ -84,7 +84,7 @@ def _text_file(mesh: Path, labels: Path) -> Path:
     return found[0]
 
 
-def _scannet_entries(path: Path, names: ClassNames) -> Iterator[tuple[str, str, InstanceLabel]]:
+def _scannet_entries(path: Path, names: ClassIdNames) -> Iterator[tuple[str, str, InstanceLabel]]:
     for number, line in enumerate(read_lines(path), start=1):
         words = line.split()
         if not words:
@@ -97,7 +97,7 @@ def _scannet_entries(path: Path, names: ClassNames) -> Iterator[tuple[str, str, 
         yield where, mask, InstanceLabel(class_of_id(where, class_id, names), confidence_of(where, confidence))
 
 
-def _folder_entries(path: Path, names: ClassNames | None) -> Iterator[tuple[str, str, InstanceLabel]]:
+def _folder_entries(path: Path, names: ClassIdNames | None) -> Iterator[tuple[str, str, InstanceLabel]]:
     for where, entry in read_entries(path):
         mask = entry.get("mask")
         if not isinstance(mask, str) or not mask:

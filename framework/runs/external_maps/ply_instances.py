@@ -14,7 +14,7 @@ from framework.data import Int32, Int64
 from framework.errors import DataError
 from framework.files.ply import PlyMesh
 from framework.mapping.instances.instance_list import vertices_by_id
-from framework.runs.external_maps.class_labels import ClassNames, InstanceLabel, class_of_id
+from framework.runs.external_maps.class_labels import ClassIdNames, InstanceLabel, class_of_id
 from framework.runs.external_maps.external_map import ExternalInstance, ExternalMap
 
 INSTANCE_NAMES = ("instance", "instance_id", "instanceid", "object_id", "objectid", "object", "inst", "instance_label")
@@ -37,7 +37,7 @@ def read_ply_instances(
     path: Path,
     surface: PlyMesh,
     chosen: LabelProperties,
-    names: ClassNames | None,
+    names: ClassIdNames | None,
     labels: Mapping[int, InstanceLabel] | None,
 ) -> ExternalMap:
     """Return the map in a labeled PLY file.
@@ -128,6 +128,6 @@ def _whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> Int64:
     return whole
 
 
-def _majority(path: Path, class_ids: Int64, names: ClassNames | None) -> str:
+def _majority(path: Path, class_ids: Int64, names: ClassIdNames | None) -> str:
     ids, counts = np.unique(class_ids, return_counts=True)
     return class_of_id(str(path), int(ids[counts.argmax()]), names)

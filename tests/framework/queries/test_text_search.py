@@ -226,7 +226,7 @@ def test_query_invalid_arguments_raise_before_reading(question: dict[str, Any], 
 
 
 def test_query_unanswerable_request_raises(embedded: Map, run_without: Path) -> None:
-    with pytest.raises(DataError, match=r"query: expected a run directory, got .* without"):
+    with pytest.raises(DataError, match=r"query: expected a run directory with map.npz, got .* without"):
         query("nowhere", "bed")
     with pytest.raises(
         DataError, match="expected embeddings of its objects, got none; run with detector=with_embeddings"

@@ -12,7 +12,7 @@ from framework.detection.candidates import OutputLayout
 from framework.detection.masks.binary_masks import tight_boxes
 from framework.detection.masks.letterbox import Placement
 from framework.errors import ConfigError, DataError
-from framework.vocabulary.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO, ClassNames
 from plugins.detectors.onnx_boxes import OnnxBoxes
 from tests.support import registered
 from tests.support.networks.tiny_networks import constant_network
@@ -153,8 +153,9 @@ def test_onnx_boxes_unsupported_network_shape_or_label_raises(tmp_path):
     with pytest.raises(DataError, match="84 columns"):
         OnnxBoxes(weights=weights, sha256="", layout=OutputLayout.yolo, device="cpu")
     (tmp_path / "labels.txt").write_text("chair\nflibbertigibbet")
+    labels = {"label_space": str(tmp_path / "labels.txt"), "class_names": ClassNames.COCO}
     with pytest.raises(ConfigError, match="flibbertigibbet"):
-        OnnxBoxes(weights=weights, label_space=str(tmp_path / "labels.txt"), layout=OutputLayout.yolo, device="cpu")
+        OnnxBoxes(weights=weights, **labels, layout=OutputLayout.yolo, device="cpu")
 
 
 @pytest.mark.parametrize(

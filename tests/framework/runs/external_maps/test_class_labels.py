@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from framework.errors import ConfigError, DataError
-from framework.runs.external_maps.class_labels import ClassNames, InstanceLabel, read_labels_by_id
+from framework.runs.external_maps.class_labels import ClassIdNames, InstanceLabel, read_labels_by_id
 
 
 def written(path: Path, content: object) -> Path:
@@ -17,26 +17,26 @@ def written(path: Path, content: object) -> Path:
 
 
 def test_label_space_ids_start_at_zero_except_nyu40() -> None:
-    assert ClassNames.of("coco").name("x", 0) == "person"
-    assert ClassNames.of("nyu40").name("x", 1) == "wall"
-    assert ClassNames.of("nyu40").name("x", 40) == "otherprop"
+    assert ClassIdNames.of("coco").name("x", 0) == "person"
+    assert ClassIdNames.of("nyu40").name("x", 1) == "wall"
+    assert ClassIdNames.of("nyu40").name("x", 40) == "otherprop"
 
 
 def test_label_space_file_has_one_name_per_id(tmp_path: Path) -> None:
-    assert ClassNames.of(str(written(tmp_path / "names.txt", "forklift\npallet\n"))).name("x", 1) == "pallet"
-    assert ClassNames.of(str(written(tmp_path / "a.json", ["forklift", "pallet"]))).name("x", 1) == "pallet"
-    assert ClassNames.of(str(written(tmp_path / "b.json", {"1163": "pallet"}))).name("x", 1163) == "pallet"
+    assert ClassIdNames.of(str(written(tmp_path / "names.txt", "forklift\npallet\n"))).name("x", 1) == "pallet"
+    assert ClassIdNames.of(str(written(tmp_path / "a.json", ["forklift", "pallet"]))).name("x", 1) == "pallet"
+    assert ClassIdNames.of(str(written(tmp_path / "b.json", {"1163": "pallet"}))).name("x", 1163) == "pallet"
 
 
 def test_unknown_label_space_names_the_option() -> None:
     with pytest.raises(ConfigError, match="--label-space: expected one of coco"):
-        ClassNames.of("nyu41")
+        ClassIdNames.of("nyu41")
 
 
 @pytest.mark.parametrize("content", [{"chair": 3}, {"3": 4}, {}, 3])
 def test_invalid_names_are_error(content: object, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected a"):
-        ClassNames.of(str(written(tmp_path / "names.json", content)))
+        ClassIdNames.of(str(written(tmp_path / "names.json", content)))
 
 
 @pytest.mark.parametrize(

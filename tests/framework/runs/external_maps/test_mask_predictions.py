@@ -11,7 +11,7 @@ import pytest
 from framework.errors import DataError
 from framework.files.ply import PlyMesh
 from framework.runs.external_maps.array_files import read_mask
-from framework.runs.external_maps.class_labels import ClassNames
+from framework.runs.external_maps.class_labels import ClassIdNames
 from framework.runs.external_maps.external_map import ExternalMap, read_surface
 from framework.runs.external_maps.mask_predictions import read_mask_predictions
 
@@ -40,7 +40,7 @@ def mask_folder(folder: Path, entries: object, **masks: object) -> Path:
     return folder
 
 
-def read(labels: Path, names: ClassNames | None = None) -> ExternalMap:
+def read(labels: Path, names: ClassIdNames | None = None) -> ExternalMap:
     return read_mask_predictions(MESH, SURFACE, labels, names)
 
 
@@ -90,7 +90,7 @@ def test_mask_folder_accepts_flags_and_indices(tmp_path: Path) -> None:
     ]
     flags = [True, False, False, False, True]
     masks = {"flags": flags, "indices": [3, 1, 3], "bytes": np.array([[0], [1], [0], [0], [1]], np.uint8)}
-    found = read(mask_folder(tmp_path / "masks", entries, **masks), ClassNames.of("nyu40"))
+    found = read(mask_folder(tmp_path / "masks", entries, **masks), ClassIdNames.of("nyu40"))
     assert shown(found) == {1: ([0, 4], "chair", 0.9), 2: ([1, 3], "sofa", 0.8), 3: ([1, 4], "unlabeled", None)}
 
 
@@ -98,7 +98,7 @@ def test_mask_folder_accepts_csv(tmp_path: Path) -> None:
     np.save(tmp_path / "0.npy", np.array([2]))
     np.save(tmp_path / "1.npy", np.array([3, 4]))
     (tmp_path / "instances.csv").write_text("mask,class,confidence\n0.npy,traffic light,0.5\n1.npy,5,\n")
-    found = read(tmp_path, ClassNames.of("nyu40"))
+    found = read(tmp_path, ClassIdNames.of("nyu40"))
     assert shown(found) == {1: ([2], "traffic light", 0.5), 2: ([3, 4], "chair", None)}
 
 

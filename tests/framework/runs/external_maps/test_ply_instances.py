@@ -9,13 +9,13 @@ import pytest
 
 from framework.errors import DataError
 from framework.files.ply import PlyMesh, read_ply, write_ply
-from framework.runs.external_maps.class_labels import ClassNames, InstanceLabel
+from framework.runs.external_maps.class_labels import ClassIdNames, InstanceLabel
 from framework.runs.external_maps.external_map import UNLABELED, ExternalMap
 from framework.runs.external_maps.ply_instances import LabelProperties, read_ply_instances
 
 VERTICES = np.array([[k, 0, 0] for k in range(6)], np.float32)
 TRIANGLES = np.array([[0, 1, 2], [3, 4, 5]], np.int32)
-NYU40 = ClassNames.of("nyu40")
+NYU40 = ClassIdNames.of("nyu40")
 
 
 def surface_of(tmp_path: Path, **properties: list[int] | list[float]) -> PlyMesh:
