@@ -363,7 +363,6 @@ def copy(folders, tmp_path):
             {"id2label": {str(k): f"LABEL_{k}" for k in range(6)}},
             r"detector\.model: .*: expected class names, got none",
         ),
-        ("config.json", {"id2label": {str(k): f"thing {k}" for k in range(6)}}, "expected the weights in"),
         ("config.json", {"id2label": {"0": "chair", "1": "bed"}}, "expected the weights in"),
         ("config.json", {"num_queries": 13}, "expected the weights in"),
         ("config.json", {"model_type": "unknown type"}, "unknown type"),
@@ -387,6 +386,11 @@ def test_transformers_unusable_model_folder_raises_with_reason(copy, name, value
     with pytest.raises((ConfigError, DataError), match=message) as caught:
         built(copy.folder)
     assert one_line(caught)
+
+
+def test_transformers_own_labels_are_class_names(copy):
+    copy.change("config.json", id2label={str(k): f"thing {k}" for k in range(6)})
+    assert built(copy.folder).classes == tuple(f"thing {k}" for k in range(6))
 
 
 def test_transformers_unknown_architecture_raises(tmp_path):

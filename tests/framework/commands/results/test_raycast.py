@@ -138,7 +138,7 @@ def test_raycast_without_map_is_one_line_error(stored: Path, command: Command, t
     for run in (stored, tmp_path / "nowhere"):
         status, output, error = command(run)
         assert (status, output, error.count("\n")) == (1, "", 1)
-        assert error.startswith("error: raycast: expected a run directory, got")
+        assert error.startswith("error: raycast: expected a run directory with map.npz, got")
 
 
 def test_raycast_without_mapped_frames_is_one_line_error(stored: Path, command: Command) -> None:
