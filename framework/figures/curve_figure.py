@@ -128,7 +128,7 @@ def mean_progress(runs: Sequence[DetectedObjects]) -> Curve:
     """Return the number of detected objects over the frames of one or more runs, to the end of the shortest run."""
     end = min(run.frames[-1] for run in runs)
     frames = np.unique(np.concatenate([run.frames[run.frames <= end] for run in runs]))
-    counts = np.stack([np.searchsorted(run.first, frames, side="right") for run in runs])
+    counts = np.stack([np.searchsorted(run.first, frames, side="right") for run in runs]).astype(np.float64)
     return Curve(frames, counts.mean(axis=0), counts.min(axis=0), counts.max(axis=0), (len(runs), len(runs)))
 
 

@@ -101,7 +101,7 @@ def test_workflow_writes_figure(folder: Path) -> None:
 @requires_pdflatex
 def test_workflow_table_compiles_in_latex(folder: Path, tmp_path: Path) -> None:
     table = (folder / EXPERIMENT / "table.tex").read_text()
-    log = log_of_paper(tmp_path, table, "tab:nearest-points", "tab:nearest-points-differences")
+    log = log_of_paper(tmp_path, table, "tab:nearest_points", "tab:nearest_points-differences")
     assert "Overfull" not in log
     assert "undefined" not in log
 
