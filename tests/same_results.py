@@ -64,7 +64,7 @@ def settings(directory: Path, names: Collection[str] = ()) -> dict[str, object]:
 
 
 def translated(key: str) -> str:
-    """Return the new name of a config key, or the same key if there is none."""
+    """Return the new name of a config key, or the same key if it was not renamed."""
     group, dot, name = key.rpartition(".")
     return RENAMED.get(key) or group + dot + (new_name(key) or name).rpartition(".")[2]
 

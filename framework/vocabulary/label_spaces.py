@@ -127,7 +127,7 @@ def to_class_names(labels: Sequence[str], class_names: ClassNames, key: str = "d
         ConfigError: No label is an object class, or the class names are COCO and a label is unknown.
     """
     unknown = [] if class_names is ClassNames.OWN else _unknown(labels)
-    in_coco = any(MEANINGS.get(_key(label)) for label in labels)
+    in_coco = any(map(coco_name, labels))
     if class_names is ClassNames.COCO or (class_names is ClassNames.AUTO and in_coco and not unknown):
         return to_coco(labels, key)
     if unknown:
@@ -152,6 +152,11 @@ def _key(label: str) -> str:
     return label.partition(",")[0].strip().lower()
 
 
+def coco_name(label: str) -> str | None:
+    """Return the COCO name of a label in any known label space, or None without one."""
+    return MEANINGS.get(_key(label))
+
+
 def _unknown(labels: Sequence[str]) -> list[str]:
     return [label for label in labels if _key(label) not in MEANINGS]
 
@@ -173,7 +178,7 @@ def to_coco(labels: Sequence[str], key: str = "detector.label_space") -> LabelMa
             f"{key}: expected names of a label space, got unknown labels ({len(unknown)} of {len(labels)}): "
             f"{', '.join(map(repr, unknown))}; set detector.class_names=OWN to keep all names"
         )
-    meanings = [MEANINGS[_key(label)] for label in labels]
+    meanings = list(map(coco_name, labels))
     classes = tuple(name for name in COCO if name in meanings)
     if not classes:
         raise ConfigError(f"{key}: expected at least one object class of COCO, got none in {len(labels)} labels")

@@ -79,7 +79,7 @@ def _class_at(words: list[str], at: int, known: dict[str, str]) -> tuple[int, st
         known: The class names by lower-case name.
 
     Returns:
-        The number of words and the class name, or 0 and "" if there is none.
+        The number of words and the class name, or 0 and "" if no class name matches.
     """
     for length in range(min(MAX_WORDS, len(words) - at), 0, -1):
         phrase = words[at : at + length]

@@ -44,7 +44,7 @@ class Accelerometer:
 
 
 def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> Accelerometer | None:
-    """Return the first usable accelerometer in a bag, or None if there is none.
+    """Return the first usable accelerometer in a bag, or None if no accelerometer is usable.
 
     Args:
         bag: The bag.

@@ -80,7 +80,7 @@ def found_topics(bag: RosBag, given: Topics) -> Topics:
 
 
 def camera_info_of(bag: RosBag, image: str) -> str:
-    """Return the CameraInfo topic of an image topic, or "" if there is none."""
+    """Return the CameraInfo topic of an image topic, or "" if the bag has no such topic."""
     infos = bag.topics(CAMERA_INFO)
     folders = {topic: f"/{topic.strip('/').rpartition('/')[0]}" for topic in (image, *infos)}
     shared = {topic: len(PurePosixPath(commonpath([folders[topic], folders[image]])).parts) for topic in infos}

@@ -121,7 +121,7 @@ def number_slices(cells, starts):
 
 @device
 def _crossing(a, b):
-    """Return (1, position between a and b) of a zero crossing, or (0, 0) if there is none."""
+    """Return (1, position between a and b) of a zero crossing, or (0, 0) without a crossing."""
     crosses = (a ^ b) < 0
     where = np.float32(a) / np.float32(a - b if crosses else 1)
     return (np.float32(1.0), where) if crosses else (np.float32(0.0), np.float32(0.0))

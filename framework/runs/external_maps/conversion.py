@@ -16,7 +16,7 @@ from framework.files.ply import PlyMesh
 from framework.geometry import transform
 from framework.mapping.instances.instance_list import aligned_box, box_around
 from framework.runs.external_maps.external_map import MAX_COORDINATE, UNLABELED, ExternalInstance, ExternalMap
-from framework.vocabulary.label_spaces import COCO, MEANINGS
+from framework.vocabulary.label_spaces import COCO, coco_name
 
 GRAY = 180  # RGB value of surfaces without colors
 NO_FRAME = -1  # first and last frame of an imported instance
@@ -111,7 +111,7 @@ class ConvertedMap:
 
 def coco_class(instance: ExternalInstance) -> str | None:
     """Return the COCO class of an instance, or None without one. Case and text after a comma are ignored."""
-    return None if instance.label is None else MEANINGS.get(instance.label.partition(",")[0].strip().lower())
+    return None if instance.label is None else coco_name(instance.label)
 
 
 def _left_out(instances: Mapping[int, ExternalInstance], kept: Mapping[int, ExternalInstance]) -> str:

@@ -12,9 +12,9 @@ import pytest
 from framework.data import Float64, Frame, Pose
 from framework.geometry import exp_se3, inverse, pose_distance
 from framework.registry import assemble
-from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
-from tests.support.scenes.analytic_scene import NOTHING, Scene, pose, room, walk
+from tests.support.scenes.analytic_scene import Scene, pose, room, walk
+from tests.support.tracked_frames import track_and_fuse
 
 pytestmark = pytest.mark.integration
 
@@ -28,15 +28,7 @@ def with_odometry(frames: Sequence[Frame], poses: Sequence[Float64]) -> list[Fra
 
 
 def tracked(frames: Sequence[Frame], **parameters: object) -> list[Pose]:
-    """Track and fuse the frames as the pipeline does; lost frames are not fused."""
-    tracker = assemble(VoxelHashingIcp, **parameters)
-    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
-    poses = []
-    for frame in frames:
-        poses.append(tracker.track(frame, fuser.scene))
-        if not poses[-1].lost:
-            fuser.fuse(frame, poses[-1], NOTHING)
-    return poses
+    return track_and_fuse(assemble(VoxelHashingIcp, **parameters), frames)
 
 
 def error(found: Pose, frame: Frame) -> float:

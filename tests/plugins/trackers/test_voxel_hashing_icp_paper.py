@@ -12,12 +12,11 @@ import pytest
 from framework.data import Frame, Pose
 from framework.errors import ConfigError
 from framework.geometry import exp_se3
-from framework.registry import assemble
-from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers import voxel_hashing_icp
 from plugins.trackers.voxel_hashing_icp import ResidualWeights, VoxelHashingIcp
 from tests.support.registered import built
-from tests.support.scenes.analytic_scene import NOTHING, Scene, room, walk
+from tests.support.scenes.analytic_scene import Scene, room, walk
+from tests.support.tracked_frames import track_and_fuse
 
 pytestmark = pytest.mark.integration
 
@@ -26,16 +25,6 @@ def paper_tracker(*overrides: str) -> VoxelHashingIcp:
     tracker = built("tracker", "voxel_hashing_icp_paper", *overrides)
     assert isinstance(tracker, VoxelHashingIcp)
     return tracker
-
-
-def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> list[Pose]:
-    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
-    poses = []
-    for frame in frames:
-        poses.append(tracker.track(frame, fuser.scene))
-        if not poses[-1].lost:
-            fuser.fuse(frame, poses[-1], NOTHING)
-    return poses
 
 
 def drift(pose: Pose, frame: Frame) -> float:
@@ -54,7 +43,7 @@ def covered(frame: Frame) -> Frame:
 
 def test_paper_tracker_recovers_known_motion() -> None:
     frames = walked(40)
-    poses = run(paper_tracker(), frames)
+    poses = track_and_fuse(paper_tracker(), frames)
     assert not any(pose.lost for pose in poses)
     assert max(drift(pose, frame) for pose, frame in zip(poses, frames, strict=True)) < 0.008
 
@@ -71,7 +60,7 @@ def test_paper_tracker_uses_published_parameters(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(voxel_hashing_icp, "linearize", noted)
     monkeypatch.setattr(voxel_hashing_icp, "CONVERGED", 0.0)
-    run(paper_tracker(), walked(2))
+    track_and_fuse(paper_tracker(), walked(2))
     widths = [width for width, *_ in calls]
     assert [widths.count(width) for width in (40, 80, 160)] == [4, 6, 8 + 1]  # 1 more for the result
     for width, weights, brightness, linear in calls:
@@ -87,7 +76,7 @@ def test_paper_tracker_lost_frames_keep_last_pose() -> None:
     frames = walked(30)
     away = [room().frame(exp_se3(np.array([0, 0, -1.4, 0, 0, 0])) @ walk(1)[0], k) for k in range(10, 13)]
     shown = [*frames[:10], *away, covered(frames[10]), *frames[10:]]
-    poses = run(paper_tracker(), shown)
+    poses = track_and_fuse(paper_tracker(), shown)
     assert [pose.lost for pose in poses] == [False] * 10 + [True] * 4 + [False] * 20
     for pose in poses[10:14]:
         np.testing.assert_array_equal(pose.T_world_camera, poses[9].T_world_camera)
@@ -102,7 +91,7 @@ def test_paper_tracker_uses_no_features(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(tracker._keyframes.extractor, "extract", fail)
     frames = walked(12)
-    lost = [pose.lost for pose in run(tracker, [*frames[:8], covered(frames[8]), *frames[8:]])]
+    lost = [pose.lost for pose in track_and_fuse(tracker, [*frames[:8], covered(frames[8]), *frames[8:]])]
     assert lost == [False] * 8 + [True] + [False] * 4
     assert not tracker.keyframes()
     assert not tracker._visited
@@ -117,21 +106,21 @@ def hidden_frames() -> list[Frame]:
 
 def test_paper_tracker_agreement_is_not_checked() -> None:
     """Half of the points are random. The checks of the default tracker would reject the pose."""
-    poses = run(paper_tracker(), hidden_frames())
+    poses = track_and_fuse(paper_tracker(), hidden_frames())
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], hidden_frames()[-1]) < 0.01
-    checked = run(paper_tracker("tracker.min_agreement=0.92"), hidden_frames())
+    checked = track_and_fuse(paper_tracker("tracker.min_agreement=0.92"), hidden_frames())
     assert checked[-1].lost
-    occluded = run(paper_tracker("tracker.max_occluded=0.015"), hidden_frames())
+    occluded = track_and_fuse(paper_tracker("tracker.max_occluded=0.015"), hidden_frames())
     assert occluded[-1].lost
 
 
 @pytest.mark.parametrize("steady", [0, 10**9])
 def test_paper_tracker_steady_motion_has_no_effect(monkeypatch: pytest.MonkeyPatch, steady: int) -> None:
     frames = hidden_frames()
-    expected = run(paper_tracker(), frames)
+    expected = track_and_fuse(paper_tracker(), frames)
     monkeypatch.setattr(voxel_hashing_icp, "STEADY", steady)
-    for pose, other in zip(run(paper_tracker(), frames), expected, strict=True):
+    for pose, other in zip(track_and_fuse(paper_tracker(), frames), expected, strict=True):
         assert pose.lost == other.lost
         np.testing.assert_array_equal(pose.T_world_camera, other.T_world_camera)
 
@@ -141,7 +130,7 @@ def test_paper_tracker_recovers_with_single_alignment(monkeypatch: pytest.Monkey
     align = VoxelHashingIcp._align
     monkeypatch.setattr(VoxelHashingIcp, "_align", lambda *a: aligned.append(True) or align(*a))  # type: ignore[func-returns-value]
     frames = walked(6)
-    poses = run(paper_tracker(), [*frames[:4], covered(frames[4]), *frames[4:]])
+    poses = track_and_fuse(paper_tracker(), [*frames[:4], covered(frames[4]), *frames[4:]])
     assert [pose.lost for pose in poses] == [False] * 4 + [True] + [False] * 2
     assert len(aligned) == len(poses) - 1
 
@@ -149,24 +138,24 @@ def test_paper_tracker_recovers_with_single_alignment(monkeypatch: pytest.Monkey
 def test_paper_tracker_frame_with_few_matching_points_is_lost() -> None:
     frames = walked(5)
     noise = np.random.default_rng(0).uniform(0.5, 4, frames[-1].depth.shape).astype(np.float32)
-    poses = run(paper_tracker(), [*frames[:4], dataclasses.replace(frames[-1], depth=noise)])
+    poses = track_and_fuse(paper_tracker(), [*frames[:4], dataclasses.replace(frames[-1], depth=noise)])
     assert poses[-1].lost
     assert "agree with the map" in poses[-1].reason
-    poses = run(paper_tracker("tracker.min_matched=1"), frames)
+    poses = track_and_fuse(paper_tracker("tracker.min_matched=1"), frames)
     assert all(pose.lost for pose in poses[1:])
 
 
 def test_paper_tracker_frame_with_implausible_step_is_lost() -> None:
     frames = walked(8)
-    assert not run(paper_tracker(), [frames[0], frames[4]])[1].lost
-    poses = run(paper_tracker("tracker.max_translation=0.002"), [frames[0], frames[4]])
+    assert not track_and_fuse(paper_tracker(), [frames[0], frames[4]])[1].lost
+    poses = track_and_fuse(paper_tracker("tracker.max_translation=0.002"), [frames[0], frames[4]])
     assert "implausible step of" in poses[1].reason
 
 
 def test_paper_tracker_frame_of_single_wall_is_lost() -> None:
     """Color is not used at the finest level, so the motion along the wall is undetermined."""
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
-    poses = run(paper_tracker(), [wall.frame(T, k) for k, T in enumerate(walk(3))])
+    poses = track_and_fuse(paper_tracker(), [wall.frame(T, k) for k, T in enumerate(walk(3))])
     assert [pose.lost for pose in poses] == [False, True, True]
     assert "does not determine the motion" in poses[1].reason
 
@@ -174,7 +163,8 @@ def test_paper_tracker_frame_of_single_wall_is_lost() -> None:
 def test_paper_tracker_linear_weights_have_small_effect() -> None:
     frames = walked(12)
     tukey, linear = (
-        run(VoxelHashingIcp(finest_scale=1.0, residual_weights=weights), frames) for weights in ResidualWeights
+        track_and_fuse(VoxelHashingIcp(finest_scale=1.0, residual_weights=weights), frames)
+        for weights in ResidualWeights
     )
     assert not np.array_equal(tukey[-1].T_world_camera, linear[-1].T_world_camera)
     assert max(drift(poses[-1], frames[-1]) for poses in (tukey, linear)) < 0.006

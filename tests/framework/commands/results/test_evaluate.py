@@ -21,6 +21,7 @@ from framework.files.directory_lock import locked
 from framework.runs import reevaluation, run_directory
 from framework.runs.provenance import config_hash
 from tests.support import reported_run
+from tests.support.command_call import call_command
 from tests.support.scenes.corner_room import CornerRoom
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
@@ -55,14 +56,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     """Return a function that runs the command in this process and returns the status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["evaluate", *map(str, arguments)])
-        status = 0
-        try:
-            evaluate.main()
-        except SystemExit as ended:
-            status = int(ended.code or 0)
-        written = capsys.readouterr()
-        return status, written.out, written.err
+        return call_command(evaluate, arguments, monkeypatch, capsys)
 
     return start
 

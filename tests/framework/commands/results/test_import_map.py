@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -25,6 +24,7 @@ from framework.runs.manifest import Manifest
 from framework.runs.mesh_file import read_mesh
 from framework.runs.stored_runs import read_record
 from framework.tables.experiment_tables import write_tables
+from tests.support.command_call import call_command
 from tests.support.reported_run import FAKES, write_run
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
@@ -52,14 +52,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     """Return a function that runs a command in this process and returns the status, stdout and stderr."""
 
     def start(module: ModuleType, *arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["instancemap", *map(str, arguments)])
-        status = 0
-        try:
-            module.main()
-        except SystemExit as ended:
-            status = int(ended.code or 0)
-        written = capsys.readouterr()
-        return status, written.out, written.err
+        return call_command(module, arguments, monkeypatch, capsys)
 
     return start
 
