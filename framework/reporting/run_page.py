@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import yaml
 from PIL import Image
 
 from framework.data import Float64
+from framework.editing.edited_run import EDITS, default_directory
 from framework.errors import FrameError
 from framework.files.image_files import read_color
 from framework.registry import STAGES
@@ -86,16 +88,21 @@ class RunReport:
         """Return the HTML page. The result is deterministic."""
         contents = self.contents
         match_results = self.check.match_results if self.check else {}
+        colors = colors_by_id(contents.objects)
         data: dict[str, Any] = {
             "likely": LIKELY,
             "maps": [] if self.scene is None else [{"name": contents.name, **self.scene.data()}],
             "objects": [
-                object_data(one, contents, self.pictures.get(one.id), match_results.get(one.id))
+                object_data(
+                    one, contents, hex_color(colors[one.id]), self.pictures.get(one.id), match_results.get(one.id)
+                )
                 for one in contents.objects
             ],
+            "edit": _editing(contents),
         }
         context = {
             "name": contents.name,
+            "partial": contents.partial,
             "stages": stage_names(contents),
             "numbers": headline_numbers(contents),
             "notices": self._notices(),
@@ -242,6 +249,14 @@ def overview_url(path: Path) -> str:
         return ""
     small.thumbnail((OVERVIEW_WIDTH, OVERVIEW_WIDTH))
     return webp_url(small, 80)
+
+
+def _editing(contents: RunContents) -> dict[str, Any]:
+    """Return the class names of a map, and the command that applies edits to it."""
+    run = contents.record.directory
+    names = {name for one in contents.objects for name in (one.class_name, *one.class_probabilities)}
+    command = ["instancemap", "edit", str(run), "--edits", EDITS, "--out", str(default_directory(run))]
+    return {"classes": sorted(names), "command": shlex.join(command)}
 
 
 def _provenance(contents: RunContents) -> dict[str, Any]:
