@@ -11,7 +11,7 @@ class EditingMode {
     this.selection = []; // ids of instances, in order of selection
     this.latest = null; // id of the latest selected object, whose details are shown
     this.saved = editsFile([]); // content of the latest downloaded file
-    this.instances = new EditedInstances(report.objects, []);
+    this.edited = new EditedInstances(report.objects, []);
     byId("edit-classes").append(...report.edit.classes.map((name) => {
       const option = made("option");
       option.value = name;
@@ -32,7 +32,7 @@ class EditingMode {
     on("edit-name", "input", () => this.buttons());
     on("edit-form", "submit", (event) => {
       event.preventDefault();
-      if (this.instances.refusal("rename", this.selection, this.className)) return;
+      if (this.edited.refusal("rename", this.selection, this.className)) return;
       this.add({ rename: [this.selection[0], this.className] });
       byId("edit-name").value = "";
       this.buttons();
@@ -75,7 +75,7 @@ class EditingMode {
 
   /** Selects the instance that contains an object, or removes it from the selection. */
   toggle(id) {
-    const owner = this.instances.owners.get(id);
+    const owner = this.edited.owners.get(id);
     if (!owner) return;
     const selected = this.selection.includes(owner.id);
     this.selection = selected ? this.selection.filter((one) => one !== owner.id) : [...this.selection, owner.id];
@@ -91,9 +91,9 @@ class EditingMode {
 
   /** Computes the instances from the edits, and shows them. */
   refresh() {
-    this.instances = new EditedInstances(report.objects, this.edits);
-    this.selection = this.selection.filter((id) => this.instances.instances.has(id));
-    if (!this.instances.owners.has(this.latest)) this.latest = null;
+    this.edited = new EditedInstances(report.objects, this.edits);
+    this.selection = this.selection.filter((id) => this.edited.instances.has(id));
+    if (!this.edited.owners.has(this.latest)) this.latest = null;
     this.page.show();
     this.list();
     this.show();
@@ -102,12 +102,12 @@ class EditingMode {
   /** Shows the selection. */
   show() {
     if (!this.on) return;
-    const { instances } = this.instances;
+    const { instances } = this.edited;
     const members = this.selection.flatMap((id) => instances.get(id).members);
     const labeled = this.page.shown().filter((one) => one.owner === one.id && (one.edited || this.selection.includes(one.id)));
     const texts = new Map(labeled.map((one) => [one.id, `${one.class} ${one.id}`]));
     this.page.select(members, this.latest, texts);
-    const names = this.selection.map((id) => `${this.instances.name(id)} ${id}`);
+    const names = this.selection.map((id) => `${this.edited.name(id)} ${id}`);
     byId("edit-selection").textContent = names.length
       ? `Selected: ${names.join(", ")}`
       : "Select objects with a click in the map or the table. A second click deselects.";
@@ -120,7 +120,7 @@ class EditingMode {
       byId(id).title = reason || title;
     };
     const { selection } = this;
-    const refusal = (operation, name) => this.instances.refusal(operation, selection, name);
+    const refusal = (operation, name) => this.edited.refusal(operation, selection, name);
     set("edit-merge", refusal("merge"), `Merge into ${selection[0]}, the first selected object`);
     set("edit-parts", refusal("split"), "Split into connected parts");
     set("edit-plane", refusal("split"), "Separate the dominant plane, such as a table top, from the rest");
@@ -139,8 +139,11 @@ class EditingMode {
       button.setAttribute("aria-label", `Remove edit ${k + 1}: ${editText(edit)}`);
       button.addEventListener("click", () => this.remove(k));
       const isNew = edit.rename && !report.edit.classes.includes(edit.rename[1]);
-      return made("li", "", editText(edit), ...(isNew ? [made("span", "faint", " (new class)")] : []), button);
+      const text = made("span", "", editText(edit));
+      if (isNew) text.append(made("span", "faint", " (new class)"));
+      return made("li", "", text, button);
     }));
+    byId("edit-list").scrollTop = byId("edit-list").scrollHeight;
     byId("edit-splits").hidden = !this.edits.some((edit) => edit.split);
     byId("edit-apply").hidden = !this.edits.length || editsFile(this.edits) !== this.saved;
   }

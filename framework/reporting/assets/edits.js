@@ -91,7 +91,7 @@ class EditedInstances {
         class: this.name(owner.id),
         color,
         classColor: classColors.get(owner.names[0]) || color,
-        edited: Boolean(owner.renamed || owner.members.length > 1 || owner.splits.length),
+        edited: owner.renamed || owner.members.length > 1,
         note,
       };
     });

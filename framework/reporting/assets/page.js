@@ -160,7 +160,7 @@ class Page {
   /** Returns the objects of the map as recorded or, in the editing mode, after the edits. */
   shown() {
     const recorded = report.maps.length ? report.maps[this.map || 0].objects : report.objects;
-    return this.editing && this.editing.on ? this.editing.instances.shown(recorded) : recorded;
+    return this.editing && this.editing.on ? this.editing.edited.shown(recorded) : recorded;
   }
 
   /** Shows the current objects in the map, the table and the legend. */

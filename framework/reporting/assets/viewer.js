@@ -141,14 +141,12 @@ class MapViewer {
     this.paint();
   }
 
-  /** Shows texts (Map by id) at the centers of objects. */
+  /** Shows texts (Map by id) at the centroids of objects. */
   setLabels(texts) {
     this.labels = [...texts].filter(([id]) => this.shown.parts.has(id)).map(([id, text]) => {
-      const { geometry } = this.shown.parts.get(id);
-      geometry.computeBoundingSphere();
       const element = document.createElement("span");
       element.textContent = text;
-      return { element, center: geometry.boundingSphere.center };
+      return { element, center: centroid(this.shown.parts.get(id).geometry) };
     });
     this.labelLayer.replaceChildren(...this.labels.map(({ element }) => element));
     this.draw();
@@ -286,6 +284,13 @@ class MapViewer {
 
 /** Returns true for objects with a minimum confidence. Edited objects are always likely, deleted ones never. */
 function isLikely(object, least) { return !object.deleted && (object.edited || object.confidence >= least); }
+
+function centroid(geometry) {
+  const positions = geometry.getAttribute("position");
+  const sum = new THREE.Vector3();
+  for (let k = 0; k < positions.count; k += 1) sum.add(new THREE.Vector3().fromBufferAttribute(positions, k));
+  return sum.divideScalar(positions.count);
+}
 
 function material() {
   return new THREE.ShaderMaterial({
