@@ -14,8 +14,10 @@ from PIL import Image
 
 from framework.data import Float64
 from framework.editing.edited_run import EDITS, default_directory
-from framework.errors import FrameError
+from framework.errors import DataError, FrameError
 from framework.files.image_files import read_color
+from framework.mapping.instance_map import FORMAT
+from framework.mapping.storage.map_file import read_format
 from framework.registry import STAGES
 from framework.reporting.charts import (
     FLAT_HEIGHT,
@@ -39,7 +41,7 @@ from framework.reporting.truth_section import TruthCheck, truth_section
 from framework.reporting.visibility import NOT_CAMERA, spread_out
 from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
-from framework.runs.stored_runs import is_number
+from framework.runs.stored_runs import MAP, is_number
 
 OVERVIEW_WIDTH = 1400  # px, of the image for browsers without WebGL
 SMALL_PATH = 0.3  # maximum extent of a path that is also shown enlarged, relative to the width of the top view
@@ -102,7 +104,7 @@ class RunReport:
         }
         context = {
             "name": contents.name,
-            "partial": contents.partial,
+            "not_editable": _not_editable(contents),
             "stages": stage_names(contents),
             "numbers": headline_numbers(contents),
             "notices": self._notices(),
@@ -257,6 +259,18 @@ def _editing(contents: RunContents) -> dict[str, Any]:
     names = {name for one in contents.objects for name in (one.class_name, *one.class_probabilities)}
     command = ["instancemap", "edit", str(run), "--edits", EDITS, "--out", str(default_directory(run))]
     return {"classes": sorted(names), "command": shlex.join(command)}
+
+
+def _not_editable(contents: RunContents) -> str:
+    """Return the reason why `instancemap edit` cannot edit a run, "" = none."""
+    if contents.partial:
+        return "instancemap edit cannot apply edits to this run, because it is partial."
+    try:
+        if read_format(contents.record.directory / MAP) == str(FORMAT):
+            return ""
+    except DataError:
+        pass  # missing, as in imported maps, or damaged
+    return f"instancemap edit cannot apply edits to this run, because it has no {MAP} with instances in voxels."
 
 
 def _provenance(contents: RunContents) -> dict[str, Any]:

@@ -54,7 +54,8 @@ class EditedInstances {
     const unknown = ids.find((id) => !this.instances.has(id));
     if (unknown) return `Object ${unknown} has been merged or deleted`;
     if (operation === "rename" && !name) return "Enter a class name";
-    if (name.length > LONGEST_CLASS_NAME) return `Enter at most ${LONGEST_CLASS_NAME} characters`;
+    if (/(?! )[\p{C}\p{Z}]/u.test(name)) return "Enter a name without control characters";
+    if ([...name].length > LONGEST_CLASS_NAME) return `Enter at most ${LONGEST_CLASS_NAME} characters`;
     return "";
   }
 

@@ -246,6 +246,10 @@ def test_report_without_webgl_shows_still_image(pages: list[Path], browser: Any)
     assert page.evaluate("document.querySelector('.still').naturalWidth") > 1000
     page.locator("#objects-table tbody tr").first.click()
     assert "Class probabilities" in page.inner_text("#panel")
+    page.get_by_role("button", name="Edit", exact=True).click()
+    page.locator("#objects-table tbody tr").first.click()
+    page.get_by_role("button", name="Delete", exact=True).click()
+    assert "deleted" in page.locator("#objects-table tbody tr").first.inner_text()
     context.close()
 
 
@@ -358,6 +362,8 @@ def test_report_impossible_edits_are_disabled(divided: Path, opened: Any) -> Non
     assert reasons() == nothing | {"merge": "Select two or more objects", "rename": "Enter a class name"}
     page.locator("#edit-name").fill("  ")
     assert reasons()["rename"] == "Enter a class name"
+    page.locator("#edit-name").fill("a\u200bb")
+    assert reasons()["rename"] == "Enter a name without control characters"
     row(page, 2).click()
     single = dict.fromkeys(("parts", "rename"), "Select a single object")
     assert reasons() == nothing | single
