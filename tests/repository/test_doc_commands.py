@@ -74,6 +74,7 @@ def test_documented_commands_and_scripts_are_all_tested() -> None:
         *blocks("python", "README.md"),  # test_new_plugin.py
         *blocks("python", "docs/python.md"),
         *blocks("python", "docs/tutorials/research_project.md"),  # test_research_workflow.py
+        *blocks("python", "docs/tutorials/own_classes.md"),  # test_own_classes_tutorial.py
         *(block("python", words) for words in EXECUTED),
     }
     assert not set(blocks("python")) - scripts
