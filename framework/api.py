@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -58,6 +59,7 @@ from framework.runtime.process_settings import Settings, configure_process
 from framework.runtime.run_log import Journal
 from framework.sensors.noise_models import SensorKind
 from framework.tracking.keyframes import read_keyframes
+from framework.vocabulary.label_spaces import ClassNames
 
 __all__ = [
     "Camera",
@@ -94,12 +96,15 @@ __all__ = [
     "configure_process",
     "edit",
     "export",
+    "import_map",
     "load_map",
     "load_runs",
     "open_dataset",
     "query",
     "untimed",
 ]
+
+log = logging.getLogger(__name__)
 
 
 def begin(config: DictConfig) -> Pipeline:
@@ -402,6 +407,75 @@ def edit(run: Path | str, edits: Sequence[Mapping[str, Any]] | Path | str, out: 
     entries = read_edits(Path(edits)) if isinstance(edits, str | Path) else edits_of("edits", edits)
     edited_run.EditedRun.of(Path(run), entries).write(directory)
     return directory
+
+
+def import_map(
+    mesh: Path | str,
+    directory: Path | str,
+    *overrides: str,
+    name: str | None = None,
+    labels: Path | str | None = None,
+    label_space: Path | str | None = None,
+    class_names: str = "AUTO",
+    instance_property: str | None = None,
+    class_property: str | None = None,
+    no_instance: int = 0,
+    scale: float = 1.0,
+    transform: Float64 | Path | str | None = None,
+    up: Sequence[float] | None = None,
+) -> Path:
+    """Convert the map of another system to a run directory for tables, reports, `load_runs` and `export`.
+
+    Changes and assumptions, such as instances that are left out, are logged as warnings.
+
+    Example: `import_map("other.ply", "outputs/other", "dataset=desk", label_space="nyu40")`.
+
+    Args:
+        mesh: A PLY file, or points (V, 3) in an NPY file, in the world frame of the ground truth.
+        directory: The new run directory.
+        overrides: The dataset to compare with, as on the command line: "dataset=NAME", "dataset.KEY=VALUE", "seed=N".
+        name: The name of the row in tables; None = the name of the directory.
+        labels: A JSON or CSV file with the class and confidence of each instance id, ScanNet predictions (text file or
+            its folder), or a mask folder; None = properties of the mesh.
+        label_space: The names of class ids: a label space such as "nyu40", or a text or JSON file; None = NYU40 for
+            ScanNet predictions, otherwise none.
+        class_names: "COCO" (instances of other classes are left out), "OWN" (the given names), or "AUTO" (OWN if a name
+            is in no known label space, otherwise COCO).
+        instance_property: The property of the PLY file with instance ids; None = detected by name.
+        class_property: The property with class ids; None = detected by name; "" = no classes.
+        no_instance: The id of points without an instance.
+        scale: The number of meters per unit of the mesh, > 0.
+        transform: T_world_map (4, 4), applied after `scale`, or a text file; None = identity.
+        up: The up direction (3,) in the world frame; None = unknown.
+
+    Returns:
+        The run directory.
+
+    Raises:
+        ConfigError: The directory is not empty, or an argument is invalid.
+        DataError: A file is missing or invalid, or no instance is left.
+    """
+    from framework.runs.external_maps.map_import import MapImport
+    from framework.runs.external_maps.ply_instances import LabelProperties
+
+    if class_names not in ClassNames.__members__:
+        known = ", ".join(ClassNames.__members__)
+        raise ConfigError(f"class_names: expected one of {known}, got {class_names!r:.60}")
+    chosen = MapImport(
+        mesh=Path(mesh),
+        labels=None if labels is None else Path(labels),
+        label_space=None if label_space is None else str(label_space),
+        class_names=ClassNames[class_names],
+        properties=LabelProperties(instance_property, class_property, no_instance),
+        scale=scale,
+        transform=Path(transform) if isinstance(transform, str) else transform,
+        up=up,
+    )
+    remarks, title = chosen.write(Path(directory), name, overrides)
+    for remark in remarks:
+        log.warning("import_map: %s", remark)
+    log.info("import_map: %s", title)
+    return Path(directory)
 
 
 def query(run: Map | Path | str, words: str, by: str | None = None, model: Path | str | None = None) -> QueryResult:

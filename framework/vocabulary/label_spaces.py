@@ -22,6 +22,7 @@ from framework.files.atomic_write import read_text
 from framework.files.search_paths import expanded
 
 LARGEST_FILE = 2**20  # bytes, maximum size of a list of labels
+LONGEST_CLASS_NAME = 100  # characters
 _OTHER_NAMES = "other_names"  # section for spellings outside of all spaces
 
 
@@ -126,19 +127,46 @@ def to_class_names(labels: Sequence[str], class_names: ClassNames, key: str = "d
     Raises:
         ConfigError: No label is an object class, or the class names are COCO and a label is unknown.
     """
-    unknown = [] if class_names is ClassNames.OWN else _unknown(labels)
-    in_coco = any(map(coco_name, labels))
-    if class_names is ClassNames.COCO or (class_names is ClassNames.AUTO and in_coco and not unknown):
+    if not keeps_names(labels, class_names):
         return to_coco(labels, key)
-    if unknown:
-        message = "%s: all names are kept, because %d of %d are in no known label space: %s"
-        log.info(message, key, len(unknown), len(labels), ", ".join(map(with_similar, dict.fromkeys(unknown))))
+    if class_names is ClassNames.AUTO and (reason := reason_for_names(labels)):
+        log.info("%s: %s", key, reason)
     names = [label.strip() for label in labels]
     classes = tuple(dict.fromkeys(name for name in names if name.lower() != NO_CLASS))
     if not classes:
         raise ConfigError(f"{key}: expected at least one class, got none in {len(labels)} labels")
     index = {name: k for k, name in enumerate(classes)}
     return LabelMapping(classes, np.array([index.get(name, -1) for name in names], np.int32))
+
+
+def keeps_names(labels: Sequence[str], class_names: ClassNames) -> bool:
+    """Return True if classes have the names of their label space, False if they have COCO names."""
+    if class_names is ClassNames.AUTO:
+        return bool(_unknown(labels)) or not any(map(coco_name, labels))
+    return class_names is ClassNames.OWN
+
+
+def reason_for_names(labels: Sequence[str]) -> str:
+    """Return the reason why AUTO keeps the names of labels, "" if all are in known label spaces."""
+    unknown = _unknown(labels)
+    if not unknown:
+        return ""
+    listed = ", ".join(map(with_similar, dict.fromkeys(unknown)))
+    return f"all names are kept, because {len(unknown)} of {len(labels)} are in no known label space: {listed}"
+
+
+def check_class_name(where: str, name: str) -> None:
+    """Raise DataError unless a class name is valid in all outputs.
+
+    Args:
+        where: The location of the name, for messages.
+        name: The name.
+    """
+    if name != name.strip() or not 0 < len(name) <= LONGEST_CLASS_NAME or not name.isprintable():
+        raise DataError(
+            f"{where}: expected a class name of 1 to {LONGEST_CLASS_NAME} characters without outer spaces and control "
+            f"characters, got {name!r:.120}"
+        )
 
 
 def with_similar(name: str) -> str:
