@@ -31,6 +31,7 @@ from framework.data import (
 )
 from framework.datasets.frames.sequence_reader import FRAME_RATE
 from framework.detection.domain import warn_outside_domain
+from framework.detection.map_classes import with_classes_of_map
 from framework.detection.stored.cache import with_cache
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.interfaces import (
@@ -120,7 +121,7 @@ def begin(config: DictConfig) -> Pipeline:
     fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
     tracker = build(PoseTracker, config.get("tracker"))
     viewer = build(Viewer, config.get("viewer"))
-    detector = with_cache(build(Detector, config.get("detector")), config)  # last, because loading a network is slow
+    classes: tuple[str, ...] = ()
     chosen = {key: config.get(key) for key in ("resume_from", "localize_in") if config.get(key) is not None}
     if len(chosen) > 1:
         raise ConfigError("resume_from and localize_in: expected at most one of these keys, got both; remove one")
@@ -129,7 +130,10 @@ def begin(config: DictConfig) -> Pipeline:
         scene = scene_of(key, run)
         if key == "resume_from":
             fuser.resume(scene)
+            classes = scene.classes
         tracker.load_keyframes(read_keyframes(run / KEYFRAMES), scene)
+    detector = build(Detector, config.get("detector"))  # last, because loading a network is slow
+    detector = with_cache(with_classes_of_map(detector, classes), config)
     compile_for_run()
     return Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from string import ascii_letters, digits, punctuation
+from urllib.parse import quote, unquote
 
 import numpy as np
 
@@ -16,13 +18,16 @@ TYPES = {**dict.fromkeys(CHANNELS, np.uint8), "instance": np.int32, "class": np.
 """Types of the vertex properties other than the position."""
 
 CLASSES = "classes "  # prefix of the comment with the class names
+# characters of class names that are not percent-encoded; a PLY header is ASCII, and commas separate the names
+SAFE = (ascii_letters + digits + punctuation + " ").translate(str.maketrans("", "", ",%"))
 
 
 def write_mesh(path: Path, mesh: InstanceMesh) -> None:
     """Write a mesh to a binary PLY file.
 
     Each vertex has a position in m, a color, an instance id and a class. The class is an index into the class names in
-    the header. Vertices without an instance have the id 0, and vertices without a class have the index -1.
+    the header. Vertices without an instance have the id 0, and vertices without a class have the index -1. Commas,
+    percent signs and non-ASCII characters of class names are percent-encoded (RFC 3986, UTF-8).
     """
     properties: dict[str, Array] = {
         **{channel: mesh.colors[:, k] for k, channel in enumerate(CHANNELS)},
@@ -31,7 +36,7 @@ def write_mesh(path: Path, mesh: InstanceMesh) -> None:
     }
     comments = (
         "InstanceMap; meters; instance 0 = none; class -1 = none, else an index into:",
-        f"{CLASSES}{','.join(mesh.classes)}",
+        f"{CLASSES}{','.join(quote(name, SAFE) for name in mesh.classes)}",
     )
     write_ply(path, mesh.vertices, mesh.triangles, properties, comments)
 
@@ -68,4 +73,4 @@ def read_mesh(path: Path) -> InstanceMesh:
 def listed_classes(comments: Sequence[str]) -> list[tuple[str, ...]]:
     """Return the class names in each comment of `write_mesh` with classes."""
     lists = [comment[len(CLASSES) :] for comment in comments if f"{comment} ".startswith(CLASSES)]
-    return [tuple(names.split(",")) if names else () for names in lists]
+    return [tuple(map(unquote, names.split(","))) if names else () for names in lists]

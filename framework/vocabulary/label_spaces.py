@@ -169,10 +169,10 @@ def check_class_name(where: str, name: str) -> None:
         )
 
 
-def with_similar(name: str) -> str:
-    """Return a quoted name, with the most similar known name if there is one."""
-    close = get_close_matches(_key(name), MEANINGS, n=1, cutoff=0.75)
-    return f"{name!r} (similar to {close[0]!r})" if close else repr(name)
+def with_similar(name: str, others: Sequence[str] = ()) -> str:
+    """Return a quoted name, with the most similar name among others and all known names if there is one."""
+    close = get_close_matches(_key(name), [*others, *MEANINGS], n=1, cutoff=0.75)
+    return f"{name!r} (similar to {close[0]!r})" if close and close[0] != name else repr(name)
 
 
 def _key(label: str) -> str:
