@@ -14,7 +14,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig
 
 from framework.compilation.catalog import compile_for_run
-from framework.config.composition import composed, resolved
+from framework.config.composition import composed, composed_with_choices, resolved
 from framework.config.validation import checked_path
 from framework.data import (
     Camera,
@@ -34,6 +34,7 @@ from framework.detection.domain import warn_outside_domain
 from framework.detection.map_classes import with_classes_of_map
 from framework.detection.stored.cache import with_cache
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
+from framework.files.atomic_write import atomic_write
 from framework.interfaces import (
     ClusterRefiner,
     Detector,
@@ -54,11 +55,13 @@ from framework.queries.map_queries import Map
 from framework.queries.text_search import Match, QueryResult, TextQuery, search
 from framework.registry import build
 from framework.runs.data_frame import load_runs
-from framework.runs.stored_runs import KEYFRAMES, MAP
+from framework.runs.run_directory import write_run
+from framework.runs.stored_runs import KEYFRAMES, MAP, REPORT
 from framework.runtime.cpu_budget import limited_threads
 from framework.runtime.process_settings import Settings, configure_process
 from framework.runtime.run_log import Journal
 from framework.sensors.noise_models import SensorKind
+from framework.tables.experiment_tables import write_tables
 from framework.tracking.keyframes import read_keyframes
 from framework.vocabulary.label_spaces import ClassNames
 
@@ -102,8 +105,14 @@ __all__ = [
     "load_runs",
     "open_dataset",
     "query",
+    "report",
+    "run",
+    "tables",
     "untimed",
 ]
+
+SWEEPS = ("experiment", "hydra", "launcher")
+"""Config groups of the command line that run several jobs, and of its working directory."""
 
 log = logging.getLogger(__name__)
 
@@ -181,11 +190,9 @@ class Mapper(Map):
     """
 
     def __init__(self, *overrides: str, **named: object) -> None:
-        words = [*overrides, *(_override(name, value) for name, value in named.items())]
+        words = _overrides("Mapper", overrides, named)
         for override in words:
-            if not isinstance(override, str):
-                raise ConfigError(f"Mapper: expected overrides such as 'fuser.voxel_size=0.02', got {override!r}")
-            if override.lstrip("+~").startswith(("dataset", "hydra", "experiment", "sequences", "launcher")):
+            if override.lstrip("+~").startswith(("dataset", "sequences", *SWEEPS)):
                 raise ConfigError(
                     f"Mapper: expected an override of a stage or setting, got {override}; use dataset, experiment, "
                     "sequences, launcher and hydra overrides only on the command line"
@@ -305,6 +312,14 @@ class Mapper(Map):
         return super().at_pixel(u, v, camera, T_world_camera)
 
 
+def _overrides(where: str, overrides: Sequence[str], named: Mapping[str, object]) -> list[str]:
+    words = [*overrides, *(_override(name, value) for name, value in named.items())]
+    for override in words:
+        if not isinstance(override, str):
+            raise ConfigError(f"{where}: expected overrides such as 'fuser.voxel_size=0.02', got {override!r}")
+    return words
+
+
 def _override(name: str, value: object) -> str:
     if value is None or isinstance(value, bool | int | float):
         return f"{name}={'null' if value is None else value}"
@@ -331,6 +346,78 @@ def open_dataset(name: str, **parameters: object) -> RGBDSequence:
     """
     words = [_override("dataset", name), *(_override(f"dataset.{key}", value) for key, value in parameters.items())]
     return build(RGBDSequence, composed(*words).dataset)
+
+
+def run(directory: Path | str, *overrides: str, **named: object) -> Path:
+    """Map a sequence and write a run directory, as the command `instancemap` does.
+
+    Example: `run("outputs/demo", "fuser.voxel_size=0.02", dataset="desk")`.
+
+    Args:
+        directory: The new run directory.
+        overrides: The overrides of the command line, such as "dataset.root=DIR". Experiments, launchers and Hydra's own
+            settings are not supported.
+        named: Overrides as keywords.
+
+    Returns:
+        The run directory.
+
+    Raises:
+        ConfigError: A name is unknown, or a value is invalid.
+        DataError: The directory is not empty, the sequence cannot be read, or no frame could be mapped.
+        PartialRunError: An error ended the run early. The outputs are those of the mapped frames.
+    """
+    from framework.importing.folder_writer import check_new
+
+    words = _overrides("run", overrides, named)
+    for override in words:
+        if override.lstrip("+~").startswith(SWEEPS):
+            raise ConfigError(
+                f"run: expected an override of a single run, got {override}; use {', '.join(SWEEPS)} overrides only on "
+                "the command line"
+            )
+    check_new(Path(directory))
+    config, choices = composed_with_choices(*words)
+    with limited_threads(Settings.of(config).threads):
+        write_run(begin(config), config, Path(directory), choices).check()
+    return Path(directory)
+
+
+def report(run: Path | str, out: Path | str | None = None) -> Path:
+    """Write an interactive HTML report of a run.
+
+    Args:
+        run: The run directory.
+        out: The file; None = `report.html` in the run directory.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        DataError: The run cannot be read, or the file cannot be written.
+    """
+    from framework.reporting.run_contents import RunContents
+    from framework.reporting.run_page import RunReport
+
+    path = Path(run) / REPORT if out is None else Path(out)
+    page = RunReport.of(RunContents.read(Path(run))).html()
+    with atomic_write(path) as temporary:
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names may be invalid Unicode
+    return path
+
+
+def tables(directory: Path | str, *overrides: str) -> str:
+    """Write table.md, table.tex and table.csv of the runs below a folder, and return the Markdown text.
+
+    Args:
+        directory: The folder. The runs are in this folder and its subfolders.
+        overrides: Settings of the table, such as "table.columns=[instances.ap50]".
+
+    Raises:
+        DataError: No run is complete.
+        ConfigError: A setting is invalid.
+    """
+    return write_tables(Path(directory), overrides)
 
 
 def load_map(path: Path | str) -> Map:
