@@ -562,10 +562,10 @@ def import_map(
         transform=Path(transform) if isinstance(transform, str) else transform,
         up=up,
     )
-    remarks, title = chosen.write(Path(directory), name, overrides)
-    for remark in remarks:
+    found = chosen.write(Path(directory), name, overrides)
+    log.info("import_map: %s; %s", found.source, found.title)
+    for remark in found.remarks:
         log.warning("import_map: %s", remark)
-    log.info("import_map: %s", title)
     return Path(directory)
 
 

@@ -54,8 +54,8 @@ def main() -> None:
     add("--up", metavar=("X", "Y", "Z"), nargs=3, type=float, help=up)
     parsed = arguments(parser)
     with one_line_errors():
-        remarks, title = map_import(parsed).write(parsed.directory, parsed.name, parsed.overrides)
-        print("\n".join([*remarks, title, str(parsed.directory)]))
+        found = map_import(parsed).write(parsed.directory, parsed.name, parsed.overrides)
+        print("\n".join([found.source, *found.remarks, found.title, str(parsed.directory)]))
 
 
 def map_import(parsed: argparse.Namespace) -> MapImport:

@@ -19,6 +19,15 @@ from framework.vocabulary.label_spaces import ClassNames
 
 
 @dataclass(frozen=True)
+class ImportSummary:
+    """The result of an import, for the user."""
+
+    source: str  # format and origin of the labels
+    remarks: tuple[str, ...]  # changes and assumptions, such as the number of instances that are left out
+    title: str  # the main metrics
+
+
+@dataclass(frozen=True)
 class MapImport:
     """The files of a map, and the options of its import."""
 
@@ -32,16 +41,13 @@ class MapImport:
     transform: Path | Float64 | None = None
     up: Sequence[float] | None = None  # up direction (3,) in the world frame; None = unknown
 
-    def write(self, directory: Path, name: str | None, overrides: Sequence[str]) -> tuple[list[str], str]:
+    def write(self, directory: Path, name: str | None, overrides: Sequence[str]) -> ImportSummary:
         """Write the run directory of the map.
 
         Args:
             directory: The new run directory.
             name: Name of the row in tables; None = name of the directory.
             overrides: Overrides of the dataset and the seed.
-
-        Returns:
-            The changes and assumptions, one line each, and the main metrics as one line.
 
         Raises:
             ConfigError: The directory is not empty, or an option is invalid.
@@ -55,8 +61,8 @@ class MapImport:
         row = name or directory.resolve().name
         options = self.chosen_options()
         title = write_imported_run(directory, row, converted, data, placement.up, options, external.masks)
-        compared = [] if data.dataset else ["no dataset: import the map again with dataset=NAME to evaluate it"]
-        return [external.source, *converted.remarks, *compared], title
+        compared = () if data.dataset else ("no dataset: import the map again with dataset=NAME to evaluate it",)
+        return ImportSummary(external.source, (*converted.remarks, *compared), title)
 
     def chosen_options(self) -> Mapping[str, ImportOption]:
         """Return the options that differ from their defaults, by name. The up direction is part of the metrics."""
