@@ -524,7 +524,8 @@ def import_map(
     Args:
         mesh: A PLY file, or points (V, 3) in an NPY file, in the world frame of the ground truth.
         directory: The new run directory.
-        overrides: The dataset to compare with, as on the command line: "dataset=NAME", "dataset.KEY=VALUE", "seed=N".
+        overrides: The dataset to compare with, as on the command line: "dataset=NAME", "dataset.KEY=VALUE",
+            "evaluation.KEY=VALUE", "seed=N".
         name: The name of the row in tables; None = the name of the directory.
         labels: A JSON or CSV file with the class and confidence of each instance id, ScanNet predictions (text file or
             its folder), or a mask folder; None = properties of the mesh.

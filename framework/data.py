@@ -452,6 +452,15 @@ class ReferenceTrajectory:
 
 
 @dataclass(frozen=True)
+class AnnotatedObjects:
+    """All annotated objects of a scene, including those without a COCO class, with their names in label spaces."""
+
+    instance_ids: Int32  # (V,) at SceneTruth.points_world, 0 = no object
+    own_names: Mapping[int, str | None]  # names in the annotation by instance id; None = no name
+    names: Mapping[str, Mapping[int, str]]  # names by label space and instance id; objects of other classes are missing
+
+
+@dataclass(frozen=True)
 class SceneTruth:
     """The ground-truth instances of a sequence as labeled surface points, for evaluation."""
 
@@ -460,6 +469,7 @@ class SceneTruth:
     class_names: Mapping[int, str | None] = field(default_factory=dict)  # as in FrameTruth; None = not evaluated
     classes: tuple[str, ...] | None = None  # all annotated classes; None = unknown
     trajectory: ReferenceTrajectory | None = None  # None = all maps share the world frame of the points
+    annotated: AnnotatedObjects | None = None  # None = class_names are the names of the annotation
 
     def __post_init__(self) -> None:
         v = len(self.points_world)

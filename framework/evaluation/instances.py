@@ -274,7 +274,7 @@ class _Overlaps:
             predicted = transfer_labels(map_points, predicted, truth.points_world, reach)
         else:
             true = transfer_labels(truth.points_world, true, map_points, reach)
-        points = _contingency(predicted, true, ids, truth_ids)
+        points = contingency(predicted, true, ids, truth_ids)
         intersection = points[1:, 1:]
         union = points[1:].sum(axis=1)[:, None] + points[:, 1:].sum(axis=0)[None, :] - intersection
         classes = np.array([truth.class_names.get(int(k)) for k in truth_ids], object)
@@ -390,7 +390,7 @@ def transfer_labels(points: Float32, labels: Int32, targets: Float32, max_distan
     return transferred
 
 
-def _contingency(predicted: Int32, true: Int32, predicted_ids: Int64, truth_ids: Array) -> Int64:
+def contingency(predicted: Int32, true: Int32, predicted_ids: Int64, truth_ids: Array) -> Int64:
     """Return the number of points (1 + K, 1 + T) with each pair of labels.
 
     Row 0 and column 0 are for points without an instance.

@@ -15,6 +15,7 @@ import trimesh
 from framework.config.validation import require
 from framework.data import InstanceMesh
 from framework.errors import ConfigError, DataError
+from framework.exporting.benchmark_predictions import BenchmarkPredictions
 from framework.exporting.decimation import joined
 from framework.exporting.floor_plan import write_floor_plan, write_geojson
 from framework.exporting.glb import glb
@@ -42,10 +43,14 @@ class ExportFormat(Enum):
     OBJ = "obj"
     FLOORPLAN = "floorplan"
     GRAPH = "graph"
+    SCANNET = "scannet"
+    NPZ = "npz"
 
 
 MESHES = {ExportFormat.GLB: ".glb", ExportFormat.PLY: ".ply", ExportFormat.USD: ".usdc", ExportFormat.OBJ: ".obj"}
 """File extensions of the formats that contain surfaces."""
+
+PREDICTIONS = (ExportFormat.SCANNET, ExportFormat.NPZ)  # predictions for benchmarks, of all instances
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,8 @@ class Chosen:
     collision: Collision = Collision.HULL  # collision shape of objects in USD files
     resolution: float = 0.05  # cell size of a floor plan, m, in [0.01, 1]
     robot_height: float = 1.0  # minimum height of observed empty space above a free cell, m, in [0.1, 3]
+    label_space: str | None = None  # of predictions: nyu40, scannet20, scannet200 or a JSON file; None = as evaluated
+    points: Path | str | None = None  # PLY or NPY file with the points of predictions; None = ground-truth points
 
     def __post_init__(self) -> None:
         for name, low, high in (("min_confidence", 0.0, 1.0), ("resolution", 0.01, 1.0), ("robot_height", 0.1, 3.0)):
@@ -128,12 +135,16 @@ def export(
     formats, chosen = list(dict.fromkeys(formats)), chosen or Chosen()
     if ExportFormat.USD in formats:
         check_usd()
+    directory = run / "export" if out is None else out
+    predictions = [one for one in formats if one in PREDICTIONS]
+    written = _write_predictions(run, predictions, directory, chosen) if predictions else []
+    formats = [one for one in formats if one not in PREDICTIONS]
+    if not formats:
+        return written
     room = read_room(run, up, floor)
     _check_known(run, room, formats)
     room = room.chosen(chosen.objects, chosen.min_confidence)
-    directory = run / "export" if out is None else out
     directory.mkdir(parents=True, exist_ok=True)
-    written: list[Path] = []
     if surfaces := [one for one in formats if one in MESHES]:
         written += _write_surfaces(room, surfaces, directory, chosen)
     others = [one for one in formats if one not in MESHES]
@@ -146,6 +157,13 @@ def export(
         write_scene_graph(directory / "scene_graph.json", room, found)
         written.append(directory / "scene_graph.json")
     return written
+
+
+def _write_predictions(run: Path, formats: Sequence[ExportFormat], directory: Path, chosen: Chosen) -> list[Path]:
+    points = None if chosen.points is None else Path(chosen.points)
+    found = BenchmarkPredictions.of(run, chosen.label_space, points)
+    write = {ExportFormat.SCANNET: found.write_scannet, ExportFormat.NPZ: found.write_npz}
+    return [path for one in formats for path in write[one](directory)]
 
 
 def _check_known(run: Path, room: UprightRoom, formats: Sequence[ExportFormat]) -> None:

@@ -17,7 +17,7 @@ from framework.errors import DataError
 
 ASSETS = files("framework.reporting") / "assets"
 STYLE = "report.css"
-SCRIPTS = ("three.min.js", "viewer.js", "table.js", "page.js")
+SCRIPTS = ("three.min.js", "viewer.js", "table.js", "edits.js", "editing.js", "page.js")
 POLICY = (
     "default-src 'none'; img-src data:; style-src '{style}'; script-src '{script}'; base-uri 'none'; form-action 'none'"
 )

@@ -65,9 +65,9 @@ def object_rows(
 
 
 def object_data(
-    one: StoredInstance, contents: RunContents, picture: Picture | None, match_result: MatchResult | None
+    one: StoredInstance, contents: RunContents, color: str, picture: Picture | None, match_result: MatchResult | None
 ) -> dict[str, Any]:
-    """Return the data of an object for the panel next to the map, as JSON values."""
+    """Return the data of an object for the panel next to the map and for the editing mode, as JSON values."""
     imported = contents.record.is_imported  # class distributions and frames are unknown
     known = {} if imported else one.class_probabilities
     likeliest = sorted(known.items(), key=lambda entry: (-entry[1], entry[0]))[:SHOWN_CLASSES]
@@ -76,6 +76,7 @@ def object_data(
         "id": one.id,
         "class": one.class_name,
         "confidence": one.confidence,
+        "color": color,
         "probabilities": [[name, round(probability, 4)] for name, probability in likeliest],
         "size": f"{_size(one, contents.up)} cm",
         "place": ", ".join(_position(one).split()) + " m",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,11 @@ import yaml
 from PIL import Image
 
 from framework.data import Float64
-from framework.errors import FrameError
+from framework.editing.edited_run import EDITS, default_directory
+from framework.errors import DataError, FrameError
 from framework.files.image_files import read_color
+from framework.mapping.instance_map import FORMAT
+from framework.mapping.storage.map_file import read_format
 from framework.registry import STAGES
 from framework.reporting.charts import (
     FLAT_HEIGHT,
@@ -37,7 +41,7 @@ from framework.reporting.truth_section import TruthCheck, truth_section
 from framework.reporting.visibility import NOT_CAMERA, spread_out
 from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
-from framework.runs.stored_runs import is_number
+from framework.runs.stored_runs import MAP, is_number
 
 OVERVIEW_WIDTH = 1400  # px, of the image for browsers without WebGL
 SMALL_PATH = 0.3  # maximum extent of a path that is also shown enlarged, relative to the width of the top view
@@ -86,16 +90,21 @@ class RunReport:
         """Return the HTML page. The result is deterministic."""
         contents = self.contents
         match_results = self.check.match_results if self.check else {}
+        colors = colors_by_id(contents.objects)
         data: dict[str, Any] = {
             "likely": LIKELY,
             "maps": [] if self.scene is None else [{"name": contents.name, **self.scene.data()}],
             "objects": [
-                object_data(one, contents, self.pictures.get(one.id), match_results.get(one.id))
+                object_data(
+                    one, contents, hex_color(colors[one.id]), self.pictures.get(one.id), match_results.get(one.id)
+                )
                 for one in contents.objects
             ],
+            "edit": _editing(contents),
         }
         context = {
             "name": contents.name,
+            "not_editable": _not_editable(contents),
             "stages": stage_names(contents),
             "numbers": headline_numbers(contents),
             "notices": self._notices(),
@@ -242,6 +251,26 @@ def overview_url(path: Path) -> str:
         return ""
     small.thumbnail((OVERVIEW_WIDTH, OVERVIEW_WIDTH))
     return webp_url(small, 80)
+
+
+def _editing(contents: RunContents) -> dict[str, Any]:
+    """Return the class names of a map, and the command that applies edits to it."""
+    run = contents.record.directory
+    names = {name for one in contents.objects for name in (one.class_name, *one.class_probabilities)}
+    command = ["instancemap", "edit", str(run), "--edits", EDITS, "--out", str(default_directory(run))]
+    return {"classes": sorted(names), "command": shlex.join(command)}
+
+
+def _not_editable(contents: RunContents) -> str:
+    """Return the reason why `instancemap edit` cannot edit a run, "" = none."""
+    if contents.partial:
+        return "instancemap edit cannot apply edits to this run, because it is partial."
+    try:
+        if read_format(contents.record.directory / MAP) == str(FORMAT):
+            return ""
+    except DataError:
+        pass  # missing, as in imported maps, or damaged
+    return f"instancemap edit cannot apply edits to this run, because it has no {MAP} with instances in voxels."
 
 
 def _provenance(contents: RunContents) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from framework.reporting.run_contents import RunContents
 from framework.reporting.run_source import Footage
 from framework.reporting.visibility import sightings
 from framework.runs.instances_file import StoredInstance
+from framework.runs.reevaluation import classes_of
 from framework.runs.stored_runs import is_number
 
 TRUE_COLOR = (255, 196, 0)  # RGB, outline of missed objects
@@ -95,10 +96,12 @@ class TruthCheck:
             [one.confidence for one in objects],
             [one.class_name for one in objects],
         )
-        judged, missed = judge(predictions, truth)
+        compared = classes_of(contents.record).compare(predictions, truth)
+        judged, missed = judge(compared.predictions, compared.truth)
         pictures: Mapping[int, Picture] = {}
         if scene is not None and photographer is not None and missed:
-            true_ids = transfer_labels(truth.points_world, truth.instance_ids, scene.mesh.vertices, MAX_DISTANCE)
+            points, ids = compared.truth.points_world, compared.truth.instance_ids
+            true_ids = transfer_labels(points, ids, scene.mesh.vertices, MAX_DISTANCE)
             labels = np.where(np.isin(true_ids, list(missed)), true_ids, 0).astype(np.int32)
             best = sightings(scene.mesh, labels, contents.viewpoints, footage.camera, footage.clarity).best
             color: UInt8 = np.array(TRUE_COLOR, np.uint8)

@@ -12,7 +12,9 @@ import numpy as np
 from framework.data import Float64, Instance, InstanceMesh, Pose, SceneTruth
 from framework.errors import DataError
 from framework.evaluation import instances, trajectory
+from framework.evaluation.compared_classes import AGNOSTIC, Compared, ComparedClasses, indices, listed
 from framework.evaluation.instances import PredictedInstances, Transfer
+from framework.evaluation.scannet_benchmark import BenchmarkScene, benchmark_metrics, semantic_metrics
 from framework.evaluation.truth_alignment import in_map_world
 from framework.files.hashing import add_values
 from framework.interfaces import RGBDVideo, SceneMap
@@ -30,6 +32,9 @@ MAIN_FIGURES = (
     "ap50_agnostic",
     "mean_iou",
 )  # keys below `instances.` that are stored for both directions of the label transfer
+CLASSES = "evaluated_classes."  # prefix of the keys about the label space of the evaluation
+LABEL_SPACE, CLASS_NAMES = CLASSES + "label_space", CLASSES + "names"
+IGNORED_IN_MAP, IGNORED_IN_TRUTH = CLASSES + "ignored_in_map", CLASSES + "ignored_in_ground_truth"
 TRUTH = "truth_sha256"  # key of the ground-truth hash in metrics.json
 
 
@@ -91,6 +96,7 @@ def instance_metrics(
     found: Mapping[int, Instance],
     classes: tuple[str, ...],
     trajectory: tuple[Float64, Float64],
+    compared_classes: ComparedClasses,
 ) -> Metrics:
     """Return the number of instances and their metrics.
 
@@ -102,6 +108,7 @@ def instance_metrics(
         found: The instances of the map by id.
         classes: The class names of the map.
         trajectory: The timestamps (F,), s, and the poses T_world_camera (F, 4, 4) of the mapped frames.
+        compared_classes: The label space of the evaluation.
     """
     count: Metrics = {"instances.count": len(found)}
     truth = video.scene_truth()
@@ -112,13 +119,18 @@ def instance_metrics(
     except DataError as error:
         log.warning("instances are not evaluated: %s", error)
         return count
-    return count | evaluation_metrics(PredictedInstances.of_map(mesh, found, classes), truth, aligned, video.annotation)
+    predictions = PredictedInstances.of_map(mesh, found, classes)
+    return count | evaluation_metrics(predictions, truth, aligned, video.annotation, compared_classes)
 
 
 def evaluation_metrics(
-    predictions: PredictedInstances, truth: SceneTruth, aligned: SceneTruth, annotation: str
+    predictions: PredictedInstances,
+    truth: SceneTruth,
+    aligned: SceneTruth,
+    annotation: str,
+    compared_classes: ComparedClasses,
 ) -> Metrics:
-    """Return the instance metrics, the release of the ground truth and its hash.
+    """Return the instance metrics, the label space, the release of the ground truth and its hash.
 
     By default, labels are transferred from the map to the ground truth. The keys `instances.to_map.*` contain the main
     metrics with labels transferred from the ground truth to the map.
@@ -128,11 +140,41 @@ def evaluation_metrics(
         truth: The ground truth in the world frame of the dataset, for the hash.
         aligned: The ground truth in the world frame of the map.
         annotation: The release of the ground truth, or "" for a dataset with a single release.
+        compared_classes: The label space of the evaluation.
     """
-    figures = instances.evaluate(predictions, aligned).metrics()
-    to_map = instances.evaluate(predictions, aligned, transfer=Transfer.TO_MAP).metrics()
+    compared = compared_classes.compare(predictions, aligned)
+    for side, ignored in (("map", compared.ignored_predictions), ("ground truth", compared.ignored_truths)):
+        if ignored:
+            message = "evaluation.label_space=%s: ignored %d objects of the %s: %s"
+            log.info(message, compared_classes.label_space, sum(ignored.values()), side, listed(ignored))
+    figures = instances.evaluate(compared.predictions, compared.truth).metrics()
+    to_map = instances.evaluate(compared.predictions, compared.truth, transfer=Transfer.TO_MAP).metrics()
     of_map = {f"instances.to_map.{name}": to_map[f"instances.{name}"] for name in MAIN_FIGURES if to_map}
-    return {**figures, **of_map, "annotation_release": annotation or None, TRUTH: truth_sha256(truth)}
+    return {
+        **figures,
+        **of_map,
+        **_scannet_metrics(compared, compared_classes),
+        LABEL_SPACE: compared_classes.label_space,
+        CLASS_NAMES: compared_classes.names_text,
+        IGNORED_IN_MAP: listed(compared.ignored_predictions) or None,
+        IGNORED_IN_TRUTH: listed(compared.ignored_truths) or None,
+        "annotation_release": annotation or None,
+        TRUTH: truth_sha256(truth),
+    }
+
+
+def _scannet_metrics(compared: Compared, compared_classes: ComparedClasses) -> Metrics:
+    """Return the metrics of ScanNet's benchmarks, or an empty dictionary without a label space."""
+    if compared_classes.label_space is None:
+        return {}
+    predictions, truth, classes = compared.predictions, compared.truth, compared_classes.classes
+    objects = compared_classes.object_classes
+    ids = compared.predicted_ids()
+    found: Metrics = {**benchmark_metrics([BenchmarkScene.of(ids, predictions, truth, objects)], objects)}
+    if compared_classes.label_space == AGNOSTIC:
+        return found
+    names = dict(zip(predictions.ids.tolist(), predictions.class_names, strict=True))
+    return found | semantic_metrics(indices(ids, names, classes), compared.true_classes, classes)
 
 
 def truth_sha256(truth: SceneTruth) -> str:
@@ -145,7 +187,8 @@ def truth_sha256(truth: SceneTruth) -> str:
 
 def is_evaluation(key: str) -> bool:
     """Return True for the key of a metric from `evaluation_metrics`."""
-    return key in ("annotation_release", TRUTH) or (key.startswith("instances.") and key != "instances.count")
+    prefixes = ("instances.", "semantic.", CLASSES)
+    return key in ("annotation_release", TRUTH) or (key.startswith(prefixes) and key != "instances.count")
 
 
 def class_name(instance: Instance, classes: tuple[str, ...]) -> str | None:

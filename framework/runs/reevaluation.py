@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from omegaconf import OmegaConf
 
 from framework.data import SceneTruth
 from framework.errors import DataError
+from framework.evaluation.compared_classes import ComparedClasses
 from framework.evaluation.instances import PredictedInstances
+from framework.evaluation.scannet_benchmark import BenchmarkScene
 from framework.evaluation.truth_alignment import in_map_world
 from framework.files.directory_lock import locked
 from framework.files.json_file import write_json
@@ -19,7 +22,7 @@ from framework.files.tum_trajectory import read_tum
 from framework.interfaces import RGBDVideo
 from framework.registry import build
 from framework.runs.manifest import MANIFEST, Manifest
-from framework.runs.metrics import TRUTH, evaluation_metrics, is_evaluation
+from framework.runs.metrics import CLASS_NAMES, LABEL_SPACE, TRUTH, evaluation_metrics, is_evaluation
 from framework.runs.provenance import code_version, leaves
 from framework.runs.stored_map import read_objects
 from framework.runs.stored_runs import CONFIG, EVALUATION, GROUND_TRUTH, METRICS, TRAJECTORY, Record
@@ -75,7 +78,9 @@ class Reevaluation:
     metrics: Mapping[str, Any]  # new contents of metrics.json
 
     @classmethod
-    def of(cls, record: Record, truth: Truth, allow_changed: bool = False) -> Reevaluation:
+    def of(
+        cls, record: Record, truth: Truth, allow_changed: bool = False, classes: ComparedClasses | None = None
+    ) -> Reevaluation:
         """Evaluate the instances of a run again.
 
         All other metrics of the run are kept.
@@ -84,6 +89,7 @@ class Reevaluation:
             record: The stored run.
             truth: The ground truth of its dataset.
             allow_changed: Accept a ground truth that has changed since the run.
+            classes: The label space; None = the label space of the last evaluation.
 
         Raises:
             DataError: The files of the run are inconsistent, or the ground truth is missing or has changed.
@@ -97,7 +103,8 @@ class Reevaluation:
             return cls(record, record.metrics)
         aligned = truth.in_world_of(record)
         assert aligned is not None
-        found = evaluation_metrics(read_predictions(record), truth.scene, aligned, truth.annotation)
+        chosen = classes_of(record) if classes is None else classes
+        found = evaluation_metrics(read_predictions(record), truth.scene, aligned, truth.annotation, chosen)
         if not allow_changed and record.metrics.get(TRUTH) not in (None, found[TRUTH]):
             raise DataError(
                 f"{record.directory}: expected the ground truth of the run ({TRUTH} {record.metrics[TRUTH]!s:.8}), got "
@@ -152,6 +159,22 @@ class Reevaluation:
                 stored.with_files(self.record.directory, stored.files).write(self.record.directory)
 
 
+def benchmark_scene(found: Reevaluation, truth: Truth) -> BenchmarkScene | None:
+    """Return the overlaps of a re-evaluated run for ScanNet's metrics over several scenes.
+
+    The result is None without ground truth or without a label space.
+
+    Raises:
+        DataError: The files of the run are inconsistent.
+    """
+    record = replace(found.record, metrics=found.metrics)
+    aligned, classes = truth.in_world_of(record), classes_of(record)
+    if aligned is None or classes.label_space is None:
+        return None
+    compared = classes.compare(read_predictions(record), aligned)
+    return BenchmarkScene.of(compared.predicted_ids(), compared.predictions, compared.truth, classes.object_classes)
+
+
 def read_predictions(record: Record) -> PredictedInstances:
     """Return the instances of a stored run for evaluation.
 
@@ -165,6 +188,23 @@ def read_predictions(record: Record) -> PredictedInstances:
         [instance.confidence for instance in instances],
         [instance.class_name for instance in instances],
     )
+
+
+def classes_of(record: Record) -> ComparedClasses:
+    """Return the label space of the last evaluation of a run.
+
+    Raises:
+        ConfigError: The label space no longer exists.
+        DataError: The stored names are invalid.
+    """
+    if LABEL_SPACE not in record.metrics:  # a run of an older version, or without ground truth
+        return ComparedClasses.of(record.config)
+    stored = record.metrics.get(CLASS_NAMES)
+    try:
+        names = {} if stored is None else json.loads(stored)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{record.directory}: {CLASS_NAMES}: expected names as JSON, got {stored!r:.60}") from error
+    return ComparedClasses.of({"evaluation": {"label_space": record.metrics[LABEL_SPACE], "names": names}})
 
 
 def dataset_of(record: Record, ground_truth: str | None = None) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from framework.data import Instance
 from framework.datasets.frames.sequence_reader import Recording
 from framework.detection.stored.cache import cache_metrics
 from framework.errors import DataError, InstanceMapError, PartialRunError
+from framework.evaluation.compared_classes import ComparedClasses
 from framework.files.atomic_write import atomic_write, remove_left_over
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum, write_tum
@@ -81,11 +82,13 @@ class RunRecord:
     choices: Mapping[str, str | None]  # chosen option of each config group
     inputs: Mapping[str, str]  # SHA-256 of the input files, by config key
     provenance: Metrics  # code and machine at the start of the run
+    compared_classes: ComparedClasses  # label space of the evaluation
 
     @classmethod
     def begin(cls, directory: Path, config: DictConfig, choices: Mapping[str, str | None]) -> RunRecord:
         """Prepare the directory for a run, and remove the metrics, manifest and report of an earlier run."""
         plain = resolved(config)
+        compared_classes = ComparedClasses.of(plain)
         inputs = input_hashes(plain)
         provenance: Metrics = {**code_version(), **plugin_code(plain), **environment()}
         directory.mkdir(parents=True, exist_ok=True)
@@ -94,7 +97,7 @@ class RunRecord:
             (directory / name).unlink(missing_ok=True)
         _write_config(directory / CONFIG, plain)
         _reset_peak_memory()
-        return cls(directory, plain, choices, inputs, provenance)
+        return cls(directory, plain, choices, inputs, provenance, compared_classes)
 
     def write(
         self, video: RGBDVideo, result: RunResult, counts: Mapping[str, int] | None = None
@@ -138,7 +141,9 @@ class RunRecord:
         if found is not None:
             # as written, so that a re-evaluation returns the same metrics
             stored = attempt(read_tum, self.directory / TRAJECTORY)
-            figures |= (stored and attempt(instance_metrics, video, *found, scene.classes, stored)) or {}
+            if stored is not None:
+                classes = self.compared_classes
+                figures |= attempt(instance_metrics, video, *found, scene.classes, stored, classes) or {}
         figures |= attempt(trajectory_metrics, result) or {}
         title = headline({"sequence": video.name, **figures})
         if found is not None:

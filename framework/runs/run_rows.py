@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from framework.registry import STAGES
-from framework.runs.metrics import TRUTH
+from framework.runs.metrics import CLASS_NAMES, LABEL_SPACE, TRUTH
 from framework.runs.stored_runs import CHOICE, Record, is_number
 
 DATA = "dataset.root"  # config key of the dataset folder
@@ -103,7 +103,7 @@ class RunRow:
 
 def data_of(record: Record) -> tuple[Any, ...]:
     """Return a key for the dataset, sequence and ground truth of a run."""
-    keys = ("sequence", "annotation_release", TRUTH)
+    keys = ("sequence", "annotation_release", TRUTH, LABEL_SPACE, CLASS_NAMES)
     parameters = (record.parameters.get(key) for key in (DATA, "dataset.scene"))
     return (record.choices.get("dataset"), *parameters, *(record.metrics.get(key) for key in keys))
 

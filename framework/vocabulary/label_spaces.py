@@ -43,6 +43,20 @@ COCO_BY_ID = tuple(COCO[_COCO_IDS.index(k)] if k in _COCO_IDS else NO_CLASS for 
 SCENENN_TO_COCO = {name: coco for name, coco in _SECTIONS["scenenn"].items() if coco is not None}
 """Nine SceneNN classes with their COCO names. This choice is ours, because the paper does not list its nine classes."""
 
+_SCANNET200_IDS = (
+    "1-11 13-19 21-24 26-29 31-36 38-42 44-52 54-59 62-80 82 84 86-90 93 95-107 110 112 115-116 118 120-122 125 128 "
+    "130-132 134 136 138-141 145 148 154-157 159 161 163 165-166 168-170 177 180 185 188 191 193 195 202 208 213-214 "
+    "221 229-230 232-233 242 250 261 264 276 283 286 300 304 312 323 325 331 342 356 370 392 395 399 408 417 488 540 "
+    "562 570 572 581 609 748 776 1156 1163-1176 1178-1191"
+)
+_RANGES = [[int(end) for end in part.split("-")] for part in _SCANNET200_IDS.split()]
+BENCHMARK_IDS: Mapping[str, tuple[int, ...]] = {
+    "nyu40": tuple(range(1, 41)),
+    "scannet20": tuple(SPACES["nyu40"].index(name) + 1 for name in SPACES["scannet20"]),
+    "scannet200": tuple(k for ends in _RANGES for k in range(ends[0], ends[-1] + 1)),
+}
+"""Class ids of label spaces in the files of ScanNet's benchmarks. In other label spaces, ids are indices."""
+
 MEANINGS: Mapping[str, str | None] = {name: coco for names in _SECTIONS.values() for name, coco in names.items()}
 """COCO names by lower-case name in any space; None = no object class of COCO."""
 
@@ -86,12 +100,13 @@ class LabelMapping:
         return rows.astype(np.float32), known
 
 
-def read_labels(name_or_path: str, key: str = "detector.label_space") -> tuple[str, ...]:
+def read_labels(name_or_path: str, key: str = "detector.label_space", also: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the names of a label space, or the lines of a text file with one name per line.
 
     Args:
         name_or_path: The name of a label space, such as "coco" or "nyu40", or the path of a text file.
         key: The config key or option, for messages.
+        also: Other values of the key, for messages.
 
     Raises:
         ConfigError: The label space or file does not exist, or the file is invalid.
@@ -103,7 +118,8 @@ def read_labels(name_or_path: str, key: str = "detector.label_space") -> tuple[s
         lines = read_text(path, LARGEST_FILE).rstrip().splitlines()
     except DataError as error:
         raise ConfigError(
-            f"{key}: expected one of {', '.join(SPACES)}, or a text file with one name per line, got {name_or_path}"
+            f"{key}: expected one of {', '.join([*SPACES, *also])}, or a text file with one name per line, got "
+            f"{name_or_path}"
         ) from error
     names = tuple(line.strip() for line in lines)
     if "" in names:  # skipping an empty line would shift the following names
@@ -171,22 +187,22 @@ def check_class_name(where: str, name: str) -> None:
 
 def with_similar(name: str, others: Sequence[str] = ()) -> str:
     """Return a quoted name, with the most similar name among others and all known names if there is one."""
-    close = get_close_matches(_key(name), [*others, *MEANINGS], n=1, cutoff=0.75)
+    close = get_close_matches(label_key(name), [*others, *MEANINGS], n=1, cutoff=0.75)
     return f"{name!r} (similar to {close[0]!r})" if close and close[0] != name else repr(name)
 
 
-def _key(label: str) -> str:
+def label_key(label: str) -> str:
     """Return a label without case, outer spaces and synonyms after a comma."""
     return label.partition(",")[0].strip().lower()
 
 
 def coco_name(label: str) -> str | None:
     """Return the COCO name of a label in any known label space, or None without one."""
-    return MEANINGS.get(_key(label))
+    return MEANINGS.get(label_key(label))
 
 
 def _unknown(labels: Sequence[str]) -> list[str]:
-    return [label for label in labels if _key(label) not in MEANINGS]
+    return [label for label in labels if label_key(label) not in MEANINGS]
 
 
 def to_coco(labels: Sequence[str], key: str = "detector.label_space") -> LabelMapping:

@@ -12,13 +12,16 @@ from typing import Any
 from tqdm import tqdm
 
 from framework.commands.command_line import EXIT_FAILED, KNOWN_ERRORS, arguments, one_line_errors, print_error
-from framework.errors import DataError
+from framework.errors import ConfigError, DataError
+from framework.evaluation.compared_classes import ComparedClasses
 from framework.evaluation.instances import Transfer
-from framework.runs.metrics import MAIN_FIGURES
-from framework.runs.reevaluation import Reevaluation, Truth, dataset_of
+from framework.evaluation.scannet_benchmark import BenchmarkScene, benchmark_metrics
+from framework.runs.metrics import IGNORED_IN_MAP, IGNORED_IN_TRUTH, MAIN_FIGURES
+from framework.runs.reevaluation import Reevaluation, Truth, benchmark_scene, dataset_of
 from framework.runs.stored_runs import Record, find_records
 from framework.tables.metric_columns import head
 
+SCANNET = {"ap": "AP", "ap50": "AP50", "ap25": "AP25"}  # headings by metric
 REFUSED = "refused: "  # prefix of an error
 
 
@@ -52,13 +55,41 @@ def main() -> None:
         default=argparse.SUPPRESS,
         help=argparse.SUPPRESS,
     )
+    space = (
+        "label space, as in evaluation.label_space: coco, nyu40, scannet20, scannet200, agnostic or a text file; '' = "
+        "names of the map and the ground truth; default: label space of the last evaluation"
+    )
+    parser.add_argument("--label-space", metavar="SPACE", help=space)
+    named = (
+        "class in the label space of a name, as in evaluation.names; empty CLASS = ignored; repeatable; only with "
+        "--label-space"
+    )
+    parser.add_argument("--name", metavar="NAME=CLASS", action="append", default=[], help=named)
     parser.add_argument("--dry-run", action="store_true", help="print the changes without writing them")
     parsed = arguments(parser)
     with one_line_errors():
         transfer, write = Transfer(parsed.transfer), not parsed.dry_run
-        failed = evaluate_runs(parsed.run, transfer, write, parsed.allow_changed_ground_truth, parsed.ground_truth)
+        changed, classes = parsed.allow_changed_ground_truth, chosen_classes(parsed.label_space, parsed.name)
+        failed = evaluate_runs(parsed.run, transfer, write, changed, parsed.ground_truth, classes)
     if failed:
         sys.exit(EXIT_FAILED)
+
+
+def chosen_classes(label_space: str | None, names: Sequence[str]) -> ComparedClasses | None:
+    """Return the label space of the options --label-space and --name, or None without the options.
+
+    Raises:
+        ConfigError: An option is invalid.
+    """
+    if label_space is None and not names:
+        return None
+    if label_space is None:
+        raise ConfigError("--name: expected also --label-space, got none; set --label-space ('' = unchanged names)")
+    pairs = [word.partition("=") for word in names]
+    if wrong := [name + sign + chosen for name, sign, chosen in pairs if not name or not sign]:
+        raise ConfigError(f"--name: expected NAME=CLASS, got {wrong[0]!r:.60}")
+    table = {name: chosen or None for name, _, chosen in pairs}
+    return ComparedClasses.of({"evaluation": {"label_space": label_space or None, "names": table}})
 
 
 def evaluate_runs(
@@ -67,6 +98,7 @@ def evaluate_runs(
     write: bool,
     allow_changed: bool = False,
     ground_truth: str | None = None,
+    classes: ComparedClasses | None = None,
 ) -> int:
     """Evaluate all runs in folders and their subfolders, and print one line per run.
 
@@ -76,6 +108,7 @@ def evaluate_runs(
         write: Write the metrics to metrics.json.
         allow_changed: Evaluate even if the ground truth has changed since the run.
         ground_truth: Value of --ground-truth; None = ground truth used by the run.
+        classes: The label space; None = the label space of the last evaluation.
 
     Returns:
         The number of failures.
@@ -84,6 +117,8 @@ def evaluate_runs(
     for failure in failures:
         print_error(failure, REFUSED)
     failed = len(failures)
+    scenes: dict[str, BenchmarkScene] = {}
+    evaluated = 0
 
     def key(record: Record) -> str:
         return str(dataset_of(record, ground_truth))
@@ -95,15 +130,36 @@ def evaluate_runs(
             for record in group:
                 try:
                     truth = truth or Truth.of(dataset_of(record, ground_truth))
-                    found = Reevaluation.of(record, truth, allow_changed or ground_truth is not None)
+                    found = Reevaluation.of(record, truth, allow_changed or ground_truth is not None, classes)
                     if write:
                         found.write()
                     tqdm.write(f"{record.directory}: {summary(found, transfer)}")
+                    for line in ignored(found):
+                        tqdm.write(f"  {line}")
+                    if len(records) > 1 and (scene := benchmark_scene(found, truth)):
+                        scenes[str(record.metrics.get("sequence"))] = scene
+                        evaluated += 1
                 except KNOWN_ERRORS as error:
                     print_error(error, f"{REFUSED}{record.directory}: " if truth is None else REFUSED)
                     failed += 1
                 bar.update()
+    if len(scenes) == evaluated > 1:  # one run per scene
+        print(over_scenes(list(scenes.values())))
     return failed
+
+
+def ignored(found: Reevaluation) -> list[str]:
+    """Return a line with the ignored objects of the map, and one of the ground truth, if there are any."""
+    sides = {"map": IGNORED_IN_MAP, "ground truth": IGNORED_IN_TRUTH}
+    return [f"ignored in the {side}: {names}" for side, key in sides.items() if (names := found.metrics.get(key))]
+
+
+def over_scenes(scenes: Sequence[BenchmarkScene]) -> str:
+    """Return ScanNet's metrics over several scenes together, as text."""
+    classes = sorted({name for scene in scenes for name in scene.truth_classes})
+    found = benchmark_metrics(scenes, classes)
+    means = ", ".join(f"{name} {found[f'instances.scannet.{key}']:.3f}" for key, name in SCANNET.items() if found)
+    return f"all {len(scenes)} scenes together, by the rules of ScanNet's benchmark: {means or 'no ground truth'}"
 
 
 def summary(found: Reevaluation, transfer: Transfer) -> str:

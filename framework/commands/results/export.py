@@ -16,9 +16,12 @@ def main() -> None:
         "scene graph to standard file formats."
     )
     add = parser.add_argument
-    formats = ("glb", "ply", "usd", "obj", "floorplan", "graph")
+    formats = ("glb", "ply", "usd", "obj", "floorplan", "graph", "scannet", "npz")
     add("run", metavar="RUN", type=Path, help="run directory, complete or partial")
-    listed = f"one or more of {', '.join(formats)}; floorplan also writes the ROS map; default: glb"
+    listed = (
+        f"one or more of {', '.join(formats)}; floorplan also writes the ROS map; scannet and npz are predictions for "
+        "benchmarks; default: glb"
+    )
     add("--to", metavar="FORMAT", nargs="+", default=["glb"], choices=formats, help=listed)
     add("--out", metavar="DIR", type=Path, help="output folder; default: RUN/export")
     only = "id or class of the exported objects; repeatable; default: all objects"
@@ -39,6 +42,14 @@ def main() -> None:
     add("--resolution", metavar="M", type=float, default=0.05, help="side of a cell, m, in [0.01, 1]; default: 0.05")
     height = "robot height, m, in [0.1, 3]; cells are free if observed empty up to this height; default: 1"
     add("--robot-height", metavar="M", type=float, default=1.0, help=height)
+    add = parser.add_argument_group("predictions for benchmarks").add_argument
+    space = (
+        "label space: nyu40, scannet20, scannet200, or a JSON file with the name of each class id; default: label "
+        "space of the evaluation if it is one of these, otherwise scannet20"
+    )
+    add("--label-space", metavar="SPACE", help=space)
+    points = "PLY or NPY file with the labeled points, in the world frame of the dataset; default: ground-truth points"
+    add("--points", metavar="FILE", type=Path, help=points)
     parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
@@ -52,6 +63,8 @@ def main() -> None:
             collision=parsed.collision,
             resolution=parsed.resolution,
             robot_height=parsed.robot_height,
+            label_space=parsed.label_space,
+            points=parsed.points,
         )
         for path in export(parsed.run, map(ExportFormat, parsed.to), parsed.out, chosen, parsed.up, parsed.floor):
             print(path)

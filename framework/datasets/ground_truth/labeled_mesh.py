@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from framework.data import Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
+from framework.data import AnnotatedObjects, Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
 from framework.errors import NoPoseError
 from framework.files.hashing import add_array, path_hash
 from framework.rendering import rasterizer
@@ -24,10 +24,13 @@ class LabeledMesh:
     instance_ids: Int32  # (V,), 0 = no instance
     class_names: Mapping[int, str | None]  # by instance id; None = unknown class, not evaluated
     classes: tuple[str, ...] | None = None  # all annotated classes; None = unknown
+    annotated: AnnotatedObjects | None = None  # None = class_names are the names of the annotation
 
     def scene_truth(self) -> SceneTruth:
         """Return the vertices as ground-truth points."""
-        return SceneTruth(self.vertices, self.instance_ids, dict(self.class_names), self.classes)
+        return SceneTruth(
+            self.vertices, self.instance_ids, dict(self.class_names), self.classes, annotated=self.annotated
+        )
 
     def seen_by(self, camera: Camera, T_world_camera: Float64) -> FrameTruth:
         """Return the ground truth of a view, rendered on demand.

@@ -36,6 +36,7 @@ from framework.datasets.scannet.scannet_annotation import (
     LABEL_TABLE,
     read_label_table,
     read_labeled_mesh,
+    read_scannet200_names,
 )
 from framework.datasets.scannet.sens_file import open_sens
 from framework.errors import DataError, errors_of
@@ -85,9 +86,11 @@ class ScanNet(LabeledRecording):
 
     def _read_mesh(self, mesh: Path, segments: Path, objects: Path) -> LabeledMesh:
         nyu40: dict[str, str] = {}
+        scannet200: dict[str, str] = {}
         for table in self._label_tables:  # the second release and the nearer folder take precedence
             nyu40 |= read_label_table(table)
-        return read_labeled_mesh(mesh, segments, objects, nyu40)
+            scannet200 |= read_scannet200_names(table)
+        return read_labeled_mesh(mesh, segments, objects, nyu40, scannet200)
 
 
 def _sens_contents(path: Path) -> Contents:

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from framework.data import Int64
+from framework.data import AnnotatedObjects, Int64
 from framework.datasets.calibration.camera_json import read_json_object
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.errors import DataError
 from framework.files.atomic_write import read_text
 from framework.files.number_lines import SHOWN
 from framework.files.ply import read_ply
-from framework.vocabulary.label_spaces import MEANINGS
+from framework.vocabulary.label_spaces import MEANINGS, SPACES
 
 LARGEST_FILE = 2**24  # bytes; segments of the largest room take 5 MB; parsed JSON takes up to 30 times the memory
 MAX_OBJECT_ID = np.iinfo(np.int32).max - 2  # instance id = object id + 1; one more id is used for unlabeled vertices
@@ -26,6 +26,7 @@ LABEL_TABLE = "scannetv2-labels.combined.tsv"
 FIRST_LABEL_TABLE = "scannet-labels.combined.tsv"  # of the first release (2017), with other names
 NAME_COLUMNS = ("raw_category", "category")  # annotated names; the first release has no raw_category
 CLASS_COLUMN = "nyu40class"
+ID_COLUMN = "id"
 UNNAMED = frozenset(  # names that do not identify a class
     {"object", "objects", "unknown", "junk", "furniture", "decoration"}
     | {"otherprop", "otherfurniture", "otherstructure"}
@@ -43,13 +44,20 @@ class SegGroup:
     segments: Int64  # (S,) ids of mesh segments
 
 
-def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[str, str]) -> LabeledMesh:
+def read_labeled_mesh(
+    mesh: Path,
+    segs: Path,
+    aggregation: Path,
+    nyu40: Mapping[str, str],
+    scannet200: Mapping[str, str] | None = None,
+) -> LabeledMesh:
     """Read the mesh and its annotated objects.
 
     The instance id of an object is its object id + 1. If objects overlap, the later object takes precedence. Objects of
     a COCO class have the name of this class. Objects of other known classes, such as wall or cabinet, become instance
     0, so that detections there are false positives. Objects of unknown classes have the class None. Unlabeled vertices
     form one more instance of class None, so that detections there are not evaluated, as in the ScanNet benchmark.
+    `LabeledMesh.annotated` contains all objects.
 
     Args:
         mesh: The mesh, a PLY file.
@@ -57,6 +65,7 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
         aggregation: The JSON file with the segments of each object.
         nyu40: The NYU40 class of each name from `read_label_table`; empty = no table. Spaces and punctuation in names
             are ignored.
+        scannet200: The ScanNet200 class of each name from `read_scannet200_names`; None = unknown.
 
     Raises:
         DataError: A file is invalid, the files are inconsistent, or a name is not in the table.
@@ -77,8 +86,9 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
             f"{FIRST_LABEL_TABLE} next to this table for annotations of ScanNet's first release"
         )
     unlabeled = max((group.object_id + 2 for group in groups), default=1)
-    instance_of_segment = np.full(len(present), unlabeled, np.int32)
+    instance_of_segment, object_of_segment = np.full((2, len(present)), unlabeled, np.int32)
     class_names: dict[int, str | None] = {}
+    own_names: dict[int, str | None] = {}
     unknown: set[str] = set()
     for group in groups:
         absent = group.segments[~np.isin(group.segments, present)]
@@ -86,7 +96,7 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
             expected = f"expected segments of {segs.name}"
             raise DataError(f"{aggregation}: object {group.object_id}: {expected}, got segment {absent[0]}")
         instance = group.object_id + 1
-        own = _spelled(group.label, spellings)
+        own = own_names[instance] = _spelled(group.label, spellings)
         # the annotated name is preferred: NYU40 has a single class for microwaves, keyboards and bottles
         names = [name for name in (own, nyu40.get(own, "")) if name in MEANINGS and name not in UNNAMED]
         if not names:
@@ -96,12 +106,33 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
             instance = 0
         else:
             class_names[instance] = MEANINGS[names[0]]
-        instance_of_segment[np.searchsorted(present, group.segments)] = instance
+        places = np.searchsorted(present, group.segments)
+        instance_of_segment[places], object_of_segment[places] = instance, group.object_id + 1
     if unlabeled in instance_of_segment:
-        class_names[unlabeled] = None
+        class_names[unlabeled] = own_names[unlabeled] = None
     if unknown:
         log.info("%s: objects of unknown class are not evaluated: %s", mesh.parent.name, ", ".join(sorted(unknown)))
-    return LabeledMesh(ply.vertices, ply.triangles, instance_of_segment[segment_of_vertex], class_names)
+    annotated = AnnotatedObjects(
+        object_of_segment[segment_of_vertex],
+        own_names,
+        _names_in_spaces(own_names, nyu40, scannet200 or {}),
+    )
+    return LabeledMesh(
+        ply.vertices, ply.triangles, instance_of_segment[segment_of_vertex], class_names, annotated=annotated
+    )
+
+
+def _names_in_spaces(
+    own_names: Mapping[int, str | None], nyu40: Mapping[str, str], scannet200: Mapping[str, str]
+) -> Mapping[str, Mapping[int, str]]:
+    """Return the names of objects by label space and instance id. Label spaces without a table are missing."""
+    found = {
+        space: {key: table[name] for key, name in own_names.items() if name is not None and table.get(name)}
+        for space, table in (("nyu40", nyu40), ("scannet200", scannet200))
+        if table
+    }
+    # ScanNet20 is a part of NYU40. Class-agnostic evaluation requires only the walls and floors.
+    return found | {space: found["nyu40"] for space in ("scannet20", "agnostic") if "nyu40" in found}
 
 
 def read_aggregation(path: Path) -> tuple[SegGroup, ...]:
@@ -129,19 +160,44 @@ def read_label_table(path: Path) -> Mapping[str, str]:
     Raises:
         DataError: A column is missing, or a line is too short.
     """
+    return {row[0]: row[1] for row in _read_columns(path, ())}
+
+
+def read_scannet200_names(path: Path) -> Mapping[str, str]:
+    """Return the ScanNet200 class of each object name in a label table.
+
+    As in ScanNet200, names with the id of a class belong to this class. In a table without ids, only names that equal a
+    class are included.
+
+    Raises:
+        DataError: A column is missing, or a line is too short.
+    """
+    classes = frozenset(SPACES["scannet200"])
+    rows = _read_columns(path, (ID_COLUMN,))
+    class_of_id = {row[2]: row[0] for row in rows if row[0] in classes and row[2]}
+    found = {row[0]: row[0] if row[0] in classes else class_of_id.get(row[2]) for row in rows}
+    return {name: one for name, one in found.items() if one is not None}
+
+
+def _read_columns(path: Path, optional: Sequence[str]) -> list[tuple[str, ...]]:
+    """Read the name and the NYU40 class in each row of a label table, in lower case, and the optional columns.
+
+    The values of missing optional columns are empty strings.
+    """
     header, *rows = read_text(path, LARGEST_FILE).rstrip("\r\n").split("\n")
     columns = header.rstrip("\r").split("\t")
     written = next((name for name in NAME_COLUMNS if name in columns), "")
     if not written or CLASS_COLUMN not in columns:
         expected = f"expected columns {' or '.join(NAME_COLUMNS)} and {CLASS_COLUMN}, separated by tabs"
         raise DataError(f"{path}, line 1: {expected}, got {header[:SHOWN]!r}")
-    raw, nyu40 = columns.index(written), columns.index(CLASS_COLUMN)
-    table: dict[str, str] = {}
+    places = [columns.index(name) if name in columns else None for name in (written, CLASS_COLUMN, *optional)]
+    least = max(place for place in places if place is not None)
+    table = []
     for n, row in enumerate(rows, start=2):
         words = row.rstrip("\r").split("\t")
-        if len(words) <= max(raw, nyu40):
+        if len(words) <= least:
             raise DataError(f"{path}, line {n}: expected {len(columns)} columns, got {len(words)}")
-        table[words[raw].strip().lower()] = words[nyu40].strip().lower()
+        table.append(tuple("" if place is None else words[place].strip().lower() for place in places))
     return table
 
 

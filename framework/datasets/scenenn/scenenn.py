@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.data import Camera
+from framework.data import AnnotatedObjects, Camera
 from framework.datasets.frames.numbered_images import first_size, numbered_images, paired_images
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, StoredImages
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
@@ -41,6 +41,14 @@ from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 DEPTH_SCALE = 1000.0  # units per meter
 MADE_BY = "synthesize.json"  # only in the root folder of synthetic scenes
+
+NYU40_NAMES = {
+    "fridge": "refridgerator",
+    "structure": "otherstructure",
+    "furniture": "otherfurniture",
+    "prop": "otherprop",
+}
+"""Names of NYU40 with another spelling in SceneNN. SceneNN also writes underscores for spaces."""
 
 log = logging.getLogger(__name__)
 
@@ -125,7 +133,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
 
     Instances of the nine evaluated classes have COCO names. Labels without a name or an annotation have the class None,
     so that detections there are not evaluated. Label 0 and labels of other classes, such as wall, become instance 0, so
-    that detections there are false positives.
+    that detections there are false positives. `LabeledMesh.annotated` contains all labels, with the names of NYU40.
 
     Raises:
         DataError: A file cannot be read, or the mesh has no labels.
@@ -146,13 +154,18 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
         )
         log.warning(message, mesh, annotation.name, len(unlisted), min(unlisted))
     class_names: dict[int, str | None] = {}
+    own_names: dict[int, str | None] = {}
     ids = np.zeros(len(present), np.int32)
     for k, label in enumerate(present.tolist()):
         nyu_class = _nyu_class(names.get(label))
+        if label:
+            own_names[label] = NYU40_NAMES.get(nyu_class, nyu_class.replace("_", " ")) or None
         if label and (not nyu_class or nyu_class in SCENENN_TO_COCO):
             ids[k] = label
             class_names[label] = SCENENN_TO_COCO.get(nyu_class)
-    return LabeledMesh(ply.vertices, ply.triangles, ids[inverse], class_names, tuple(SCENENN_TO_COCO.values()))
+    annotated = AnnotatedObjects(present.astype(np.int32)[inverse], own_names, {})
+    classes = tuple(SCENENN_TO_COCO.values())
+    return LabeledMesh(ply.vertices, ply.triangles, ids[inverse], class_names, classes, annotated)
 
 
 def _nyu_class(label: Annotated | None) -> str:

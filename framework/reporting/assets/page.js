@@ -33,16 +33,25 @@ function meter(share) {
     drawn("rect", { class: "meter-part", width: 100 * share, height: 10 }));
 }
 
+/** Downloads a content (text or ArrayBuffer) as a file. */
+function download(content, type, name) {
+  const link = made("a");
+  link.href = URL.createObjectURL(new Blob([content], { type }));
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
 class Page {
   constructor() {
     this.objects = new Map((report.objects || []).map((one) => [one.id, one]));
     const table = byId("objects-table");
     this.table = table && new ObjectTable(table, (id) => this.choose(id, { fly: true }));
     this.viewer = null;
-    this.chosen = null;
+    this.editing = byId("editor") && new EditingMode(this);
     this.confidence = report.likely;
     if (byId("canvas")) this.startViewer();
-    else document.body.dataset.ready = "true";
+    else this.ready();
     document.querySelectorAll(".card[data-id]").forEach((card) => {
       card.addEventListener("click", () => this.choose(Number(card.dataset.id), { fly: true }));
     });
@@ -65,7 +74,7 @@ class Page {
       document.querySelector(".viewer").classList.add("no-webgl");
       byId("panel").firstElementChild.textContent = `The 3D view is not available (${error.message}); showing an image.`;
       this.legend();
-      document.body.dataset.ready = "true";
+      this.ready();
       return;
     }
     this.map = 0;
@@ -75,16 +84,18 @@ class Page {
     this.viewer.setConfidence(this.confidence);
     this.legend();
     this.setTime(1000);
+    this.ready();
+  }
+
+  ready() {
+    if (this.editing) byId("edit").hidden = false;
     document.body.dataset.ready = "true";
   }
 
   buttons() {
-    const views = [...document.querySelectorAll("[data-view]")];
-    views.forEach((button) => button.addEventListener("click", () => {
-      views.forEach((one) => one.setAttribute("aria-pressed", one === button));
-      this.viewer.setView(button.dataset.view);
-      this.legend();
-    }));
+    document.querySelectorAll("[data-view]").forEach((button) => {
+      button.addEventListener("click", () => this.setView(button.dataset.view));
+    });
     const maps = [...document.querySelectorAll("[data-map]")];
     maps.forEach((button) => button.addEventListener("click", () => {
       maps.forEach((one) => one.setAttribute("aria-pressed", one === button));
@@ -104,6 +115,12 @@ class Page {
     byId("save").addEventListener("click", () => this.save());
     byId("time").addEventListener("input", (event) => this.setTime(Number(event.target.value)));
     byId("play").addEventListener("click", () => this.play());
+  }
+
+  setView(view) {
+    document.querySelectorAll("[data-view]").forEach((one) => one.setAttribute("aria-pressed", one.dataset.view === view));
+    this.viewer.setView(view);
+    this.legend();
   }
 
   setTime(thousandths) {
@@ -127,11 +144,7 @@ class Page {
   }
 
   save() {
-    const link = made("a");
-    link.href = URL.createObjectURL(new Blob([this.glbs[this.map]], { type: "model/gltf-binary" }));
-    link.download = `${report.maps[this.map].name.replace(/[^\w.-]+/g, "_")}.glb`;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    download(this.glbs[this.map], "model/gltf-binary", `${report.maps[this.map].name.replace(/[^\w.-]+/g, "_")}.glb`);
   }
 
   filter() {
@@ -144,16 +157,36 @@ class Page {
       : `${likely} objects with a confidence of at least ${this.confidence.toFixed(2)}; the other rows are dimmed`;
   }
 
+  /** Returns the objects of the map as recorded or, in the editing mode, after the edits. */
+  shown() {
+    const recorded = report.maps.length ? report.maps[this.map || 0].objects : report.objects;
+    return this.editing && this.editing.on ? this.editing.edited.shown(recorded) : recorded;
+  }
+
+  /** Shows the current objects in the map, the table and the legend. */
+  show() {
+    if (this.viewer) this.viewer.setObjects(this.shown());
+    if (this.table) this.table.show(this.shown());
+    this.filter();
+    if (byId("legend")) this.legend();
+  }
+
   /** Selects an object, or clears the selection (null), in the map, the table and the panel. */
   choose(id, { fly = false } = {}) {
+    if (this.editing && this.editing.on) return void this.editing.toggle(id);
     if (!this.objects.has(id) && this.objects.size) id = null;
-    this.chosen = id;
+    if (this.viewer && fly && id !== null) this.fly(id);
+    this.select(id === null ? [] : [id], id, new Map(), !fly);
+  }
+
+  /** Marks objects as selected, labels objects in the map (texts by id), and shows the details of one object or null. */
+  select(ids, detailed, labels, scroll) {
     if (this.viewer) {
-      this.viewer.choose(id);
-      if (fly && id !== null) this.fly(id);
+      this.viewer.choose(ids);
+      this.viewer.setLabels(labels);
     }
-    if (this.table) this.table.choose(id, !fly);
-    this.panel(id);
+    if (this.table) this.table.choose(ids, scroll);
+    this.panel(detailed);
   }
 
   /** Moves the camera to an object, and scrolls to the map if most of it is not visible. */
@@ -168,17 +201,17 @@ class Page {
     if (!panel) return;
     panel.querySelector(".details")?.remove();
     const object = this.objects.get(id);
-    const data = report.maps[this.map || 0].objects.find((one) => one.id === id);
+    const data = this.shown().find((one) => one.id === id);
     for (const one of panel.children) one.hidden = Boolean(object || data);
     if (object) panel.append(this.details(object, data));
     else if (data) panel.append(made("div", "details", made("h3", "", `${data.class} ${data.id}`), `confidence ${data.confidence.toFixed(2)}`));
   }
 
-  details(object, { color }) {
+  details(object, { color, class: name }) {
     const close = made("button", "close", "×");
     close.setAttribute("aria-label", "Clear selection");
-    close.addEventListener("click", () => this.choose(null));
-    const parts = [close, made("h3", "", swatch(color), object.class, " ", made("span", "faint", String(object.id)))];
+    close.addEventListener("click", () => (this.editing && this.editing.on ? this.editing.clear() : this.choose(null)));
+    const parts = [close, made("h3", "", swatch(color), name, " ", made("span", "faint", String(object.id)))];
     const picture = this.table && this.table.picture(object.id);
     if (picture) {
       const copy = picture.cloneNode();
@@ -206,8 +239,8 @@ class Page {
   }
 
   legend() {
-    const { objects } = report.maps[this.map || 0];
-    const likely = objects.filter((one) => one.confidence >= this.confidence).sort((a, b) => b.confidence - a.confidence);
+    const objects = this.shown().filter((one) => (one.owner || one.id) === one.id); // without objects merged into others
+    const likely = objects.filter((one) => isLikely(one, this.confidence)).sort((a, b) => b.confidence - a.confidence);
     const classes = this.viewer && this.viewer.view === "class";
     const entries = classes ? [...new Map(likely.map((one) => [one.class, one])).values()] : likely;
     byId("legend").replaceChildren(...entries.map((one) => {

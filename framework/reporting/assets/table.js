@@ -52,9 +52,26 @@ class ObjectTable {
     return shown;
   }
 
-  choose(id, scroll) {
+  /** Shows the names, colors and changes of objects. Deleted objects are marked. */
+  show(objects) {
+    const byId = new Map(objects.map((one) => [one.id, one]));
     for (const row of this.rows) {
-      const chosen = Number(row.dataset.id) === id;
+      const one = byId.get(Number(row.dataset.id));
+      const cell = row.querySelector(".name");
+      row.dataset.words = one.class.toLowerCase();
+      row.classList.toggle("deleted", Boolean(one.deleted));
+      cell.dataset.value = `${one.class} ${String(one.id).padStart(8, "0")}`;
+      cell.querySelector("b").textContent = one.class;
+      cell.querySelector(".swatch rect").setAttribute("fill", one.color);
+      cell.querySelector("small")?.remove();
+      if (one.note) cell.append(made("small", "", one.note));
+    }
+  }
+
+  /** Marks the rows of the objects with these ids as selected. */
+  choose(ids, scroll) {
+    for (const row of this.rows) {
+      const chosen = ids.includes(Number(row.dataset.id));
       row.setAttribute("aria-selected", chosen);
       if (chosen && scroll) row.scrollIntoView({ block: "nearest" });
     }

@@ -62,11 +62,13 @@ class MapViewer {
     this.scene = new THREE.Scene();
     this.view = "color";
     this.confidence = 0;
-    this.chosen = null;
+    this.chosen = new Set();
+    this.labels = []; // texts at objects: { element, center }
     this.now = 1;
     this.showPath = true;
     this.maps = [];
     this.shown = null;
+    this.labelLayer = canvas.parentElement.querySelector(".labels");
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
     this.listenForClicks();
@@ -97,7 +99,7 @@ class MapViewer {
     if (this.shown) this.scene.remove(this.shown.group);
     this.shown = this.maps[number];
     this.scene.add(this.shown.group);
-    this.chosen = null;
+    this.chosen = new Set();
     if (!keepView) this.reset();
     this.paint();
   }
@@ -126,9 +128,28 @@ class MapViewer {
   setPath(shown) { this.showPath = shown; this.paint(); }
   setTime(share) { this.now = share; this.paint(); }
 
-  choose(id) {
-    this.chosen = id;
+  /** Fades all objects except those with these ids; no ids = fades nothing. */
+  choose(ids) {
+    this.chosen = new Set(ids);
     this.paint();
+  }
+
+  /** Replaces the names, colors and states of the objects. */
+  setObjects(objects) {
+    const byId = new Map(objects.map((one) => [one.id, one]));
+    for (const part of this.shown.parts.values()) part.userData.object = byId.get(part.userData.id);
+    this.paint();
+  }
+
+  /** Shows texts (Map by id) at the centroids of objects. */
+  setLabels(texts) {
+    this.labels = [...texts].filter(([id]) => this.shown.parts.has(id)).map(([id, text]) => {
+      const element = document.createElement("span");
+      element.textContent = text;
+      return { element, center: centroid(this.shown.parts.get(id).geometry) };
+    });
+    this.labelLayer.replaceChildren(...this.labels.map(({ element }) => element));
+    this.draw();
   }
 
   /** Moves the camera smoothly to an object. */
@@ -152,11 +173,12 @@ class MapViewer {
     const ground = rgb(styleColor("--void"));
     for (const [id, part] of this.shown.parts) {
       const { object } = part.userData;
-      const likely = object && object.confidence >= this.confidence;
+      const likely = object && isLikely(object, this.confidence);
       const { uniforms } = part.material;
-      uniforms.painted.value = this.view === "color" ? 0 : likely ? 2 : 1;
+      const colored = this.view === "color" && !(object && object.deleted);
+      uniforms.painted.value = colored ? 0 : likely ? 2 : 1;
       if (object) uniforms.paint.value.set(...rgb(this.view === "class" ? object.classColor : object.color));
-      uniforms.faded.value = this.chosen === null || id === this.chosen ? 0 : FADED;
+      uniforms.faded.value = !this.chosen.size || this.chosen.has(id) ? 0 : FADED;
       uniforms.ground.value.set(...ground);
       uniforms.now.value = this.now;
     }
@@ -187,6 +209,17 @@ class MapViewer {
     this.controls.update();
     this.renderer.setClearColor(new THREE.Color().setRGB(...rgb(styleColor("--void"))), 1);
     this.renderer.render(this.scene, this.camera);
+    this.placeLabels();
+  }
+
+  placeLabels() {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    for (const { element, center } of this.labels) {
+      const { x, y, z } = center.clone().project(this.camera);
+      element.hidden = Math.max(Math.abs(x), Math.abs(y), Math.abs(z)) > 1;
+      element.style.left = `${(width * (x + 1)) / 2}px`;
+      element.style.top = `${(height * (1 - y)) / 2}px`;
+    }
   }
 
   resize() {
@@ -245,8 +278,18 @@ class MapViewer {
       return seen.getX(face.a) <= this.now;
     });
     const object = first && first.object.userData.object;
-    return object && object.confidence >= this.confidence ? object.id : null;
+    return object && isLikely(object, this.confidence) ? object.id : null;
   }
+}
+
+/** Returns true for objects with a minimum confidence. Edited objects are always likely, deleted ones never. */
+function isLikely(object, least) { return !object.deleted && (object.edited || object.confidence >= least); }
+
+function centroid(geometry) {
+  const positions = geometry.getAttribute("position");
+  const sum = new THREE.Vector3();
+  for (let k = 0; k < positions.count; k += 1) sum.add(new THREE.Vector3().fromBufferAttribute(positions, k));
+  return sum.divideScalar(positions.count);
 }
 
 function material() {

@@ -12,10 +12,10 @@ from framework.errors import DataError
 from framework.files.atomic_write import read_text
 from framework.files.json_file import read_json
 from framework.runs.external_maps.external_map import UNLABELED
-from framework.vocabulary.label_spaces import SPACES, read_labels
+from framework.vocabulary.label_spaces import BENCHMARK_IDS, SPACES, read_labels
 
 KEY = "label_space"
-NYU40 = "nyu40"  # label space of ScanNet predictions; its first class has the id 1, as in ScanNet
+NYU40 = "nyu40"  # label space of ScanNet predictions
 MAX_DIGITS = 10  # maximum number of digits of an id
 
 
@@ -30,8 +30,8 @@ class ClassIdNames:
     def of(cls, label_space: str) -> ClassIdNames:
         """Return the names of a label space or file.
 
-        The ids of a label space or text file start at 0, those of NYU40 at 1. A JSON file contains an object with the
-        name of each id, or a list of names from id 0.
+        NYU40, ScanNet20 and ScanNet200 have the ids of ScanNet's benchmarks. The ids of another label space or a text
+        file start at 0. A JSON file contains an object with the name of each id, or a list of names from id 0.
 
         Raises:
             ConfigError: The label space or text file does not exist, or the file is invalid.
@@ -39,8 +39,8 @@ class ClassIdNames:
         """
         if Path(label_space).suffix.lower() == ".json":
             return cls(_names_in_json(Path(label_space)), label_space)
-        first = 1 if label_space == NYU40 else 0
-        return cls(dict(enumerate(read_labels(label_space, KEY), start=first)), label_space)
+        labels = read_labels(label_space, KEY)
+        return cls(dict(zip(BENCHMARK_IDS.get(label_space, range(len(labels))), labels, strict=True)), label_space)
 
     @property
     def all(self) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from framework.config.composition import composed_with_choices, resolved
 from framework.data import Float64
 from framework.errors import ConfigError
+from framework.evaluation.compared_classes import ComparedClasses
 from framework.evaluation.instances import PredictedInstances
 from framework.files.atomic_write import atomic_write
 from framework.files.hashing import path_hash
@@ -49,25 +50,30 @@ class MappedData:
     dataset: Mapping[str, Any]  # resolved config; empty = unknown dataset
     option: str | None  # chosen option of the config group `dataset`; None = unknown dataset
     seed: int  # seed of the runs that are compared in pairs with the map
+    classes: ComparedClasses  # label space of the evaluation
 
     @classmethod
     def of(cls, overrides: Sequence[str]) -> MappedData:
         """Return the dataset of overrides such as `dataset=rgbd_folder` and `dataset.root=DIR`.
 
         Raises:
-            ConfigError: An override is invalid, or is not an override of the dataset or the seed.
+            ConfigError: An override is invalid, or is not an override of the dataset, evaluation or seed.
         """
         keys = [word.partition("=")[0].lstrip("+~") for word in overrides]
         for word, key in zip(overrides, keys, strict=True):
-            if "=" not in word or key.partition(".")[0] not in ("dataset", "seed"):
-                raise ConfigError(f"import-map: expected dataset=NAME, dataset.KEY=VALUE or seed=N, got {word!r:.60}")
+            if "=" not in word or key.partition(".")[0] not in ("dataset", "evaluation", "seed"):
+                raise ConfigError(
+                    f"import-map: expected dataset=NAME, dataset.KEY=VALUE, evaluation.KEY=VALUE or seed=N, got "
+                    f"{word!r:.60}"
+                )
         if any(key.startswith("dataset.") for key in keys) and "dataset" not in keys:
             raise ConfigError(f"import-map: expected dataset=NAME, got only {', '.join(overrides)}; add dataset=NAME")
         config, choices = composed_with_choices(*overrides)
         plain = resolved(config)
+        classes = ComparedClasses.of(plain)
         if "dataset" not in keys:
-            return cls({}, None, plain["seed"])
-        return cls(plain["dataset"], choices["dataset"], plain["seed"])
+            return cls({}, None, plain["seed"], classes)
+        return cls(plain["dataset"], choices["dataset"], plain["seed"], classes)
 
 
 def write_imported_run(
@@ -110,7 +116,7 @@ def write_imported_run(
         "pose_source": EXTERNAL,
         **_up_metrics(converted, up),
         "instances.count": len(converted.instances),
-        **({} if video is None else _evaluation(video, converted)),
+        **({} if video is None else _evaluation(video, converted, data.classes)),
         "seed": data.seed,
         "config_hash": config_hash(config),
         INPUTS: hash_of(inputs),
@@ -132,7 +138,7 @@ def write_imported_run(
     return title
 
 
-def _evaluation(video: RGBDVideo, converted: ConvertedMap) -> Metrics:
+def _evaluation(video: RGBDVideo, converted: ConvertedMap, classes: ComparedClasses) -> Metrics:
     """Return the instance metrics of a map in the world frame of the ground truth, {} without ground truth."""
     truth = video.scene_truth()
     if truth is None:
@@ -144,7 +150,7 @@ def _evaluation(video: RGBDVideo, converted: ConvertedMap) -> Metrics:
         [one.confidence for one in instances.values()],
         [class_name(one, converted.mesh.classes) or NO_CLASS for one in instances.values()],
     )
-    return evaluation_metrics(predictions, truth, truth, video.annotation)
+    return evaluation_metrics(predictions, truth, truth, video.annotation, classes)
 
 
 def _up_metrics(converted: ConvertedMap, up: Float64 | None) -> Metrics:

@@ -18,6 +18,7 @@ from omegaconf import OmegaConf
 
 from framework.data import InstanceMesh, Pose, SceneTruth
 from framework.errors import DataError, MapFullError
+from framework.evaluation.compared_classes import ComparedClasses
 from framework.evaluation.instances import PredictedInstances, Transfer, evaluate
 from framework.files.tum_trajectory import read_tum
 from framework.pipeline import Pipeline
@@ -142,7 +143,8 @@ def test_instance_metrics_have_both_transfers_and_truth_release(
 ) -> None:
     scene = mapped(room).scene
     room.annotation = annotation
-    metrics = instance_metrics(room, scene.mesh(), scene.instances(), CLASSES, (np.zeros(0), np.zeros((0, 4, 4))))
+    no_poses = np.zeros(0), np.zeros((0, 4, 4))
+    metrics = instance_metrics(room, scene.mesh(), scene.instances(), CLASSES, no_poses, ComparedClasses())
     predictions = PredictedInstances.of_map(scene.mesh(), scene.instances(), CLASSES)
     to_truth, to_map = (evaluate(predictions, room.scene_truth(), transfer=way).metrics() for way in Transfer)
     assert to_map["instances.mean_iou"] != to_truth["instances.mean_iou"]
@@ -151,6 +153,8 @@ def test_instance_metrics_have_both_transfers_and_truth_release(
     assert len(str(metrics.pop("truth_sha256"))) == 64
     for name in ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou"):
         assert metrics.pop(f"instances.to_map.{name}") == to_map[f"instances.{name}"]
+    for name in ("label_space", "names", "ignored_in_map", "ignored_in_ground_truth"):
+        assert metrics.pop(f"evaluated_classes.{name}") is None
     assert metrics == to_truth
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 import sys
 from collections.abc import Callable
@@ -126,6 +127,24 @@ def test_report_object_without_class_is_listed(stored: Path, command) -> None:
     assert f"object {entries[0]['id']}" in texts((stored / "report.html").read_text())
 
 
+def test_report_contains_command_that_applies_edits(stored: Path, command) -> None:
+    run = stored.rename(stored.with_name("my room's run"))
+    assert command(run)[0] == 0
+    page = (run / "report.html").read_text()
+    assert "cannot apply edits" not in page
+    [data] = re.findall(r'id="report-data">(.*?)</script>', page)
+    editing = json.loads(data)["edit"]
+    options = ["--edits", "edits.json", "--out", f"{run}_edited"]
+    assert shlex.split(editing["command"]) == ["instancemap", "edit", str(run), *options]
+    assert editing["classes"] == ["chair", "couch"]
+
+
+def test_report_of_map_that_cannot_be_edited_says_so(stored: Path, command) -> None:
+    (stored / "map.npz").unlink()
+    assert command(stored)[0] == 0
+    assert "cannot apply edits to this run, because it has no map.npz" in texts((stored / "report.html").read_text())
+
+
 def test_report_is_removed_by_new_run_in_folder(stored: Path, command) -> None:
     assert command(stored)[0] == 0
     write_run(stored, frames=3)
@@ -152,6 +171,7 @@ def test_report_of_partial_run_is_marked_partial(stored: Path, command) -> None:
     assert command(stored)[0] == 0
     message = texts((stored / "report.html").read_text())
     assert "This run is partial: interrupted by Ctrl-C." in message
+    assert "cannot apply edits to this run, because it is partial" in message
     assert "The map is empty" in message
 
 

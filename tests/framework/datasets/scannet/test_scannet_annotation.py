@@ -15,6 +15,7 @@ from framework.datasets.scannet.scannet_annotation import (
     read_aggregation,
     read_label_table,
     read_labeled_mesh,
+    read_scannet200_names,
 )
 from framework.errors import DataError
 from framework.files.ply import write_ply
@@ -41,7 +42,9 @@ def read(folder: Path, groups: list[dict[str, Any]], segments: list[int] | None 
     (folder / "s.aggregation.json").write_text(json.dumps({"sceneId": "scannet.s", "segGroups": groups}))
     (folder / "labels.tsv").write_text(table)
     nyu40 = read_label_table(folder / "labels.tsv") if table else {}
-    return read_labeled_mesh(folder / "s.ply", folder / "s.segs.json", folder / "s.aggregation.json", nyu40)
+    scannet200 = read_scannet200_names(folder / "labels.tsv") if table else {}
+    files = (folder / "s.ply", folder / "s.segs.json", folder / "s.aggregation.json")
+    return read_labeled_mesh(*files, nyu40, scannet200)
 
 
 def test_scannet_annotation_maps_segments_to_instances(tmp_path: Path) -> None:
@@ -96,6 +99,21 @@ def test_scannet_annotation_label_maps_to_instance_and_class(
 @pytest.mark.parametrize(("label", "name"), [("recliner chair", "chair"), ("gizmo", None), ("laptop", "laptop")])
 def test_scannet_label_table_resolves_rare_names(tmp_path: Path, label: str, name: str | None) -> None:
     assert read(tmp_path, [group(0, label, *SEGMENTS)], table=TABLE).class_names == {1: name}
+
+
+def test_scannet_annotated_objects_have_names_in_label_spaces(tmp_path: Path) -> None:
+    table = (
+        "id\traw_category\tnyu40class\n2\tchair\tchair\n5\toffice chair\tchair\n2\tstack of chairs\tchair\n"
+        "1\twall\twall\n900\tgizmo\totherprop\n"
+    )
+    groups = [group(0, "stack of chairs", 3), group(1, "office chair", 70), group(2, "wall", 5), group(3, "gizmo", 9)]
+    annotated = read(tmp_path, groups, table=table).annotated
+    assert annotated is not None
+    np.testing.assert_array_equal(np.unique(annotated.instance_ids), [1, 2, 3, 4, 5])  # 5 = unlabeled
+    assert annotated.own_names == {1: "stack of chairs", 2: "office chair", 3: "wall", 4: "gizmo", 5: None}
+    assert annotated.names["nyu40"] == {1: "chair", 2: "chair", 3: "wall", 4: "otherprop"}
+    assert annotated.names["scannet200"] == {1: "chair", 2: "office chair", 3: "wall"}
+    assert annotated.names["scannet20"] is annotated.names["agnostic"] is annotated.names["nyu40"]
 
 
 def test_scannet_label_table_of_first_release_is_read(tmp_path: Path) -> None:

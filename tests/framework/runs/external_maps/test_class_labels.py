@@ -16,10 +16,13 @@ def written(path: Path, content: object) -> Path:
     return path
 
 
-def test_label_space_ids_start_at_zero_except_nyu40() -> None:
+def test_label_space_ids_are_those_of_scannet_or_start_at_zero() -> None:
     assert ClassIdNames.of("coco").name("x", 0) == "person"
     assert ClassIdNames.of("nyu40").name("x", 1) == "wall"
     assert ClassIdNames.of("nyu40").name("x", 40) == "otherprop"
+    assert ClassIdNames.of("scannet20").name("x", 39) == "otherfurniture"
+    assert ClassIdNames.of("scannet200").name("x", 13) == "pillow"
+    assert ClassIdNames.of("scannet200").name("x", 1191) == "mattress"
 
 
 def test_label_space_file_has_one_name_per_id(tmp_path: Path) -> None:
