@@ -328,7 +328,7 @@ def test_report_of_point_cloud_has_no_map(folder: Path, tmp_path: Path, command)
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["fuser.voxel_size=0.01"], "import-map: expected dataset=NAME, dataset.KEY=VALUE or seed=N"),
+        (["fuser.voxel_size=0.01"], "import-map: expected dataset=NAME, dataset.KEY=VALUE, evaluation.KEY=VALUE or"),
         (["dataset.frames=6"], "import-map: expected dataset=NAME, got only dataset.frames=6"),
         (["dataset=nowhere"], "dataset: expected one of"),
         (["--up", "0", "0", "0"], "up: expected a nonzero direction"),
