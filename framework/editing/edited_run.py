@@ -25,7 +25,7 @@ from framework.runs.instances_file import write_instances
 from framework.runs.manifest import Manifest
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import TRUTH, is_evaluation
-from framework.runs.reevaluation import Reevaluation, Truth
+from framework.runs.reevaluation import Reevaluation, Truth, classes_of
 from framework.runs.run_directory import headline, likely_labels
 from framework.runs.stored_runs import (
     EDITED_FROM,
@@ -38,6 +38,7 @@ from framework.runs.stored_runs import (
     Record,
     read_record,
 )
+from framework.vocabulary.label_spaces import label_space_of
 
 log = logging.getLogger(__name__)
 
@@ -127,12 +128,18 @@ class EditedRun:
             for key, value in self.record.metrics.items()
             if not is_evaluation(key) and not key.startswith(EVALUATION)
         }
-        metrics |= {"instances.count": instances, EDITED_FROM: str(self.record.directory.resolve())}
+        metrics |= {
+            "label_space": label_space_of(self.scene.classes),
+            "instances.count": instances,
+            EDITED_FROM: str(self.record.directory.resolve()),
+        }
         if TRUTH not in self.record.metrics:
             return metrics
         try:
             return Reevaluation.of(
-                replace(self.record, directory=out, metrics=metrics), Truth.of(self.record.dataset)
+                replace(self.record, directory=out, metrics=metrics),
+                Truth.of(self.record.dataset),
+                classes=classes_of(self.record),
             ).metrics
         except (InstanceMapError, OSError) as error:
             log.warning("instances are not evaluated: %s", error)

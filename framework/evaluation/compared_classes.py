@@ -25,10 +25,8 @@ import numpy as np
 from framework.data import Int32, SceneTruth
 from framework.errors import ConfigError
 from framework.evaluation.instances import MAX_DISTANCE, PredictedInstances, transfer_labels
-from framework.vocabulary.label_spaces import coco_name, label_key, read_labels
+from framework.vocabulary.label_spaces import AGNOSTIC, OBJECT, coco_name, label_key, read_labels
 
-AGNOSTIC = "agnostic"  # label space with the single class OBJECT
-OBJECT = "object"
 BACKGROUND = ("wall", "floor")
 OF_DATASET = (None, "coco")  # label spaces with the class names of the dataset
 OUTSIDE = ""  # class name of an object that is ignored

@@ -16,6 +16,7 @@ import trimesh
 from framework.data import Float32, Float64, Int32, UInt8, UInt16
 from framework.exporting.object_meshes import Coloring, Part, linear, part_colors
 from framework.rendering.surface import Surface
+from framework.vocabulary.label_spaces import label_space_of
 
 T_GLTF_ROOM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 COLOR = "_LINEAR"  # color attribute, because the 8-bit colors of trimesh are too coarse for dark linear colors
@@ -79,7 +80,13 @@ def extras(part: Part) -> dict[str, Any]:
     one = part.object
     if one is None:
         return {}
-    return {"id": one.id, "class": one.class_name, "probability": one.probability, "confidence": one.confidence}
+    return {
+        "id": one.id,
+        "class": one.class_name,
+        "label_space": label_space_of(part.mesh.classes),
+        "probability": one.probability,
+        "confidence": one.confidence,
+    }
 
 
 def _unit(normals: Float32) -> Float32:

@@ -15,6 +15,7 @@ from framework.exporting.relations import Relation, relations
 from framework.exporting.rooms import Rooms, rooms
 from framework.exporting.upright_room import RoomObject, UprightRoom
 from framework.files.json_file import write_json
+from framework.vocabulary.label_spaces import label_space_of
 
 DIGITS = 4  # decimal places of lengths in m and areas in m^2
 
@@ -35,7 +36,8 @@ def scene_graph(room: UprightRoom, plan: Plan | None) -> dict[str, Any]:
     if divided is not None:
         nodes += [{"id": "floor", "kind": "floor"}, {"id": "walls", "kind": "walls"}, *_room_nodes(divided)]
         edges += _room_edges(room, divided)
-    return {"T_room_world": room.T_room_world.tolist(), "nodes": nodes, "edges": edges}
+    label_space = label_space_of(room.mesh.classes)
+    return {"T_room_world": room.T_room_world.tolist(), "label_space": label_space, "nodes": nodes, "edges": edges}
 
 
 def _object_node(one: RoomObject) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from framework.data import Float32, Int32, UInt8
 from framework.errors import DataError
 from framework.exporting.object_meshes import Coloring, Part, linear, part_colors
 from framework.files.atomic_write import atomic_write
+from framework.vocabulary.label_spaces import label_space_of
 
 MISSING = "usd: expected the package usd-core, got none; run pip install 'instancemap[usd]'"
 NOT_WRITTEN = "the USD library failed"
@@ -109,6 +110,7 @@ def _add_object(stage: Any, part: Part, colors: UInt8, collision: Collision) -> 
     Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
     UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr(Vt.TokenArray([one.class_name]))
     prim.SetCustomDataByKey("instancemap:id", one.id)
+    prim.SetCustomDataByKey("instancemap:label_space", label_space_of(part.mesh.classes))
     prim.SetCustomDataByKey("instancemap:confidence", one.confidence)
     if one.probability is not None:
         prim.SetCustomDataByKey("instancemap:probability", one.probability)

@@ -18,6 +18,7 @@ from framework.live_view.drawing_thread import FrameNote, FrameUpdate, MapSnapsh
 from framework.live_view.instance_colors import InstanceColors, seen_instances
 from framework.live_view.mesh_regions import MeshRegions
 from framework.mapping.instances.instance_list import box_around, vertices_by_id
+from framework.vocabulary.label_spaces import label_space_of
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -45,6 +46,7 @@ class RerunDrawing:
         self._rr, self._recording = rerun, recording
         self._stride, self._jpeg_quality, self._min_confidence = stride, jpeg_quality, min_confidence
         self._regions, self._colors = MeshRegions(region), InstanceColors()
+        self._label_space: str | None = None  # of the map; None = not yet drawn
         self._first_s: float | None = None  # timestamp of the first frame
         self._path: list[Float32] = []  # (3,) positions of the last path segment
         self._pieces = 0
@@ -77,6 +79,9 @@ class RerunDrawing:
             self._turn(snapshot.up)
         shown = {key: of for key, of in snapshot.objects.items() if of[1] >= self._min_confidence}
         mesh = snapshot.mesh
+        if self._label_space is None:
+            self._label_space = label_space_of(mesh.classes)
+            self._recording.log(at.LOG, self._rr.TextLog(f"label space: {self._label_space}", level="INFO"))
         ids = np.where(np.isin(mesh.instance_ids, [*shown]), mesh.instance_ids, 0).astype(np.int32)
         self._mesh = replace(mesh, instance_ids=ids)
         members = vertices_by_id(ids)

@@ -230,6 +230,8 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
         found.append(("Frames per second", f"{fps:.1f}", "/s", "all stages"))
     if (count := known("instances.count")) is not None:
         found.append(("Objects", str(len(likely_ids(contents))), "", f"of {count:.0f}; confidence ≥ {LIKELY}"))
+    if space := metrics.get("label_space"):
+        found.append(("Label space", str(space), "", ""))
     if (ap50 := known("instances.ap50")) is not None:
         ap25 = known("instances.ap25")
         found.append(("AP50", f"{ap50:.2f}", "", "" if ap25 is None else f"AP25 {ap25:.2f}"))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from string import ascii_letters, digits, punctuation
 from urllib.parse import quote, unquote
 
 import numpy as np
@@ -17,17 +16,16 @@ CHANNELS = ("red", "green", "blue")
 TYPES = {**dict.fromkeys(CHANNELS, np.uint8), "instance": np.int32, "class": np.int32}
 """Types of the vertex properties other than the position."""
 
+SAFE = "".join(chr(code) for code in range(32, 127) if chr(code) not in ",%")  # not escaped in class names
 CLASSES = "classes "  # prefix of the comment with the class names
-# characters of class names that are not percent-encoded; a PLY header is ASCII, and commas separate the names
-SAFE = (ascii_letters + digits + punctuation + " ").translate(str.maketrans("", "", ",%"))
 
 
 def write_mesh(path: Path, mesh: InstanceMesh) -> None:
     """Write a mesh to a binary PLY file.
 
     Each vertex has a position in m, a color, an instance id and a class. The class is an index into the class names in
-    the header. Vertices without an instance have the id 0, and vertices without a class have the index -1. Commas,
-    percent signs and non-ASCII characters of class names are percent-encoded (RFC 3986, UTF-8).
+    the header, where commas and characters outside of ASCII are escaped as in URLs. Vertices without an instance have
+    the id 0, and vertices without a class have the index -1.
     """
     properties: dict[str, Array] = {
         **{channel: mesh.colors[:, k] for k, channel in enumerate(CHANNELS)},

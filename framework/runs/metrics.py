@@ -12,7 +12,7 @@ import numpy as np
 from framework.data import Float64, Instance, InstanceMesh, Pose, SceneTruth
 from framework.errors import DataError
 from framework.evaluation import instances, trajectory
-from framework.evaluation.compared_classes import AGNOSTIC, Compared, ComparedClasses, indices, listed
+from framework.evaluation.compared_classes import Compared, ComparedClasses, indices, listed
 from framework.evaluation.instances import PredictedInstances, Transfer
 from framework.evaluation.scannet_benchmark import BenchmarkScene, benchmark_metrics, semantic_metrics
 from framework.evaluation.truth_alignment import in_map_world
@@ -20,6 +20,7 @@ from framework.files.hashing import add_values
 from framework.interfaces import RGBDVideo, SceneMap
 from framework.mapping.gravity import floor_height
 from framework.runtime.run_log import STAGES, RunResult
+from framework.vocabulary.label_spaces import AGNOSTIC
 
 log = logging.getLogger(__name__)
 

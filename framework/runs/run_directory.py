@@ -64,6 +64,7 @@ from framework.runtime.process_settings import frozen_garbage_collector
 from framework.runtime.run_log import RunResult
 from framework.runtime.signals import ENDING, Interruption, signals_deferred
 from framework.tracking.keyframes import write_keyframes
+from framework.vocabulary.label_spaces import label_space_of
 
 log = logging.getLogger(__name__)
 
@@ -131,7 +132,7 @@ class RunRecord:
         if found is not None:
             attempt(write_instances, self.directory / INSTANCES, *found, scene.classes)
             figures |= attempt(room_metrics, scene, found[0]) or {}
-            figures["instances.count"] = len(found[1])
+            figures |= {"label_space": label_space_of(scene.classes), "instances.count": len(found[1])}
         attempt(self._write_partial, video, figures, attempt.error)  # in case the process is killed
         if found is not None:  # the map is written before the evaluation, in case the ground truth is unusable
             attempt(write_mesh, self.directory / MESH, found[0])

@@ -9,7 +9,7 @@ from typing import Any
 
 from framework.evaluation.instances import MAX_DISTANCE
 from framework.registry import STAGES
-from framework.runs.metrics import is_evaluation
+from framework.runs.metrics import IGNORED_IN_MAP, IGNORED_IN_TRUTH, LABEL_SPACE, is_evaluation
 from framework.runs.plugin_code import CODE
 from framework.runs.run_rows import DATA, Run, RunRow, dependent_keys
 from framework.runs.stored_runs import Record, is_number
@@ -18,6 +18,7 @@ from framework.tables.metric_columns import Direction, direction, head
 from framework.tables.statistics import ALPHA
 
 OF_RESULTS = ("instances.", "trajectory.", "map.", "frames")  # prefixes of metrics that do not depend on the machine
+NAMES_OF_MAP = "names of the map and the ground truth"  # evaluation without conversion of names
 MOST_NAMES = 12  # maximum number of sequences that a note names
 
 
@@ -47,6 +48,8 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
     yield from _protocol(comparison)
     yield from _published(comparison)
     yield f"Data: {data(comparison.records)}."
+    if known := [str(space) for record in comparison.records if (space := record.metrics.get("label_space"))]:
+        yield f"Label space of the maps: {counted(known)}."
     yield f"Code: {counted(record.code for record in comparison.records)}."
     yield from _mixed_code(comparison)
     if used := machines(comparison.records):
@@ -177,8 +180,19 @@ def _protocol(comparison: ComparisonTable) -> Iterator[str]:
             f"Label transfer: each ground-truth vertex gets the instance of the nearest map vertex {near}. "
             "AP is in [0, 1]."
         )
+    spaces = [record.metrics.get(LABEL_SPACE) for record in comparison.records]
+    if any(spaces):
+        yield f"Evaluation in the label space: {counted(str(space or NAMES_OF_MAP) for space in spaces)}."
+    if ignored := [text for text in map(_ignored, comparison.records) if text]:
+        yield f"Ignored objects: {counted(ignored)}."
     if True in kinds:
         yield f"Label transfer, to map: each map vertex gets the instance of the nearest ground-truth vertex {near}."
+
+
+def _ignored(record: Record) -> str:
+    """Return the names of the objects that an evaluation ignored because of their classes."""
+    sides = {"map": IGNORED_IN_MAP, "ground truth": IGNORED_IN_TRUTH}
+    return "; ".join(f"{side}: {names}" for side, key in sides.items() if (names := record.metrics.get(key)))
 
 
 def _published(comparison: ComparisonTable) -> Iterator[str]:

@@ -34,6 +34,9 @@ SPACES: Mapping[str, tuple[str, ...]] = {k: tuple(names) for k, names in _SECTIO
 """Names of each label space, in the label order of detectors trained on the space."""
 
 COCO = SPACES["coco"]  # 80 classes
+AGNOSTIC = "agnostic"  # label space with the single class OBJECT
+OBJECT = "object"
+OWN_CLASSES = "own classes"  # classes outside of all label spaces
 NO_CLASS = "n/a"  # name of an unused id, in any space
 _UNUSED_IDS = (0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # planned classes without annotations
 _COCO_IDS = [k for k in range(91) if k not in _UNUSED_IDS]
@@ -153,6 +156,19 @@ def to_class_names(labels: Sequence[str], class_names: ClassNames, key: str = "d
         raise ConfigError(f"{key}: expected at least one class, got none in {len(labels)} labels")
     index = {name: k for k, name in enumerate(classes)}
     return LabelMapping(classes, np.array([index.get(name, -1) for name in names], np.int32))
+
+
+def label_space_of(classes: Sequence[str]) -> str:
+    """Return the name of the label space of a map.
+
+    It is the first label space with all of the classes, OWN_CLASSES if there is none, AGNOSTIC for the single class
+    OBJECT, and "none" for a map without classes.
+    """
+    if not classes:
+        return "none"
+    if tuple(classes) == (OBJECT,):
+        return AGNOSTIC
+    return next((space for space, names in SPACES.items() if set(classes) <= set(names)), OWN_CLASSES)
 
 
 def keeps_names(labels: Sequence[str], class_names: ClassNames) -> bool:

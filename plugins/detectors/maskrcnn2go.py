@@ -59,7 +59,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class MaskRCNN2Go(Detector):
-    """Mask R-CNN 2Go (Facebook, Apache-2.0), on the CPU or with CUDA.
+    """Mask R-CNN 2Go (Facebook, Apache-2.0), for the classes of COCO, on the CPU or with CUDA.
 
     The published mask AP on COCO 2014 minival is 20.9. On x86 CPUs with VNNI (since about 2020), the network computes
     with 8-bit integers, in one thread per frame. On other devices, it computes in floating point with the same weights.

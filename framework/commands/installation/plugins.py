@@ -27,6 +27,7 @@ from framework.config.composition import config_loader, one_line
 from framework.config.hydra_api import CachingConfigRepository
 from framework.errors import ConfigError, DataError
 from framework.registry import GROUPS, check_option, composition, find_class, holds_one, parameter_fields, plugin_fields
+from framework.vocabulary.label_spaces import SPACES
 
 COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
 _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
@@ -166,3 +167,6 @@ def main() -> None:
             print(f"{stage} ({GROUPS[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")
             described = [describe(option) for option in options if option.stage == stage]
             print("\n\n".join(described) or "  (none)", end="\n\n")
+            if stage == "detector":
+                spaces = ", ".join(f"{name} ({len(classes)} classes)" for name, classes in SPACES.items())
+                print(f"  Label spaces: {spaces}, or a text file with one name per line\n")

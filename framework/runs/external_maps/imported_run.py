@@ -35,6 +35,7 @@ from framework.runs.metrics import Metrics, class_name, evaluation_metrics
 from framework.runs.provenance import code_version, config_hash, parameters_of
 from framework.runs.run_directory import headline, likely_labels
 from framework.runs.stored_runs import CHOICE, CONFIG, EXTERNAL, INSTANCES, MESH, METRICS, RESULT_FILES
+from framework.vocabulary.label_spaces import label_space_of
 
 ImportOption = str | Path | float | None
 
@@ -115,6 +116,7 @@ def write_imported_run(
         **{f"{CHOICE}{stage}": EXTERNAL for stage in STAGES if stage != "dataset"},
         "pose_source": EXTERNAL,
         **_up_metrics(converted, up),
+        "label_space": label_space_of(converted.mesh.classes),
         "instances.count": len(converted.instances),
         **({} if video is None else _evaluation(video, converted, data.classes)),
         "seed": data.seed,
