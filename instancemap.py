@@ -23,7 +23,9 @@
 
 `export("outputs/demo", "glb", "usd")` writes files in standard formats. `edit("outputs/demo", [{"delete": [9]}])`
 corrects the instances of a run. `query("outputs/demo", "a red chair").objects` lists the matching objects, best match
-first. `load_runs("multirun/sweep")` returns the runs of a sweep as a data frame.
+first. `run("outputs/fine", "fuser.voxel_size=0.01", dataset="desk")` writes a run directory. `report` and `tables`
+write its HTML report and the tables of runs. `load_runs("multirun/sweep")` returns the runs of a sweep as a data frame.
+`import_map("other.ply", "outputs/other")` converts the map of another system to a run directory.
 
 A Mapper is thread-safe; queries wait until the current frame is mapped.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig
 
 from framework.compilation.catalog import compile_for_run
-from framework.config.composition import composed, resolved
+from framework.config.composition import composed, composed_with_choices, resolved
 from framework.config.validation import checked_path
 from framework.data import (
     Camera,
@@ -30,8 +31,10 @@ from framework.data import (
 )
 from framework.datasets.frames.sequence_reader import FRAME_RATE
 from framework.detection.domain import warn_outside_domain
+from framework.detection.map_classes import with_classes_of_map
 from framework.detection.stored.cache import with_cache
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
+from framework.files.atomic_write import atomic_write
 from framework.interfaces import (
     ClusterRefiner,
     Detector,
@@ -52,12 +55,15 @@ from framework.queries.map_queries import Map
 from framework.queries.text_search import Match, QueryResult, TextQuery, search
 from framework.registry import build
 from framework.runs.data_frame import load_runs
-from framework.runs.stored_runs import KEYFRAMES, MAP
+from framework.runs.run_directory import write_run
+from framework.runs.stored_runs import KEYFRAMES, MAP, REPORT
 from framework.runtime.cpu_budget import limited_threads
 from framework.runtime.process_settings import Settings, configure_process
 from framework.runtime.run_log import Journal
 from framework.sensors.noise_models import SensorKind
+from framework.tables.experiment_tables import write_tables
 from framework.tracking.keyframes import read_keyframes
+from framework.vocabulary.label_spaces import ClassNames
 
 __all__ = [
     "Camera",
@@ -94,12 +100,21 @@ __all__ = [
     "configure_process",
     "edit",
     "export",
+    "import_map",
     "load_map",
     "load_runs",
     "open_dataset",
     "query",
+    "report",
+    "run",
+    "tables",
     "untimed",
 ]
+
+SWEEPS = ("experiment", "hydra", "launcher")
+"""Config groups of the command line that run several jobs, and of its working directory."""
+
+log = logging.getLogger(__name__)
 
 
 def begin(config: DictConfig) -> Pipeline:
@@ -115,7 +130,7 @@ def begin(config: DictConfig) -> Pipeline:
     fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
     tracker = build(PoseTracker, config.get("tracker"))
     viewer = build(Viewer, config.get("viewer"))
-    detector = with_cache(build(Detector, config.get("detector")), config)  # last, because loading a network is slow
+    classes: tuple[str, ...] = ()
     chosen = {key: config.get(key) for key in ("resume_from", "localize_in") if config.get(key) is not None}
     if len(chosen) > 1:
         raise ConfigError("resume_from and localize_in: expected at most one of these keys, got both; remove one")
@@ -124,7 +139,10 @@ def begin(config: DictConfig) -> Pipeline:
         scene = scene_of(key, run)
         if key == "resume_from":
             fuser.resume(scene)
+            classes = scene.classes
         tracker.load_keyframes(read_keyframes(run / KEYFRAMES), scene)
+    detector = build(Detector, config.get("detector"))  # last, because loading a network is slow
+    detector = with_cache(with_classes_of_map(detector, classes), config)
     compile_for_run()
     return Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval)
 
@@ -172,11 +190,9 @@ class Mapper(Map):
     """
 
     def __init__(self, *overrides: str, **named: object) -> None:
-        words = [*overrides, *(_override(name, value) for name, value in named.items())]
+        words = _overrides("Mapper", overrides, named)
         for override in words:
-            if not isinstance(override, str):
-                raise ConfigError(f"Mapper: expected overrides such as 'fuser.voxel_size=0.02', got {override!r}")
-            if override.lstrip("+~").startswith(("dataset", "hydra", "experiment", "sequences", "launcher")):
+            if override.lstrip("+~").startswith(("dataset", "sequences", *SWEEPS)):
                 raise ConfigError(
                     f"Mapper: expected an override of a stage or setting, got {override}; use dataset, experiment, "
                     "sequences, launcher and hydra overrides only on the command line"
@@ -296,6 +312,14 @@ class Mapper(Map):
         return super().at_pixel(u, v, camera, T_world_camera)
 
 
+def _overrides(where: str, overrides: Sequence[str], named: Mapping[str, object]) -> list[str]:
+    words = [*overrides, *(_override(name, value) for name, value in named.items())]
+    for override in words:
+        if not isinstance(override, str):
+            raise ConfigError(f"{where}: expected overrides such as 'fuser.voxel_size=0.02', got {override!r}")
+    return words
+
+
 def _override(name: str, value: object) -> str:
     if value is None or isinstance(value, bool | int | float):
         return f"{name}={'null' if value is None else value}"
@@ -322,6 +346,78 @@ def open_dataset(name: str, **parameters: object) -> RGBDSequence:
     """
     words = [_override("dataset", name), *(_override(f"dataset.{key}", value) for key, value in parameters.items())]
     return build(RGBDSequence, composed(*words).dataset)
+
+
+def run(directory: Path | str, *overrides: str, **named: object) -> Path:
+    """Map a sequence and write a run directory, as the command `instancemap` does.
+
+    Example: `run("outputs/demo", "fuser.voxel_size=0.02", dataset="desk")`.
+
+    Args:
+        directory: The new run directory.
+        overrides: The overrides of the command line, such as "dataset.root=DIR". Experiments, launchers and Hydra's own
+            settings are not supported.
+        named: Overrides as keywords.
+
+    Returns:
+        The run directory.
+
+    Raises:
+        ConfigError: A name is unknown, or a value is invalid.
+        DataError: The directory is not empty, the sequence cannot be read, or no frame could be mapped.
+        PartialRunError: An error ended the run early. The outputs are those of the mapped frames.
+    """
+    from framework.importing.folder_writer import check_new
+
+    words = _overrides("run", overrides, named)
+    for override in words:
+        if override.lstrip("+~").startswith(SWEEPS):
+            raise ConfigError(
+                f"run: expected an override of a single run, got {override}; use {', '.join(SWEEPS)} overrides only on "
+                "the command line"
+            )
+    check_new(Path(directory))
+    config, choices = composed_with_choices(*words)
+    with limited_threads(Settings.of(config).threads):
+        write_run(begin(config), config, Path(directory), choices).check()
+    return Path(directory)
+
+
+def report(run: Path | str, out: Path | str | None = None) -> Path:
+    """Write an interactive HTML report of a run.
+
+    Args:
+        run: The run directory.
+        out: The file; None = `report.html` in the run directory.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        DataError: The run cannot be read, or the file cannot be written.
+    """
+    from framework.reporting.run_contents import RunContents
+    from framework.reporting.run_page import RunReport
+
+    path = Path(run) / REPORT if out is None else Path(out)
+    page = RunReport.of(RunContents.read(Path(run))).html()
+    with atomic_write(path) as temporary:
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names may be invalid Unicode
+    return path
+
+
+def tables(directory: Path | str, *overrides: str) -> str:
+    """Write table.md, table.tex and table.csv of the runs below a folder, and return the Markdown text.
+
+    Args:
+        directory: The folder. The runs are in this folder and its subfolders.
+        overrides: Settings of the table, such as "table.columns=[instances.ap50]".
+
+    Raises:
+        DataError: No run is complete.
+        ConfigError: A setting is invalid.
+    """
+    return write_tables(Path(directory), overrides)
 
 
 def load_map(path: Path | str) -> Map:
@@ -402,6 +498,76 @@ def edit(run: Path | str, edits: Sequence[Mapping[str, Any]] | Path | str, out: 
     entries = read_edits(Path(edits)) if isinstance(edits, str | Path) else edits_of("edits", edits)
     edited_run.EditedRun.of(Path(run), entries).write(directory)
     return directory
+
+
+def import_map(
+    mesh: Path | str,
+    directory: Path | str,
+    *overrides: str,
+    name: str | None = None,
+    labels: Path | str | None = None,
+    label_space: Path | str | None = None,
+    class_names: str = "AUTO",
+    instance_property: str | None = None,
+    class_property: str | None = None,
+    no_instance: int = 0,
+    scale: float = 1.0,
+    transform: Float64 | Path | str | None = None,
+    up: Sequence[float] | None = None,
+) -> Path:
+    """Convert the map of another system to a run directory for tables, reports, `load_runs` and `export`.
+
+    Changes and assumptions, such as instances that are left out, are logged as warnings.
+
+    Example: `import_map("other.ply", "outputs/other", "dataset=desk", label_space="nyu40")`.
+
+    Args:
+        mesh: A PLY file, or points (V, 3) in an NPY file, in the world frame of the ground truth.
+        directory: The new run directory.
+        overrides: The dataset to compare with, as on the command line: "dataset=NAME", "dataset.KEY=VALUE",
+            "evaluation.KEY=VALUE", "seed=N".
+        name: The name of the row in tables; None = the name of the directory.
+        labels: A JSON or CSV file with the class and confidence of each instance id, ScanNet predictions (text file or
+            its folder), or a mask folder; None = properties of the mesh.
+        label_space: The names of class ids: a label space such as "nyu40", or a text or JSON file; None = NYU40 for
+            ScanNet predictions, otherwise none.
+        class_names: "COCO" (instances of other classes are left out), "OWN" (the given names), or "AUTO" (OWN if a name
+            is in no known label space, otherwise COCO).
+        instance_property: The property of the PLY file with instance ids; None = detected by name.
+        class_property: The property with class ids; None = detected by name; "" = no classes.
+        no_instance: The id of points without an instance.
+        scale: The number of meters per unit of the mesh, > 0.
+        transform: T_world_map (4, 4), applied after `scale`, or a text file; None = identity.
+        up: The up direction (3,) in the world frame; None = unknown.
+
+    Returns:
+        The run directory.
+
+    Raises:
+        ConfigError: The directory is not empty, or an argument is invalid.
+        DataError: A file is missing or invalid, or no instance is left.
+    """
+    from framework.runs.external_maps.map_import import MapImport
+    from framework.runs.external_maps.ply_instances import LabelProperties
+
+    if class_names not in ClassNames.__members__:
+        known = ", ".join(ClassNames.__members__)
+        raise ConfigError(f"class_names: expected one of {known}, got {class_names!r:.60}")
+    chosen = MapImport(
+        mesh=Path(mesh),
+        labels=None if labels is None else Path(labels),
+        label_space=None if label_space is None else str(label_space),
+        class_names=ClassNames[class_names],
+        properties=LabelProperties(instance_property, class_property, no_instance),
+        scale=scale,
+        transform=Path(transform) if isinstance(transform, str) else transform,
+        up=up,
+    )
+    found = chosen.write(Path(directory), name, overrides)
+    log.info("import_map: %s; %s", found.source, found.title)
+    for remark in found.remarks:
+        log.warning("import_map: %s", remark)
+    return Path(directory)
 
 
 def query(run: Map | Path | str, words: str, by: str | None = None, model: Path | str | None = None) -> QueryResult:

@@ -49,8 +49,7 @@ def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) ->
     if unknown:
         raise DataError(
             f"frame {frame.index}: expected ground-truth classes among the {len(classes)} classes of the detector, got "
-            f"{', '.join(map(repr, unknown))}; list all names in a file and set detector=ground_truth and "
-            "detector.label_space to this file"
+            f"{', '.join(map(repr, unknown))}; list all names in a file and set detector.label_space to this file"
         )
 
     found, areas = np.unique(frame.truth.instance_ids, return_counts=True)

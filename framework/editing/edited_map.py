@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from copy import deepcopy
 from dataclasses import replace
-from difflib import get_close_matches
 from itertools import count
 
 import numpy as np
@@ -22,6 +22,9 @@ from framework.mapping.labels.label_evidence import MAX_SCORE, Evidence
 from framework.mapping.labels.label_rule import EXACT_BITS
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE
+from framework.vocabulary.label_spaces import with_similar
+
+log = logging.getLogger(__name__)
 
 CERTAIN = 1e6  # class evidence of a renamed instance; exceeds the evidence of any sequence of detections
 LISTED = 20  # maximum number of ids in an error message
@@ -48,7 +51,7 @@ class EditedMap:
         """Apply an edit, and return a description of its result.
 
         Raises:
-            DataError: An instance or a class is unknown, or an instance cannot be split.
+            DataError: An instance is unknown or cannot be split, or the map has too many classes for a new one.
         """
         match edit:
             case Merge(ids):
@@ -112,13 +115,10 @@ class EditedMap:
         self.scene.volume.changed(NO_BLOCKS)
 
     def _rename(self, key: int, name: str) -> None:
+        if name not in self.scene.classes:
+            log.warning("rename %d: new class %s", key, with_similar(name, self.scene.classes))
+            self.scene.add_class(name)
         classes = self.scene.classes
-        if name not in classes:
-            close = get_close_matches(name.strip().lower(), classes, n=3)
-            hint = (
-                f"; did you mean {' or '.join(map(repr, close))}?" if close else f"; choose one of {', '.join(classes)}"
-            )
-            raise DataError(f"expected a class of the map, got {name!r:.60}{hint}")
         k, evidence, voxels = classes.index(name), self.scene.labels.in_use(), self._voxels_of(key)
         self.scene.table.records[key].class_evidence = CERTAIN * np.eye(len(classes))[k]
         slots = np.full(evidence.class_ids.shape[1], NO_CLASS, np.uint8)

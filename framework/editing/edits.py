@@ -18,6 +18,7 @@ from typing import Any
 from framework.errors import DataError
 from framework.files.json_file import read_json, write_json
 from framework.mapping.storage.map_file import LARGEST_ID
+from framework.vocabulary.label_spaces import check_class_name
 
 
 class SplitBy(Enum):
@@ -57,7 +58,7 @@ class Rename:
     """Set the class of an instance, with probability 1."""
 
     id: int
-    class_name: str
+    class_name: str  # a class of the map, or a new class
 
     @property
     def entry(self) -> dict[str, list[int | str]]:
@@ -158,5 +159,6 @@ def edit_of(where: str, operation: str, values: object) -> Edit:
         case "split", ["parts" | "plane" as by]:
             return Split(ids[0], SplitBy(by))
         case "rename", [str(class_name)]:
+            check_class_name(where, class_name)
             return Rename(ids[0], class_name)
     raise error

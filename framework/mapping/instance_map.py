@@ -100,6 +100,19 @@ class InstanceMap(InstanceTableMap):
         self.labels.merge_instances(kept, dropped)
         self.volume.changed(NO_BLOCKS)
 
+    def add_class(self, name: str) -> None:
+        """Add a class to a map with classes. The class distributions of the instances do not change.
+
+        Raises:
+            DataError: The map has the maximum number of classes.
+        """
+        if len(self.classes) == NO_CLASS:
+            raise DataError(f"expected one of the {NO_CLASS} classes of the map, which is the maximum, got {name!r}")
+        self.classes += (name,)
+        self.labels.add_class(self.table.logarithmic)
+        self.table.add_class()
+        self.volume.changed(NO_BLOCKS)
+
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         volume = self.volume
         return render(volume.voxels, self.labels.evidence, volume.sensor, camera, T_world_camera)

@@ -7,6 +7,7 @@ and marks a complete run.
 from __future__ import annotations
 
 import csv
+import gc
 import logging
 import sys
 from collections import Counter
@@ -19,14 +20,20 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from framework.compilation.catalog import compile_for_run
 from framework.config.composition import one_line, resolved
 from framework.data import Instance
-from framework.errors import InstanceMapError
+from framework.datasets.frames.sequence_reader import Recording
+from framework.detection.stored.cache import cache_metrics
+from framework.errors import DataError, InstanceMapError, PartialRunError
 from framework.evaluation.compared_classes import ComparedClasses
 from framework.files.atomic_write import atomic_write, remove_left_over
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum, write_tum
-from framework.interfaces import RGBDVideo
+from framework.interfaces import RGBDSequence, RGBDVideo
+from framework.live_view.guarded_viewer import watched_run
+from framework.pipeline import Pipeline
+from framework.registry import STAGES, build
 from framework.rendering.overview import write_overview
 from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import write_instances
@@ -51,8 +58,11 @@ from framework.runs.stored_runs import (
     REPORT,
     RESULT_FILES,
     TRAJECTORY,
+    read_metrics,
 )
+from framework.runtime.process_settings import frozen_garbage_collector
 from framework.runtime.run_log import RunResult
+from framework.runtime.signals import ENDING, Interruption, signals_deferred
 from framework.tracking.keyframes import write_keyframes
 from framework.vocabulary.label_spaces import label_space_of
 
@@ -190,6 +200,50 @@ class RunRecord:
             log.info("%s%s", _from_here(self.directory / written[0]), others)
         if error is not None:
             log.warning("partial run (%s): its metrics are in %s", reason(error), PARTIAL_METRICS)
+
+
+def write_run(
+    pipeline: Pipeline, config: DictConfig, directory: Path, choices: Mapping[str, str | None]
+) -> Interruption:
+    """Map the sequence or live video of a config, and write the run directory.
+
+    Args:
+        pipeline: The stages of the config.
+        config: The config of the run.
+        directory: The run directory.
+        choices: The chosen option of each config group.
+
+    Returns:
+        A record of the signal that arrived during writing or ended a live video, if any.
+
+    Raises:
+        Interrupted: A signal ended the run early.
+        PartialRunError: An error ended the run early. The error is its cause. If no frame was mapped, the error itself
+            is raised.
+    """
+    gc.collect()  # otherwise, a garbage collection would delay one of the first few hundred frames
+    video = build(RGBDVideo, config.get("dataset"))  # last, because a synthetic scene takes the longest to build
+    compile_for_run()  # kernels of the synthetic renderer
+    record = RunRecord.begin(directory, config, choices)
+    chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
+    length = f"{len(video)} frames" if isinstance(video, RGBDSequence) else "live until Ctrl-C"
+    log.info("mapping %s: %s, %s", video.name, length, chosen)
+    if isinstance(video, Recording):  # third-party datasets may have another class
+        from framework.checking.recording_check import warn_of_poses
+
+        warn_of_poses(video)
+    with signals_deferred(*ENDING) as interruption, watched_run(pipeline.viewer, directory, record.config) as outcome:
+        with frozen_garbage_collector():
+            result = pipeline.run_to_any_end(video, directory)
+        with interruption.second_ends_at_once("after the outputs are written"):
+            error = record.write(video, result, cache_metrics(pipeline.detector))
+        with suppress(DataError):  # the disk may be full
+            outcome.metrics = read_metrics(directory)
+        if isinstance(error, Exception):
+            raise PartialRunError(reason(error)) from error
+        if error is not None:
+            raise error
+    return interruption
 
 
 @dataclass

@@ -22,6 +22,7 @@ from framework.files.atomic_write import read_text
 from framework.files.search_paths import expanded
 
 LARGEST_FILE = 2**20  # bytes, maximum size of a list of labels
+LONGEST_CLASS_NAME = 100  # characters
 _OTHER_NAMES = "other_names"  # section for spellings outside of all spaces
 
 
@@ -145,13 +146,10 @@ def to_class_names(labels: Sequence[str], class_names: ClassNames, key: str = "d
     Raises:
         ConfigError: No label is an object class, or the class names are COCO and a label is unknown.
     """
-    unknown = [] if class_names is ClassNames.OWN else _unknown(labels)
-    in_coco = any(map(coco_name, labels))
-    if class_names is ClassNames.COCO or (class_names is ClassNames.AUTO and in_coco and not unknown):
+    if not keeps_names(labels, class_names):
         return to_coco(labels, key)
-    if unknown:
-        message = "%s: all names are kept, because %d of %d are in no known label space: %s"
-        log.info(message, key, len(unknown), len(labels), ", ".join(map(with_similar, dict.fromkeys(unknown))))
+    if class_names is ClassNames.AUTO and (reason := reason_for_names(labels)):
+        log.info("%s: %s", key, reason)
     names = [label.strip() for label in labels]
     classes = tuple(dict.fromkeys(name for name in names if name.lower() != NO_CLASS))
     if not classes:
@@ -173,10 +171,40 @@ def label_space_of(classes: Sequence[str]) -> str:
     return next((space for space, names in SPACES.items() if set(classes) <= set(names)), OWN_CLASSES)
 
 
-def with_similar(name: str) -> str:
-    """Return a quoted name, with the most similar known name if there is one."""
-    close = get_close_matches(label_key(name), MEANINGS, n=1, cutoff=0.75)
-    return f"{name!r} (similar to {close[0]!r})" if close else repr(name)
+def keeps_names(labels: Sequence[str], class_names: ClassNames) -> bool:
+    """Return True if classes have the names of their label space, False if they have COCO names."""
+    if class_names is ClassNames.AUTO:
+        return bool(_unknown(labels)) or not any(map(coco_name, labels))
+    return class_names is ClassNames.OWN
+
+
+def reason_for_names(labels: Sequence[str]) -> str:
+    """Return the reason why AUTO keeps the names of labels, "" if all are in known label spaces."""
+    unknown = _unknown(labels)
+    if not unknown:
+        return ""
+    listed = ", ".join(map(with_similar, dict.fromkeys(unknown)))
+    return f"all names are kept, because {len(unknown)} of {len(labels)} are in no known label space: {listed}"
+
+
+def check_class_name(where: str, name: str) -> None:
+    """Raise DataError unless a class name is valid in all outputs.
+
+    Args:
+        where: The location of the name, for messages.
+        name: The name.
+    """
+    if name != name.strip() or not 0 < len(name) <= LONGEST_CLASS_NAME or not name.isprintable():
+        raise DataError(
+            f"{where}: expected a class name of 1 to {LONGEST_CLASS_NAME} characters without outer spaces and control "
+            f"characters, got {name!r:.120}"
+        )
+
+
+def with_similar(name: str, others: Sequence[str] = ()) -> str:
+    """Return a quoted name, with the most similar name among others and all known names if there is one."""
+    close = get_close_matches(label_key(name), [*others, *MEANINGS], n=1, cutoff=0.75)
+    return f"{name!r} (similar to {close[0]!r})" if close and close[0] != name else repr(name)
 
 
 def label_key(label: str) -> str:

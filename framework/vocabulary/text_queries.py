@@ -21,7 +21,7 @@ EVERYDAY = {"fridge": "refrigerator", "plant": "potted plant", "phone": "cell ph
             "telly": "tv"}  # fmt: skip
 """Everyday words outside of all label spaces, with their COCO names."""
 
-MAX_WORDS = 4  # maximum number of words in a class name
+MAX_WORDS = 4  # maximum number of words in a name of a label space
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ def object_words(query: str, classes: Collection[str]) -> ObjectWords:
         query: The text query.
         classes: The known class names.
     """
-    words = re.findall(r"[^\W_]+(?:[-'][^\W_]+)*", query.lower())
-    known = {name.lower(): name for name in classes}
+    words = _words(query)
+    known = {" ".join(_words(name)): name for name in classes}
     found, colors, unknown = list[str](), list[str](), list[str]()
     at = 0
     while at < len(words):
@@ -65,6 +65,11 @@ def object_words(query: str, classes: Collection[str]) -> ObjectWords:
     return ObjectWords(tuple(dict.fromkeys(found)), tuple(dict.fromkeys(colors)), tuple(dict.fromkeys(unknown)))
 
 
+def _words(text: str) -> list[str]:
+    """Return the lower-case words of a text, without punctuation."""
+    return re.findall(r"[^\W_]+(?:[-'][^\W_]+)*", text.lower())
+
+
 def _color(word: list[str]) -> str:
     """Return the first word, with the spelling of COLOR_NAMES if it is a color."""
     return OTHER_SPELLINGS.get(word[0], word[0]) if word else ""
@@ -76,12 +81,13 @@ def _class_at(words: list[str], at: int, known: dict[str, str]) -> tuple[int, st
     Args:
         words: The words of the query.
         at: The index of the first word.
-        known: The class names by lower-case name.
+        known: The class names by their words, joined by spaces.
 
     Returns:
         The number of words and the class name, or 0 and "" if no class name matches.
     """
-    for length in range(min(MAX_WORDS, len(words) - at), 0, -1):
+    longest = max([MAX_WORDS, *(name.count(" ") + 1 for name in known)])
+    for length in range(min(longest, len(words) - at), 0, -1):
         phrase = words[at : at + length]
         for last in _singulars(phrase[-1]):
             text = " ".join([*phrase[:-1], last])

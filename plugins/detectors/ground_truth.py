@@ -11,7 +11,7 @@ from framework.data import Detections, Frame
 from framework.detection.masks.binary_masks import tight_boxes
 from framework.detection.true_instances import true_instances
 from framework.interfaces import Detector
-from framework.vocabulary.label_spaces import read_labels
+from framework.vocabulary.label_spaces import ClassNames, read_labels, to_class_names
 
 
 @dataclass
@@ -28,7 +28,7 @@ class GroundTruthDetector(Detector):
 
     def __post_init__(self) -> None:
         require(self.min_pixels >= 1, "detector.min_pixels", self.min_pixels, "at least 1 px")
-        self.classes = read_labels(self.label_space)
+        self.classes = to_class_names(read_labels(self.label_space), ClassNames.OWN).classes
 
     def detect(self, frame: Frame) -> Detections:
         truth = true_instances(frame, self.classes, self.min_pixels)

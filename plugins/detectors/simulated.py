@@ -16,7 +16,7 @@ from framework.detection.masks.binary_masks_kernels import contacts
 from framework.detection.recurring_false_positives import false_positive_cells
 from framework.detection.true_instances import TrueInstances, true_instances
 from framework.interfaces import Detector
-from framework.vocabulary.label_spaces import COCO
+from framework.vocabulary.label_spaces import ClassNames, read_labels, to_class_names
 
 # fmt: off
 LOOKALIKES = (
@@ -83,7 +83,7 @@ class Candidate:
 
     instance: int  # id in the ground truth; negative for a false detection
     part: int  # 0; 1 for the second half of a split object
-    class_id: int  # index into COCO
+    class_id: int  # index into the classes of the detector
     mask: Bool  # (H, W)
     true_mask: Bool  # (H, W) ground-truth mask of the instance; empty for a false detection
 
@@ -109,6 +109,9 @@ class SimulatedDetector(Detector):
 
     As with real detectors, the errors of an object do not average out over a video. Random numbers depend on the seed,
     purpose, frame and instance, but not on the order of calls. The detector raises DataError without ground truth.
+
+    Classes outside of COCO have no similar classes. They are confused with all other classes of the label space with
+    the same probability.
     """
 
     seed: int = 0  # seed of the simulated errors, >= 0
@@ -138,13 +141,17 @@ class SimulatedDetector(Detector):
     false_positives: float = 0.5  # mean number of false positives per image, >= 0
     false_positive_score: float = 0.25  # mean score of false positives, in (0, 1)
     recurring_fraction: float = 0.0  # fraction of false positives at fixed locations with fixed classes, in [0, 1]
+    label_space: str = "coco"  # class names: a label space such as coco, or a text file with one name per line
 
     def __post_init__(self) -> None:
         require(self.seed >= 0, "detector.seed", self.seed, "at least 0")
         check_intervals("detector", self, **INTERVALS)
         grid = self.mask_grid
         require(grid == 0 or 4 <= grid <= 4096, "detector.mask_grid", grid, "0 or a value in [4, 4096]")
-        self.classes = COCO
+        self.classes = to_class_names(read_labels(self.label_space), ClassNames.OWN).classes
+        # indices of the classes of clutter; all classes if the label space has none of them
+        self._clutter_ids = [self.classes.index(name) for name in CLUTTER_CLASSES if name in self.classes]
+        self._clutter_ids = self._clutter_ids or [*range(len(self.classes))]
         self._kernel = confusion_kernel(self.classes, self.confusion)
 
     def detect(self, frame: Frame) -> Detections:
@@ -183,7 +190,7 @@ class SimulatedDetector(Detector):
         for instance, mask in things.items():
             random = self._random(Draw.CLUTTER, instance)
             if random.random() < self.clutter_rate and np.count_nonzero(mask) <= LARGEST_CLUTTER * mask.size:
-                class_id = self.classes.index(CLUTTER_CLASSES[random.integers(len(CLUTTER_CLASSES))])
+                class_id = self._clutter_ids[random.integers(len(self._clutter_ids))]
                 candidates.append(Candidate(instance, 0, class_id, mask, np.zeros_like(mask)))
         return candidates
 
@@ -316,7 +323,7 @@ class SimulatedDetector(Detector):
                 scale = frame.camera.fx / cell.z
                 a, b = np.exp(own.uniform(np.log(RECURRING_SIZES[0]), np.log(RECURRING_SIZES[1]), 2)) / 2 * scale
                 x, y, instance = cell.u, cell.v, -cell.key
-                class_id = self.classes.index(CLUTTER_CLASSES[own.integers(len(CLUTTER_CLASSES))])
+                class_id = self._clutter_ids[own.integers(len(self._clutter_ids))]
             mask = self._coarsen(ellipse(x, y, a, b, wobble * (self.boundary_noise / min(a, b))))
             candidates.append(Candidate(instance, 0, class_id, mask, np.zeros_like(mask)))
         return candidates
@@ -347,20 +354,25 @@ class SimulatedDetector(Detector):
 def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
     """Return the confusion matrix (C, C): the mean class distribution of objects of each class.
 
+    A single class cannot be confused.
+
     Args:
         classes: The names of the classes.
         confusion: The total probability of the wrong classes. Similar classes get most of it.
     """
+    if len(classes) == 1:
+        return np.ones((1, 1))
     index = {name: k for k, name in enumerate(classes)}
     alike = np.zeros((len(classes), len(classes)), np.bool_)
     for group in LOOKALIKES:
-        members = [index[name] for name in group]
+        members = [index[name] for name in group if name in index]
         alike[np.ix_(members, members)] = True
     np.fill_diagonal(alike, False)
     other = ~alike & ~np.eye(len(classes), dtype=np.bool_)
-    fraction = np.where(alike.any(axis=1, keepdims=True), LOOKALIKE_FRACTION, 0.0)
+    only_alike = np.where(other.any(axis=1, keepdims=True), LOOKALIKE_FRACTION, 1.0)
+    fraction = np.where(alike.any(axis=1, keepdims=True), only_alike, 0.0)
     kernel = fraction * alike / np.maximum(alike.sum(axis=1, keepdims=True), 1)
-    kernel += (1 - fraction) * other / other.sum(axis=1, keepdims=True)
+    kernel += (1 - fraction) * other / np.maximum(other.sum(axis=1, keepdims=True), 1)
     return np.asarray(confusion * kernel + (1 - confusion) * np.eye(len(classes)), np.float64)
 
 

@@ -245,6 +245,35 @@ def test_load_map_damaged_file_raises_data_error(room: CornerRoom, tmp_path: Pat
             assert "map.npz" in str(error)
 
 
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("experiment=table3_map", "run: expected an override of a single run, got experiment=table3_map"),
+        ("hydra.run.dir=x", "run: expected an override of a single run, got hydra.run.dir=x"),
+        ("detector=unregistered", "got unregistered"),
+        ("seed=-1", r"seed: expected an integer in \["),
+        (None, "run: expected overrides such as 'fuser.voxel_size=0.02', got None"),
+    ],
+)
+def test_run_invalid_override_writes_nothing(override: Any, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=message):
+        instancemap.run(tmp_path / "run", override)
+    assert not (tmp_path / "run").exists()
+
+
+def test_run_keeps_existing_directory(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(DataError, match="expected a new or empty folder"):
+        instancemap.run(tmp_path)
+
+
+def test_report_and_tables_without_run_raise_data_error(tmp_path: Path) -> None:
+    for function in (instancemap.report, instancemap.tables):
+        with pytest.raises(DataError, match=str(tmp_path)):
+            function(tmp_path)
+    assert not [*tmp_path.iterdir()]
+
+
 def test_api_configs_match_command() -> None:
     assert (CONF / "config.yaml").exists()
     assert composed("dataset=synthetic").fuser.voxel_size == composed("~dataset").fuser.voxel_size

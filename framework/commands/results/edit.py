@@ -35,7 +35,7 @@ def main() -> None:
     add_edit("--merge", "ID", "+", "merge instances into the first one")
     parts = "split an instance by its connected parts (default) or its dominant plane; the largest part keeps the id"
     add_edit("--split", ("ID", "parts|plane"), "+", parts)
-    add_edit("--rename", ("ID", "CLASS"), 2, "set the class of an instance, with probability 1")
+    add_edit("--rename", ("ID", "NAME"), 2, "set the class of an instance, with probability 1; new classes are allowed")
     add_edit("--delete", "ID", "+", "change instances to background")
     add_edit("--edits", "FILE", None, "apply the edits in a JSON file, such as edits.json of an edited run")
     add("--out", metavar="DIR", type=Path, help="new run directory; default: RUN_edited, next to RUN")

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from framework.commands.command_line import arguments, one_line_errors
-from framework.data import Float64
-from framework.errors import ConfigError
+from framework.vocabulary.label_spaces import ClassNames
 
-IMPORT_OPTIONS = ("labels", "label_space", "instance_property", "class_property", "no_instance", "scale", "transform")
+if TYPE_CHECKING:
+    from framework.runs.external_maps.map_import import MapImport
 
 
 def main() -> None:
@@ -38,6 +36,11 @@ def main() -> None:
         "file with the name of each id; default: nyu40 for ScanNet predictions, otherwise none"
     )
     add("--label-space", metavar="SPACE", help=space)
+    names = (
+        "class names of the map: COCO (other classes are left out), OWN (the given names), or AUTO (OWN if a name is "
+        "in no known label space, otherwise COCO); default: AUTO"
+    )
+    add("--class-names", choices=[*ClassNames.__members__], default=ClassNames.AUTO.name, help=names)
     add = parser.add_argument_group("properties of a PLY file").add_argument
     add("--instance-property", metavar="NAME", help="property with instance ids; default: detected by name")
     kinds = "property with class ids; '' = no classes; default: detected by name"
@@ -51,58 +54,22 @@ def main() -> None:
     add("--up", metavar=("X", "Y", "Z"), nargs=3, type=float, help=up)
     parsed = arguments(parser)
     with one_line_errors():
-        for line in import_map(parsed):
-            print(line)
+        found = map_import(parsed).write(parsed.directory, parsed.name, parsed.overrides)
+        print("\n".join([found.source, *found.remarks, found.title, str(parsed.directory)]))
 
 
-def import_map(parsed: argparse.Namespace) -> list[str]:
-    """Convert a map and write its run directory.
-
-    Args:
-        parsed: The arguments of the command.
-
-    Returns:
-        The lines of the output.
-
-    Raises:
-        InstanceMapError: A file or option is invalid.
-    """
-    from framework.importing.folder_writer import check_new  # slow imports: after the arguments are checked
-    from framework.runs.external_maps.conversion import ConvertedMap, MapPlacement, read_transform
-    from framework.runs.external_maps.imported_run import MappedData, write_imported_run
-    from framework.runs.external_maps.map_formats import read_external_map
+def map_import(parsed: argparse.Namespace) -> MapImport:
+    """Return the import with the arguments of the command."""
+    from framework.runs.external_maps.map_import import MapImport  # slow import: after the arguments are checked
     from framework.runs.external_maps.ply_instances import LabelProperties
 
-    check_new(parsed.directory)
-    T_world_map = np.eye(4) if parsed.transform is None else read_transform(parsed.transform)
-    placement = MapPlacement(parsed.scale, T_world_map, None if parsed.up is None else unit_vector("--up", parsed.up))
-    data = MappedData.of(parsed.overrides)
-    properties = LabelProperties(parsed.instance_property, parsed.class_property, parsed.no_instance)
-    external = read_external_map(parsed.mesh, parsed.labels, parsed.label_space, properties)
-    converted = ConvertedMap.of(external, placement)
-    name = parsed.name or parsed.directory.resolve().name
-    title = write_imported_run(parsed.directory, name, converted, data, placement.up, chosen_options(parsed))
-    compared = [] if data.dataset else ["no dataset: import the map again with dataset=NAME to evaluate it"]
-    return [external.source, *converted.remarks, *compared, title, str(parsed.directory)]
-
-
-def chosen_options(parsed: argparse.Namespace) -> Mapping[str, Path | str | float | None]:
-    """Return the import options that differ from their defaults, by name."""
-    chosen = {name: getattr(parsed, name) for name in IMPORT_OPTIONS}
-    if parsed.label_space is not None and Path(parsed.label_space).is_file():  # files are hashed
-        chosen["label_space"] = Path(parsed.label_space)
-    defaults = {"no_instance": 0, "scale": 1.0}
-    return {"mesh": parsed.mesh} | {key: value for key, value in chosen.items() if value != defaults.get(key)}
-
-
-def unit_vector(option: str, values: list[float]) -> Float64:
-    """Return a direction (3,) as a unit vector.
-
-    Raises:
-        ConfigError: The direction is zero or not finite.
-    """
-    vector = np.array(values, np.float64)
-    length = float(np.linalg.norm(vector))
-    if not 0 < length < np.inf:
-        raise ConfigError(f"{option}: expected a nonzero direction of finite numbers, got {values}")
-    return vector / length
+    return MapImport(
+        mesh=parsed.mesh,
+        labels=parsed.labels,
+        label_space=parsed.label_space,
+        class_names=ClassNames[parsed.class_names],
+        properties=LabelProperties(parsed.instance_property, parsed.class_property, parsed.no_instance),
+        scale=parsed.scale,
+        transform=parsed.transform,
+        up=parsed.up,
+    )

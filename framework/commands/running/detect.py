@@ -57,7 +57,7 @@ def job(config: DictConfig) -> None:
     from framework.detection.stored.cache import with_cache
     from framework.registry import build  # local: config errors are reported before heavy imports
     from framework.runtime.process_settings import Settings
-    from framework.vocabulary.label_spaces import COCO
+    from framework.vocabulary.label_spaces import COCO, ClassNames, coco_name, keeps_names
 
     settings = Settings.of(config)
     settings.apply()
@@ -72,6 +72,8 @@ def job(config: DictConfig) -> None:
     how = ["detector=precomputed", as_argument("detector.path", out)]
     if detector.classes != COCO:
         how.append(as_argument("detector.label_space", write_labels(out, detector.classes)))
+        if not keeps_names(detector.classes, ClassNames.AUTO) and any(coco_name(k) != k for k in detector.classes):
+            how.append("detector.class_names=OWN")
     log.info("use it with: %s", " ".join(how))
 
 

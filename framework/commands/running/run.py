@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import gc
-import logging
 import sys
 from collections.abc import Mapping
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from multiprocessing import parent_process
 from pathlib import Path
 
@@ -19,15 +17,13 @@ from omegaconf import DictConfig
 from framework.commands.command_line import Jobs, is_of_sweep
 from framework.commands.running.choices import error_of_first_run, with_row
 from framework.commands.running.sweep import by_joblib, ending
-from framework.errors import DataError, PartialRunError
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.runs.objective import objective_keys, objective_of
-from framework.runs.stored_runs import is_recorded, read_metrics
-from framework.runtime.signals import ENDING, Interruption, raise_on_signals, signals_deferred
+from framework.runs.stored_runs import is_recorded
+from framework.runtime.signals import Interruption, raise_on_signals
 from framework.runtime.sweep_worker import job_of_worker
 
-log = logging.getLogger(__name__)
 jobs = Jobs()
 
 
@@ -76,42 +72,14 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
             is raised.
     """
     from framework.api import begin  # local: after Hydra has checked the names
-    from framework.compilation.catalog import compile_for_run
-    from framework.datasets.frames.sequence_reader import Recording
-    from framework.detection.stored.cache import cache_metrics
-    from framework.interfaces import RGBDSequence, RGBDVideo
-    from framework.live_view.guarded_viewer import watched_run
-    from framework.registry import STAGES, build
-    from framework.runs.run_directory import RunRecord, reason
-    from framework.runtime.process_settings import Settings, frozen_garbage_collector
+    from framework.runs.run_directory import write_run
+    from framework.runtime.process_settings import Settings
 
     settings = Settings.of(config)
     settings.apply()
     pipeline = begin(config)
     settings.apply()  # apply to torch, if a stage has loaded it
-    gc.collect()  # otherwise, a garbage collection would delay one of the first few hundred frames
-    video = build(RGBDVideo, config.get("dataset"))  # last, because a synthetic scene takes the longest to build
-    compile_for_run()  # kernels of the synthetic renderer
-    record = RunRecord.begin(directory, config, choices)
-    chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
-    length = f"{len(video)} frames" if isinstance(video, RGBDSequence) else "live until Ctrl-C"
-    log.info("mapping %s: %s, %s", video.name, length, chosen)
-    if isinstance(video, Recording):  # third-party datasets may have another class
-        from framework.checking.recording_check import warn_of_poses
-
-        warn_of_poses(video)
-    with signals_deferred(*ENDING) as interruption, watched_run(pipeline.viewer, directory, record.config) as outcome:
-        with frozen_garbage_collector():
-            result = pipeline.run_to_any_end(video, directory)
-        with interruption.second_ends_at_once("after the outputs are written"):
-            error = record.write(video, result, cache_metrics(pipeline.detector))
-        with suppress(DataError):  # the disk may be full
-            outcome.metrics = read_metrics(directory)
-        if isinstance(error, Exception):
-            raise PartialRunError(reason(error)) from error
-        if error is not None:
-            raise error
-    return interruption
+    return write_run(pipeline, config, directory, choices)
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from framework.data import Float32, Float64, Int32
 from framework.mapping.instances.object_embedding import ObjectEmbedding, added
+from framework.mapping.labels.label_evidence import UNSEEN
 from framework.mapping.labels.label_evidence_kernels import Combine
 
 
@@ -153,6 +154,12 @@ class InstanceTable:
         a.embedding = added(a.embedding, b.embedding)
         a.first_frame = min(a.first_frame, b.first_frame)
         a.last_frame = max(a.last_frame, b.last_frame)
+
+    def add_class(self) -> None:
+        """Add a class with the probability 0 to all instances."""
+        for record in self.records.values():
+            unseen = record.class_evidence.max() - UNSEEN if self.logarithmic else 0.0
+            record.class_evidence = np.append(record.class_evidence, unseen)
 
     def class_probabilities(self, record: InstanceRecord) -> Float32:
         """Return the class distribution (C,) of an instance from its detections."""

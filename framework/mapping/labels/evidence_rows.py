@@ -24,7 +24,7 @@ from framework.mapping.labels.evidence_rows_kernels import (
     sum_classes_of_instances,
     update_rows,
 )
-from framework.mapping.labels.label_evidence import Evidence, Measurement
+from framework.mapping.labels.label_evidence import UNSEEN, Evidence, Measurement
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, reserved
@@ -144,6 +144,26 @@ class EvidenceRows:
         self._make_room(seen.blocks, new)
         label_new(grid, seen, self.evidence, measurement, list_bits, self._row_bits, new, free_classes, evicted)
         self.evicted += int(evicted.sum())
+
+    def add_class(self, logarithmic: bool) -> None:
+        """Add a class without evidence in any voxel. Compact storage has no slots for such classes.
+
+        Args:
+            logarithmic: True if the evidence consists of log-likelihoods.
+        """
+        if self.storage is Storage.COMPACT:
+            return
+        old = self.in_use()
+        new_id = np.full((len(old.class_ids), 1), self._class_slots, np.uint8)
+        unseen = old.class_value.max(axis=1, keepdims=True) - int(UNSEEN * self.score_scale) if logarithmic else 0
+        new_value = np.broadcast_to(unseen, new_id.shape).astype(old.class_value.dtype)
+        self._class_slots += 1
+        self.fill(
+            old._replace(
+                class_ids=np.concatenate([old.class_ids, new_id], axis=1),
+                class_value=np.concatenate([old.class_value, new_value], axis=1),
+            )
+        )
 
     def merge_instances(self, kept: int, dropped: int) -> None:
         """Add the evidence for instance `dropped` to the evidence for `kept` in every voxel."""

@@ -14,7 +14,7 @@ from framework.files.json_file import read_json
 from framework.runs.external_maps.external_map import UNLABELED
 from framework.vocabulary.label_spaces import BENCHMARK_IDS, SPACES, read_labels
 
-KEY = "--label-space"
+KEY = "label_space"
 NYU40 = "nyu40"  # label space of ScanNet predictions
 MAX_DIGITS = 10  # maximum number of digits of an id
 
@@ -41,6 +41,11 @@ class ClassIdNames:
             return cls(_names_in_json(Path(label_space)), label_space)
         labels = read_labels(label_space, KEY)
         return cls(dict(zip(BENCHMARK_IDS.get(label_space, range(len(labels))), labels, strict=True)), label_space)
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """The names of all class ids."""
+        return tuple(self.names.values())
 
     def name(self, where: str, class_id: int) -> str:
         """Return the name of a class id. Ids below the first class mean UNLABELED.

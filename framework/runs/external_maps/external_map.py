@@ -33,6 +33,8 @@ class ExternalMap:
     surface: PlyMesh  # in the world frame and the units of the file; a point cloud has no triangles
     instances: Mapping[int, ExternalInstance]  # by positive id; instances may overlap
     source: str  # format and origin of the labels, for messages
+    label_space: tuple[str, ...] = ()  # names of all class ids; () = no class ids
+    masks: tuple[Path, ...] = ()  # mask files of predictions that are given as a text file
 
 
 def read_surface(path: Path) -> PlyMesh:

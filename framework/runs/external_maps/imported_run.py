@@ -37,7 +37,10 @@ from framework.runs.run_directory import headline, likely_labels
 from framework.runs.stored_runs import CHOICE, CONFIG, EXTERNAL, INSTANCES, MESH, METRICS, RESULT_FILES
 from framework.vocabulary.label_spaces import label_space_of
 
+ImportOption = str | Path | float | None
+
 ORIGIN = "external."  # prefix of the import options in metrics.json and manifest.json
+MASKS = f"{ORIGIN}masks"  # key of the hash of listed masks in manifest.json
 NO_POSES = np.zeros((0, 4, 4))
 
 
@@ -80,7 +83,8 @@ def write_imported_run(
     converted: ConvertedMap,
     data: MappedData,
     up: Float64 | None,
-    options: Mapping[str, str | Path | float | None],
+    options: Mapping[str, ImportOption],
+    masks: Sequence[Path] = (),
 ) -> str:
     """Write the run directory of an imported map, and evaluate it if the dataset has ground-truth instances.
 
@@ -91,6 +95,7 @@ def write_imported_run(
         data: The dataset of the map.
         up: Up direction (3,) in the world frame, a unit vector; None = unknown.
         options: The options of the import by name. The hashes of files are stored.
+        masks: Files that the file in the option `labels` lists, which are also hashed.
 
     Returns:
         The main metrics as one line of text.
@@ -103,6 +108,8 @@ def write_imported_run(
     given = {f"{ORIGIN}{key}": value for key, value in options.items() if value is not None}
     files = {key: value for key, value in given.items() if isinstance(value, Path)}
     inputs = {**input_hashes(config), **{key: path_hash(path) for key, path in files.items()}}
+    if masks:
+        inputs[MASKS] = hash_of({str(k): path_hash(path) for k, path in enumerate(masks)})
     found: Metrics = {
         "sequence": name if video is None else video.name,
         f"{CHOICE}dataset": data.option,

@@ -55,17 +55,21 @@ def read_mask_predictions(mesh: Path, surface: PlyMesh, labels: Path, names: Cla
     listed = next((labels / name for name in LISTS if path_exists(labels / name)), None)
     if listed is None:
         listed = _text_file(mesh, labels)
-        entries = list(_scannet_entries(listed, names or ClassIdNames.of(NYU40)))
+        names = names or ClassIdNames.of(NYU40)
+        entries = list(_scannet_entries(listed, names))
     else:
         entries = list(_folder_entries(listed, names))
     if not entries:
         raise DataError(f"{listed}: expected at least one instance, got none")
     instances = {}
-    for key, (where, mask, label) in enumerate(entries, start=1):
-        vertices = read_mask(_inside(where, listed.parent, mask), len(surface.vertices))
+    masks = [_inside(where, listed.parent, mask) for where, mask, _ in entries]
+    for key, (mask, (_, _, label)) in enumerate(zip(masks, entries, strict=True), start=1):
+        vertices = read_mask(mask, len(surface.vertices))
         if len(vertices):
             instances[key] = ExternalInstance(vertices, label.name, label.confidence)
-    return ExternalMap(surface, instances, f"instances: {len(entries)} masks in {listed}")
+    source = f"instances: {len(entries)} masks in {listed}"
+    space = () if names is None else names.all
+    return ExternalMap(surface, instances, source, space, () if labels.is_dir() else tuple(masks))
 
 
 def _text_file(mesh: Path, labels: Path) -> Path:
@@ -79,7 +83,7 @@ def _text_file(mesh: Path, labels: Path) -> Path:
         names = ", ".join(file.name for file in found[:5]) or "none"
         raise DataError(
             f"{labels}: expected {LISTS[0]}, {LISTS[1]}, or the ScanNet predictions {mesh.stem}.txt, got {names}; set "
-            "--labels to the file of the scene"
+            "labels to the file of the scene"
         )
     return found[0]
 

@@ -56,23 +56,23 @@ def read_ply_instances(
         DataError: A property is missing or invalid, or a class id has no name.
     """
     properties = _properties(surface)
-    instance_name = _found(path, properties, chosen.instance, INSTANCE_NAMES, "--instance-property")
+    instance_name = _found(path, properties, chosen.instance, INSTANCE_NAMES, "instance_property")
     if instance_name is None:
         raise DataError(
             f"{path}: expected a property with instance ids ({', '.join(INSTANCE_NAMES[:4])}, ...), got only "
-            f"{', '.join(properties) or 'coordinates'}; set --instance-property, or --labels to predictions or masks"
+            f"{', '.join(properties) or 'coordinates'}; set instance_property, or labels to predictions or masks"
         )
     ids, offset = _ids(path, instance_name, properties[instance_name], chosen.no_instance)
     members = {key - offset: vertices for key, vertices in vertices_by_id(ids).items()}
     if labels is not None:
         found = {key: labels[key] for key in members if key in labels}
         without = len(members) - len(found)
-        source = f"instances: property {instance_name}; classes: --labels"
+        source = f"instances: property {instance_name}; classes: labels"
         source += f", {without} of {len(members)} instances without an entry left out" if without else ""
     else:
         class_name = None
         if chosen.class_ != "":
-            class_name = _found(path, properties, chosen.class_, CLASS_NAMES, "--class-property")
+            class_name = _found(path, properties, chosen.class_, CLASS_NAMES, "class_property")
         source = f"instances: property {instance_name}; classes: {f'property {class_name}' if class_name else 'none'}"
         found = dict.fromkeys(members, InstanceLabel(None, None))
         if class_name is not None:
@@ -81,7 +81,7 @@ def read_ply_instances(
     instances = {
         key + offset: ExternalInstance(members[key], label.name, label.confidence) for key, label in found.items()
     }
-    return ExternalMap(surface, instances, source)
+    return ExternalMap(surface, instances, source, () if names is None else names.all)
 
 
 def _properties(surface: PlyMesh) -> dict[str, npt.NDArray[Any]]:
@@ -113,7 +113,7 @@ def _ids(path: Path, name: str, values: npt.NDArray[Any], no_instance: int) -> t
     if lowest < 0:
         raise DataError(
             f"{path}: {name}: expected instance ids >= 0, and {no_instance} for no instance, got {lowest}; set "
-            f"--no-instance {lowest} if it means no instance"
+            f"no_instance={lowest} if it means no instance"
         )
     offset = int(lowest == 0)
     if int(ids.max(initial=0)) > LARGEST_ID:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from PIL import Image
 import instancemap
 from framework.commands.results.diff import in_world
 from framework.commands.results.reproduce import reproduce_all
-from framework.commands.running.run import run as write_run
+from framework.commands.running.run import run as run_pipeline
 from framework.config import composition
 from framework.datasets.ground_truth.named_truth import read_named_truth
 from framework.editing.edited_run import EditedRun
@@ -24,15 +25,21 @@ from framework.mapping.instance_map import InstanceMap
 from framework.registry import assemble
 from framework.runs.instances_file import read_instances
 from framework.runs.manifest import Manifest, RunStatus
+from framework.runs.mesh_file import read_mesh
 from framework.runs.stored_runs import completed_runs, read_record
 from framework.testing.corner_room import exact_clusters, frame_at, pose_at
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.support import reported_run
+from tests.support.scenes.corner_room import GivenPose
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
 
 EDITS = [{"delete": [1]}, {"rename": [2, "chair"]}]
 CHANGED = {"instances.json", "mesh.ply", "map.npz", "overview.png", "metrics.json"}
+
+
+def write_run_of(config: dict[str, Any], directory: Path) -> None:
+    run_pipeline(OmegaConf.create(config), directory, {})
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +131,34 @@ def test_edited_map_can_be_resumed(edited: Path) -> None:
     assert len(classes) == 1
 
 
+@pytest.fixture
+def relocalized(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tracker with given poses resumes maps."""
+    monkeypatch.setattr(GivenPose, "load_keyframes", lambda *_: None)
+
+
+@pytest.mark.usefixtures("relocalized")
+def test_map_with_new_class_can_be_resumed(run: Path, tmp_path: Path) -> None:
+    """The detector does not know the new class. The instance keeps it, and other instances keep theirs."""
+    edited = instancemap.edit(run, [{"rename": [2, "forklift"]}], tmp_path / "edited")
+    stored = {one.id: one for one in read_instances(edited / "instances.json")}
+    assert (stored[2].class_name, stored[1].class_probabilities["forklift"]) == ("forklift", 0.0)
+    assert read_mesh(edited / "mesh.ply").classes == ("chair", "couch", "forklift")
+    write_run_of(reported_run.CONFIG | {"resume_from": str(edited)}, tmp_path / "resumed")
+    resumed = {one.id: one for one in read_instances(tmp_path / "resumed" / "instances.json")}
+    assert [one.class_name for one in resumed.values()] == ["chair", "forklift"]
+    assert resumed[2].observations > stored[2].observations
+
+
+@pytest.mark.usefixtures("relocalized")
+def test_resume_with_other_detector_fails_before_the_run(run: Path, tmp_path: Path) -> None:
+    detector = {"_target_": "plugins.detectors.none.NoDetections"}
+    config = reported_run.CONFIG | {"resume_from": str(run), "detector": detector}
+    with pytest.raises(ConfigError, match=r"detector: expected the 2 classes of the stored map, got other classes"):
+        write_run_of(config, tmp_path / "resumed")
+    assert not (tmp_path / "resumed").exists()
+
+
 def test_completed_runs_omit_edited_runs(run: Path, edited: Path) -> None:
     """Corrected maps must not replace the results of their runs in tables."""
     records, others = completed_runs(run.parent)
@@ -156,7 +191,7 @@ def test_edit_error_names_the_edit(run: Path, tmp_path: Path) -> None:
 
 def test_edit_of_map_without_voxel_labels_raises_data_error(tmp_path: Path) -> None:
     config = reported_run.CONFIG | {"fuser": {"_target_": "plugins.fusers.object_volumes.ObjectVolumes"}}
-    write_run(OmegaConf.create(config), tmp_path / "run", {})
+    write_run_of(config, tmp_path / "run")
     with pytest.raises(DataError, match=r"map.npz: expected map format \d+, got .*; map with a fuser that stores"):
         EditedRun.of(tmp_path / "run", [])
 

@@ -12,6 +12,7 @@ from framework.data import InstanceMesh
 from framework.errors import DataError
 from framework.files.ply import write_ply
 from framework.runs.mesh_file import read_mesh, write_mesh
+from framework.vocabulary.label_spaces import COCO
 from tests.support.scenes.corner_room import GridMap
 
 TETRAHEDRON = InstanceMesh(
@@ -25,7 +26,14 @@ TETRAHEDRON = InstanceMesh(
 
 
 @pytest.mark.parametrize(
-    "mesh", [TETRAHEDRON, GridMap().mesh(), replace(TETRAHEDRON, classes=())], ids=["some", "empty", "no classes"]
+    "mesh",
+    [
+        TETRAHEDRON,
+        GridMap().mesh(),
+        replace(TETRAHEDRON, classes=()),
+        replace(TETRAHEDRON, classes=("sofa, couch", "50% palette", "Hubwagen für Paletten")),
+    ],
+    ids=["some", "empty", "no classes", "encoded classes"],
 )
 def test_mesh_file_round_trip_is_exact(tmp_path: Path, mesh: InstanceMesh) -> None:
     write_mesh(tmp_path / "mesh.ply", mesh)
@@ -33,6 +41,11 @@ def test_mesh_file_round_trip_is_exact(tmp_path: Path, mesh: InstanceMesh) -> No
     for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
         np.testing.assert_array_equal(getattr(read, name), getattr(mesh, name))
     assert read.classes == mesh.classes
+
+
+def test_mesh_file_lists_plain_classes_unchanged(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "mesh.ply", replace(TETRAHEDRON, classes=COCO))
+    assert f"comment classes {','.join(COCO)}\n".encode() in (tmp_path / "mesh.ply").read_bytes()
 
 
 def test_read_mesh_foreign_ply_raises_one_line_error(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def test_own_classes_tutorial_shows_its_output(output: tuple[Path, str]) -> None
         if line != "...":
             assert re.sub(r"at [\d.]+/s", "", line) in re.sub(r"at [\d.]+/s", "", found)
     [rows] = [grid for grid in grids(output[1]) if "| screen |" in grid[0] and "minus" not in grid[0]]
-    assert rows == table.splitlines()
+    assert rows == grids(table)[0]
 
 
 def test_own_classes_tutorial_writes_report_figure_and_metrics(output: tuple[Path, str]) -> None:

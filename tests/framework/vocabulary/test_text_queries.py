@@ -45,6 +45,15 @@ def test_object_words_finds_only_given_classes_in_any_case() -> None:
     assert object_words("a chair", ("couch",)) == ObjectWords((), (), ("chair",))
 
 
+@pytest.mark.parametrize(
+    "query", ["the euro_pallet", "red Euro Pallets", "euro-pallet, used", "fork/lift (a b c d e)", "größe <5.5>"]
+)
+def test_object_words_find_own_names_with_punctuation(query: str) -> None:
+    classes = ("euro_pallet", "Euro-Pallet, used", "fork/lift (a b c d e)", "Größe <5.5>")
+    found = object_words(query, classes)
+    assert (len(found.classes), found.unknown) == (1, ())
+
+
 @pytest.mark.parametrize("name", COLOR_NAMES)
 def test_typical_color_has_its_name_and_best_fit(name: str) -> None:
     plain = {"black": (0, 0, 0), "gray": (128, 128, 128), "white": (255, 255, 255), "red": (220, 20, 30),

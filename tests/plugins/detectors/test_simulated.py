@@ -1,6 +1,6 @@
 """Tests for the simulated detector and the statistics of its errors."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from framework.errors import ConfigError, DataError
 from framework.vocabulary.label_spaces import COCO
 from plugins.detectors.ground_truth import GroundTruthDetector
 from plugins.detectors.simulated import (
+    CLUTTER_CLASSES,
     LOOKALIKES,
     SimulatedDetector,
     confusion_kernel,
@@ -383,3 +384,57 @@ def test_simulated_invalid_parameter_raises(parameters):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name}: expected .*, got"):
         SimulatedDetector(**parameters)
+
+
+OWN_TRUTH = FrameTruth(IDS, {5: "forklift", 6: "pallet", 9: "forklift", 12: "chair", 30: None})
+
+
+def own_detector(folder, *names, **parameters):
+    (folder / "names.txt").write_text("\n".join(names))
+    return SimulatedDetector(label_space=str(folder / "names.txt"), **parameters)
+
+
+def test_simulated_own_classes_without_errors_give_ground_truth(tmp_path):
+    names = "forklift", "pallet", "chair"
+    perfect = {field.name: getattr(PERFECT, field.name) for field in fields(PERFECT) if field.name != "label_space"}
+    own = own_detector(tmp_path, *names, **perfect)
+    truth = GroundTruthDetector(label_space=own.label_space)
+    assert own.classes == truth.classes == names
+    image = replace(frame(), truth=OWN_TRUTH)
+    assert same(own.detect(image), truth.detect(image))
+
+
+def test_simulated_own_classes_are_confused_equally():
+    kernel = confusion_kernel(("forklift", "chair", "couch", "pallet"), 0.3)
+    np.testing.assert_allclose(kernel[0], [0.7, 0.1, 0.1, 0.1])
+    np.testing.assert_allclose(kernel[1], [0.03, 0.7, 0.24, 0.03])  # a chair is similar to a couch
+
+
+@pytest.mark.parametrize("classes", [("object",), ("chair", "couch"), ("forklift", "pallet")])
+def test_simulated_confusions_of_few_classes_are_distributions(classes):
+    kernel = confusion_kernel(classes, 0.3)
+    np.testing.assert_allclose(kernel.sum(axis=1), 1)
+    assert kernel[0, 0] == pytest.approx(1.0 if len(classes) == 1 else 0.7)
+
+
+def test_simulated_clutter_has_own_classes(tmp_path):
+    """The label space has no class of CLUTTER_CLASSES."""
+    own = own_detector(tmp_path, "forklift", "pallet", clutter_rate=1.0, false_positives=3, recurring_fraction=1.0)
+    image = replace(frame(), truth=FrameTruth(IDS, {5: None, 6: "pallet"}), T_world_camera=np.eye(4))
+    assert {own.classes[k] for k in own.detect(image).class_probabilities.argmax(axis=1)} <= {"forklift", "pallet"}
+
+
+def test_simulated_coco_classes_are_unchanged():
+    """A label space must not change the random numbers of the default."""
+    detector = SimulatedDetector()
+    assert detector.classes == COCO
+    assert [COCO[k] for k in detector._clutter_ids] == list(CLUTTER_CLASSES)
+    index = {name: k for k, name in enumerate(COCO)}
+    alike = [{other for group in LOOKALIKES if name in group for other in group} - {name} for name in COCO]
+    expected = np.zeros((len(COCO), len(COCO)))
+    for k, similar in enumerate(alike):
+        fraction = 0.8 if similar else 0.0
+        expected[k] = 0.25 * (1 - fraction) / (len(COCO) - 1 - len(similar))
+        expected[k, [index[name] for name in similar]] = 0.25 * fraction / max(len(similar), 1)
+        expected[k, k] = 0.75
+    np.testing.assert_allclose(detector._kernel, expected, rtol=1e-12)

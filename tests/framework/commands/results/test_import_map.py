@@ -13,6 +13,7 @@ import jsonschema
 import numpy as np
 import pytest
 
+import instancemap
 from framework.api import load_runs
 from framework.commands.results import diff, evaluate, export, import_map, query, reproduce
 from framework.commands.results.report import write_reports
@@ -151,6 +152,71 @@ def test_map_without_classes_has_class_agnostic_scores(folder: Path, command) ->
     assert scores(folder / "again") == scores(other)
 
 
+def test_own_classes_are_kept_and_recorded(folder: Path, tmp_path: Path, command) -> None:
+    ours, other = folder / "ours", folder / "other"
+    words = [external_ply(ours, tmp_path / "other.ply"), other, "--label-space", "nyu40", "--class-names", "OWN"]
+    assert command(import_map, *words, *DATASET)[0] == 0
+    assert sorted(one.class_name for one in read_instances(other / "instances.json")) == ["chair", "sofa", "wall"]
+    assert metrics_of(other)["external.class_names"] == "OWN"
+    assert Manifest.read(other).parameters["external.class_names"] == "OWN"
+
+
+def test_listed_masks_are_hashed(folder: Path, tmp_path: Path, command) -> None:
+    ours = folder / "ours"
+    labels = scannet_predictions(ours, tmp_path / "predictions") / "mesh.txt"
+    hashes = []
+    for name in ("before", "same", "after"):
+        if name == "after":
+            mask = sorted((tmp_path / "predictions" / "predicted_masks").iterdir())[0]
+            mask.write_text(mask.read_text().replace("1", "2", 1))  # the same instance
+        assert command(import_map, ours / "mesh.ply", folder / name, "--labels", labels)[0] == 0
+        hashes.append(Manifest.read(folder / name).inputs["external.masks"])
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_python_import_equals_command(
+    folder: Path, tmp_path: Path, command, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(composition, "_added", [FAKES])
+    mesh = external_ply(folder / "ours", tmp_path / "other.ply")
+    np.savetxt(tmp_path / "T.txt", np.eye(4))
+    words = ("--label-space", "nyu40", "--up", 0, 0, 2, "--name", "Other", "--transform", tmp_path / "T.txt")
+    assert command(import_map, mesh, folder / "command", *words, *DATASET)[0] == 0
+    written = instancemap.import_map(
+        mesh, folder / "python", *DATASET, label_space="nyu40", up=(0, 0, 2), name="Other", transform=np.eye(4)
+    )
+    assert written == folder / "python"
+    assert Manifest.read(written).changed_files(written) == []
+    assert "left out: 1 of 3 instances without a COCO class: wall (1)" in caplog.text
+    files = Manifest.read(written).files
+    assert files["instances.json"] == Manifest.read(folder / "command").files["instances.json"]
+    given = metrics_of(written)
+    assert given.pop("external.transform") == str(np.eye(4).tolist())
+    inputs = "inputs_sha256"  # contains the transform file
+    assert {**given, inputs: ""} == {
+        key: "" if key == inputs else value
+        for key, value in metrics_of(folder / "command").items()
+        if key != "external.transform"
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"class_names": "own"}, "class_names: expected one of AUTO, COCO, OWN, got 'own'"),
+        ({"up": (1.0, 0.0)}, "up: expected a nonzero direction of 3 finite numbers"),
+        ({"scale": 0}, "scale: expected a positive number"),
+        ({"transform": np.ones((4, 4))}, "transform: expected a rigid transform"),
+        ({"label_space": "nowhere"}, "label_space: expected one of"),
+        ({"class_property": "nowhere"}, "class_property: expected one of"),
+    ],
+)
+def test_python_import_invalid_argument_raises(arguments: dict[str, Any], message: str, folder: Path) -> None:
+    with pytest.raises(instancemap.InstanceMapError, match=message):
+        instancemap.import_map(folder / "ours" / "mesh.ply", folder / "other", **arguments)
+    assert not (folder / "other").exists()
+
+
 def test_transform_moves_map_to_the_world_frame(folder: Path, tmp_path: Path, command) -> None:
     ours, other = folder / "ours", folder / "other"
     T_map_world = np.array([[0.0, -1, 0, 3], [1, 0, 0, -2], [0, 0, 1, 5], [0, 0, 0, 1]])
@@ -262,14 +328,14 @@ def test_report_of_point_cloud_has_no_map(folder: Path, tmp_path: Path, command)
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["fuser.voxel_size=0.01"], "import-map: expected dataset=NAME, dataset.KEY=VALUE or seed=N"),
+        (["fuser.voxel_size=0.01"], "import-map: expected dataset=NAME, dataset.KEY=VALUE, evaluation.KEY=VALUE or"),
         (["dataset.frames=6"], "import-map: expected dataset=NAME, got only dataset.frames=6"),
         (["dataset=nowhere"], "dataset: expected one of"),
-        (["--up", "0", "0", "0"], "--up: expected a nonzero direction"),
-        (["--scale", "-1"], "--scale: expected a positive number"),
+        (["--up", "0", "0", "0"], "up: expected a nonzero direction"),
+        (["--scale", "-1"], "scale: expected a positive number"),
         (["--transform", "nowhere.txt"], "nowhere.txt: expected a text file"),
         (["--labels", "nowhere.json"], "nowhere.json: expected"),
-        (["--label-space", "nowhere"], "--label-space: expected one of"),
+        (["--label-space", "nowhere"], "label_space: expected one of"),
     ],
 )
 def test_invalid_argument_writes_nothing(words: list[str], message: str, folder: Path, command) -> None:

@@ -32,7 +32,7 @@ def test_label_space_file_has_one_name_per_id(tmp_path: Path) -> None:
 
 
 def test_unknown_label_space_names_the_option() -> None:
-    with pytest.raises(ConfigError, match="--label-space: expected one of coco"):
+    with pytest.raises(ConfigError, match="label_space: expected one of coco"):
         ClassIdNames.of("nyu41")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from framework.errors import DataError
 from framework.files.ply import PlyMesh
 from framework.runs.external_maps.conversion import NO_FRAME, ConvertedMap, MapPlacement, read_transform
 from framework.runs.external_maps.external_map import ExternalInstance, ExternalMap
-from framework.vocabulary.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO, ClassNames
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 4], [1, 1, 1]], np.float32)
 TRIANGLES = np.array([[0, 1, 2]], np.int32)
@@ -36,16 +37,48 @@ def test_names_of_other_spaces_become_coco_names() -> None:
 
 
 def test_instances_without_coco_class_are_counted() -> None:
-    external = external_map(([0], "chair", 1.0), ([1], "wall", 1.0), ([2], "wall", 1.0), ([3], "forklift", 1.0))
+    """All names are in known label spaces."""
+    external = external_map(([0], "chair", 1.0), ([1], "wall", 1.0), ([2], "wall", 1.0), ([3], "floor", 1.0))
     converted = ConvertedMap.of(external, HERE)
     assert converted.mesh.instance_ids.tolist() == [1, 0, 0, 0, 0]
     [remark] = converted.remarks
-    assert remark == "left out: 3 of 4 instances without a COCO class: wall (2), forklift (1)"
+    assert remark == "left out: 3 of 4 instances without a COCO class: wall (2), floor (1)"
+
+
+def test_auto_keeps_all_names_with_unknown_name() -> None:
+    external = external_map(([0], "Sofa", 1.0), ([1], "wall", 1.0), ([2], "forklift", 1.0), ([3], "unlabeled", 1.0))
+    converted = ConvertedMap.of(external, HERE)
+    assert converted.mesh.classes == ("Sofa", "wall", "forklift")
+    assert converted.mesh.class_ids.tolist() == [0, 1, 2, -1, -1]
+    assert converted.remarks == (
+        "classes: all names are kept, because 1 of 3 are in no known label space: 'forklift'",
+        "left out: 1 of 4 instances without a class: unlabeled (1)",
+    )
+
+
+def test_auto_considers_label_space_without_instances() -> None:
+    """The classes of a scene do not depend on the objects in it."""
+    external = replace(external_map(([0], "chair", 1.0), ([1], "wall", 1.0)), label_space=("n/a", "pallet", "chair"))
+    assert ConvertedMap.of(external, HERE).mesh.classes == ("pallet", "chair", "wall")
+
+
+@pytest.mark.parametrize(
+    ("class_names", "ids"), [(ClassNames.COCO, [1, 0, 0, 0, 0]), (ClassNames.OWN, [1, 2, 3, 0, 0])]
+)
+def test_class_names_select_instances(class_names: ClassNames, ids: list[int]) -> None:
+    external = external_map(([0], "chair", 1.0), ([1], "wall", 1.0), ([2], "forklift", 1.0))
+    assert ConvertedMap.of(external, HERE, class_names).mesh.instance_ids.tolist() == ids
 
 
 def test_map_without_coco_class_is_error() -> None:
-    with pytest.raises(DataError, match=r"expected an instance with a COCO class, got none .*wall .1"):
-        ConvertedMap.of(external_map(([0], "wall", 1.0)), HERE)
+    with pytest.raises(DataError, match=r"an instance with a COCO class, got none .*wall .1.*; set class_names=OWN"):
+        ConvertedMap.of(external_map(([0], "wall", 1.0)), HERE, ClassNames.COCO)
+
+
+@pytest.mark.parametrize("name", ["fork\nlift", "f" * 101])
+def test_invalid_class_name_is_error(name: str) -> None:
+    with pytest.raises(DataError, match="class: expected a class name of 1 to 100 characters"):
+        ConvertedMap.of(external_map(([0], name, 1.0)), HERE)
 
 
 def test_map_without_classes_keeps_all_instances() -> None:
@@ -96,12 +129,12 @@ def test_placement_up_gives_upright_boxes() -> None:
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
 def test_invalid_scale_is_error(scale: float) -> None:
-    with pytest.raises(DataError, match="--scale: expected a positive number"):
+    with pytest.raises(DataError, match="scale: expected a positive number"):
         MapPlacement(scale)
 
 
 def test_coordinates_in_millimeters_are_error() -> None:
-    with pytest.raises(DataError, match="set --scale"):
+    with pytest.raises(DataError, match="set scale"):
         ConvertedMap.of(external_map(([0, 1], "chair", 0.5)), MapPlacement(1e6))
 
 

@@ -51,7 +51,7 @@ def test_chosen_properties_have_precedence(tmp_path: Path) -> None:
 
 
 def test_unknown_property_is_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"--instance-property: expected one of label, got mine"):
+    with pytest.raises(DataError, match=r"instance_property: expected one of label, got mine"):
         instances_in(surface_of(tmp_path, label=[5] * 6), LabelProperties("mine"))
 
 
@@ -67,7 +67,7 @@ def test_empty_class_property_gives_no_classes(tmp_path: Path) -> None:
 
 
 def test_class_ids_without_names_are_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="expected names of the class ids, got none; set --label-space"):
+    with pytest.raises(DataError, match="expected names of the class ids, got none; set label_space"):
         instances_in(surface_of(tmp_path, instance=[1] * 6, label=[5] * 6), names=None)
 
 
@@ -82,7 +82,7 @@ def test_class_id_below_label_space_is_unlabeled(tmp_path: Path) -> None:
 
 def test_negative_instance_is_error_until_chosen(tmp_path: Path) -> None:
     surface = surface_of(tmp_path, instance=[-1, 0, 0, 1, 1, 1], label=[5] * 6)
-    with pytest.raises(DataError, match="set --no-instance -1 if it means no instance"):
+    with pytest.raises(DataError, match="set no_instance=-1 if it means no instance"):
         instances_in(surface)
     found = instances_in(surface, LabelProperties(no_instance=-1))
     assert {key: one.vertices.tolist() for key, one in found.instances.items()} == {1: [1, 2], 2: [3, 4, 5]}
