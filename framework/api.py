@@ -450,14 +450,14 @@ def export(
 
     Args:
         run: The run directory.
-        formats: "glb", "ply", "usd", "obj", "floorplan" or "graph".
+        formats: "glb", "ply", "usd", "obj", "floorplan" or "graph", or predictions for benchmarks: "scannet" or "npz".
         out: The output folder; None = `export` in the run directory.
         objects: Classes or ids of the exported objects; () = the whole scene.
         up: The up direction (3,) in the world frame; None = the up direction of the run.
         floor: The floor height along the up direction, m; None = the floor height of the run, or unknown if `up` is
             given.
-        choices: min_confidence, triangles, coloring, collision, resolution, robot_height; see `instancemap export
-            --help`.
+        choices: min_confidence, triangles, coloring, collision, resolution, robot_height, label_space, points; see
+            `instancemap export --help`.
 
     Returns:
         The paths of the files.
@@ -532,7 +532,7 @@ def import_map(
         label_space: The names of class ids: a label space such as "nyu40", or a text or JSON file; None = NYU40 for
             ScanNet predictions, otherwise none.
         class_names: "COCO" (instances of other classes are left out), "OWN" (the given names), or "AUTO" (OWN if a name
-            is in no known label space, otherwise COCO).
+            is in no known label space, or if `evaluation.label_space` is not COCO; otherwise COCO).
         instance_property: The property of the PLY file with instance ids; None = detected by name.
         class_property: The property with class ids; None = detected by name; "" = no classes.
         no_instance: The id of points without an instance.

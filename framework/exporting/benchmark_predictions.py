@@ -67,7 +67,7 @@ class BenchmarkPredictions:
         class_id_names = ClassIdNames.of(label_space or default)
         if (least := min(class_id_names.names)) < 1:
             raise DataError(
-                f"--label-space: expected class ids of at least 1, got {least} in {class_id_names.source}; write a "
+                f"label_space: expected class ids of at least 1, got {least} in {class_id_names.source}; write a "
                 "JSON file with the name of each id"
             )
         names = evaluated.names if evaluated.label_space == class_id_names.source else {}
@@ -127,9 +127,7 @@ def _truth(record: Record, points: Path | None) -> SceneTruth:
     if points is None:
         found = truth.in_world_of(record)
         if found is None:
-            raise DataError(
-                f"{record.directory}: expected ground-truth instances of the dataset, got none; set --points"
-            )
+            raise DataError(f"{record.directory}: expected ground-truth instances of the dataset, got none; set points")
         return found
     vertices = read_surface(points).vertices
     unlabeled = SceneTruth(vertices, np.zeros(len(vertices), np.int32))

@@ -10,6 +10,7 @@ import numpy as np
 
 from framework.data import Float64
 from framework.errors import ConfigError
+from framework.evaluation.compared_classes import OF_DATASET
 from framework.importing.folder_writer import check_new
 from framework.runs.external_maps.conversion import ConvertedMap, MapPlacement, read_transform
 from framework.runs.external_maps.imported_run import ImportOption, MappedData, write_imported_run
@@ -57,7 +58,10 @@ class MapImport:
         placement = MapPlacement(self.scale, self._T_world_map(), None if self.up is None else unit_vector(self.up))
         data = MappedData.of(overrides)
         external = read_external_map(self.mesh, self.labels, self.label_space, self.properties)
-        converted = ConvertedMap.of(external, placement, self.class_names)
+        class_names = self.class_names
+        if class_names is ClassNames.AUTO and data.classes.label_space not in OF_DATASET:
+            class_names = ClassNames.OWN  # the evaluation converts the names
+        converted = ConvertedMap.of(external, placement, class_names)
         row = name or directory.resolve().name
         options = self.chosen_options()
         title = write_imported_run(directory, row, converted, data, placement.up, options, external.masks)

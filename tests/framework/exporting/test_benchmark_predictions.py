@@ -122,7 +122,7 @@ def test_predictions_of_given_points_need_no_ground_truth(scannet_run: Path, tmp
 
 def test_class_ids_below_one_are_error(scannet_run: Path, tmp_path: Path) -> None:
     (tmp_path / "names.json").write_text('["chair", "table"]')
-    with pytest.raises(DataError, match="--label-space: expected class ids of at least 1, got 0"):
+    with pytest.raises(DataError, match="label_space: expected class ids of at least 1, got 0"):
         export(scannet_run, [ExportFormat.NPZ], tmp_path, Chosen(label_space=str(tmp_path / "names.json")))
     (tmp_path / "names.json").write_text('{"20": "chair", "80": "table"}')
     [path] = export(scannet_run, [ExportFormat.NPZ], tmp_path, Chosen(label_space=str(tmp_path / "names.json")))
@@ -133,5 +133,26 @@ def test_predictions_without_ground_truth_are_error(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(CornerRoom, "scene_truth", lambda self: None)
     directory = reported_run.write_run(tmp_path / "run")
     monkeypatch.setattr(composition, "_added", [reported_run.FAKES])
-    with pytest.raises(DataError, match="expected ground-truth instances of the dataset, got none; set --points"):
+    with pytest.raises(DataError, match="expected ground-truth instances of the dataset, got none; set points"):
         export(directory, [ExportFormat.NPZ], tmp_path)
+
+
+def test_imported_ground_truth_in_label_space_is_perfect(
+    scannet_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Classes outside of COCO, such as cabinet, are kept for an evaluation in another label space."""
+    [_, _, truth] = export(scannet_run, [ExportFormat.SCANNET], tmp_path, Chosen(label_space="nyu40"))
+    codes = np.loadtxt(truth, dtype=np.int64)
+    entries = []
+    for code in np.unique(codes[codes // 1000 > 2]).tolist():  # without walls and floors
+        np.save(tmp_path / f"{code}.npy", codes == code)
+        entries.append({"mask": f"{code}.npy", "class": code // 1000, "confidence": 0.5})
+    (tmp_path / "instances.json").write_text(json.dumps(entries))
+    mesh = SCENE / "scene0000_00/scene0000_00_vh_clean_2.ply"
+    words = (mesh, tmp_path / "true", "--labels", tmp_path, "--label-space", "nyu40", *OVERRIDES[:3])
+    status, _, err = call_command(import_map, (*words, "evaluation.label_space=nyu40"), monkeypatch, capsys)
+    assert (status, err) == (0, "")
+    metrics = json.loads((tmp_path / "true" / "metrics.json").read_text())
+    assert metrics["instances.ap"] == metrics["instances.scannet.ap"] == metrics["instances.ap50.cabinet"] == 1.0
+    assert metrics["semantic.iou.cabinet"] == 1.0
+    assert metrics["semantic.iou.wall"] == 0.0

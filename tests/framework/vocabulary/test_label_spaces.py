@@ -1,16 +1,21 @@
 """Tests for the label spaces and their conversion to COCO."""
 
+import csv
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from framework.errors import ConfigError
 from framework.vocabulary.label_spaces import (
     _SECTIONS,
+    BENCHMARK_IDS,
     COCO,
     MEANINGS,
     SCENENN_TO_COCO,
     SPACES,
     ClassNames,
+    label_space_of,
     read_labels,
     to_class_names,
     to_coco,
@@ -161,3 +166,31 @@ def test_read_labels_from_text_file_checks_lines(tmp_path):
         read_labels(str(path))
     with pytest.raises(ConfigError, match="got cocoo"):
         read_labels("cocoo")
+
+
+@pytest.mark.parametrize(
+    ("classes", "name"),
+    [
+        ((), "none"),
+        (("object",), "agnostic"),
+        (("chair", "couch"), "coco"),
+        (("cabinet", "sofa"), "nyu40"),
+        (("office chair", "couch"), "scannet200"),
+        (("forklift", "chair"), "own classes"),
+    ],
+)
+def test_label_space_of_map_is_first_with_its_classes(classes: tuple[str, ...], name: str) -> None:
+    assert label_space_of(classes) == name
+
+
+@pytest.mark.parametrize(
+    ("label_space", "name", "number"),
+    [("nyu40", "nyu40class", "nyu40id"), ("scannet20", "nyu40class", "nyu40id"), ("scannet200", "raw_category", "id")],
+)
+def test_benchmark_ids_equal_label_table_of_scannet(label_space: str, name: str, number: str) -> None:
+    table = Path(__file__).resolve().parents[4] / "shared/data/scannet_scene0000/scannetv2-labels.combined.tsv"
+    if not table.is_file():
+        pytest.skip(f"{table} does not exist")
+    with table.open(newline="") as file:
+        ids = {row[name]: int(row[number]) for row in csv.DictReader(file, delimiter="\t")}
+    assert BENCHMARK_IDS[label_space] == tuple(ids[name] for name in SPACES[label_space])
