@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from framework.compilation.catalog import compile_for_run
 from framework.config.composition import composed, composed_with_choices, resolved
-from framework.config.validation import checked_path
+from framework.config.validation import checked_path, without_interpolation
 from framework.data import (
     Camera,
     Detections,
@@ -324,7 +324,8 @@ def _override(name: str, value: object) -> str:
     if value is None or isinstance(value, bool | int | float):
         return f"{name}={'null' if value is None else value}"
     if isinstance(value, str | Path):
-        return f"{name}={QuotedString(str(value), Quote.single).with_quotes()}"
+        text = without_interpolation(str(value))  # a value in Python is no reference
+        return f"{name}={QuotedString(text, Quote.single).with_quotes()}"
     raise ConfigError(f"{name}: expected a string, path, number, bool or None, got {value!r:.60}")
 
 

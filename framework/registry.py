@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.config.composition import config_loader, running_loader
 from framework.config.hydra_api import CachingConfigRepository, create_defaults_list
 from framework.config.renamed_keys import rename_hint
-from framework.config.validation import values_of
+from framework.config.validation import values_of, without_interpolation
 from framework.errors import ConfigError, InstanceMapError, first_line
 from framework.files.search_paths import PROJECT_ROOT
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDVideo, Viewer
@@ -329,7 +329,8 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
             reason = first_line(error)
             raise ConfigError(f"{where}: {key}: expected a valid reference, got an error ({reason})") from error
         try:
-            schema[key] = value
+            # a resolved value is not a reference
+            schema[key] = without_interpolation(value) if isinstance(value, str) else value
         except OmegaConfBaseException as error:
             raise ConfigError(f"{where}: {key}: expected {values_of(fields[key][1])}, got {_shown(value)}") from error
     return schema, plugins

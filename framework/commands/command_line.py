@@ -9,6 +9,7 @@ import argparse
 import hashlib
 import logging
 import os
+import re
 import signal
 import sys
 import traceback
@@ -30,6 +31,7 @@ from tqdm import tqdm
 
 from framework.config.composition import FileConfigSource, InstalledConfigs, add_config_dir, one_line
 from framework.config.hydra_api import replace_file_source
+from framework.config.text_values import literal
 from framework.errors import ConfigError, InstanceMapError, PartialRunError
 from framework.runtime.signals import Interrupted
 
@@ -38,12 +40,14 @@ log = logging.getLogger(__name__)
 KNOWN_ERRORS = (InstanceMapError, HydraException, OmegaConfBaseException, OSError)
 EXIT_FAILED = 1
 EXIT_PARTIAL = 3  # a run ended early and wrote partial outputs
+WITH_VALUE = ("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--package", "-p")
+"""Options of Hydra with a value as the next argument."""
 EXIT_SIGNAL = 128  # plus the signal's number, as in shells: 130 after Ctrl-C, 143 after SIGTERM
 
 
 def directory_name(overrides: str) -> str:
-    """Return a directory name for overrides, without path separators and with at most 200 characters."""
-    name = overrides.replace(os.sep, "_") or "defaults"
+    """Return a directory name for overrides, of at most 200 characters, without path separators, quotes and escapes."""
+    name = re.sub(r"\\(.)|['\"]", r"\1", overrides).replace(os.sep, "_").replace("\\", "_") or "defaults"
     return name if len(name) <= 200 else f"{name[:180]}_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
 
 
@@ -161,9 +165,19 @@ class Jobs:
             for folder in filter(Path.is_dir, _config_dirs(sys.argv[1:])):  # Hydra reports a missing folder
                 add_config_dir(folder)  # for steps after Hydra has finished, such as the figure of a sweep
             Plugins.instance().register(InstalledConfigs)
+            sys.argv[1:] = literal_arguments(sys.argv[1:])
             command()
         if self.status:
             sys.exit(self.status)
+
+
+def literal_arguments(words: Sequence[str]) -> list[str]:
+    """Return the arguments of a command of Hydra, with quoted text values in its overrides."""
+    multirun = not {"-m", "--multirun"}.isdisjoint(words)
+    given = [k for k, word in enumerate(words) if "=" in word and not word.startswith(("-", "~"))]
+    given = [k for k in given if k == 0 or words[k - 1] not in WITH_VALUE]
+    quoted = dict(zip(given, literal([words[k] for k in given], multirun), strict=True))
+    return [quoted.get(k, word) for k, word in enumerate(words)]
 
 
 def check_switches(config: DictConfig) -> None:

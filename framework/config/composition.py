@@ -47,6 +47,10 @@ def composed_with_choices(*overrides: str) -> tuple[DictConfig, dict[str, str | 
     Raises:
         ConfigError: A name is unknown or a value is invalid.
     """
+    from framework.config.text_values import literal  # local: it composes the selected options
+
+    with _config_errors():
+        overrides = tuple(literal(overrides))
     with _config_errors(), config_loader() as loader:
         config = loader.load_configuration("config", [*overrides], RunMode.RUN, from_shell=False)
         choices = {str(group): option for group, option in config.hydra.runtime.choices.items()}
@@ -83,6 +87,11 @@ def add_config_dir(folder: Path) -> None:
     if not folder.is_dir():
         raise ConfigError(f"--config-dir: expected an existing folder, got {folder}; correct the path")
     _added.append(folder.resolve())
+
+
+def added_config_dirs() -> tuple[Path, ...]:
+    """Return the folders of add_config_dir."""
+    return tuple(_added)
 
 
 @cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from enum import Enum
@@ -173,6 +174,11 @@ def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:
     content = OmegaConf.to_container(block)
     assert isinstance(content, dict)
     return {str(key): value for key, value in content.items()}
+
+
+def without_interpolation(text: str) -> str:
+    """Return a text with escaped references `${`, which OmegaConf takes literally."""
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
 
 
 def values_of(kind: Any) -> str:

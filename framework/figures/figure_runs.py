@@ -6,7 +6,9 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import get_type_hints
 
+from framework.config.text_values import literal_in_block
 from framework.config.validation import checked_rows
 from framework.errors import DataError
 from framework.figures.figure_choice import OF_RUNS, FigureChoice
@@ -37,7 +39,7 @@ class Pictured:
         """
         if not directory.is_dir():
             raise DataError(f"{directory}: expected a folder of runs, got no folder")
-        sweep = read_sweep(directory, overrides)
+        sweep = read_sweep(directory, literal_in_block(BLOCK, get_type_hints(FigureChoice), overrides))
         if not sweep.get(BLOCK):
             raise DataError(f"{directory}: expected a sweep with a figure, got none; add figure.kind=bar, for example")
         choice = FigureChoice.of(sweep[BLOCK])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from framework.config.text_values import typed
 from framework.errors import ConfigError, DataError
 from framework.importing.bags import ros_bag
 from framework.importing.bags.ros_topics import Topics
@@ -47,7 +48,7 @@ def open_source(path: Path, topics: Topics | None = None) -> Source:
                 raise ConfigError(f"{', '.join(topics.given)}: expected a ROS bag, got {path}; omit these options")
             return kind.open(place)
     if (path / "camera.json").exists() and (path / "depth").is_dir():
-        command = f"instancemap dataset=rgbd_folder dataset.root={path}"
+        command = f"instancemap dataset=rgbd_folder {typed('dataset.root', path)}"
         raise DataError(f"{path}: expected a recording, got an RGB-D folder; run {command}")
     known = "; ".join(f"{kind.name}: {kind.needs}" for kind in FORMATS)
     raise DataError(f"{path}: expected a supported format, got an unknown format; supported: {known}")

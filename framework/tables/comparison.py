@@ -6,8 +6,9 @@ from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, S
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
+from framework.config.text_values import literal_in_block
 from framework.errors import DataError
 from framework.runs.metrics import is_evaluation
 from framework.runs.run_rows import DATA, Mean, Run, RunRow, is_below, is_of_data, natural, rows_of
@@ -52,7 +53,7 @@ class ComparisonTable:
         sweep's config cannot be read, and ConfigError for an invalid table.
         """
         records, incomplete = completed_runs(directory)
-        sweep = read_sweep(directory, overrides)
+        sweep = read_sweep(directory, literal_in_block("table", get_type_hints(TableChoice), overrides))
         choice, asked = TableChoice.of_stored_sweep(sweep.get("table")), asked_keys(sweep)
         choice.check_keys({key for record in records for key in record.settings} | (asked or set()))
         selected = [record for record in records if choice.selects(record)]

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
+from framework.config.text_values import typed
 from framework.importing.bags.ros_topics import Topics
 from framework.importing.folder_writer import LONGER_SIDE, ODOMETRY, Writing, check_new, write_folder
 from framework.importing.formats import FORMATS, open_source
@@ -60,6 +61,7 @@ def main() -> None:
         if best is not None and best != writing.turned:
             degrees = QUARTER * best.quarters
             print(f"the images are not upright, which reduces detection accuracy; import again with --rotate {degrees}")
-        print(f"check it: instancemap check dataset=rgbd_folder dataset.root={root}")
-        prior = f" dataset.odometry={root / ODOMETRY}" if source.odometry else ""
-        print(f"map it: instancemap dataset=rgbd_folder dataset.root={root}{prior}")
+        dataset = f"dataset=rgbd_folder {typed('dataset.root', root)}"
+        print(f"check it: instancemap check {dataset}")
+        prior = f" {typed('dataset.odometry', root / ODOMETRY)}" if source.odometry else ""
+        print(f"map it: instancemap {dataset}{prior}")

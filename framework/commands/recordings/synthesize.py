@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
+from framework.config.text_values import typed
 from framework.errors import ConfigError
 from framework.runtime.process_settings import available_cores
 from framework.synthetic.benchmark import SCENES
@@ -44,4 +45,5 @@ def main() -> None:
         recording = BenchmarkSettings(parsed.seed, parsed.frames, parsed.rate, parsed.width, parsed.camera_speed)
         write_scenes(parsed.directory, {name: SCENES[name] for name in names}, recording, parsed.jobs)
         root = parsed.directory.resolve()
-        print(f"{root} is complete; map it: instancemap dataset=scenenn dataset.root={root} dataset.scene={names[0]}")
+        command = f"instancemap dataset=scenenn {typed('dataset.root', root)} dataset.scene={names[0]}"
+        print(f"{root} is complete; map it: {command}")

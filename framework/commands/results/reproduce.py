@@ -10,10 +10,12 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.commands.command_line import EXIT_FAILED, KNOWN_ERRORS, arguments, one_line_errors, print_error
+from framework.config.text_values import value_in
 from framework.errors import ConfigError, DataError
 from framework.runs.reproduction import Reproduction, causes
 from framework.runs.run_bundle import opened_bundle
@@ -137,8 +139,8 @@ def _run_again(record: Record, overrides: Sequence[str], directory: Path) -> Non
     OmegaConf.set_struct(config, True)  # unknown keys are errors
     for override in overrides:
         try:
-            config.merge_with_dotlist([override])
-        except OmegaConfBaseException as error:
+            OmegaConf.update(config, *value_in(config, override))
+        except (HydraException, OmegaConfBaseException) as error:
             raise ConfigError(
                 f"{override}: expected KEY=VALUE with a key and a type of the run's config, got an unknown key or a "
                 "value of another type"

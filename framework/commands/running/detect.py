@@ -9,8 +9,6 @@ from __future__ import annotations
 import logging
 import math
 import os
-import re
-import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +24,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from framework.commands.command_line import Jobs, is_of_sweep, print_error
 from framework.commands.running.choices import swept_keys
 from framework.commands.running.sweep import ending, overrides_of
+from framework.config.text_values import typed
 from framework.config.validation import checked_file, checked_path
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError
 from framework.files.search_paths import CONF
@@ -69,20 +68,12 @@ def job(config: DictConfig) -> None:
         from framework.tables.detection_table import write_metrics
 
         write_metrics(out.parent, list(hydra_config.overrides.task), metrics)
-    how = ["detector=precomputed", as_argument("detector.path", out)]
+    how = ["detector=precomputed", typed("detector.path", out)]
     if detector.classes != COCO:
-        how.append(as_argument("detector.label_space", write_labels(out, detector.classes)))
+        how.append(typed("detector.label_space", write_labels(out, detector.classes)))
         if not keeps_names(detector.classes, ClassNames.AUTO) and any(coco_name(k) != k for k in detector.classes):
             how.append("detector.class_names=OWN")
     log.info("use it with: %s", " ".join(how))
-
-
-def as_argument(key: str, path: Path) -> str:
-    """Return an override for the shell, quoted if necessary."""
-    if re.fullmatch(r"[\w./-]+", str(path)):
-        return f"{key}={path}"
-    escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
-    return shlex.quote(f'{key}="{escaped}"')
 
 
 def file_of_job(out: object, folder: Path) -> Path:
@@ -94,8 +85,8 @@ def file_of_job(out: object, folder: Path) -> Path:
     name = checked_path("out", out).name
     if name != out:
         raise ConfigError(
-            f"out: expected a file name without a folder in a sweep, got {out}; set out={name} (each job writes its "
-            "own file below hydra.sweep.dir)"
+            f"out: expected a file name without a folder in a sweep, got {out}; set {typed('out', name)} (each job "
+            "writes its own file below hydra.sweep.dir)"
         )
     folder.mkdir(parents=True, exist_ok=True)
     return folder / name
