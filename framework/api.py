@@ -14,7 +14,8 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig
 
 from framework.compilation.catalog import compile_for_run
-from framework.config.composition import composed, composed_with_choices, resolved
+from framework.config.composition import composed, composed_with_choices, config_errors, resolved
+from framework.config.text_values import literal
 from framework.config.validation import checked_path, without_interpolation
 from framework.data import (
     Camera,
@@ -53,7 +54,7 @@ from framework.live_view.guarded_viewer import watched_run
 from framework.pipeline import Pipeline, watched
 from framework.queries.map_queries import Map
 from framework.queries.text_search import Match, QueryResult, TextQuery, search
-from framework.registry import build
+from framework.registry import build, text_kind
 from framework.runs.data_frame import load_runs
 from framework.runs.run_directory import write_run
 from framework.runs.stored_runs import KEYFRAMES, MAP, REPORT
@@ -317,7 +318,8 @@ def _overrides(where: str, overrides: Sequence[str], named: Mapping[str, object]
     for override in words:
         if not isinstance(override, str):
             raise ConfigError(f"{where}: expected overrides such as 'fuser.voxel_size=0.02', got {override!r}")
-    return words
+    with config_errors():
+        return literal(words, text_kind)
 
 
 def _override(name: str, value: object) -> str:

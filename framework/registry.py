@@ -26,6 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.config.composition import config_loader, running_loader
 from framework.config.hydra_api import CachingConfigRepository, create_defaults_list
 from framework.config.renamed_keys import rename_hint
+from framework.config.text_values import TextKind
 from framework.config.validation import values_of, without_interpolation
 from framework.errors import ConfigError, InstanceMapError, first_line
 from framework.files.search_paths import PROJECT_ROOT
@@ -87,6 +88,28 @@ def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
     except (ImportError, ValueError) as error:
         raise ConfigError(f"{where}: expected a working constructor, got an error ({first_line(error)})") from error
     return plugin
+
+
+def text_kind(config: DictConfig, key: str) -> TextKind | None:
+    """Return the kind of the parameter of a plugin, or None for an unknown key.
+
+    Args:
+        config: A composed config of registered options.
+        key: Dotted key, such as dataset.root.
+    """
+    group, *parts = key.split(".")
+    if group not in GROUPS or not parts:
+        return None
+    node: Any = config.get(group)
+    for part in parts[:-1]:
+        node = node.get(part) if isinstance(node, DictConfig) else None
+    if not isinstance(node, DictConfig) or not isinstance(target := node.get("_target_"), str):
+        return None
+    try:
+        found = parameter_fields(find_class(GROUPS[group], target)).get(parts[-1])
+    except ConfigError:  # an invalid class is reported when it is built
+        return None
+    return None if found is None else TextKind.of(found[1])
 
 
 @contextmanager

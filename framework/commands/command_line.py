@@ -33,6 +33,7 @@ from framework.config.composition import FileConfigSource, InstalledConfigs, add
 from framework.config.hydra_api import replace_file_source
 from framework.config.text_values import literal
 from framework.errors import ConfigError, InstanceMapError, PartialRunError
+from framework.registry import text_kind
 from framework.runtime.signals import Interrupted
 
 log = logging.getLogger(__name__)
@@ -176,7 +177,7 @@ def literal_arguments(words: Sequence[str]) -> list[str]:
     multirun = not {"-m", "--multirun"}.isdisjoint(words)
     given = [k for k, word in enumerate(words) if "=" in word and not word.startswith(("-", "~"))]
     given = [k for k in given if k == 0 or words[k - 1] not in WITH_VALUE]
-    quoted = dict(zip(given, literal([words[k] for k in given], multirun), strict=True))
+    quoted = dict(zip(given, literal([words[k] for k in given], text_kind, multirun), strict=True))
     return [quoted.get(k, word) for k, word in enumerate(words)]
 
 

@@ -47,11 +47,7 @@ def composed_with_choices(*overrides: str) -> tuple[DictConfig, dict[str, str | 
     Raises:
         ConfigError: A name is unknown or a value is invalid.
     """
-    from framework.config.text_values import literal  # local: it composes the selected options
-
-    with _config_errors():
-        overrides = tuple(literal(overrides))
-    with _config_errors(), config_loader() as loader:
+    with config_errors(), config_loader() as loader:
         config = loader.load_configuration("config", [*overrides], RunMode.RUN, from_shell=False)
         choices = {str(group): option for group, option in config.hydra.runtime.choices.items()}
         with open_dict(config):
@@ -60,7 +56,7 @@ def composed_with_choices(*overrides: str) -> tuple[DictConfig, dict[str, str | 
 
 
 @contextmanager
-def _config_errors() -> Iterator[None]:
+def config_errors() -> Iterator[None]:
     """Convert errors of Hydra and OmegaConf in the `with` body to ConfigError."""
     try:
         yield

@@ -25,10 +25,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from framework.config.composition import added_config_dirs, config_loader
 from framework.config.validation import checked_rows, without_interpolation
-from framework.errors import ConfigError
-from framework.registry import GROUPS, find_class, parameter_fields
 
-SELECTING = (*GROUPS, "experiment", "preset")
+SELECTING = ("dataset", "detector", "tracker", "refiner", "fuser", "viewer", "experiment", "preset")
 """Config groups that select the plugins of a run."""
 
 OF_HYDRA = ("hydra", "now")  # resolvers that Hydra registers when it starts an application
@@ -70,20 +68,24 @@ KEYS: Mapping[str, TextKind] = {
 """Kinds of the keys that are not parameters of plugins."""
 
 
-def literal(overrides: Sequence[str], multirun: bool = False) -> list[str]:
+KindOf = Callable[[DictConfig, str], TextKind | None]
+"""Function of a config and a dotted key: the kind of the parameter of a plugin, or None for an unknown key."""
+
+
+def literal(overrides: Sequence[str], kind_of: KindOf, multirun: bool = False) -> list[str]:
     """Return overrides of the main config with quoted text values.
 
     Args:
         overrides: Overrides as typed, KEY=VALUE.
+        kind_of: `text_kind` of the registry.
         multirun: True if commas separate values. In an experiment, they always do.
 
     Raises:
-        ConfigError: The class of a plugin is invalid.
         HydraException: A group has no such option.
     """
     if all(_is_plain(override) for override in overrides):
         return [*overrides]
-    choices = _Choices(overrides, multirun)
+    choices = _Choices(overrides, kind_of, multirun)
     return [_quoted(override, choices.kind, choices.sweeps, choices.interpolates) for override in overrides]
 
 
@@ -105,13 +107,19 @@ def literal_in_block(block: str, kinds: Mapping[str, Any], overrides: Sequence[s
     return [_quoted(override, kind, False, lambda _: True) for override in overrides]
 
 
-def value_in(config: DictConfig, override: str) -> tuple[str, Any]:
+def value_in(config: DictConfig, override: str, kind_of: KindOf) -> tuple[str, Any]:
     """Return the key and the value of an override of a composed config, with a literal value for text parameters.
+
+    `kind_of` is `text_kind` of the registry.
 
     Raises:
         HydraException: The override is not KEY=VALUE.
     """
-    word = _quoted(override, lambda key: _kind_in(config, key), False, lambda _: True)
+
+    def kind(key: str) -> TextKind:
+        return KEYS.get(key) or kind_of(config, key) or TextKind.NONE
+
+    word = _quoted(override, kind, False, lambda _: True)
     parsed = OverridesParser.create().parse_override(word)
     return parsed.key_or_group, parsed.value()
 
@@ -130,7 +138,8 @@ def typed(key: str, value: object) -> str:
 class _Choices:
     """The plugins that overrides select."""
 
-    def __init__(self, overrides: Sequence[str], multirun: bool) -> None:
+    def __init__(self, overrides: Sequence[str], kind_of: KindOf, multirun: bool) -> None:
+        self._kind_of = kind_of
         self._groups: dict[str, list[str]] = {}  # options of each group
         for override in overrides:
             key, equals, value = override.partition("=")
@@ -159,9 +168,9 @@ class _Choices:
     def _kind(self, key: str) -> TextKind:
         if key in KEYS:
             return KEYS[key]
-        if key.partition(".")[0] not in GROUPS or "." not in key:
+        if key.partition(".")[0] not in SELECTING or "." not in key:
             return TextKind.NONE
-        return next((kind for config in self._configs() if (kind := _kind_in(config, key)) is not None), TextKind.NONE)
+        return next(filter(None, (self._kind_of(config, key) for config in self._configs())), TextKind.NONE)
 
     def interpolates(self, value: str) -> bool:
         """Return True if all references in a value are to existing keys or resolvers."""
@@ -181,25 +190,6 @@ def _composed(*words: str) -> DictConfig:
 def _composed_with(words: tuple[str, ...], folders: tuple[Path, ...]) -> DictConfig:
     with config_loader() as loader:
         return loader.load_configuration("config", [*words], RunMode.RUN, from_shell=False)
-
-
-def _kind_in(config: DictConfig, key: str) -> TextKind | None:
-    """Return the kind of a dotted key in a config, or None for an unknown key."""
-    if key in KEYS:
-        return KEYS[key]
-    group, *parts = key.split(".")
-    if group not in GROUPS or not parts:
-        return None
-    node: Any = config.get(group)
-    for part in parts[:-1]:
-        node = node.get(part) if isinstance(node, DictConfig) else None
-    if not isinstance(node, DictConfig) or not isinstance(target := node.get("_target_"), str):
-        return None
-    try:
-        found = parameter_fields(find_class(GROUPS[group], target)).get(parts[-1])
-    except ConfigError:  # an invalid class is reported when it is built
-        return None
-    return None if found is None else TextKind.of(found[1])
 
 
 def _quoted(override: str, kind: Callable[[str], TextKind], sweeps: bool, interpolates: Callable[[str], bool]) -> str:

@@ -8,20 +8,30 @@ Handheld Kinect videos with KinectFusion poses:
 
 Color and depth are not registered in the published files. The offset is 30 px or more. Only the intrinsics of the depth
 camera are published.
+
+Other recordings in this layout have a camera.json, or a text file with the 3x3 intrinsic matrix such as
+camera-intrinsics.txt, in the folder of the sequence or of the scene. Their depth and poses are those of the color
+camera. Color images may be JPEG files, and numbers may have any number of digits.
 """
 
 from __future__ import annotations
 
+import logging
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from framework.data import Camera, Float64, UInt16
+from framework.datasets.calibration.camera_json import StoredCamera
+from framework.datasets.calibration.own_camera import CAMERA_JSON, own_camera
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording, StoredImages
 from framework.datasets.seven_scenes_kernels import register_depth
 from framework.errors import DataError
+from framework.files.atomic_write import path_exists
 from framework.files.number_lines import read_matrix
 
 DEPTH_SCALE = 1000.0  # units per meter
@@ -30,39 +40,81 @@ DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)  # as published
 # parallel and 25 mm apart, as in a Kinect. Fitting this offset as well does not improve the alignment.
 COLOR_CAMERA = Camera(640, 480, 529.0, 529.0, 320.0, 239.0)
 BASELINE = 0.025  # m, from the depth camera to the color camera along the x axis of the depth camera
-_IMAGE_NAME = re.compile(r"frame-([0-9]{6})\.(color|depth)\.png")
+PUBLISHED = StoredCamera(COLOR_CAMERA, DEPTH_SCALE, None)
+_IMAGE_NAME = re.compile(r"(frame-([0-9]+))\.(?:color\.(?:png|jpg|jpeg)|depth\.png)")
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
 class SevenScenes(Recording):
-    """A sequence of 7-Scenes, with depth and poses registered to the color camera.
+    """A sequence of 7-Scenes, or another recording in the same layout.
 
-    Lens distortion and the time offset between color and depth are ignored.
+    Published sequences: depth and poses are registered to the color camera. Lens distortion and the time offset between
+    color and depth are ignored.
     """
 
     def open(self) -> Contents:
         self.name = f"{self.folder.resolve().parent.name}-{self.name}"
-        names = (_IMAGE_NAME.fullmatch(path.name) for path in self.folder.iterdir())
-        numbers = sorted({int(match[1]) for match in names if match})
-        if not numbers:
+        found = sorted({path.name for path in self.folder.iterdir() if _IMAGE_NAME.fullmatch(path.name)})
+        stems: dict[int, str] = {}
+        for name in found:
+            match = _IMAGE_NAME.fullmatch(name)
+            assert match is not None
+            if stems.setdefault(int(match[2]), match[1]) != match[1]:
+                expected = f"expected one name for frame {int(match[2])}"
+                raise DataError(f"{self.folder}: {expected}, got {stems[int(match[2])]} and {match[1]}; remove one")
+        if not stems:
             expected = "expected images such as frame-000000.color.png, got none"
             raise DataError(f"{self.folder}: {expected}; set dataset.scene to a sequence such as chess/seq-01")
-        frames = [_recorded(self.folder, number) for number in numbers]
-        return Contents(COLOR_CAMERA, "the camera of 7-Scenes", DEPTH_SCALE, frames)
+        images = {number: StoredImages.of_files(*_paths(self.folder, stems[number])) for number in sorted(stems)}
+        camera, source = self._calibration([Path(one.color_name) for one in images.values()])
+        is_published = camera is PUBLISHED
+        frames = []
+        for number, files in images.items():
+            stored = replace(files, depth=partial(_registered, files)) if is_published else files
+            pose = partial(_color_pose if is_published else _pose, self.folder / f"{stems[number]}.pose.txt")
+            frames.append(RecordedFrame.posed(stored, number / FRAME_RATE, pose))
+        return Contents(camera.camera, source, camera.depth_scale, frames, camera.distortion, camera.sensor)
+
+    def _calibration(self, color: Sequence[Path]) -> tuple[StoredCamera, Path | str]:
+        """Return the calibration and its source: a file next to the images, or the publication."""
+        for folder in dict.fromkeys((self.folder, self.folder.absolute().parent)):
+            if (own := own_camera(folder, color, DEPTH_SCALE)) is not None:
+                log.info(
+                    "%s: camera from %s; depth and poses are taken as those of the color camera", self.name, own[1]
+                )
+                return own
+        log.info("%s: published camera of 7-Scenes, because the folder has no %s", self.name, CAMERA_JSON)
+        return PUBLISHED, "the camera of 7-Scenes"
 
 
-def _recorded(folder: Path, number: int) -> RecordedFrame:
-    stem = f"frame-{number:06d}"
-    files = StoredImages.of_files(folder / f"{stem}.color.png", folder / f"{stem}.depth.png")
-    images = replace(files, depth=lambda: register(files.depth()))
-    return RecordedFrame.posed(images, number / FRAME_RATE, lambda: _color_pose(folder / f"{stem}.pose.txt"))
+def _paths(folder: Path, stem: str) -> tuple[Path, Path]:
+    """Return the paths of the color and depth images of a frame, which may not exist.
+
+    Raises:
+        DataError: The frame has several color images.
+    """
+    colors = [path for suffix in ("png", "jpg", "jpeg") if path_exists(path := folder / f"{stem}.color.{suffix}")]
+    if len(colors) > 1:
+        raise DataError(f"{colors[0]}: expected one color image of the frame, got also {colors[1].name}; remove one")
+    return (colors or [folder / f"{stem}.color.png"])[0], folder / f"{stem}.depth.png"
+
+
+def _registered(images: StoredImages) -> UInt16:
+    return register(images.depth())
+
+
+def _pose(path: Path) -> Float64:
+    """Return the pose T_world_camera (4, 4) in a file."""
+    return read_matrix(path).pose()
 
 
 def _color_pose(path: Path) -> Float64:
     """Return the pose T_world_camera (4, 4) of the color camera."""
     T_depthcamera_camera = np.eye(4)
     T_depthcamera_camera[0, 3] = BASELINE
-    return read_matrix(path).pose() @ T_depthcamera_camera
+    return _pose(path) @ T_depthcamera_camera
 
 
 def register(raw: UInt16) -> UInt16:

@@ -6,8 +6,8 @@ Kinect videos with motion-capture poses:
     rgb/, depth/            8-bit color; uint16 depth along z, registered to color, 5000 units per m; 0 = no reading
     groundtruth.txt         optional; TUM format, T_world_camera of the color camera, about 100 poses per second
     camera.json             for other recordings in this layout: intrinsics, depth scale and distortion, with the
-                            same keys as in an RGB-D folder; read with intrinsics=AUTO if the folder's name does not
-                            contain freiburg1, freiburg2 or freiburg3
+                            same keys as in an RGB-D folder; read with intrinsics=AUTO. A text file with the 3x3
+                            intrinsic matrix, such as camera-intrinsics.txt, is also read.
 
 The published depth correction factors are already applied. The images of freiburg1 and freiburg2 have a lens distortion
 of 5 px or more in half of the pixels, which is corrected on reading. The images of freiburg3 were published
@@ -30,7 +30,8 @@ import numpy as np
 
 from framework.config.validation import require
 from framework.data import Camera, Float64
-from framework.datasets.calibration.camera_json import CAMERA_KEYS, StoredCamera, read_camera
+from framework.datasets.calibration.camera_json import CAMERA_KEYS, StoredCamera
+from framework.datasets.calibration.own_camera import CAMERA_JSON, own_camera
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.sequence_reader import Contents, RecordedFrame, Recording, StoredImages
 from framework.errors import ConfigError, DataError
@@ -48,7 +49,7 @@ log = logging.getLogger(__name__)
 class Intrinsics(Enum):
     """Published calibration of the color camera."""
 
-    AUTO = "from the folder name or camera.json"
+    AUTO = "from camera.json or the folder name"
     FREIBURG1 = "freiburg1"
     FREIBURG2 = "freiburg2"
     FREIBURG3 = "freiburg3"
@@ -86,8 +87,8 @@ class TumRgbd(Recording):
         super().__post_init__()
 
     def open(self) -> Contents:
-        (camera, depth_scale, distortion, sensor), source = self._stored_camera()
         color, depth = _read_list(self.folder / "rgb.txt"), _read_list(self.folder / "depth.txt")
+        (camera, depth_scale, distortion, sensor), source = self._stored_camera(color)
         color_times, depth_times = ([image.timestamp for image in images] for images in (color, depth))
         pairs = associate(color_times, depth_times, self.max_time_difference)
         if not pairs:
@@ -106,20 +107,23 @@ class TumRgbd(Recording):
             frames.append(replace(recorded, color_timestamp=time, depth_timestamp=depth[j].timestamp))
         return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None, sensor)
 
-    def _stored_camera(self) -> tuple[StoredCamera, Path | str]:
+    def _stored_camera(self, color: Sequence[ListedImage]) -> tuple[StoredCamera, Path | str]:
         """Return the camera and the file or parameter that defines it."""
-        intrinsics, own = self.intrinsics, self.folder / "camera.json"
+        intrinsics = self.intrinsics
         if intrinsics is Intrinsics.AUTO:
+            own = own_camera(self.folder, [image.path for image in color], DEPTH_SCALE)
+            if own is not None:
+                log.info("%s: camera from %s", self.name, own[1])
+                return own
             named = re.search(r"freiburg[123]", self.name)
-            if not named and path_exists(own):
-                return read_camera(own), own
             if not named:
                 raise ConfigError(
                     f"dataset.intrinsics: expected freiburg1, freiburg2 or freiburg3 in the folder's name, got "
-                    f"{self.name}; set FREIBURG1, FREIBURG2, FREIBURG3 or ROS_DEFAULT, or write {own} with "
-                    f"{', '.join(CAMERA_KEYS)}"
+                    f"{self.name}; set FREIBURG1, FREIBURG2, FREIBURG3 or ROS_DEFAULT, or write "
+                    f"{self.folder / CAMERA_JSON} with {', '.join(CAMERA_KEYS)}"
                 )
             intrinsics = Intrinsics(named[0])
+        log.info("%s: published camera %s of TUM RGB-D", self.name, intrinsics.name)
         return PUBLISHED[intrinsics], f"dataset.intrinsics={intrinsics.name}"
 
 

@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.commands.command_line import EXIT_FAILED, KNOWN_ERRORS, arguments, one_line_errors, print_error
 from framework.config.text_values import value_in
 from framework.errors import ConfigError, DataError
+from framework.registry import text_kind
 from framework.runs.reproduction import Reproduction, causes
 from framework.runs.run_bundle import opened_bundle
 from framework.runs.stored_runs import METRICS, Record, find_records, no_run_error, read_record, without_edited
@@ -139,7 +140,7 @@ def _run_again(record: Record, overrides: Sequence[str], directory: Path) -> Non
     OmegaConf.set_struct(config, True)  # unknown keys are errors
     for override in overrides:
         try:
-            OmegaConf.update(config, *value_in(config, override))
+            OmegaConf.update(config, *value_in(config, override, text_kind))
         except (HydraException, OmegaConfBaseException) as error:
             raise ConfigError(
                 f"{override}: expected KEY=VALUE with a key and a type of the run's config, got an unknown key or a "

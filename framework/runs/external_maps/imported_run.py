@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from omegaconf import OmegaConf
 
-from framework.config.composition import composed_with_choices, resolved
+from framework.config.composition import composed_with_choices, config_errors, resolved
+from framework.config.text_values import literal
 from framework.data import Float64
 from framework.errors import ConfigError
 from framework.evaluation.compared_classes import ComparedClasses
@@ -24,7 +25,7 @@ from framework.files.hashing import path_hash
 from framework.files.json_file import write_json
 from framework.interfaces import RGBDVideo
 from framework.mapping.gravity import floor_height
-from framework.registry import STAGES, build
+from framework.registry import STAGES, build, text_kind
 from framework.rendering.overview import write_overview
 from framework.runs.external_maps.conversion import ConvertedMap
 from framework.runs.inputs import INPUTS, hash_of, input_hashes
@@ -69,7 +70,9 @@ class MappedData:
                 )
         if any(key.startswith("dataset.") for key in keys) and "dataset" not in keys:
             raise ConfigError(f"import-map: expected dataset=NAME, got only {', '.join(overrides)}; add dataset=NAME")
-        config, choices = composed_with_choices(*overrides)
+        with config_errors():
+            words = literal(overrides, text_kind)
+        config, choices = composed_with_choices(*words)
         plain = resolved(config)
         classes = ComparedClasses.of(plain)
         if "dataset" not in keys:

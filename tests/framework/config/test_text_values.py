@@ -15,7 +15,7 @@ from framework.config.text_values import literal, literal_in_block, typed, value
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import InstanceMapError, printable
 from framework.interfaces import RGBDSequence
-from framework.registry import build
+from framework.registry import build, text_kind
 
 FOLDERS = [
     *("Küche", "部屋", "room (2)", "a=b", "room#1", "kitchen, old", "it's", '"big"', "[a]", "{b}", "a&b", "trailing "),
@@ -42,12 +42,14 @@ SCENES = [
 
 
 def values(key: str, *words: str) -> object:
-    return OmegaConf.select(composed(*words), key)
+    return OmegaConf.select(composed(*literal(words, text_kind)), key)
 
 
 @pytest.mark.parametrize("name", FOLDERS)
 def test_path_with_special_characters_is_literal(name: str) -> None:
-    config = composed("dataset=rgbd_folder", f"dataset.root=/scans/{name}", f"dataset.scene=x{name}")
+    config = composed(
+        *literal(["dataset=rgbd_folder", f"dataset.root=/scans/{name}", f"dataset.scene=x{name}"], text_kind)
+    )
     assert (config.dataset.root, config.dataset.scene) == (f"/scans/{name}", f"x{name}")
 
 
@@ -117,18 +119,18 @@ def test_list_of_names_with_umlauts_is_a_list() -> None:
 )
 def test_commas_separate_values_in_sweep(value: str, expected: str) -> None:
     words = ["dataset=rgbd_folder", f"dataset.root={value}"]
-    assert literal(words, multirun=True)[1] == f"dataset.root={expected}"
+    assert literal(words, text_kind, multirun=True)[1] == f"dataset.root={expected}"
     assert literal_arguments(["-m", *words])[2] == f"dataset.root={expected}"
 
 
 def test_commas_separate_values_in_experiment() -> None:
     words = ["experiment=ablation_refiner", "dataset=rgbd_folder", "dataset.root=Küche,b"]
-    assert literal(words)[2] == "dataset.root='Küche',b"
+    assert literal(words, text_kind)[2] == "dataset.root='Küche',b"
 
 
 def test_parameter_of_second_swept_option_is_literal() -> None:
     words = ["detector=none,precomputed", "detector.path=Küche,b"]
-    assert literal(words, multirun=True)[1] == "detector.path='Küche',b"
+    assert literal(words, text_kind, multirun=True)[1] == "detector.path='Küche',b"
 
 
 def test_arguments_of_hydra_options_are_unchanged() -> None:
@@ -145,8 +147,8 @@ def test_printed_override_can_be_pasted(name: str) -> None:
 @pytest.mark.parametrize("name", FOLDERS)
 def test_value_in_stored_config_is_literal(name: str) -> None:
     config = composed("dataset=rgbd_folder")
-    assert value_in(config, f"dataset.root=/{name}") == ("dataset.root", f"/{name}")
-    assert value_in(config, "fuser.voxel_size=0.02") == ("fuser.voxel_size", 0.02)
+    assert value_in(config, f"dataset.root=/{name}", text_kind) == ("dataset.root", f"/{name}")
+    assert value_in(config, "fuser.voxel_size=0.02", text_kind) == ("fuser.voxel_size", 0.02)
 
 
 @pytest.mark.parametrize(
@@ -183,7 +185,7 @@ def test_directory_name_has_no_escapes(overrides: str, name: str) -> None:
 
 def test_folder_with_reference_in_its_name_is_opened(tmp_path: Path) -> None:
     (tmp_path / "${x}").mkdir()
-    config = composed("dataset=rgbd_folder", f"dataset.root={tmp_path}/${{x}}")
+    config = composed(*literal(["dataset=rgbd_folder", f"dataset.root={tmp_path}/${{x}}"], text_kind))
     with pytest.raises(InstanceMapError, match=r"camera\.json"):
         build(RGBDSequence, config.dataset)
     assert RgbdFolder.__name__ in str(config.dataset._target_)

@@ -158,3 +158,74 @@ def test_seven_scenes_image_size_mismatch_raises(folder: Path) -> None:
     write_depth(folder / "frame-000000.depth.png", 1, (240, 320))
     with pytest.raises(DataError, match=r"frame-000000\.depth\.png: expected 640x480 px .*, got 320x240 px"):
         SevenScenes(folder)
+
+
+# Other recordings in the same layout
+
+
+def own_recording(folder: Path, suffix: str = "png", digits: int = 6) -> Path:
+    """Write a sequence of another camera, with depth of 2 m and poses of the color camera."""
+    for k in range(FRAMES):
+        stem = f"frame-{k:0{digits}d}"
+        write_color(folder / f"{stem}.color.{suffix}", (40 * k, 100, 200), (240, 320))
+        write_depth(folder / f"{stem}.depth.png", 2000, (240, 320))
+        (folder / f"{stem}.pose.txt").write_text("\n".join(" ".join(map(str, row)) for row in pose_at(k)))
+    return folder
+
+
+CAMERA_JSON = '{"width": 320, "height": 240, "fx": 300, "fy": 301, "cx": 158, "cy": 121, "depth_scale": 500}'
+K = "300 0 158\n0 301 121\n0 0 1\n"
+
+
+@pytest.mark.parametrize(("suffix", "digits"), [("png", 6), ("jpg", 6), ("jpeg", 4), ("png", 1), ("jpg", 8)])
+@pytest.mark.parametrize(
+    ("file", "content", "depth"),
+    [
+        ("camera.json", CAMERA_JSON, 4),
+        ("../camera.json", CAMERA_JSON, 4),
+        ("camera-intrinsics.txt", K, 2),
+        ("../camera-intrinsics.txt", K.replace(" ", ", "), 2),
+        ("intrinsic.txt", "300 0 158 0\n0 301 121 0\n0 0 1 0\n0 0 0 1\n", 2),
+    ],
+)
+def test_seven_scenes_own_camera_overrides_published(
+    tmp_path: Path, suffix: str, digits: int, file: str, content: str, depth: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = own_recording(tmp_path / "room" / "seq-01", suffix, digits)
+    (folder / file).write_text(content)
+    with caplog.at_level("INFO"):
+        sequence = SevenScenes(tmp_path, scene="room/seq-01")
+    assert sequence.camera == Camera(320, 240, 300, 301, 158, 121)
+    assert (len(sequence), "camera from" in caplog.text) == (FRAMES, True)
+    assert (sequence[1].depth == depth).all()
+    assert sequence[1].T_world_camera == pytest.approx(pose_at(1))
+
+
+def test_seven_scenes_published_camera_is_logged(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO"):
+        SevenScenes(folder)
+    assert "published camera of 7-Scenes" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("300 158 301 121", r"expected a 3x3 intrinsic matrix, got 4 numbers"),
+        ("300 9 158\n0 301 121\n0 0 1", r"expected intrinsics fx 0 cx / 0 fy cy / 0 0 1, got 300 9 158"),
+        ("fx 0 158\n0 301 121\n0 0 1", r"expected a 3x3 intrinsic matrix, got other text"),
+    ],
+)
+def test_seven_scenes_invalid_intrinsics_raise(tmp_path: Path, content: str, message: str) -> None:
+    folder = own_recording(tmp_path / "room")
+    (folder / "camera-intrinsics.txt").write_text(content)
+    with pytest.raises(DataError, match=message):
+        SevenScenes(folder)
+
+
+def test_seven_scenes_two_images_of_frame_raise(folder: Path) -> None:
+    write_color(folder / "frame-000001.color.jpg", (1, 2, 3))
+    with pytest.raises(DataError, match=r"expected one color image of the frame, got also frame-000001\.color\.jpg"):
+        SevenScenes(folder)
+    (folder / "frame-000001.color.jpg").rename(folder / "frame-1.color.jpg")
+    with pytest.raises(DataError, match=r"expected one name for frame 1, got frame-000001 and frame-1"):
+        SevenScenes(folder)

@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from framework.data import Camera
+from framework.datasets.calibration.own_camera import INTRINSICS
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.tum_rgbd import PUBLISHED, Intrinsics, TumRgbd, associate
 from framework.errors import ConfigError, DataError
@@ -133,11 +134,29 @@ def test_tum_rgbd_camera_json_lens_is_applied_or_raises(folder: Path) -> None:
         TumRgbd(mine)
 
 
-def test_tum_rgbd_published_camera_overrides_camera_json(folder: Path) -> None:
+@pytest.mark.parametrize(
+    "name", ["my_freiburg1_room", "rgbd_dataset_freiburg1_xyz", "freiburg2", "freiburg3_x", "desk"]
+)
+@pytest.mark.parametrize("file", ["camera.json", *INTRINSICS])
+def test_tum_rgbd_own_camera_overrides_published(
+    folder: Path, name: str, file: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    mine = folder.rename(folder.parent / name)
+    K = "600 0 310\n0 601 250\n0 0 1\n"
+    (mine / file).write_text(json.dumps(OWN) if file.endswith("json") else K)
+    with caplog.at_level(logging.INFO):
+        sequence = TumRgbd(mine)
+    assert sequence.camera == Camera(640, 480, 600.0, 601.0, 310.0, 250.0)
+    assert sequence.contents.distortion is None
+    assert f"camera from {mine / file}" in caplog.text
+    assert sequence.contents.depth_scale == (1000 if file.endswith("json") else 5000)
+
+
+def test_tum_rgbd_parameter_overrides_own_camera(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     (folder / "camera.json").write_text("no JSON")
-    assert TumRgbd(folder).camera == PUBLISHED[Intrinsics.FREIBURG1].camera
-    mine = folder.rename(folder.parent / "my_desk")
-    assert TumRgbd(mine, intrinsics=Intrinsics.FREIBURG3).camera == PUBLISHED[Intrinsics.FREIBURG3].camera
+    with caplog.at_level(logging.INFO):
+        assert TumRgbd(folder, intrinsics=Intrinsics.FREIBURG3).camera == PUBLISHED[Intrinsics.FREIBURG3].camera
+    assert "published camera FREIBURG3" in caplog.text
 
 
 # Association

@@ -14,9 +14,11 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from framework.commands.running.detect import file_of_job, write_detections
+from framework.config.text_values import literal
 from framework.data import Frame
 from framework.datasets.ground_truth.labeled_mesh import unseen
 from framework.errors import ConfigError, DataError
+from framework.registry import text_kind
 from plugins.detectors.none import NoDetections
 from plugins.detectors.precomputed import Precomputed
 from tests.support.forked_commands import FAKE_CONF, completed
@@ -90,7 +92,8 @@ def test_detect_sweep_writes_file_per_job_and_table(tmp_path: Path) -> None:
     assert fake["overrides"] == "dataset=fake detector=fake out=found.json"
     assert (fake["mask_ap50.couch"], none["correct class"]) == ("1.0", "")
     [how] = [line for line in done.stderr.splitlines() if "use it with: " in line and "label_space" in line]
-    arguments = OverridesParser.create().parse_overrides(shlex.split(how.partition("use it with: ")[2]))
+    words = literal(shlex.split(how.partition("use it with: ")[2]), text_kind)
+    arguments = OverridesParser.create().parse_overrides(words)
     values = {argument.key_or_group: argument.value() for argument in arguments}
     assert values["detector.path"] == str(jobs[0] / "found.json")
     assert values["detector.label_space"] == str(jobs[0] / "found.labels.txt")
@@ -108,8 +111,7 @@ def test_detect_sweep_rejects_file_outside_job_folder(tmp_path: Path, out: str) 
     [
         ([], "out: expected a file name, got none; set out=detections.json"),
         (["out=absent/found.json"], "out: expected an existing parent folder, got none"),
-        (["out=2024"], "out: expected a path (in quotes if it looks like a number), got 2024"),
-        (["out=[a,b]"], "out: expected a path (in quotes if it looks like a number), got ['a', 'b']"),
+        (["out=2024/[a,b]"], "out: expected an existing parent folder, got none"),
     ],
 )
 def test_detect_errors_are_one_line(tmp_path: Path, overrides: list[str], message: str) -> None:
