@@ -11,7 +11,7 @@ import numpy as np
 from framework.checking import Finding, Verdict
 from framework.checking.matched_pairs import MatchedPair
 from framework.data import Float64
-from framework.datasets.frames.conventions import CameraAxes, PoseKind, PoseReading, QuaternionOrder
+from framework.datasets.frames.conventions import CameraAxes, Mirror, PoseKind, PoseReading, QuaternionOrder
 from framework.geometry import inverse, project, transform
 
 MAX_ERROR = 1.0  # fraction of the image width, limit of the error of a point; also used for points behind the camera
@@ -27,6 +27,7 @@ MIN_LOG_UNCERTAINTY = 0.07
 MAX_ERROR_INCREASE = 1.3
 WRONG_SCALE = 2.5  # minimum factor of a clearly wrong scale; during rotation, the scale is uncertain by up to 1.6
 USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
+UNPOSED = "tracker=voxel_hashing_icp"  # setting for recordings with unusable poses
 PLAUSIBLE = (0.2, 12.0)  # m, plausible median depth of a room
 
 
@@ -52,6 +53,12 @@ def readings(pose_unit: float = 1.0) -> Iterator[PoseReading]:
     """
     for order, kind, axes in product(QuaternionOrder, PoseKind, CameraAxes):
         yield PoseReading(kind, axes, order, pose_unit)
+
+
+def mirrored_readings(pose_unit: float = 1.0) -> Iterator[PoseReading]:
+    """Yield the pose conventions with a mirrored world and camera."""
+    for mirror, kind, axes in product((Mirror.Y, Mirror.Z, Mirror.X), PoseKind, CameraAxes):
+        yield PoseReading(kind, axes, mirrored=mirror, pose_unit=pose_unit)
 
 
 def fit(pairs: Sequence[MatchedPair], reading: PoseReading, depth_factor: float | None = None) -> PoseFit:
@@ -140,8 +147,13 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     if reading == given and now <= MAX_RELATIVE_ERROR * motion and chosen.depth_factor == 1.0:
         return PoseJudgment((Finding(Verdict.FINE, "poses", f"valid: {measured}"),), as_given, as_given, others)
     if chosen.error > MAX_RELATIVE_ERROR * motion:
+        mirrored = _mirrored_fit(informative, given, MAX_RELATIVE_ERROR * motion)
+        if mirrored is not None:
+            text = f"mirrored (a left-handed world): {measured}, and {mirrored.error:.1f} px without the mirroring"
+            settings = " ".join(_settings(mirrored.reading, given))
+            return PoseJudgment((Finding(Verdict.ERROR, "poses", text, settings),), as_given, mirrored, others)
         text = f"inconsistent with the images in all supported conventions: {measured}"
-        finding = Finding(Verdict.ERROR, "poses", text, "tracker=voxel_hashing_icp")
+        finding = Finding(Verdict.ERROR, "poses", text, UNPOSED)
         return PoseJudgment((finding,), as_given, best, others)
     findings = []
     if reading != given:
@@ -156,6 +168,13 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     if chosen.depth_factor != 1.0:
         findings.append(_scale_finding(chosen, depth_scale, median_depth))
     return PoseJudgment(tuple(findings), as_given, chosen, others)
+
+
+def _mirrored_fit(pairs: Sequence[MatchedPair], given: PoseReading, max_error: float) -> PoseFit | None:
+    """Return the best fit of a mirrored convention, or None if none of them fits with an error up to `max_error` px."""
+    fits = [fit(pairs, reading, 1.0) for reading in mirrored_readings(given.pose_unit)]
+    best = min(_equal_to_best(fits), key=lambda one: (len(_settings(one.reading, given)), one.error))
+    return best if best.error <= max_error else None
 
 
 def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> PoseFit:
@@ -199,6 +218,6 @@ def _equal_to_best(fits: Sequence[PoseFit]) -> list[PoseFit]:
 
 def _settings(reading: PoseReading, given: PoseReading) -> tuple[str, ...]:
     """Return the overrides KEY=VALUE that change the convention `given` to `reading`."""
-    names = ("pose_kind", "camera_axes", "quaternion_order")
+    names = ("mirrored", "pose_kind", "camera_axes", "quaternion_order")
     changed = [name for name in names if getattr(reading, name) != getattr(given, name)]
     return tuple(f"dataset.{name}={getattr(reading, name).name}" for name in changed)

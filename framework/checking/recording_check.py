@@ -11,12 +11,15 @@ import numpy as np
 
 from framework.checking import Finding, Verdict, pose_fit, registration
 from framework.checking.color_timing import check_color_delay
+from framework.checking.depth_normalization import check_normalization
+from framework.checking.frame_times import check_times
+from framework.checking.image_geometry import check_orientation, check_principal_point
 from framework.checking.matched_pairs import MatchedPair, Matcher
 from framework.checking.pose_delay import delayed, find_delay
-from framework.checking.pose_fit import PLAUSIBLE, USUAL_SCALES, PoseJudgment
+from framework.checking.pose_fit import PLAUSIBLE, UNPOSED, USUAL_SCALES, PoseJudgment
 from framework.checking.registration import EdgeAlignment, EdgeComparison, color_gradient
 from framework.data import Camera, Float64, Frame
-from framework.datasets.frames.conventions import PoseReading
+from framework.datasets.frames.conventions import MIRRORED_POSE, OF_MATRICES, Mirror, PoseReading
 from framework.datasets.frames.sequence_reader import Recording
 from framework.errors import DataError, FrameError
 from framework.interfaces import RGBDSequence, RGBDVideo
@@ -31,7 +34,6 @@ EDGE_WINDOW = 15 / 640  # side of the window for the contrast of an edge, as a f
 MAX_MOTION = 0.2  # fraction of the image width, maximum motion per frame for the trackers
 TYPICAL = 0.5, 4.5  # m, median depth of most rooms; real recordings have 1 to 3.5
 SHOWN_MOTION = 0.06  # fraction of the image width, motion of the pair in the figure; makes errors visible
-MAX_GAP = 0.5  # s, maximum interval between frames without a gap, or five times the median interval if larger
 
 log = logging.getLogger(__name__)
 
@@ -64,10 +66,14 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
         DataError: No frame is readable.
     """
     given, depth_delay = PoseReading(), 0
+    left_handed, sequence = _without_mirroring(sequence)
     if isinstance(sequence, Recording):
         given, depth_delay = sequence.pose_reading, sequence.depth_reading.depth_delay
-        # use all depth readings, and poses before conversion
-        sequence = replace(sequence, pose_reading=PoseReading(pose_delay=given.pose_delay), max_depth=0.0)
+        # use all depth readings, and poses before conversion, but rigid
+        mirrored = given.mirrored if given.mirrored in OF_MATRICES else Mirror.NONE
+        stored = PoseReading(pose_delay=given.pose_delay, mirrored=mirrored)
+        sequence = replace(sequence, pose_reading=stored, max_depth=0.0)
+        given = replace(given, mirrored=Mirror.NONE if mirrored is not Mirror.NONE else given.mirrored)
     count = len(sequence)
     chosen = [int(k) for k in np.unique(np.linspace(0, count - 1, CHECKED_FRAMES).round())]
     frames, errors = _read(sequence, chosen)
@@ -75,6 +81,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     if errors:
         text = f"{len(errors)} of {len(chosen)} checked frames cannot be read; first error: {errors[0]}"
         findings.append(Finding(Verdict.NOTE, "frames", text))
+    causes = _image_findings(sequence, chosen)
     depth_finding, median_depth = _check_depth(frames, farthest, _scale_of(sequence))
     longest = registration.MAX_DELAY
     room = min(longest, (count - 1) // 4)  # number of frames before and after each checked frame
@@ -94,6 +101,8 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     posed = [pair for pair in pairs if _is_posed(pair)]
     if any(frame.T_world_camera is not None for frame in frames):
         judgment, pose_delay = _judge_poses(sequence, posed, given, median_depth)
+        if depth_finding.setting and _is_inconsistent(judgment):
+            judgment = _judged_at_scale(sequence, starts, given, depth_finding.setting) or judgment
     else:
         no_poses = Finding(Verdict.FINE, "poses", "none in the recording; the camera is tracked")
         judgment, pose_delay = PoseJudgment((no_poses,), None, None), 0
@@ -101,9 +110,15 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     if not any(finding.subject == "depth" for finding in judgment.findings):
         findings.append(depth_finding)
     motion_finding = _check_motion(steps, len(neighbors), sequence.camera.width)
-    findings += [*judgment.findings, registration_finding, motion_finding, _check_sharpness(frames)]
-    findings += _check_times(sequence)
-    findings.append(check_color_delay(matcher))
+    of_poses = [left_handed] if left_handed and not _has_error(judgment) else judgment.findings
+    of_pairs = [*of_poses, registration_finding, check_color_delay(matcher)]
+    if any(one.subject == "poses" and one.verdict is Verdict.FINE for one in of_pairs if judgment.given):
+        causes = [replace(cause, verdict=Verdict.NOTE) if cause.subject == "camera" else cause for cause in causes]
+    if any(cause.verdict is Verdict.ERROR for cause in causes):
+        of_pairs = []  # the results of frame pairs are consequences
+        if any(cause.subject == "depth" for cause in causes):
+            findings = [finding for finding in findings if finding.subject != "depth"]
+    findings += [*causes, *of_pairs, motion_finding, _check_sharpness(frames), *check_times(sequence)]
     findings.append(Finding(Verdict.FINE, "sensor", f"{frames[0].sensor}"))
     camera = sequence.camera
     summary = (
@@ -113,6 +128,46 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     shown = min(posed or pairs, key=lambda pair: abs(pair.motion - SHOWN_MOTION * camera.width), default=None)
     meant = delayed(shown, _stored_poses(sequence), pose_delay) if shown is not None and pose_delay else shown
     return RecordingCheck(tuple(findings), summary, tuple(frames), tuple(by_delay), judgment, shown, meant)
+
+
+def _without_mirroring(sequence: RGBDSequence) -> tuple[Finding | None, RGBDSequence]:
+    """Return an error and the sequence without the mirroring if all poses have the determinant -1."""
+    if not isinstance(sequence, Recording) or not all(MIRRORED_POSE in one.error for one in sequence.contents.frames):
+        return None, sequence
+    reading = sequence.pose_reading
+    corrected = [replace(sequence, pose_reading=replace(reading, mirrored=option)) for option in OF_MATRICES]
+    errors = []
+    for one in corrected:
+        starts = [int(fraction * len(one)) for fraction in QUICK_STARTS]
+        pairs = [pair for pair in Matcher(one).pairs(starts) if _is_posed(pair)]
+        errors.append(pose_fit.fit(pairs, PoseReading(), 1.0).error if pairs else 0.0)
+    best = int(np.argmin(errors))
+    text = f"expected a right-handed world, got {MIRRORED_POSE}"
+    return Finding(Verdict.ERROR, "poses", text, f"dataset.mirrored={OF_MATRICES[best].name}"), corrected[best]
+
+
+def _is_inconsistent(judgment: PoseJudgment) -> bool:
+    return any(finding.setting == UNPOSED for finding in judgment.findings)
+
+
+def _has_error(judgment: PoseJudgment) -> bool:
+    return any(finding.verdict is Verdict.ERROR for finding in judgment.findings)
+
+
+def _judged_at_scale(
+    sequence: RGBDSequence, starts: Sequence[int], given: PoseReading, setting: str
+) -> PoseJudgment | None:
+    """Return the result of the pose checks at another depth scale, or None if the poses are then inconsistent, too."""
+    if not isinstance(sequence, Recording):
+        return None
+    scale = float(setting.partition("=")[2])
+    scaled = replace(sequence, depth_reading=replace(sequence.depth_reading, depth_scale=scale))
+    pairs = [pair for pair in Matcher(scaled).pairs(starts) if _is_posed(pair)]
+    if not pairs:
+        return None
+    median_depth = float(np.median(np.concatenate([pair.points_first[:, 2] for pair in pairs])))
+    judgment = pose_fit.judge(pairs, replace(given, pose_delay=0), scale, median_depth)
+    return None if _is_inconsistent(judgment) else judgment
 
 
 def _judge_poses(
@@ -140,6 +195,26 @@ def _judge_poses(
 def _stored_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
     """Return the poses of all frames in a recording, including frames that are not selected."""
     return [recorded.T_world_camera for recorded in sequence.contents.frames] if isinstance(sequence, Recording) else []
+
+
+def warn_of_images(sequence: RGBDVideo) -> None:
+    """Log a warning if the camera, the orientation of color images or the unit of depth of a few frames is wrong."""
+    if not isinstance(sequence, Recording):
+        return
+    chosen = [int(k) for k in np.unique([int(fraction * len(sequence)) for fraction in QUICK_STARTS])]
+    for finding in _image_findings(sequence, chosen):
+        if finding.verdict is Verdict.ERROR:
+            log.warning("%s: %s; run `instancemap check` for details", finding.subject, finding.text)
+
+
+def _image_findings(sequence: RGBDSequence, chosen: Sequence[int]) -> list[Finding]:
+    """Return the results for the camera, the color images and the depth images that explain other errors."""
+    found = (
+        check_principal_point(sequence.camera),
+        check_orientation(sequence, chosen),
+        check_normalization(sequence, chosen),
+    )
+    return [finding for finding in found if finding is not None]
 
 
 def warn_of_poses(sequence: RGBDVideo) -> None:
@@ -274,17 +349,3 @@ def _edge_width(frame: Frame) -> float:
     strong = slope >= max(float(np.quantile(slope, 0.95)), 1e-3)
     # the width of an edge is its contrast divided by its gradient
     return float(np.median(contrast[strong] / slope[strong])) if strong.any() else float(len(window))
-
-
-def _check_times(sequence: RGBDSequence) -> list[Finding]:
-    """Check the timestamps of a recording. Other sequences and short recordings have no result."""
-    if not isinstance(sequence, Recording) or len(sequence) < 3:
-        return []
-    times: Float64 = np.array([sequence.contents.frames[k].timestamp for k in sequence.chosen])
-    steps = np.diff(times)
-    usual = float(np.median(steps))
-    gaps = int((steps > max(MAX_GAP, 5 * usual)).sum())
-    text = f"{1 / usual:.3g} Hz for {times[-1] - times[0]:.1f} s"
-    if gaps:
-        return [Finding(Verdict.NOTE, "time", f"{text}, with {gaps} gaps of up to {steps.max():.1f} s")]
-    return [Finding(Verdict.FINE, "time", text)]

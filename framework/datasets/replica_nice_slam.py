@@ -43,7 +43,7 @@ class ReplicaNiceSlam(Recording):
         frames = []
         for k, pair in images.items():
             if k < len(poses):
-                frames.append(RecordedFrame.posed(pair, k / FRAME_RATE, poses[k].pose))
+                frames.append(RecordedFrame.posed(pair, k / FRAME_RATE, poses[k].stored_pose))
             else:
                 error = f"{pair.color_name}: expected pose {k} in traj.txt, got only {len(poses)} poses"
                 frames.append(RecordedFrame(pair, k / FRAME_RATE, error=error))

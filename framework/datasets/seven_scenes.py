@@ -107,7 +107,7 @@ def _registered(images: StoredImages) -> UInt16:
 
 def _pose(path: Path) -> Float64:
     """Return the pose T_world_camera (4, 4) in a file."""
-    return read_matrix(path).pose()
+    return read_matrix(path).stored_pose()
 
 
 def _color_pose(path: Path) -> Float64:

@@ -89,8 +89,9 @@ class TumRgbd(Recording):
     def open(self) -> Contents:
         color, depth = _read_list(self.folder / "rgb.txt"), _read_list(self.folder / "depth.txt")
         (camera, depth_scale, distortion, sensor), source = self._stored_camera(color)
+        tolerance = self.max_time_difference / self.time_unit
         color_times, depth_times = ([image.timestamp for image in images] for images in (color, depth))
-        pairs = associate(color_times, depth_times, self.max_time_difference)
+        pairs = associate(color_times, depth_times, tolerance)
         if not pairs:
             raise DataError(
                 f"{self.folder}: expected images of rgb.txt and depth.txt within dataset.max_time_difference "
@@ -99,7 +100,7 @@ class TumRgbd(Recording):
         if len(pairs) < len(color):
             log.info("%s: %d of %d color images have no depth image", self.name, len(color) - len(pairs), len(color))
         path = self.folder / "groundtruth.txt"
-        truth = Trajectory.of(path, read_tum_lines(path) if path_exists(path) else [], self.max_time_difference)
+        truth = Trajectory.of(path, read_tum_lines(path) if path_exists(path) else [], tolerance)
         frames = []
         for i, j in pairs:
             images, time = StoredImages.of_files(color[i].path, depth[j].path), color[i].timestamp

@@ -150,6 +150,18 @@ class PrintedMatrix:
         with errors_of(self.where):
             return nearest_rigid(self.values)
 
+    def stored_pose(self) -> Float64:
+        """Return the nearest rigid transform (4, 4), or the nearest mirrored one if the determinant is negative.
+
+        Raises:
+            DataError: The matrix is neither of them.
+        """
+        if not np.isfinite(self.values).all() or float(np.linalg.det(self.values[:3, :3])) >= 0:
+            return self.pose()
+        mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+        with errors_of(self.where):
+            return nearest_rigid(self.values @ mirror) @ mirror
+
     def camera(self, width: int, height: int) -> Camera:
         """Return the camera with this intrinsic matrix and the given image size, px.
 

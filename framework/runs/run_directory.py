@@ -229,8 +229,9 @@ def write_run(
     length = f"{len(video)} frames" if isinstance(video, RGBDSequence) else "live until Ctrl-C"
     log.info("mapping %s: %s, %s", video.name, length, chosen)
     if isinstance(video, Recording):  # third-party datasets may have another class
-        from framework.checking.recording_check import warn_of_poses
+        from framework.checking.recording_check import warn_of_images, warn_of_poses
 
+        warn_of_images(video)
         warn_of_poses(video)
     with signals_deferred(*ENDING) as interruption, watched_run(pipeline.viewer, directory, record.config) as outcome:
         with frozen_garbage_collector():

@@ -11,6 +11,7 @@ import numpy as np
 
 from framework.config.validation import check_bounds
 from framework.data import Array, Float64, Frame, Pose
+from framework.datasets.frames.conventions import TIME_UNITS
 from framework.errors import DataError, NoPoseError
 from framework.files.tum_trajectory import read_tum
 from framework.geometry import inverse
@@ -37,16 +38,17 @@ class TrajectoryFile(PoseTracker):
     path: Path  # trajectory in TUM format
     # maximum time difference between a frame and its pose, s, >= 0; frames without a pose are skipped
     max_time_difference: float = 0.02
+    time_unit: float = 1.0  # length of one unit of the timestamps of the file, s, in [1e-9, 1]; 1e-9 = nanoseconds
     time_offset: float = 0.0  # offset added to the timestamps of the file, s
     world_frame: World = World.FIRST_FRAME  # world frame of the poses
 
     def __post_init__(self) -> None:
-        check_bounds(self, max_time_difference=(0.0, 1e6), time_offset=(-1e12, 1e12))
+        check_bounds(self, max_time_difference=(0.0, 1e6), time_unit=(1e-9, 1.0), time_offset=(-1e12, 1e12))
         self.path = Path(self.path).expanduser()
         timestamps, self._T_file_camera = read_tum(self.path)
         if len(timestamps) == 0:
             raise DataError(f"{self.path}: expected poses in TUM format, got none")
-        self._timestamps = timestamps + self.time_offset
+        self._timestamps = timestamps * self.time_unit + self.time_offset
         self._T_world_file: Float64 | None = np.eye(4) if self.world_frame is World.FILE else None
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
@@ -60,14 +62,29 @@ class TrajectoryFile(PoseTracker):
         if difference > self.max_time_difference:
             raise NoPoseError(
                 f"frame {frame.index}: {self.path.name}: expected a pose within {self.max_time_difference:g} s "
-                f"(tracker.max_time_difference) of {frame.timestamp:.3f} s, got the nearest pose {difference:.3f} s "
-                "away"
+                f"(tracker.max_time_difference) of {frame.timestamp:.3f} s, got the nearest pose {difference:.6g} s "
+                f"away{self._time_fix(frame.timestamp)}"
             )
         T_file_camera = self._T_file_camera[nearest]
         if self._T_world_file is None:
             T_world_first = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
             self._T_world_file = T_world_first @ inverse(T_file_camera)
         return Pose(self._T_world_file @ T_file_camera)
+
+    def _time_fix(self, timestamp: float) -> str:
+        """Return the setting that brings the poses to the clock of a frame at `timestamp`, s, or ""."""
+        stored = (self._timestamps - self.time_offset) / self.time_unit
+        for unit, name in TIME_UNITS.items():
+            if unit != self.time_unit and np.abs(stored * unit - timestamp).min() <= self.max_time_difference:
+                return f"; set tracker.time_unit={unit:g} (the timestamps are in {name})"
+        first, last = self._timestamps[[0, -1]]
+        if first <= timestamp <= last:
+            return ""
+        offset = timestamp - first + self.time_offset
+        return (
+            f"; the poses are from {first:.6f} to {last:.6f} s: set tracker.time_offset={offset:.6f} if the first pose "
+            "is that of this frame"
+        )
 
     def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
         """Do nothing, because the poses are in the world frame of the map."""

@@ -52,7 +52,7 @@ def _read_intrinsics(path: Path, color: Iterable[Path]) -> Camera:
     side = 3 if len(values) == 9 else 4
     K = values.reshape(side, side)[:3, :3]
     fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-    if not np.allclose(K, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]):
+    if not np.allclose(K, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])):
         found = " / ".join(" ".join(f"{value:g}" for value in row) for row in K)
         raise DataError(f"{path}: expected intrinsics fx 0 cx / 0 fy cy / 0 0 1, got {found}")
     height, width = _size(path, color)

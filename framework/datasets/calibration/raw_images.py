@@ -12,6 +12,7 @@ from framework.config.validation import require
 from framework.data import Camera, Float32, UInt8, UInt16
 from framework.datasets.calibration.undistortion import Distortion, Undistortion
 from framework.errors import FrameError
+from framework.files.image_files import UPRIGHT, exif_orientation
 
 NO_READING = 65535  # uint16, written by some sensors instead of 0
 
@@ -80,4 +81,6 @@ class Calibration:
         """Raise FrameError if an image does not have the size of the camera."""
         if shape[:2] != self.camera.shape:
             expected = f"expected {self.camera.width}x{self.camera.height} px as in {self.source}"
-            raise FrameError(f"{name}: {expected}, got {shape[1]}x{shape[0]} px")
+            tag = exif_orientation(name) if isinstance(name, Path) else UPRIGHT
+            fix = "" if tag == UPRIGHT else f" with the EXIF orientation {tag}, which is not applied; rotate the pixels"
+            raise FrameError(f"{name}: {expected}, got {shape[1]}x{shape[0]} px{fix}")

@@ -15,10 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from framework.config.validation import require
 from framework.data import Float64
+from framework.errors import DataError
 from framework.geometry import inverse
 
 COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # depth units per meter; most sensors have 1000
 LONGEST_DELAY = 1000  # frames, maximum absolute delay of poses and depth images
+TIME_UNITS = {1e-9: "nanoseconds", 1e-6: "microseconds", 1e-3: "milliseconds"}
+"""Units of timestamps other than seconds, s."""
+
 AUTO = "AUTO"  # value of `dataset.color_delay`: estimate the delay
 LONGEST_COLOR_DELAY = 0.2  # s, maximum absolute delay of color behind depth
 
@@ -50,11 +54,50 @@ _AXES = {
 }
 
 
+class Mirror(Enum):
+    """Mirroring of stored poses, by programs with left-handed coordinates such as Unity and Unreal.
+
+    The world and the camera are mirrored together (S T S with a mirror matrix S), which keeps rotation matrices. If
+    only one of them is mirrored, the stored matrices have the determinant -1.
+    """
+
+    NONE = "not mirrored"
+    X = "world and camera, along x"
+    Y = "world and camera, along y"
+    Z = "world and camera, along z"
+    WORLD = "world only"
+    CAMERA = "camera only, along y"
+
+    def undone(self, stored: Float64) -> Float64:
+        """Return a stored transform (4, 4) without the mirroring."""
+        if self is Mirror.NONE:
+            return stored
+        if self is Mirror.WORLD:  # in another world frame for another axis, which is arbitrary
+            return _FLIPS["Y"] @ stored
+        if self is Mirror.CAMERA:
+            return stored @ _FLIPS["Y"]
+        return _FLIPS[self.name] @ stored @ _FLIPS[self.name]
+
+
+OF_MATRICES = (Mirror.WORLD, Mirror.CAMERA)
+"""Kinds of mirroring in which the determinant of stored matrices is -1."""
+
+_FLIPS = {name: np.diag([1.0 - 2 * (name == axis) for axis in "XYZ"] + [1.0]) for name in "XYZ"}
+
+
 class QuaternionOrder(Enum):
     """Order of the components of a quaternion."""
 
     XYZW = "x y z w"
     WXYZ = "w x y z"
+
+
+MIRRORED_POSE = "a mirrored pose (det R = -1, a left-handed world)"
+
+
+def is_mirrored(T: Float64) -> bool:
+    """Return True if the determinant of the rotation part of a transform (4, 4) is negative."""
+    return float(np.linalg.det(T[:3, :3])) < 0
 
 
 @dataclass(frozen=True)
@@ -69,6 +112,9 @@ class PoseReading:
     quaternion_order: QuaternionOrder = QuaternionOrder.XYZW  # component order of the stored quaternions
     pose_unit: float = 1.0  # length of one unit of the translations, m, in [1e-6, 1e6]; 0.001 = millimeters
     pose_delay: int = 0  # offset of the pose index, in [-1000, 1000]; image k has pose k + offset
+    # mirroring of the stored poses: NONE, X, Y or Z (world and camera, along this axis), WORLD or CAMERA (determinant
+    # -1)
+    mirrored: Mirror = Mirror.NONE
 
     def __post_init__(self) -> None:
         require(1e-6 <= self.pose_unit <= 1e6, "dataset.pose_unit", self.pose_unit, "a value in [1e-6, 1e6] m")
@@ -80,12 +126,23 @@ class PoseReading:
         )
 
     def pose(self, stored: Float64) -> Float64:
-        """Convert a stored rigid transform (4, 4) to T_world_camera (4, 4) with OpenCV's axes, in meters."""
+        """Convert a stored transform (4, 4) to T_world_camera (4, 4) with OpenCV's axes, in meters.
+
+        The transform is rigid, or mirrored with the determinant -1.
+
+        Raises:
+            DataError: The result is not rigid, because `mirrored` does not fit.
+        """
+        if is_mirrored(stored) != (self.mirrored in OF_MATRICES):
+            expected = f"expected {MIRRORED_POSE if not is_mirrored(stored) else 'a rigid transform'}"
+            got, fix = ("det R = 1", "NONE") if not is_mirrored(stored) else (MIRRORED_POSE, "WORLD")
+            raise DataError(f"pose: {expected}, got {got}; set dataset.mirrored={fix}")
         if self == PoseReading():
             return stored
         T = stored.copy()
         if self.quaternion_order is QuaternionOrder.WXYZ:
             T[:3, :3] = Rotation.from_quat(np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), -1)).as_matrix()
+        T = self.mirrored.undone(T)
         T[:3, 3] *= self.pose_unit
         if self.pose_kind is PoseKind.T_CAMERA_WORLD:
             T = inverse(T)

@@ -135,6 +135,7 @@ class Recording(RGBDSequence):
     # ground truth for the evaluation: labeled mesh (PLY with instances.json) or run directory; None = ground truth of
     # the recording
     ground_truth: Path | None = None
+    time_unit: float = 1.0  # length of one unit of the stored timestamps, s, in [1e-9, 1]; 1e-9 = nanoseconds
     # depth sensor, which selects the noise model: AUTO (from the recording, else KINECT_V1), EXACT (rendered depth),
     # KINECT_V1, REALSENSE_D435, TIME_OF_FLIGHT or PHONE_LIDAR
     sensor: SensorChoice = SensorChoice.AUTO
@@ -148,6 +149,7 @@ class Recording(RGBDSequence):
     def __post_init__(self) -> None:
         check_selection(self.start, self.stop, self.stride, self.frame_fraction)
         check_max_depth(self.max_depth)
+        require(1e-9 <= self.time_unit <= 1, "dataset.time_unit", self.time_unit, "a value in [1e-9, 1] s")
         color_delay_of(self.color_delay)
         self.root = folder_of(Path(self.root))
         self.folder = self.root / self.scene
@@ -157,8 +159,9 @@ class Recording(RGBDSequence):
         self.name = self.folder.resolve().name
         self.named_truth = None if self.ground_truth is None else read_named_truth(Path(self.ground_truth))
         stored = self.open()
+        timed = [_in_seconds(frame, self.time_unit) for frame in stored.frames]
         depth_scale = self.depth_reading.depth_scale or stored.depth_scale
-        posed = [_posed(frame, self.pose_reading) for frame in delay_poses(stored.frames, self.pose_reading.pose_delay)]
+        posed = [_posed(frame, self.pose_reading) for frame in delay_poses(timed, self.pose_reading.pose_delay)]
         ordered = _in_order_of_time(self.name, _with_plausible_image_times(self.name, posed))
         frames = delay_depth(ordered, self.depth_reading.depth_delay)
         self.contents = replace(stored, frames=frames, depth_scale=depth_scale)
@@ -357,6 +360,14 @@ def _with_later(frames: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[R
         yield frame, frames[k + delay] if 0 <= k + delay < len(frames) else None
 
 
+def _in_seconds(frame: RecordedFrame, unit: float) -> RecordedFrame:
+    """Return a frame with timestamps in s from timestamps in units of `unit` s."""
+    if unit == 1:
+        return frame
+    color, depth = (None if time is None else unit * time for time in (frame.color_timestamp, frame.depth_timestamp))
+    return replace(frame, timestamp=unit * frame.timestamp, color_timestamp=color, depth_timestamp=depth)
+
+
 def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
     """Convert the pose of a frame to the default convention.
 
@@ -364,7 +375,10 @@ def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
     """
     if recorded.T_world_camera is None:
         return recorded
-    T_world_camera = reading.pose(recorded.T_world_camera)
+    try:
+        T_world_camera = reading.pose(recorded.T_world_camera)
+    except DataError as error:
+        return RecordedFrame(recorded.images, recorded.timestamp, error=f"{recorded.images.color_name}: {error}")
     distance = math.hypot(*T_world_camera[:3, 3])
     if distance <= FARTHEST:
         return replace(recorded, T_world_camera=T_world_camera)

@@ -1,0 +1,278 @@
+"""Tests for errors of inputs that have other errors as consequences. Only the cause must be reported."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from framework.checking import Finding, Verdict
+from framework.checking.image_geometry import check_principal_point
+from framework.checking.recording_check import RecordingCheck, check, warn_of_images
+from framework.data import Camera, Float64
+from framework.datasets.frames.conventions import DepthReading, Mirror, PoseReading
+from framework.datasets.replica_nice_slam import ReplicaNiceSlam
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.datasets.tum_rgbd import TumRgbd
+from framework.errors import DataError
+from framework.files.tum_trajectory import write_tum
+from framework.geometry import inverse
+from tests.support.recordings.damaged import write_damaged
+
+pytestmark = pytest.mark.integration
+
+FARTHEST = 5.0  # m
+DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
+FRAMES = 14
+
+
+def errors(found: RecordingCheck) -> list[Finding]:
+    return [finding for finding in found.findings if finding.verdict is Verdict.ERROR]
+
+
+def desk(place: Path, poses: bool = True, pose: Callable[[Float64], Float64] = lambda T: T) -> Path:
+    """Write every second frame of the desk as undistorted images, with depth in mm."""
+    for name in ("color", "depth"):
+        (place / name).mkdir(parents=True)
+    frames = [DESK[2 * k] for k in range(FRAMES)]
+    for k, frame in enumerate(frames):
+        cv2.imwrite(str(place / f"color/{k:06d}.png"), frame.color[..., ::-1])
+        cv2.imwrite(str(place / f"depth/{k:06d}.png"), np.rint(1000 * frame.depth).astype(np.uint16))
+    camera = frames[0].camera
+    write_camera(place, 1, 1, camera)
+    if poses:
+        write_tum(place / "poses.txt", [k / 15 for k in range(FRAMES)], [pose(one.T_world_camera) for one in frames])
+    return place
+
+
+def write_camera(place: Path, x: float, y: float, camera: Camera = DESK.camera) -> None:
+    content = {"width": camera.width, "height": camera.height, "depth_scale": 1000}
+    content |= {"fx": x * camera.fx, "fy": y * camera.fy, "cx": x * camera.cx, "cy": y * camera.cy}
+    (place / "camera.json").write_text(json.dumps(content))
+
+
+# Depth normalized frame by frame
+
+
+def normalized(depth: np.ndarray, kind: str) -> np.ndarray:
+    valid = depth > 0
+    if kind == "inverse":
+        depth = np.where(valid, 1 / np.maximum(depth, 0.1), 0)
+    low, high = depth[valid].min(), depth[valid].max()
+    unit = np.where(valid, (depth - low) / (high - low), 0)
+    return {
+        "16 bits": np.rint(unit * 65535),
+        "8 bits times 257": np.rint(unit * 255) * 257,
+        "8 bits times 256": np.rint(unit * 255) * 256,
+        "8 bits": np.rint(unit * 255),
+        "inverse": np.rint(unit * 65535),
+        "by maximum": np.rint(np.where(valid, depth / high, 0) * 65535),
+        "to 10 m": np.rint(unit * 10_000),
+    }[kind].astype(np.uint16)
+
+
+KINDS = ["16 bits", "8 bits times 257", "8 bits times 256", "8 bits", "inverse", "by maximum", "to 10 m"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_check_of_normalized_depth_names_it_alone(tmp_path: Path, kind: str) -> None:
+    place = desk(tmp_path / "room", poses=kind != "inverse")
+    for path in (place / "depth").iterdir():
+        cv2.imwrite(str(path), normalized(cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / 1000, kind))
+    scale = 13107.0 if "16" in kind or "257" in kind else 0.0
+    [finding] = errors(check(RgbdFolder(place, depth_reading=DepthReading(depth_scale=scale)), FARTHEST))
+    assert (finding.subject, finding.setting) == ("depth", "")
+    assert finding.text.startswith("normalized frame by frame")
+
+
+@pytest.mark.parametrize("scale", [1000, 5000, 13107, 256, 4000])
+def test_check_of_clipped_depth_in_fixed_unit_is_not_normalized(tmp_path: Path, scale: int) -> None:
+    """Depth beyond the range of uint16 is clipped to 65535 or removed."""
+    place = desk(tmp_path / "room")
+    for path in (place / "depth").iterdir():
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / 1000
+        cv2.imwrite(str(path), np.minimum(np.rint(scale * depth), 65535).astype(np.uint16))
+    found = check(RgbdFolder(place, depth_reading=DepthReading(depth_scale=float(scale))), FARTHEST)
+    assert not any("normalized" in finding.text for finding in found.findings)
+    assert not errors(found)
+
+
+# Intrinsics of another resolution
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "fix"),
+    [
+        (2, 2, "multiply fx, fy, cx, cy by 0.5"),
+        (3, 3, "multiply fx, fy, cx, cy by 0.3333"),
+        (0.5, 0.5, "multiply fx, fy, cx, cy by 2"),
+        (0.25, 0.25, "multiply fx, fy, cx, cy by 4"),
+        (3, 2.25, "multiply fx, cx by 0.3333 and fy, cy by 0.4444"),
+        (1.5, 1.5, "multiply fx, fy, cx, cy by 0.6667"),
+    ],
+)
+def test_principal_point_of_other_resolution_names_factor(x: float, y: float, fix: str) -> None:
+    for cx, cy in ((318.6, 235.3), (322.0, 246.0)):
+        finding = check_principal_point(Camera(640, 480, 517 * x, 517 * y, cx * x, cy * y))
+        assert finding is not None
+        assert fix in finding.text
+
+
+@pytest.mark.parametrize(("cx", "cy"), [(319.5, 239.5), (318.6, 255.3), (300, 270), (365, 205), (639 / 2 + 100, 240)])
+def test_principal_point_near_center_has_no_error(cx: float, cy: float) -> None:
+    assert check_principal_point(Camera(640, 480, 517, 517, cx, cy)) is None
+
+
+@pytest.mark.parametrize("factor", [2, 0.5])
+def test_check_of_double_intrinsics_names_camera_alone(
+    tmp_path: Path, factor: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    place = desk(tmp_path / "room")
+    write_camera(place, factor, factor)
+    [finding] = errors(check(RgbdFolder(place), FARTHEST))
+    assert finding.subject == "camera"
+    assert f"multiply fx, fy, cx, cy by {1 / factor:g}" in finding.text
+    warn_of_images(RgbdFolder(place))
+    assert "principal point" in caplog.text
+
+
+# Depth scale
+
+
+def test_check_of_wrong_depth_scale_does_not_blame_poses(tmp_path: Path) -> None:
+    place = desk(tmp_path / "room")
+    reading = DepthReading(depth_scale=5000.0)
+    found = errors(check(RgbdFolder(place, stop=12, stride=2, depth_reading=reading), FARTHEST))
+    assert [finding.setting for finding in found] == ["dataset.depth_scale=1000"]
+
+
+# Timestamps
+
+
+@pytest.mark.parametrize(
+    ("unit", "start"), [(1e-9, 1305031102.0), (1e-3, 1305031102.0), (1e-6, 0.0), (1e-9, 0.0), (1e-3, 5.0)]
+)
+def test_check_of_times_in_other_unit_names_setting(tmp_path: Path, unit: float, start: float) -> None:
+    place = desk(tmp_path / "room")
+    lines = [line.split(maxsplit=1) for line in (place / "poses.txt").read_text().splitlines()]
+    text = "".join(f"{(float(time) + start) / unit:.0f} {rest}\n" for time, rest in lines)
+    (place / "poses.txt").write_text(text)
+    found = check(RgbdFolder(place), FARTHEST)
+    assert [finding.setting for finding in errors(found)] == [f"dataset.time_unit={unit:g}"]
+    corrected = RgbdFolder(place, time_unit=unit)
+    assert corrected[3].timestamp == pytest.approx(start + 3 / 15, abs=1e-2)
+    assert not errors(check(corrected, FARTHEST))
+
+
+# Mirrored worlds
+
+
+@pytest.mark.parametrize("axis", ["X", "Y", "Z"])
+@pytest.mark.parametrize("inverted", [False, True])
+def test_check_of_mirrored_poses_names_setting(tmp_path: Path, axis: str, inverted: bool) -> None:
+    S = np.diag([1.0 - 2 * (name == axis) for name in "XYZ"] + [1.0])
+    place = desk(tmp_path / "room", pose=lambda T: inverse(S @ T @ S) if inverted else S @ T @ S)
+    kind = " dataset.pose_kind=T_CAMERA_WORLD" if inverted else ""
+    [finding] = errors(check(RgbdFolder(place), FARTHEST))
+    assert finding.setting == f"dataset.mirrored={axis}{kind}"
+
+
+def replica(place: Path, pose: Callable[[Float64], Float64]) -> ReplicaNiceSlam:
+    """Write the desk in the layout of Replica, with poses as matrices."""
+    desk(place / "desk", poses=False)
+    (place / "room/results").mkdir(parents=True)
+    for k in range(FRAMES):
+        color = cv2.imread(str(place / f"desk/color/{k:06d}.png"))
+        cv2.imwrite(str(place / f"room/results/frame{k:06d}.jpg"), color)
+        (place / f"desk/depth/{k:06d}.png").rename(place / f"room/results/depth{k:06d}.png")
+    c = DESK.camera
+    content = {"w": 640, "h": 480, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "scale": 1000}
+    (place / "cam_params.json").write_text(json.dumps({"camera": content}))
+    poses = [pose(DESK[2 * k].T_world_camera).ravel() for k in range(FRAMES)]
+    (place / "room/traj.txt").write_text("\n".join(" ".join(map(str, T)) for T in poses))
+    return ReplicaNiceSlam(place, scene="room")
+
+
+@pytest.mark.parametrize(
+    ("flips", "side", "mirrored"),
+    [
+        ((1, -1, 1), "world", "WORLD"),
+        ((-1, 1, 1), "world", "WORLD"),
+        ((1, 1, -1), "world", "WORLD"),
+        ((-1, -1, -1), "world", "WORLD"),
+        ((1, -1, 1), "camera", "CAMERA"),
+    ],
+)
+def test_check_of_poses_with_negative_determinant_names_setting(
+    tmp_path: Path, flips: tuple[int, int, int], side: str, mirrored: str
+) -> None:
+    S = np.diag([*flips, 1.0])
+    sequence = replica(tmp_path, (lambda T: S @ T) if side == "world" else (lambda T: T @ S))
+    [finding] = errors(check(sequence, FARTHEST))
+    assert finding.setting == f"dataset.mirrored={mirrored}"
+    assert "left-handed world" in finding.text
+    reading = PoseReading(mirrored=Mirror[mirrored])
+    corrected = ReplicaNiceSlam(tmp_path, scene="room", pose_reading=reading)
+    assert not errors(check(corrected, FARTHEST))
+
+
+@pytest.mark.parametrize("mirror", [Mirror.WORLD, Mirror.CAMERA])
+def test_mirrored_setting_of_rigid_poses_raises(mirror: Mirror) -> None:
+    with pytest.raises(DataError, match=r"set dataset\.mirrored=NONE"):
+        PoseReading(mirrored=mirror).pose(np.eye(4))
+    with pytest.raises(DataError, match=r"set dataset\.mirrored=WORLD"):
+        PoseReading().pose(np.diag([1.0, -1.0, 1.0, 1.0]))
+
+
+# EXIF orientation
+
+
+@pytest.mark.parametrize("poses", [True, False])
+@pytest.mark.parametrize("tag", [2, 3, 4])
+def test_check_of_images_with_orientation_names_it_alone(tmp_path: Path, poses: bool, tag: int) -> None:
+    place = desk(tmp_path / "room", poses)
+    for path in list((place / "color").iterdir()):
+        color = cv2.imread(str(path))[..., ::-1]
+        stored = {2: color[:, ::-1], 3: color[::-1, ::-1], 4: color[::-1]}[tag]
+        write_tagged(path, stored, tag)
+    [finding] = errors(check(RgbdFolder(place), FARTHEST))
+    assert finding.subject == "color"
+    assert f"EXIF orientation {tag}" in finding.text
+
+
+@pytest.mark.parametrize("tag", [1, 3, 6])
+def test_check_of_upright_pixels_with_orientation_has_no_error(tmp_path: Path, tag: int) -> None:
+    place = desk(tmp_path / "room")
+    for path in list((place / "color").iterdir()):
+        write_tagged(path, cv2.imread(str(path))[..., ::-1], tag)
+    found = check(RgbdFolder(place), FARTHEST)
+    assert not errors(found)
+    assert any("EXIF" in finding.text for finding in found.findings) == (tag != 1)
+
+
+def test_size_error_names_orientation(tmp_path: Path) -> None:
+    place = desk(tmp_path / "room")
+    for path in list((place / "color").iterdir()):
+        write_tagged(path, np.rot90(cv2.imread(str(path))[..., ::-1]), 6)
+    with pytest.raises(DataError, match=r"got 480x640 px with the EXIF orientation 6"):
+        RgbdFolder(place)
+
+
+def write_tagged(path: Path, color: np.ndarray, tag: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = tag
+    Image.fromarray(np.ascontiguousarray(color)).save(path.with_suffix(".jpg"), exif=exif, quality=95)
+    path.unlink()
+
+
+def test_valid_recording_logs_no_warning(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    with caplog.at_level(logging.WARNING):
+        warn_of_images(DESK)
+        warn_of_images(RgbdFolder(write_damaged(tmp_path / "desk", DESK, frames=20)))
+    assert not caplog.records
