@@ -21,6 +21,9 @@ MIN_MOTION = 0.01  # fraction of the image width; pairs with less motion fit any
 MAX_RELATIVE_ERROR = 0.2  # fraction of the motion, maximum error of valid poses; real recordings have 0.01 to 0.06
 ALIKE, ALIKE_PX = 1.15, 0.2  # ratio, and offset in px, up to which two errors count as equal
 MAX_OTHER_RATIO = 0.5  # maximum ratio of the error of another convention to the error of the configured convention
+MAX_MIRRORED_RATIO = (
+    0.7  # maximum ratio of the error of a mirrored convention to the error of the best other convention
+)
 # minimum uncertainty of the logarithm of the depth factor, due to inaccurate poses and depth in real recordings
 MIN_LOG_UNCERTAINTY = 0.07
 # maximum ratio of the errors with the estimated and the stored scale, for a clearly wrong scale
@@ -146,12 +149,13 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     measured = f"median error of {now:.1f} px in {len(informative)} pairs of frames with a motion of {motion:.0f} px"
     if reading == given and now <= MAX_RELATIVE_ERROR * motion and chosen.depth_factor == 1.0:
         return PoseJudgment((Finding(Verdict.FINE, "poses", f"valid: {measured}"),), as_given, as_given, others)
+    mirrored = _mirrored_fit(informative, given)
+    # a mirrored rotation is a rotation with other axes, so translations decide
+    if mirrored.error < min(MAX_MIRRORED_RATIO * chosen.error, MAX_RELATIVE_ERROR * motion):
+        text = f"mirrored (a left-handed world): {measured}, and {mirrored.error:.1f} px without the mirroring"
+        settings = " ".join(_settings(mirrored.reading, given))
+        return PoseJudgment((Finding(Verdict.ERROR, "poses", text, settings),), as_given, mirrored, others)
     if chosen.error > MAX_RELATIVE_ERROR * motion:
-        mirrored = _mirrored_fit(informative, given, MAX_RELATIVE_ERROR * motion)
-        if mirrored is not None:
-            text = f"mirrored (a left-handed world): {measured}, and {mirrored.error:.1f} px without the mirroring"
-            settings = " ".join(_settings(mirrored.reading, given))
-            return PoseJudgment((Finding(Verdict.ERROR, "poses", text, settings),), as_given, mirrored, others)
         text = f"inconsistent with the images in all supported conventions: {measured}"
         finding = Finding(Verdict.ERROR, "poses", text, UNPOSED)
         return PoseJudgment((finding,), as_given, best, others)
@@ -170,11 +174,10 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     return PoseJudgment(tuple(findings), as_given, chosen, others)
 
 
-def _mirrored_fit(pairs: Sequence[MatchedPair], given: PoseReading, max_error: float) -> PoseFit | None:
-    """Return the best fit of a mirrored convention, or None if none of them fits with an error up to `max_error` px."""
+def _mirrored_fit(pairs: Sequence[MatchedPair], given: PoseReading) -> PoseFit:
+    """Return the best fit of a mirrored convention."""
     fits = [fit(pairs, reading, 1.0) for reading in mirrored_readings(given.pose_unit)]
-    best = min(_equal_to_best(fits), key=lambda one: (len(_settings(one.reading, given)), one.error))
-    return best if best.error <= max_error else None
+    return min(_equal_to_best(fits), key=lambda one: (len(_settings(one.reading, given)), one.error))
 
 
 def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> PoseFit:

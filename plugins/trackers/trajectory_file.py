@@ -62,7 +62,7 @@ class TrajectoryFile(PoseTracker):
         if difference > self.max_time_difference:
             raise NoPoseError(
                 f"frame {frame.index}: {self.path.name}: expected a pose within {self.max_time_difference:g} s "
-                f"(tracker.max_time_difference) of {frame.timestamp:.3f} s, got the nearest pose {difference:.6g} s "
+                f"(tracker.max_time_difference) of {frame.timestamp:.3f} s, got the nearest pose {difference:.3f} s "
                 f"away{self._time_fix(frame.timestamp)}"
             )
         T_file_camera = self._T_file_camera[nearest]

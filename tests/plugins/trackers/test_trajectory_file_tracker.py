@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -107,3 +108,28 @@ def test_trajectory_file_missing_or_invalid_parameter_raises(tmp_path: Path, pat
         TrajectoryFile(path, max_time_difference=-1)
     with pytest.raises(ConfigError, match=r"tracker\.path"):
         registered.built("tracker", "trajectory_file")
+
+
+@pytest.mark.parametrize(
+    ("unit", "start"), [(1e-9, 1305031100.0), (1e-9, 3.0), (1e-6, 1305031100.0), (1e-3, 1305031100.0), (1e-3, 20.0)]
+)
+def test_trajectory_file_in_other_time_unit_names_setting(tmp_path: Path, unit: float, start: float) -> None:
+    path = tmp_path / "other.txt"
+    write_tum(path, [(start + k / 30) / unit for k in range(3)], [pose_at(k) for k in range(3)])
+    frames = [replace(frame, timestamp=start + frame.timestamp) for frame in CornerRoom(frames=3)]
+    with pytest.raises(NoPoseError, match=rf"set tracker\.time_unit={unit:g} \(the timestamps are in \w+seconds\)"):
+        TrajectoryFile(path).track(frames[0], SCENE)
+    tracker = TrajectoryFile(path, time_unit=unit)
+    for k, frame in enumerate(frames):
+        np.testing.assert_allclose(tracker.track(frame, SCENE).T_world_camera, pose_at(k), atol=1e-9)
+
+
+@pytest.mark.parametrize(("stored", "frames"), [(0.0, 1305031100.0), (1305031100.0, 0.0), (86400.0, 5.5)])
+def test_trajectory_file_of_other_clock_names_offset(tmp_path: Path, stored: float, frames: float) -> None:
+    path = tmp_path / "other.txt"
+    write_tum(path, [stored + k / 30 for k in range(3)], [pose_at(k) for k in range(3)])
+    first = replace(CornerRoom(frames=1)[0], timestamp=frames)
+    with pytest.raises(NoPoseError) as caught:
+        TrajectoryFile(path).track(first, SCENE)
+    offset = float(re.findall(r"set tracker\.time_offset=(\S+)", str(caught.value))[0])
+    TrajectoryFile(path, time_offset=offset).track(first, SCENE)
