@@ -153,8 +153,8 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     # a mirrored rotation is a rotation with other axes, so translations decide
     if mirrored.error < min(MAX_MIRRORED_RATIO * chosen.error, MAX_RELATIVE_ERROR * motion):
         text = f"mirrored (a left-handed world): {measured}, and {mirrored.error:.1f} px without the mirroring"
-        settings = " ".join(_settings(mirrored.reading, given))
-        return PoseJudgment((Finding(Verdict.ERROR, "poses", text, settings),), as_given, mirrored, others)
+        finding = Finding(Verdict.ERROR, "poses", text, " ".join(_settings(mirrored.reading, given)))
+        return PoseJudgment((finding,), as_given, mirrored, others)
     if chosen.error > MAX_RELATIVE_ERROR * motion:
         text = f"inconsistent with the images in all supported conventions: {measured}"
         finding = Finding(Verdict.ERROR, "poses", text, UNPOSED)

@@ -377,8 +377,8 @@ def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
         return recorded
     try:
         T_world_camera = reading.pose(recorded.T_world_camera)
-    except DataError as error:
-        return RecordedFrame(recorded.images, recorded.timestamp, error=f"{recorded.images.color_name}: {error}")
+    except DataError as reason:
+        return RecordedFrame(recorded.images, recorded.timestamp, error=f"{recorded.images.color_name}: {reason}")
     distance = math.hypot(*T_world_camera[:3, 3])
     if distance <= FARTHEST:
         return replace(recorded, T_world_camera=T_world_camera)
