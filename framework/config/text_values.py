@@ -41,7 +41,7 @@ class TextKind(Enum):
     PATH = auto()  # unlike for TEXT, numbers are also invalid if they are not converted to text
     OPTIONAL_PATH = auto()
     LIST = auto()  # list of strings
-    CONDITION = auto()  # any value, compared as text
+    CONDITION = auto()  # values of any type, compared as text
 
     @classmethod
     def of(cls, kind: Any) -> TextKind:
@@ -216,9 +216,12 @@ def _literal_value(value: str, kind: TextKind, interpolates: Callable[[str], boo
     listed = kind in (TextKind.LIST, TextKind.CONDITION) and value.startswith("[") and value.endswith("]")
     if isinstance(found, QuotedString) or not value:
         return value
+    if kind is TextKind.CONDITION:
+        forms = [form for one in (_split(value[1:-1]) if listed else [value]) for form in _forms(one)]
+        return forms[0] if len(forms) == 1 and not listed else f"[{','.join(forms)}]"
     if listed and parsed is None:  # Hydra cannot parse the elements
         return f"[{','.join(_literal_value(one, TextKind.TEXT, interpolates) for one in _split(value[1:-1]))}]"
-    if kind is TextKind.LIST or (kind is TextKind.CONDITION and parsed is not None and "_" not in value):
+    if kind is TextKind.LIST:
         return value
     if kind in (TextKind.OPTIONAL_TEXT, TextKind.OPTIONAL_PATH) and value == "null":
         return value
@@ -230,6 +233,15 @@ def _literal_value(value: str, kind: TextKind, interpolates: Callable[[str], boo
         return value
     literal_text = value if "${" not in value or interpolates(value) else without_interpolation(value)
     return _in_quotes(literal_text)
+
+
+def _forms(value: str) -> list[str]:
+    """Return a value of a condition as Hydra reads it and, if that is another text, also as typed."""
+    parsed = _parsed(f"key={value}")
+    if parsed is None or parsed.is_sweep_override():
+        return [_in_quotes(value)]
+    is_text = isinstance(parsed._value, QuotedString) or str(parsed._value) == value
+    return [value] if is_text else [value, _in_quotes(value)]
 
 
 def _is_plain(override: str) -> bool:

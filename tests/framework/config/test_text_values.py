@@ -155,7 +155,10 @@ def test_value_in_stored_config_is_literal(name: str) -> None:
     ("word", "expected"),
     [
         ("table.caption=AP50, all scenes (Küche)", "table.caption='AP50, all scenes (Küche)'"),
-        ("table.where.dataset.scene=2024_01_05", "table.where.dataset.scene='2024_01_05'"),
+        ("table.where.dataset.scene=2024_01_05", "table.where.dataset.scene=[2024_01_05,'2024_01_05']"),
+        ("table.where.dataset.scene=[1e3,a]", "table.where.dataset.scene=[1e3,'1e3',a]"),
+        ("table.where.dataset.scene=room (2)", "table.where.dataset.scene='room (2)'"),
+        ("table.where.seed=2", "table.where.seed=2"),
         ("table.where.dataset.scene=[Küche,b]", "table.where.dataset.scene=['Küche',b]"),
         ("table.names.a=our's", r"table.names.a='our\'s'"),
         ("table.columns=[fps]", "table.columns=[fps]"),
