@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shlex
 from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
@@ -37,7 +38,7 @@ def changed_tables(directory: Path) -> Iterator[str]:
     for path in stored:
         expected, found = (_grids(path.suffix, text) for text in (rendered[path.name], read_text(path)))
         if _shape(expected) != _shape(found):
-            rewrite = f"run instancemap tables {directory}"
+            rewrite = f"run instancemap tables {shlex.quote(str(directory))}"
             yield f"{path}: expected the rows and columns of the runs' table, got different ones; {rewrite}"
             continue
         for grid, stored_grid in zip(expected, found, strict=True):

@@ -49,7 +49,7 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("out=2024",), "out: expected a path"),
+        (("out=2024",), "out: expected a name with the suffix"),
         (("out=check.jpg",), "out: expected a name with the suffix"),
         (("out=nowhere/check.png",), "out: expected an existing parent folder, got none"),
         (("dataset=rgbd_folder", "dataset.root=nowhere"), "dataset.root: expected an existing folder, got nowhere"),
