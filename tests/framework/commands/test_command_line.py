@@ -20,6 +20,7 @@ pytestmark = pytest.mark.integration
 def test_directory_name_is_built_from_overrides() -> None:
     assert directory_name("dataset.root=../a/b,seed=1") == "dataset.root=.._a_b,seed=1"
     assert directory_name("") == "defaults"
+    assert directory_name(r"fuser.note=$\{seed\}.note") == "fuser.note=$seed}.note"
 
 
 def test_directory_name_of_long_overrides_is_short_and_unique() -> None:
