@@ -1,0 +1,136 @@
+"""Matching of stored detections to the frames of a sequence."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from enum import Enum
+from pathlib import Path
+
+from framework.detection.stored.image_names import ImageId, ImageName, shown
+from framework.errors import DataError
+
+KEY = "detector.image_ids"
+
+log = logging.getLogger(__name__)
+
+
+class ImageIds(Enum):
+    """Meaning of whole numbers as image ids."""
+
+    AUTO = "frame indices from 0; a number in a file name is that of the color image"
+    FROM_ZERO = "frame indices from 0, also in file names"
+    FROM_ONE = "frame indices from 1, also in file names"
+    FILE_NUMBER = "numbers in the names of the color images"
+
+
+class ImageIndex:
+    """Image ids of stored detections, by frame."""
+
+    def __init__(self, images: Iterable[ImageId], ids: ImageIds) -> None:
+        self.ids = ids
+        self._by_stem: dict[str, ImageName] = {}
+        self._by_number: dict[int, list[ImageId]] = {}
+        for image in dict.fromkeys(images):
+            if isinstance(image, ImageName):
+                self._by_stem[image.stem] = image
+            if (number := image if isinstance(image, int) else image.number) is not None:
+                self._by_number.setdefault(number, []).append(image)
+
+    def of_frame(self, index: int, name: ImageName | None) -> ImageId | None:
+        """Return the image id of a frame, or None without detections.
+
+        Args:
+            index: The index of the frame.
+            name: The name of its color image; None = no file.
+
+        Raises:
+            DataError: Several image ids belong to the frame.
+        """
+        found = self._candidates(index, name)
+        if len(found) > 1:
+            raise DataError(
+                f"detector.path: expected one image of frame {index}, got {' and '.join(map(shown, found))}; "
+                "split the file by sequence"
+            )
+        return found[0] if found else None
+
+    def _candidates(self, index: int, name: ImageName | None) -> list[ImageId]:
+        file_number = None if name is None else name.number
+        if self.ids is ImageIds.FILE_NUMBER:
+            return [] if file_number is None else self._by_number.get(file_number, [])
+        if self.ids is not ImageIds.AUTO:
+            return self._by_number.get(index + (self.ids is ImageIds.FROM_ONE), [])
+        if name is not None and name.stem in self._by_stem:
+            return [self._by_stem[name.stem]]
+        indices: list[ImageId] = [one for one in self._by_number.get(index, []) if isinstance(one, int)]
+        if name is None or file_number is None:  # without a file number, a number in a name is a frame index
+            return indices + [one for one in self._by_number.get(index, []) if isinstance(one, ImageName)]
+        same = self._by_number.get(file_number, [])
+        return indices + [one for one in same if isinstance(one, ImageName) and one.names(name)]
+
+    def matched(self, frames: Mapping[int, str]) -> dict[int, ImageId]:
+        """Return the image id of each frame with detections, by frame index.
+
+        Args:
+            frames: The path of each color image by frame index; "" = no file.
+        """
+        found = {k: self.of_frame(k, ImageName.of(path) if path else None) for k, path in frames.items()}
+        return {k: image for k, image in found.items() if image is not None}
+
+
+def check_matches(path: Path, images: Sequence[ImageId], ids: ImageIds, frames: Mapping[int, str], warns: bool) -> None:
+    """Check that image ids belong to the frames of a sequence, and log how they were read.
+
+    Args:
+        path: The file with the detections, for messages.
+        images: The distinct image ids.
+        ids: The meaning of whole numbers.
+        frames: The file name of each color image by frame index, of all frames of the sequence; "" = no file.
+        warns: True = log a warning if the ids may also have another meaning.
+
+    Raises:
+        DataError: No id belongs to a frame, or only another meaning of whole numbers fits all of them.
+    """
+    matched = ImageIndex(images, ids).matched(frames)
+    known = set(matched.values())
+    unmatched = [image for image in images if image not in known]
+    others = [(one, matches) for one in ImageIds if (matches := _complete(images, one, frames)) not in ({}, matched)]
+    fixes = " or ".join(f"{KEY}={one.name}" for one, _ in others)
+    first = next(iter(frames.values())) or "frame 0"
+    if unmatched and others:
+        raise DataError(
+            f"{KEY}: expected ids of the {len(frames)} frames (first image: {first}), got {len(unmatched)} of "
+            f"{len(images)} ids without a frame (first: {shown(unmatched[0])}) in {path} with {ids.name}; set {fixes}"
+        )
+    if not matched:
+        raise DataError(
+            f"detector.path: expected detections of this sequence ({len(frames)} frames, first image: {first}), got "
+            f"{path} with detections of {len(images)} other images (first: {shown(images[0])}); check that the file "
+            "belongs to this sequence"
+        )
+    if unmatched:
+        log.warning(
+            "%s: expected detections of this sequence only (%d frames, first image: %s), got %d of %d images that "
+            "match no frame (first: %s); check that the file belongs to this sequence",
+            path, len(frames), first, len(unmatched), len(images), shown(unmatched[0]),
+        )  # fmt: skip
+    index, image = next(iter(matched.items()))
+    log.info("%s: detections of %d of %d frames; %s is frame %d%s", path, len(matched), len(frames), shown(image),
+             index, f" ({frames[index]})" if frames[index] else "")  # fmt: skip
+    likely = [one for one, _ in others if one is not ImageIds.FROM_ONE or 1 in matched]
+    if likely and warns and ids is ImageIds.AUTO and not unmatched:
+        log.warning(
+            "%s: image ids read as frame indices from 0, and none is 0 or they are also numbers in file names; set "
+            "%s if they have another meaning, or %s=FROM_ZERO if they are frame indices",
+            path, " or ".join(f"{KEY}={one.name}" for one in likely), KEY,
+        )  # fmt: skip
+
+
+def _complete(images: Sequence[ImageId], ids: ImageIds, frames: Mapping[int, str]) -> dict[int, ImageId]:
+    """Return the frame of each image id, or an empty dictionary unless all ids have a frame."""
+    try:
+        matched = ImageIndex(images, ids).matched(frames)
+    except DataError:
+        return {}
+    return matched if set(matched.values()) == set(images) else {}
