@@ -11,8 +11,10 @@ from enum import Enum
 
 import numpy as np
 
-from framework.data import Float32
+from framework.data import Bool, Float32, Int32
 from framework.detection.candidates import Candidates, check_scores, corners, described
+from framework.detection.masks.binary_masks import masks_from_prototypes
+from framework.detection.masks.letterbox import Letterbox
 from framework.detection.runtimes.onnx_network import ExportMetadata, Outputs
 from framework.errors import DataError
 
@@ -41,6 +43,20 @@ class SegmentationOutput:
     candidates: Candidates
     coefficients: Float32  # (K, M)
     prototypes: Float32  # (M, h, w)
+
+    def masks(
+        self, chosen: Int32, borders: Float32, letterbox: Letterbox, shape: tuple[int, int], threshold: float
+    ) -> Bool:
+        """Return the masks (N, H, W) of the chosen candidates.
+
+        Args:
+            chosen: The indices (N,) of the candidates.
+            borders: The boxes (N, 4) x1 y1 x2 y2 of the chosen candidates in the image, px.
+            letterbox: The placement of the image in the input of the network.
+            shape: The image size (height, width), px.
+            threshold: The minimum probability of a pixel in the mask.
+        """
+        return masks_from_prototypes(self.coefficients[chosen], self.prototypes, borders, letterbox, shape, threshold)
 
 
 @dataclass(frozen=True)
@@ -167,7 +183,9 @@ def _table_and_prototypes(outputs: Outputs) -> tuple[Float32, Float32]:
     if len(outputs) != 2 or len(tables) != 1 or len(maps) != 1:
         raise DataError(
             "detector.weights: expected two outputs, a table (1, 4 + classes + M, K), or (1, K, 6 + M) with "
-            f"suppression, and prototypes (1, M, h, w), got {described(outputs)}"
+            f"suppression, and prototypes (1, M, h, w), or boxes, classes and masks of RF-DETR, torchvision or "
+            f"Detectron2, got {described(outputs)}; use detector=rf_detr_seg or detector=transformers_segmentation for "
+            "models on huggingface.co"
         )
     return tables[0], maps[0]
 

@@ -91,10 +91,78 @@ def recognize(
         )
     if others:
         log.warning(
-            "%s: class ids read as %s, so %d is %r; expected ids of one numbering only, got ids that are also valid "
-            "otherwise (%d would be %s); set %s if they are not COCO's annotation ids",
-            where, numbering.name, example, names[example], example, alternatives, fixes,
+            "%s: class ids read as %s, so %d is %r, but it could be %s; set %s if the ids are not those of COCO's "
+            "annotation files, or %s=%s to confirm",
+            where, numbering.name, example, names[example], alternatives, fixes, KEY, numbering.name,
         )  # fmt: skip
     else:
         log.info("%s: class ids read as %s, so %d is %r", where, numbering.name, example, names[example])
     return numbering
+
+
+def label_ids(ids: CategoryIds, labels: Sequence[str], published: CategoryIds | None) -> list[int]:
+    """Return the number of each class in the label output of a network, and log an example.
+
+    Args:
+        ids: The numbering.
+        labels: The class names.
+        published: The numbering of published networks of this layout; None = unknown. AUTO uses it. For labels other
+            than COCO's, COCO_91 is replaced by FROM_ONE.
+
+    Raises:
+        ConfigError: The numbering is AUTO and unknown, or does not match the labels.
+    """
+    is_coco = tuple(labels) == COCO
+    numbering = ids
+    if ids is CategoryIds.AUTO:
+        if published is None:
+            choices = [one.name for one in possible_numberings(labels)]
+            raise ConfigError(
+                f"{KEY}: expected the numbering of the network's labels ({', '.join(choices)}), got AUTO for a layout "
+                f"without a known numbering; set {' or '.join(f'{KEY}={choice}' for choice in choices)}"
+            )
+        numbering = CategoryIds.FROM_ONE if published is CategoryIds.COCO_91 and not is_coco else published
+    numbers = numbering.of(labels)
+    example = labels.index("chair") if is_coco else 0
+    others = " or ".join(f"{KEY}={one.name}" for one in possible_numberings(labels) if one is not numbering)
+    log.info(
+        "%s: labels of the network read as %s, so %d is %r; set %s if the network counts otherwise",
+        KEY, numbering.name, numbers[example], labels[example], others,
+    )  # fmt: skip
+    return numbers
+
+
+def column_ids(ids: CategoryIds, labels: Sequence[str], columns: int) -> list[int]:
+    """Return the column of each class in a table with C class columns, and log an example.
+
+    Args:
+        ids: The numbering of the columns.
+        labels: The class names.
+        columns: The number of class columns C.
+
+    Raises:
+        DataError: The table has another number of columns.
+        ConfigError: The numbering is AUTO, and the table has one more column than classes.
+    """
+    count, is_coco = len(labels), tuple(labels) == COCO
+    numbering, shift = ids, 0
+    if ids is CategoryIds.AUTO:
+        if is_coco and columns in (len(COCO_BY_ID) - 1, len(COCO_BY_ID)):
+            numbering, shift = CategoryIds.COCO_91, len(COCO_BY_ID) - columns
+        elif columns == count:
+            numbering = CategoryIds.FROM_ZERO
+        elif columns == count + 1:
+            raise ConfigError(
+                f"{KEY}: expected the numbering of {columns} class columns for {count} labels, got AUTO; set "
+                f"{KEY}=FROM_ONE (first column unused) or {KEY}=FROM_ZERO (last column unused)"
+            )
+    wanted = [k - shift for k in numbering.of(labels)] if numbering is not CategoryIds.AUTO else []
+    if not wanted or max(wanted) >= columns:
+        coco = f", or {len(COCO_BY_ID)}" if is_coco else ""
+        raise DataError(
+            f"detector.label_space: expected {count} or {count + 1}{coco} class columns, got {columns}; set another "
+            f"label_space, or {KEY} to the numbering of the columns"
+        )
+    example = labels.index("chair") if is_coco else 0
+    log.info("%s: class columns read as %s, so column %d is %r", KEY, numbering.name, wanted[example], labels[example])
+    return wanted
