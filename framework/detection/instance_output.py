@@ -213,26 +213,22 @@ def recognize_instances(
     if names is None or names.boxes == TENSORFLOW_BOXES:  # y1 x1 y2 x2
         return None
     found = _unbatched(outputs)[names.boxes]
+    in_unit = bool(np.abs(found).max() <= LARGEST_UNIT) if len(found) else None
     if not names.scores:
-        columns = outputs[names.classes].shape[-1]
-        ids = column_ids(category_ids, labels, columns)
-        kind, unit = BoxKind.CENTER if boxes is BoxKind.AUTO else boxes, True
-        if len(found) and np.abs(found).max() > LARGEST_UNIT:
+        if in_unit is False:
             raise DataError(
                 f"detector.weights: expected boxes in 0..1 next to class columns, got {found.max():.3g} in "
                 f"{names.boxes}; export without postprocessing"
             )
-        return InstanceLayout(names, shape, ids, kind, unit, columns)
-    in_unit = bool(np.abs(found).max() <= LARGEST_UNIT) if len(found) else None
+        columns = outputs[names.classes].shape[-1]
+        kind = BoxKind.CENTER if boxes is BoxKind.AUTO else boxes
+        return InstanceLayout(names, shape, column_ids(category_ids, labels, columns), kind, True, columns)
     if names.network is Network.TORCHVISION and in_unit and not names.masks:
         names = replace(names, network=Network.UNKNOWN)  # another SSD with the same names
-    published = {Network.TORCHVISION: CategoryIds.COCO_91, Network.DETECTRON2: CategoryIds.FROM_ZERO}.get(names.network)
-    ids = label_ids(category_ids, labels, published)
-    kind = boxes
-    if kind is BoxKind.AUTO:
-        ordered = (found[:, 2:] >= found[:, :2]).all()
-        kind = BoxKind.CORNER if ordered or not in_unit else BoxKind.CENTER
-    return InstanceLayout(names, shape, ids, kind, in_unit, 0)
+    published = {Network.TORCHVISION: CategoryIds.COCO_91, Network.DETECTRON2: CategoryIds.FROM_ZERO}
+    ids = label_ids(category_ids, labels, published.get(names.network))
+    detected = BoxKind.CENTER if in_unit and (found[:, 2:] < found[:, :2]).any() else BoxKind.CORNER
+    return InstanceLayout(names, shape, ids, detected if boxes is BoxKind.AUTO else boxes, in_unit, 0)
 
 
 def _recognize_names(outputs: Outputs, integers: Collection[str]) -> OutputNames | None:

@@ -89,14 +89,12 @@ class Precomputed(Detector):
             log.info("%s: %d of %d detections dropped because their classes have no COCO name: %s",
                      self.path, int((~known).sum()), len(stored), ", ".join(lost))  # fmt: skip
         self._images = list(dict.fromkeys(one.image for one in stored))
-        self._index = ImageIndex(self._images, self.image_ids)
+        self._index = ImageIndex(self._images, self.image_ids, self.path)
         self._complete = all(one.probabilities is not None for one in stored)
         self._of_image: dict[ImageId, list[tuple[StoredDetection, Float32]]] = defaultdict(list)
         for one, row, is_known in zip(stored, probabilities, known, strict=True):
             if is_known and one.score >= self.score_threshold:
                 self._of_image[one.image].append((one, row))
-        for of_image in self._of_image.values():
-            of_image.sort(key=lambda pair: -pair[0].score)  # stable: equal scores keep the order of the file
         self._matched = False
         self._requested: set[int] = set()
 
@@ -112,11 +110,12 @@ class Precomputed(Detector):
 
     def detect(self, frame: Frame) -> Detections:
         name = ImageName.of(frame.image_name) if frame.image_name else None
-        image = self._index.of_frame(frame.index, name)
-        self._expect_a_match(frame, image)
-        stored = None if image is None else self._of_image.get(image)
+        images = self._index.of_frame(frame.index, name)
+        self._expect_a_match(frame, bool(images))
+        stored = [pair for image in images for pair in self._of_image.get(image, [])]
         if not stored:
             return Detections.none(frame.camera.shape, self.classes)
+        stored.sort(key=lambda pair: -pair[0].score)  # stable: equal scores keep the order of the file
         masks = np.stack([_mask(one, frame) for one, _ in stored])
         tight = tight_boxes(masks)
         return Detections(
@@ -147,9 +146,9 @@ class Precomputed(Detector):
         rows[only_label] = spread_rest(rows[only_label], scores[only_label], self.class_spread)
         return rows, known
 
-    def _expect_a_match(self, frame: Frame, image: ImageId | None) -> None:
+    def _expect_a_match(self, frame: Frame, found: bool) -> None:
         """Raise DataError or log a warning if the frames requested so far have no detections."""
-        if self._matched or image is not None:
+        if self._matched or found:
             self._matched = True
             return
         self._requested.add(frame.index)

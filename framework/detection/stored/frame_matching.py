@@ -27,8 +27,9 @@ class ImageIds(Enum):
 class ImageIndex:
     """Image ids of stored detections, by frame."""
 
-    def __init__(self, images: Iterable[ImageId], ids: ImageIds) -> None:
+    def __init__(self, images: Iterable[ImageId], ids: ImageIds, path: Path) -> None:
         self.ids = ids
+        self.path = path  # for messages
         self._by_stem: dict[str, ImageName] = {}
         self._by_number: dict[int, list[ImageId]] = {}
         for image in dict.fromkeys(images):
@@ -37,23 +38,24 @@ class ImageIndex:
             if (number := image if isinstance(image, int) else image.number) is not None:
                 self._by_number.setdefault(number, []).append(image)
 
-    def of_frame(self, index: int, name: ImageName | None) -> ImageId | None:
-        """Return the image id of a frame, or None without detections.
+    def of_frame(self, index: int, name: ImageName | None) -> tuple[ImageId, ...]:
+        """Return the image ids of a frame: none, one, or a number and names with this number.
 
         Args:
             index: The index of the frame.
             name: The name of its color image; None = no file.
 
         Raises:
-            DataError: Several image ids belong to the frame.
+            DataError: Images of several sequences belong to the frame.
         """
         found = self._candidates(index, name)
-        if len(found) > 1:
+        prefixes = {one.prefix for one in found if isinstance(one, ImageName)}
+        if len(prefixes) > 1:
             raise DataError(
-                f"detector.path: expected one image of frame {index}, got {' and '.join(map(shown, found))}; "
+                f"{self.path}: expected one image of frame {index}, got {' and '.join(map(shown, found))}; "
                 "split the file by sequence"
             )
-        return found[0] if found else None
+        return tuple(found)
 
     def _candidates(self, index: int, name: ImageName | None) -> list[ImageId]:
         file_number = None if name is None else name.number
@@ -61,22 +63,22 @@ class ImageIndex:
             return [] if file_number is None else self._by_number.get(file_number, [])
         if self.ids is not ImageIds.AUTO:
             return self._by_number.get(index + (self.ids is ImageIds.FROM_ONE), [])
-        if name is not None and name.stem in self._by_stem:
-            return [self._by_stem[name.stem]]
         indices: list[ImageId] = [one for one in self._by_number.get(index, []) if isinstance(one, int)]
+        if name is not None and name.stem in self._by_stem:
+            return [*indices, self._by_stem[name.stem]]
         if name is None or file_number is None:  # without a file number, a number in a name is a frame index
             return indices + [one for one in self._by_number.get(index, []) if isinstance(one, ImageName)]
         same = self._by_number.get(file_number, [])
         return indices + [one for one in same if isinstance(one, ImageName) and one.names(name)]
 
-    def matched(self, frames: Mapping[int, str]) -> dict[int, ImageId]:
-        """Return the image id of each frame with detections, by frame index.
+    def matched(self, frames: Mapping[int, str]) -> dict[int, tuple[ImageId, ...]]:
+        """Return the image ids of each frame with detections, by frame index.
 
         Args:
-            frames: The path of each color image by frame index; "" = no file.
+            frames: The file name of each color image by frame index; "" = no file.
         """
-        found = {k: self.of_frame(k, ImageName.of(path) if path else None) for k, path in frames.items()}
-        return {k: image for k, image in found.items() if image is not None}
+        found = {k: self.of_frame(k, ImageName.of(name) if name else None) for k, name in frames.items()}
+        return {k: images for k, images in found.items() if images}
 
 
 def check_matches(path: Path, images: Sequence[ImageId], ids: ImageIds, frames: Mapping[int, str], warns: bool) -> None:
@@ -92,10 +94,19 @@ def check_matches(path: Path, images: Sequence[ImageId], ids: ImageIds, frames: 
     Raises:
         DataError: No id belongs to a frame, or only another meaning of whole numbers fits all of them.
     """
-    matched = ImageIndex(images, ids).matched(frames)
-    known = set(matched.values())
-    unmatched = [image for image in images if image not in known]
-    others = [(one, matches) for one in ImageIds if (matches := _complete(images, one, frames)) not in ({}, matched)]
+    matched = ImageIndex(images, ids, path).matched(frames)
+    frame_of: dict[ImageId, int] = {}
+    for k, found in matched.items():
+        for image in found:
+            if (other := frame_of.setdefault(image, k)) != k:
+                raise DataError(
+                    f"{path}: expected one frame with the image {shown(image)}, got frames {other} and {k} "
+                    f"({frames[k]}); use frame indices as image ids"
+                )
+    unmatched = [image for image in images if image not in frame_of]
+    others = [
+        (one, matches) for one in ImageIds if (matches := _complete(path, images, one, frames)) not in ({}, matched)
+    ]
     fixes = " or ".join(f"{KEY}={one.name}" for one, _ in others)
     first = next(iter(frames.values())) or "frame 0"
     if unmatched and others:
@@ -115,11 +126,13 @@ def check_matches(path: Path, images: Sequence[ImageId], ids: ImageIds, frames: 
             "match no frame (first: %s); check that the file belongs to this sequence",
             path, len(frames), first, len(unmatched), len(images), shown(unmatched[0]),
         )  # fmt: skip
-    index, image = next(iter(matched.items()))
+    index, (image, *_) = next(iter(matched.items()))
     log.info("%s: detections of %d of %d frames; %s is frame %d%s", path, len(matched), len(frames), shown(image),
              index, f" ({frames[index]})" if frames[index] else "")  # fmt: skip
-    likely = [one for one, _ in others if one is not ImageIds.FROM_ONE or 1 in matched]
-    if likely and warns and ids is ImageIds.AUTO and not unmatched:
+    # names of files are certain; numbers are suspicious if they begin at 1, or if files have these numbers, too
+    by_index = [k for one, k in frame_of.items() if isinstance(one, int) or not _is_named(one, frames[k])]
+    likely = [one for one, _ in others if one is not ImageIds.FROM_ONE or min(by_index, default=0) == 1]
+    if likely and by_index and warns and ids is ImageIds.AUTO and not unmatched:
         log.warning(
             "%s: image ids read as frame indices from 0, and none is 0 or they are also numbers in file names; set "
             "%s if they have another meaning, or %s=FROM_ZERO if they are frame indices",
@@ -127,10 +140,18 @@ def check_matches(path: Path, images: Sequence[ImageId], ids: ImageIds, frames: 
         )  # fmt: skip
 
 
-def _complete(images: Sequence[ImageId], ids: ImageIds, frames: Mapping[int, str]) -> dict[int, ImageId]:
-    """Return the frame of each image id, or an empty dictionary unless all ids have a frame."""
+def _complete(
+    path: Path, images: Sequence[ImageId], ids: ImageIds, frames: Mapping[int, str]
+) -> dict[int, tuple[ImageId, ...]]:
+    """Return the image ids by frame, or an empty dictionary unless all ids have a frame."""
     try:
-        matched = ImageIndex(images, ids).matched(frames)
+        matched = ImageIndex(images, ids, path).matched(frames)
     except DataError:
         return {}
-    return matched if set(matched.values()) == set(images) else {}
+    return matched if {one for found in matched.values() for one in found} == set(images) else {}
+
+
+def _is_named(image: ImageName, file_name: str) -> bool:
+    """Return True if an image id is the name or number of a file, False if it is the index of a frame."""
+    name = ImageName.of(file_name)
+    return image.stem == name.stem or (bool(file_name) and name.number is not None)

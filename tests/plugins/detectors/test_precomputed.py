@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -348,8 +349,9 @@ def test_precomputed_possible_sequence_mismatch_warns_once(tmp_path: Path, caplo
 
 
 def test_precomputed_coco_91_ids_with_other_label_space_raise(tmp_path: Path) -> None:
+    path = write(tmp_path, entry(category_name=None, category_id=1))
     with pytest.raises(ConfigError, match="FROM_ONE or FROM_ZERO"):
-        Precomputed(write(tmp_path, entry(category_name=None, category_id=1)), label_space="nyu40")
+        Precomputed(path, label_space="nyu40", category_ids=CategoryIds.COCO_91)
 
 
 def test_precomputed_invalid_parameter_raises(tmp_path: Path) -> None:
@@ -364,3 +366,87 @@ def test_precomputed_unusable_or_duplicate_label_raises(tmp_path: Path) -> None:
     (tmp_path / "labels.txt").write_text("chair\nchair\n")
     with pytest.raises(ConfigError, match=r"detector\.label_space: expected unique names, got 'chair' twice"):
         Precomputed(write(tmp_path, entry()), label_space=str(tmp_path / "labels.txt"))
+
+
+# File names
+
+
+@pytest.mark.parametrize(
+    ("image_name", "image_id"),
+    [
+        ("000004.jpg", "color/000004.jpg"),
+        ("frame_000012.jpg", "frame_000012.png"),
+        ("000012.png", "color\\000012.png"),
+        ("1305031102.175304.png", "rgb/1305031102.175304.png"),
+        ("frame-000007.color.png", "seq-01/frame-000007.color.png"),
+    ],
+)
+def test_precomputed_file_name_belongs_to_frame_with_this_file(tmp_path: Path, image_name: str, image_id: str) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id=image_id)))
+    assert len(detector.detect(replace(frame(2), image_name=image_name))) == 1
+    assert len(detector.detect(replace(frame(4), image_name="000099.png"))) == 0
+
+
+def test_precomputed_mask_named_like_color_image_is_read(tmp_path: Path) -> None:
+    detector = Precomputed(write_folder(tmp_path, name="frame_000003"))
+    assert len(detector.detect(replace(frame(1), image_name="frame_000003.jpg"))) == 2
+
+
+class NamedRoom(CornerRoom):
+    """A room whose frames have numbered files with gaps."""
+
+    def image_names(self) -> dict[int, str]:
+        return {k: f"{2 * k:06d}.jpg" for k in range(len(self))}
+
+
+def test_precomputed_detections_of_other_files_raise(tmp_path: Path) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id="color/000007.jpg")))
+    with pytest.raises(DataError, match=r"expected detections of this sequence .*000000\.jpg.*first: '000007'"):
+        detector.check_sequence(NamedRoom())
+    detector = Precomputed(write(tmp_path, entry(image_id=len(NamedRoom()))))
+    with pytest.raises(DataError, match=r"set detector\.image_ids=FROM_ONE"):
+        detector.check_sequence(NamedRoom())
+
+
+def test_precomputed_file_names_without_numbers_need_named_frames(tmp_path: Path) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id="left.png")))
+    with pytest.raises(DataError, match=r"expected frame numbers .*first: 'left'.*frame 0 has no file"):
+        detector.detect(frame())
+
+
+# Own classes
+
+
+@pytest.mark.parametrize(
+    ("labels", "found", "parameters", "name"),
+    [
+        (("forklift", "pallet"), {"category_id": 1}, {"category_ids": CategoryIds.FROM_ONE}, "forklift"),
+        (("forklift", "pallet"), {"category_id": 2}, {}, "pallet"),
+        (("forklift", "pallet"), {"category_id": 0}, {}, "forklift"),
+        (("forklift", "pallet", "chair"), {"category_name": "pallet"}, {}, "pallet"),
+        (("forklift", "pallet", "chair"), {"category_id": 3}, {}, "chair"),
+    ],
+)
+def test_precomputed_own_classes_keep_their_names(
+    tmp_path: Path, labels: tuple[str, ...], found: dict[str, Any], parameters: dict[str, Any], name: str
+) -> None:
+    (tmp_path / "labels.txt").write_text("\n".join(labels))
+    one = entry(**{"category_name": None, **found})
+    detected_one = detected(tmp_path, one, label_space=str(tmp_path / "labels.txt"), **parameters)
+    assert detected_one.classes[int(detected_one.class_probabilities[0].argmax())] == name
+
+
+def test_precomputed_ambiguous_own_ids_raise(tmp_path: Path) -> None:
+    (tmp_path / "labels.txt").write_text("forklift\npallet")
+    with pytest.raises(ConfigError, match=r"1 is 'forklift' by FROM_ONE or 'pallet' by FROM_ZERO; set detector\.cat"):
+        detected(tmp_path, entry(category_name=None, category_id=1), label_space=str(tmp_path / "labels.txt"))
+
+
+def test_precomputed_mask_folder_keeps_own_classes(tmp_path: Path) -> None:
+    (tmp_path / "labels.txt").write_text("forklift\npallet")
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    write_folder(folder, listed=[{"id": 7, "class": "forklift", "score": 0.9}])
+    found = Precomputed(folder, label_space=str(tmp_path / "labels.txt")).detect(frame(3))
+    assert found.classes == ("forklift", "pallet")
+    assert found.class_probabilities[0].argmax() == 0
