@@ -32,7 +32,7 @@ from framework.detection.candidates import (
 from framework.detection.masks.binary_masks import masks_from_grids, paste_masks
 from framework.detection.masks.letterbox import ImageFormat, Letterbox, Level, Placement, Preprocessing
 from framework.detection.runtimes.onnx_network import Outputs
-from framework.detection.segmentation_output import LARGEST_UNIT, BoxKind
+from framework.detection.segmentation_output import CONFIDENT, LARGEST_UNIT, BoxKind
 from framework.errors import DataError
 from framework.vocabulary.category_ids import CategoryIds, column_ids, label_ids
 
@@ -94,7 +94,9 @@ class InstanceOutput:
             shape: The image size (height, width), px.
             threshold: The minimum probability of a pixel in the mask.
         """
-        grids = _probabilities(self.grids[chosen])
+        grids = self.grids[chosen]
+        if _are_logits(self.grids):
+            grids = _sigmoid(grids)
         if self.in_boxes:
             return paste_masks(grids, borders, shape, threshold)
         complete = np.tile(np.array([-0.5, -0.5, shape[1] - 0.5, shape[0] - 0.5], np.float32), (len(chosen), 1))
@@ -149,16 +151,25 @@ class InstanceLayout:
         if self.columns:
             if classes.shape != (len(boxes), self.columns):
                 raise DataError(f"detector.weights: expected {self.columns} class columns, got {described(outputs)}")
-            class_scores = _probabilities(classes)[:, self.ids]
+            class_scores = (_sigmoid(classes) if _are_logits(classes) else classes)[:, self.ids]
         else:
             class_scores = class_scores_of_labels(arrays[self.names.scores], classes, self.ids)
         check_scores(class_scores, "detector.weights", fix="")
         if self.boxes is BoxKind.CENTER:
             boxes = corners(boxes)
-        unit = bool(len(boxes) and np.abs(boxes).max() <= LARGEST_UNIT) if self.unit is None else self.unit
-        if unit:
+        elif len(unordered := boxes[self._confident_and_unordered(boxes, class_scores)]):
+            raise DataError(
+                f"detector.weights: expected corners x1 y1 x2 y2 in confident detections, got {unordered[0].tolist()}; "
+                "set detector.box_format=CENTER with detector=onnx_segmentation, or export with corners"
+            )
+        if _in_unit(boxes) if self.unit is None else self.unit:
             boxes = boxes * np.array([self.shape[1], self.shape[0]] * 2, np.float32)
         return Candidates(boxes, class_scores)
+
+    @staticmethod
+    def _confident_and_unordered(boxes: Float32, class_scores: Float32) -> Bool:
+        confident = class_scores.max(axis=1, initial=0.0) >= CONFIDENT
+        return np.asarray(confident & (boxes[:, 2:] < boxes[:, :2]).any(axis=1), np.bool_)
 
     def candidates_of_boxes(self, outputs: Outputs) -> Candidates:
         """Decode the boxes of a network, and distribute the remainder of the score of labels over the other classes."""
@@ -213,7 +224,7 @@ def recognize_instances(
     if names is None or names.boxes == TENSORFLOW_BOXES:  # y1 x1 y2 x2
         return None
     found = _unbatched(outputs)[names.boxes]
-    in_unit = bool(np.abs(found).max() <= LARGEST_UNIT) if len(found) else None
+    in_unit = _in_unit(found)
     if not names.scores:
         if in_unit is False:
             raise DataError(
@@ -250,9 +261,8 @@ def _recognize_names(outputs: Outputs, integers: Collection[str]) -> OutputNames
     mask = masks[0] if masks else ""
     if len(columns) == 1 and not vectors:
         logits = arrays[columns[0]]
-        has_logits = logits.size and (logits.min() < 0 or logits.max() > 1)
         is_named = _base(boxes[0]) in DETR_BOXES or _base(columns[0]) in DETR_LOGITS
-        is_detr = len(logits) == len(arrays[boxes[0]]) and (has_logits or is_named)
+        is_detr = len(logits) == len(arrays[boxes[0]]) and (_are_logits(logits) or is_named)
         return OutputNames(Network.DETR, boxes[0], columns[0], masks=mask) if is_detr else None
     classes = [name for name in vectors if name in integers] or [name for name in vectors if _means_classes(name)]
     if columns or len(vectors) != 2 or len(classes) != 1:
@@ -287,8 +297,16 @@ def _means_classes(name: str) -> bool:
     return any(word in name.lower() for word in ("label", "class", "logit"))
 
 
-def _probabilities(values: Float32) -> Float32:
-    """Return probabilities for probabilities or logits. Logits are recognized by values outside of [0, 1]."""
-    if values.size == 0 or (values.min() >= 0 and values.max() <= 1):
-        return values
-    return np.asarray(1 / (1 + np.exp(-np.clip(values, -80, 80))), np.float32)
+def _are_logits(values: Float32) -> bool:
+    """Return True if values are logits, False if they are probabilities."""
+    return bool(values.size and (values.min() < 0 or values.max() > 1))
+
+
+def _sigmoid(logits: Float32) -> Float32:
+    return np.asarray(1 / (1 + np.exp(-np.clip(logits, -80, 80))), np.float32)
+
+
+def _in_unit(boxes: Float32) -> bool | None:
+    """Return True if boxes (K, 4) are in 0..1, False if they are in px, and None without boxes or with padding only."""
+    largest = float(np.abs(boxes).max(initial=0.0))
+    return largest <= LARGEST_UNIT if largest > 0 else None

@@ -161,7 +161,7 @@ def column_ids(ids: CategoryIds, labels: Sequence[str], columns: int) -> list[in
         coco = f", or {len(COCO_BY_ID)}" if is_coco else ""
         raise DataError(
             f"detector.label_space: expected {count} or {count + 1}{coco} class columns, got {columns}; set another "
-            f"label_space, or {KEY} to the numbering of the columns"
+            f"label_space, or {KEY}=FROM_ONE (first column unused) or {KEY}=FROM_ZERO"
         )
     example = labels.index("chair") if is_coco else 0
     log.info("%s: class columns read as %s, so column %d is %r", KEY, numbering.name, wanted[example], labels[example])

@@ -65,6 +65,17 @@ def test_onnx_segmentation_published_export_finds_chair(
     assert iou(mask) > 0.9
 
 
+def test_onnx_segmentation_dynamic_input_needs_size(tmp_path: Path) -> None:
+    weights = export(tmp_path / "n.onnx", (3, "height", "width"), mask_rcnn(62, (320, 320)), dynamic=True, empty=True)
+    with pytest.raises(ConfigError, match=r"set detector\.input_size=640"):
+        OnnxSegmentation(weights=weights, device="cpu")
+    name, mask, _ = the_object(OnnxSegmentation(weights=weights, device="cpu", input_size=320))
+    assert name == "chair"
+    letterboxed = np.zeros_like(CHAIR)  # the image covers the upper 240 of 320 px
+    letterboxed[40:120, X1:X2] = True
+    assert iou(mask, letterboxed) > 0.9
+
+
 def test_onnx_segmentation_complete_torchvision_mask_is_read(tmp_path: Path) -> None:
     outputs = mask_rcnn(62, WIDE[1:])
     pasted = np.zeros((5, 1, *WIDE[1:]))
@@ -128,6 +139,10 @@ def renamed(outputs: Any, **names: str) -> Any:
         (
             renamed(mask_rcnn(62, SQUARE[2:]), labels="6570", boxes="6568"),
             r"category_ids: expected the numbering of .*set detector\.category_ids=COCO_91 or detector\.category_ids=F",
+        ),
+        (
+            mask_rcnn(62, SQUARE[2:]) | {"boxes": np.tile([200.0, 200.0, 90.0, 90.0], (5, 1))},
+            r"weights: expected corners x1 y1 x2 y2 .*set detector\.box_format=CENTER",
         ),
         (mask_rcnn(12, SQUARE[2:]), r"category_ids: expected labels 1 to 90 of 80 classes, got 12"),
     ],

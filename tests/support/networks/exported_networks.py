@@ -18,7 +18,9 @@ BOX = (0.125, 0.25, 0.375, 0.75)  # x1 y1 x2 y2, fractions of the input
 Outputs = Mapping[str, np.ndarray[Any, Any]]
 
 
-def export(path: Path, shape: tuple[int, ...], outputs: Outputs, dynamic: bool = False, empty: bool = False) -> Path:
+def export(
+    path: Path, shape: tuple[int | str, ...], outputs: Outputs, dynamic: bool = False, empty: bool = False
+) -> Path:
     """Write a network with constant outputs.
 
     Args:
