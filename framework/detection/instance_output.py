@@ -30,7 +30,7 @@ from framework.detection.candidates import (
     spread_evenly,
 )
 from framework.detection.masks.binary_masks import masks_from_grids, paste_masks
-from framework.detection.masks.letterbox import ImageFormat, Letterbox, Level, Placement, Preprocessing
+from framework.detection.masks.letterbox import ImageFormat, ImageFormatChoice, Letterbox, Level, Placement
 from framework.detection.runtimes.onnx_network import Outputs
 from framework.detection.segmentation_output import CONFIDENT, LARGEST_UNIT, BoxKind
 from framework.errors import DataError
@@ -43,7 +43,7 @@ DETR_BOXES, DETR_LOGITS = ("dets", "pred_boxes"), ("logits", "pred_logits")  # n
 log = logging.getLogger(__name__)
 
 
-class Network(Enum):
+class NetworkAuthor(Enum):
     """Author of a network, which determines its conventions."""
 
     DETR = "RF-DETR or another DETR"
@@ -55,10 +55,10 @@ class Network(Enum):
 TENSORFLOW_BOXES = "detection_boxes"  # of TensorFlow's object detection API
 IMAGENET_BLACK = (-0.485 / 0.229, -0.456 / 0.224, -0.406 / 0.225)  # RGB, (0 - mean) / standard deviation
 IMAGENET_WHITE = (0.515 / 0.229, 0.544 / 0.224, 0.594 / 0.225)  # RGB, (1 - mean) / standard deviation
-FORMATS: Mapping[Network, ImageFormat] = {
-    Network.DETR: ImageFormat(Placement.stretch, bgr=False, black=IMAGENET_BLACK, white=IMAGENET_WHITE),
-    Network.TORCHVISION: ImageFormat(Placement.top_left, bgr=False, black=0.0, white=1.0),
-    Network.DETECTRON2: ImageFormat(Placement.top_left, bgr=True, black=0.0, white=255.0),
+FORMATS: Mapping[NetworkAuthor, ImageFormat] = {
+    NetworkAuthor.DETR: ImageFormat(Placement.stretch, bgr=False, black=IMAGENET_BLACK, white=IMAGENET_WHITE),
+    NetworkAuthor.TORCHVISION: ImageFormat(Placement.top_left, bgr=False, black=0.0, white=1.0),
+    NetworkAuthor.DETECTRON2: ImageFormat(Placement.top_left, bgr=True, black=0.0, white=255.0),
 }
 """Image formats of published networks. torchvision's and Detectron2's networks normalize the image themselves."""
 
@@ -67,7 +67,7 @@ FORMATS: Mapping[Network, ImageFormat] = {
 class OutputNames:
     """The outputs of a network by meaning."""
 
-    network: Network
+    network: NetworkAuthor
     boxes: str  # (K, 4)
     classes: str  # (K,) labels, or (K, C) class columns
     scores: str = ""  # (K,); "" = class columns
@@ -127,10 +127,10 @@ class InstanceLayout:
                 "detector=onnx_boxes"
             )
 
-    def image_format(self, preprocessing: Preprocessing, custom: ImageFormat) -> ImageFormat:
+    def image_format(self, preprocessing: ImageFormatChoice, custom: ImageFormat) -> ImageFormat:
         """Return the image format of the network, and log it if it is not the custom format."""
         known = FORMATS.get(self.names.network)
-        if known is None or preprocessing is Preprocessing.CUSTOM:
+        if known is None or preprocessing is ImageFormatChoice.CUSTOM:
             return custom
         log.info(
             "detector.preprocessing: image format of %s (%s, %s, black = %s, white = %s); set "
@@ -234,9 +234,9 @@ def recognize_instances(
         columns = outputs[names.classes].shape[-1]
         kind = BoxKind.CENTER if boxes is BoxKind.AUTO else boxes
         return InstanceLayout(names, shape, column_ids(category_ids, labels, columns), kind, True, columns)
-    if names.network is Network.TORCHVISION and in_unit and not names.masks:
-        names = replace(names, network=Network.UNKNOWN)  # another SSD with the same names
-    published = {Network.TORCHVISION: CategoryIds.COCO_91, Network.DETECTRON2: CategoryIds.FROM_ZERO}
+    if names.network is NetworkAuthor.TORCHVISION and in_unit and not names.masks:
+        names = replace(names, network=NetworkAuthor.UNKNOWN)  # another SSD with the same names
+    published = {NetworkAuthor.TORCHVISION: CategoryIds.COCO_91, NetworkAuthor.DETECTRON2: CategoryIds.FROM_ZERO}
     ids = label_ids(category_ids, labels, published.get(names.network))
     detected = BoxKind.CENTER if in_unit and (found[:, 2:] < found[:, :2]).any() else BoxKind.CORNER
     return InstanceLayout(names, shape, ids, detected if boxes is BoxKind.AUTO else boxes, in_unit, 0)
@@ -263,17 +263,17 @@ def _recognize_names(outputs: Outputs, integers: Collection[str]) -> OutputNames
         logits = arrays[columns[0]]
         is_named = _base(boxes[0]) in DETR_BOXES or _base(columns[0]) in DETR_LOGITS
         is_detr = len(logits) == len(arrays[boxes[0]]) and (_are_logits(logits) or is_named)
-        return OutputNames(Network.DETR, boxes[0], columns[0], masks=mask) if is_detr else None
+        return OutputNames(NetworkAuthor.DETR, boxes[0], columns[0], masks=mask) if is_detr else None
     classes = [name for name in vectors if name in integers] or [name for name in vectors if _means_classes(name)]
     if columns or len(vectors) != 2 or len(classes) != 1:
         return None
     (scores,) = set(vectors) - set(classes)
     names = {_base(name) for name in outputs}
-    network = Network.UNKNOWN
+    network = NetworkAuthor.UNKNOWN
     if sizes or names >= {"pred_boxes", "pred_classes"}:
-        network = Network.DETECTRON2
+        network = NetworkAuthor.DETECTRON2
     elif names >= {"boxes", "labels", "scores"}:
-        network = Network.TORCHVISION
+        network = NetworkAuthor.TORCHVISION
     return OutputNames(network, boxes[0], classes[0], scores, mask)
 
 

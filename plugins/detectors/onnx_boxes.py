@@ -20,7 +20,7 @@ from framework.detection.candidates import (
 )
 from framework.detection.instance_output import recognize_instances
 from framework.detection.masks.binary_masks import without_duplicates
-from framework.detection.masks.letterbox import Placement, Preprocessing
+from framework.detection.masks.letterbox import ImageFormatChoice, Placement
 from framework.detection.masks.masks_from_boxes import masks_in_boxes
 from framework.detection.runtimes.onnx_network import ImageNetwork, Outputs
 from framework.interfaces import Detector
@@ -59,7 +59,7 @@ class OnnxBoxes(Detector):
     max_detections: int = 100  # maximum number of detections per image, >= 1
     # image format: AUTO (that of the network if recognized with layout=auto, otherwise CUSTOM) or CUSTOM (placement,
     # padding, bgr, black_level and white_level)
-    preprocessing: Preprocessing = Preprocessing.AUTO
+    preprocessing: ImageFormatChoice = ImageFormatChoice.AUTO
     input_size: int = 0  # side of the square input, px, for networks with variable input size; 0 = size in the file
     placement: Placement = Placement.top_left  # position of the image in the input
     padding: int = 114  # gray value of the padding, in [0, 255]
@@ -122,7 +122,7 @@ class OnnxBoxes(Detector):
                 network.format = instances.image_format(self.preprocessing, network.format)
                 return instances.candidates_of_boxes
             layout = recognize_table(outputs, network.shape)
-            if layout is OutputLayout.end_to_end and self.preprocessing is Preprocessing.AUTO:
+            if layout is OutputLayout.end_to_end and self.preprocessing is ImageFormatChoice.AUTO:
                 network.format = END_TO_END_FORMAT
         ids = label_numbers(layout, outputs, self._labels, self.category_ids)
         decoder = partial(decode, layout, shape=network.shape, classes=len(self._labels), ids=ids)

@@ -11,7 +11,7 @@ from framework.data import Detections, Frame
 from framework.detection.candidates import spread_rest
 from framework.detection.instance_output import InstanceLayout, recognize_instances
 from framework.detection.masks.binary_masks import without_duplicates
-from framework.detection.masks.letterbox import Placement, Preprocessing
+from framework.detection.masks.letterbox import ImageFormatChoice, Placement
 from framework.detection.runtimes.onnx_network import ImageNetwork
 from framework.detection.segmentation_output import BoxKind, SegmentationLayout, detect_layout
 from framework.interfaces import Detector
@@ -60,7 +60,7 @@ class OnnxSegmentation(Detector):
     mask_threshold: float = 0.5  # minimum mask probability of a pixel in the mask, in (0, 1)
     # image format: AUTO (that of RF-DETR, torchvision or Detectron2 if recognized, otherwise CUSTOM) or CUSTOM
     # (placement, padding, bgr, black_level and white_level)
-    preprocessing: Preprocessing = Preprocessing.AUTO
+    preprocessing: ImageFormatChoice = ImageFormatChoice.AUTO
     input_size: int = 0  # side of the square input, px, for networks with variable input size; 0 = size in the file
     placement: Placement = Placement.center  # position of the image in the input
     padding: int = 114  # gray value of the padding, in [0, 255]

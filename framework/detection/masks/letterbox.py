@@ -20,7 +20,7 @@ class Placement(Enum):
     stretch = "stretch"  # the image fills the input with a changed aspect ratio
 
 
-class Preprocessing(Enum):
+class ImageFormatChoice(Enum):
     """Source of the image format that a network expects."""
 
     AUTO = "format of the recognized network (RF-DETR, torchvision, Detectron2, YOLO26), otherwise CUSTOM"

@@ -11,7 +11,7 @@ import pytest
 
 from framework.data import Camera, Frame
 from framework.detection.candidates import OutputLayout
-from framework.detection.masks.letterbox import Placement, Preprocessing
+from framework.detection.masks.letterbox import ImageFormatChoice, Placement
 from framework.errors import ConfigError, DataError
 from framework.vocabulary.category_ids import CategoryIds
 from plugins.detectors.onnx_boxes import OnnxBoxes
@@ -119,7 +119,7 @@ def test_onnx_segmentation_recognized_network_gets_its_image_format(
     assert wanted.placement is Placement.stretch
     np.testing.assert_allclose(wanted.white, [2.2489, 2.4286, 2.64], atol=1e-4)  # ImageNet's, RGB
     assert "detector.preprocessing: image format of RF-DETR" in caplog.text
-    custom = OnnxSegmentation(weights=weights, device="cpu", preprocessing=Preprocessing.CUSTOM)._network.format
+    custom = OnnxSegmentation(weights=weights, device="cpu", preprocessing=ImageFormatChoice.CUSTOM)._network.format
     assert (custom.placement, custom.black, custom.white) == (Placement.center, 0.0, 1.0)
     traced = export(tmp_path / "d.onnx", WIDE, detectron2(56, WIDE[1:]))
     wanted = OnnxSegmentation(weights=traced, device="cpu")._network.format

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,9 @@ from pycocotools import mask as coco
 
 from framework.commands.running.detect import write_detections, write_labels
 from framework.data import Camera, Detections, Frame
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.detection.map_classes import DetectorOfMap
+from framework.detection.stored.cache import CachedDetector
 from framework.errors import ConfigError, DataError, FrameError
 from framework.vocabulary.category_ids import CategoryIds
 from framework.vocabulary.label_spaces import COCO
@@ -390,6 +394,45 @@ def test_precomputed_file_name_belongs_to_frame_with_this_file(tmp_path: Path, i
 def test_precomputed_mask_named_like_color_image_is_read(tmp_path: Path) -> None:
     detector = Precomputed(write_folder(tmp_path, name="frame_000003"))
     assert len(detector.detect(replace(frame(1), image_name="frame_000003.jpg"))) == 2
+
+
+@pytest.mark.parametrize("numbers", [range(0, 8, 2), range(1, 5), range(4), range(7, 11), (3, 4, 9, 12)])
+@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize("masks", [False, True])
+def test_precomputed_numbered_folder_finds_its_masks(
+    tmp_path: Path, numbers: Sequence[int], stride: int, masks: bool
+) -> None:
+    """Frame k has k + 1 detections, named by the file of its color image."""
+    root, stored = tmp_path / "room", tmp_path / "stored"
+    for folder in (root / "color", root / "depth", stored):
+        folder.mkdir(parents=True)
+    camera = {"width": 8, "height": 6, "fx": 10.0, "fy": 10.0, "cx": 3.5, "cy": 2.5, "depth_scale": 1000.0}
+    (root / "camera.json").write_text(json.dumps(camera))
+    entries = []
+    for k, number in enumerate(numbers):
+        cv2.imwrite(str(root / "color" / f"{number:06d}.png"), np.zeros((6, 8, 3), np.uint8))
+        cv2.imwrite(str(root / "depth" / f"{number:06d}.png"), np.full((6, 8), 1000, np.uint16))
+        entries += [entry(image_id=f"color/{number:06d}.jpg")] * (k + 1)
+        listed = [{"id": one + 1, "class": "chair", "score": 0.5} for one in range(k + 1)]
+        write_folder(stored, np.arange(1, 49, dtype=np.uint16).reshape(6, 8), listed, f"{number:06d}")
+    sequence = RgbdFolder(root, stride=stride)
+    detector = Precomputed(stored if masks else write(tmp_path, *entries))
+    detector.check_sequence(sequence)
+    assert [len(detector.detect(one)) for one in sequence] == [one.index + 1 for one in sequence]
+
+
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        lambda detector, folder: CachedDetector(detector, folder),
+        lambda detector, folder: DetectorOfMap(detector, (*COCO, "forklift")),
+    ],
+    ids=["cached", "of_map"],
+)
+def test_precomputed_in_other_detector_checks_sequence(tmp_path: Path, wrapped: Any) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id="color/000007.jpg")))
+    with pytest.raises(DataError, match="expected detections of this sequence"):
+        wrapped(detector, tmp_path / "cache").check_sequence(NamedRoom())
 
 
 class NamedRoom(CornerRoom):
