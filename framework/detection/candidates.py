@@ -19,6 +19,7 @@ from framework.errors import DataError
 from framework.vocabulary.category_ids import CategoryIds, label_ids
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
 
+CONFIDENT = 0.5  # minimum score of detections that must have valid boxes and labels
 END_TO_END_COLUMNS = 6  # x1 y1 x2 y2, score, label
 YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows
 
@@ -310,13 +311,17 @@ def class_scores_of_labels(scores: Float32, labels: Float32, ids: Sequence[int])
     """
     column = {k: c for c, k in enumerate(ids)}
     numbers = np.rint(labels).astype(np.int64)
-    used = (scores > 0) & ((numbers != 0) | (0 in column))
-    unknown = np.array([k for k in numbers[used].tolist() if k not in column], np.int64)
-    if unknown.size:
+    is_background = (numbers == 0) & (0 not in column)
+    used = (scores > 0) & ~is_background
+    unknown = [k for k in numbers[used].tolist() if k not in column]
+    has_gaps = max(column) > len(column)
+    # published networks with COCO's ids report no background
+    unknown += [0] * bool(has_gaps and (scores[is_background] >= CONFIDENT).any())
+    if unknown:
+        fix = f", or detector.category_ids={'FROM_ONE' if min(unknown) else 'FROM_ZERO'} if labels have no gaps"
         raise DataError(
             f"detector.category_ids: expected labels {min(column)} to {max(column)} of {len(ids)} classes, got "
-            f"{unknown.max()}; set another detector.label_space, or detector.category_ids=FROM_ONE if labels have "
-            "no gaps"
+            f"{unknown[0]}; set another detector.label_space{fix if has_gaps else ''}"
         )
     check_scores(scores)
     rows = np.zeros((len(scores), len(ids)), np.float32)

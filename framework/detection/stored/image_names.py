@@ -7,7 +7,7 @@ from pathlib import PureWindowsPath
 
 from framework.errors import DataError
 
-MAX_DIGITS = 18  # maximum length of a frame number
+MAX_DIGITS = 20  # maximum length of a frame number; times in ns have 19 digits
 DIGITS = "0123456789"
 COLOR_ENDING = ".color"  # end of the names of color images in 7-Scenes and ScanNet, before the suffix
 

@@ -197,10 +197,12 @@ def test_onnx_boxes_ssd_class_columns_follow_their_number(tmp_path: Path, column
     assert the_object(detector)[0] == "chair"
 
 
-@pytest.mark.parametrize("gap", [12, 26, 45, 66, 83])
-def test_onnx_boxes_ssd_label_without_class_raises(tmp_path: Path, gap: int) -> None:
-    weights = constant_network(tmp_path / "n.onnx", (1, 3, 240, 320), ssd(gap))
-    with pytest.raises(DataError, match=rf"got {gap}; .* detector\.category_ids=FROM_ONE if labels have no gaps"):
+@pytest.mark.parametrize(
+    ("label", "fix"), [(12, "FROM_ONE"), (26, "FROM_ONE"), (45, "FROM_ONE"), (83, "FROM_ONE"), (0, "FROM_ZERO")]
+)
+def test_onnx_boxes_ssd_label_without_class_raises(tmp_path: Path, label: int, fix: str) -> None:
+    weights = constant_network(tmp_path / "n.onnx", (1, 3, 240, 320), ssd(label))
+    with pytest.raises(DataError, match=rf"got {label}; .* detector\.category_ids={fix} if labels have no gaps"):
         OnnxBoxes(weights=weights, device="cpu", layout=OutputLayout.ssd_tensorflow)
 
 
