@@ -95,24 +95,15 @@ def check_matches(path: Path, images: Sequence[ImageId], ids: ImageIds, frames: 
         DataError: No id belongs to a frame, or only another meaning of whole numbers fits all of them.
     """
     matched = ImageIndex(images, ids, path).matched(frames)
-    frame_of: dict[ImageId, int] = {}
-    for k, found in matched.items():
-        for image in found:
-            if (other := frame_of.setdefault(image, k)) != k:
-                raise DataError(
-                    f"{path}: expected one frame with the image {shown(image)}, got frames {other} and {k} "
-                    f"({frames[k]}); use frame indices as image ids"
-                )
+    frame_of = _frame_of(path, matched, frames)
     unmatched = [image for image in images if image not in frame_of]
-    others = [
-        (one, matches) for one in ImageIds if (matches := _complete(path, images, one, frames)) not in ({}, matched)
-    ]
-    fixes = " or ".join(f"{KEY}={one.name}" for one, _ in others)
+    others = [one for one in ImageIds if one is not ids and _complete(path, images, one, frames) not in ({}, matched)]
     first = next(iter(frames.values())) or "frame 0"
-    if unmatched and others:
+    if unmatched and others and ids is ImageIds.AUTO:
+        confirmed = [*others, *([ImageIds.FROM_ZERO] if all(isinstance(image, int) for image in images) else [])]
         raise DataError(
             f"{KEY}: expected ids of the {len(frames)} frames (first image: {first}), got {len(unmatched)} of "
-            f"{len(images)} ids without a frame (first: {shown(unmatched[0])}) in {path} with {ids.name}; set {fixes}"
+            f"{len(images)} ids without a frame (first: {shown(unmatched[0])}) in {path}; set {_settings(confirmed)}"
         )
     if not matched:
         raise DataError(
@@ -129,15 +120,40 @@ def check_matches(path: Path, images: Sequence[ImageId], ids: ImageIds, frames: 
     index, (image, *_) = next(iter(matched.items()))
     log.info("%s: detections of %d of %d frames; %s is frame %d%s", path, len(matched), len(frames), shown(image),
              index, f" ({frames[index]})" if frames[index] else "")  # fmt: skip
-    # names of files are certain; numbers are suspicious if they begin at 1, or if files have these numbers, too
+    if warns and ids is ImageIds.AUTO and not unmatched:
+        _warn_of_other_meanings(path, frame_of, others, frames)
+
+
+def _frame_of(path: Path, matched: Mapping[int, Sequence[ImageId]], frames: Mapping[int, str]) -> dict[ImageId, int]:
+    """Return the frame of each image id. Raise DataError if an id belongs to several frames."""
+    frame_of: dict[ImageId, int] = {}
+    for k, found in matched.items():
+        for image in found:
+            if (other := frame_of.setdefault(image, k)) != k:
+                raise DataError(
+                    f"{path}: expected one frame with the image {shown(image)}, got frames {other} and {k} "
+                    f"({frames[k]}); use frame indices as image ids"
+                )
+    return frame_of
+
+
+def _warn_of_other_meanings(
+    path: Path, frame_of: Mapping[ImageId, int], others: Sequence[ImageIds], frames: Mapping[int, str]
+) -> None:
+    """Log a warning if ids were read as frame indices, but begin at 1 or are also numbers in file names."""
     by_index = [k for one, k in frame_of.items() if isinstance(one, int) or not _is_named(one, frames[k])]
-    likely = [one for one, _ in others if one is not ImageIds.FROM_ONE or min(by_index, default=0) == 1]
-    if likely and by_index and warns and ids is ImageIds.AUTO and not unmatched:
-        log.warning(
-            "%s: image ids read as frame indices from 0, and none is 0 or they are also numbers in file names; set "
-            "%s if they have another meaning, or %s=FROM_ZERO if they are frame indices",
-            path, " or ".join(f"{KEY}={one.name}" for one in likely), KEY,
-        )  # fmt: skip
+    likely = [one for one in others if one is not ImageIds.FROM_ONE or min(by_index, default=0) == 1]
+    if not by_index or not likely:
+        return
+    reason = "begin at 1" if ImageIds.FROM_ONE in likely else "are also numbers in file names"
+    log.warning(
+        "%s: image ids read as frame indices from 0, but they %s; set %s if they have this meaning, or %s to confirm",
+        path, reason, _settings(likely), _settings([ImageIds.FROM_ZERO]),
+    )  # fmt: skip
+
+
+def _settings(choices: Sequence[ImageIds]) -> str:
+    return " or ".join(f"{KEY}={one.name}" for one in dict.fromkeys(choices))
 
 
 def _complete(

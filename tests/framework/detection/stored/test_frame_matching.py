@@ -122,6 +122,13 @@ def test_check_matches_other_sequence_raises(found: list[ImageId]) -> None:
         check_matches(PATH, found, ImageIds.AUTO, {k: name for k, name in GAPS.items() if k % 3 == 0}, warns=True)
 
 
+def test_check_matches_given_meaning_is_not_refused(caplog: pytest.LogCaptureFixture) -> None:
+    check_matches(PATH, images(*range(1, 15)), ImageIds.FROM_ZERO, PREFIXED, warns=True)
+    assert "got 1 of 14 images that match no frame (first: 14)" in caplog.text
+    with pytest.raises(DataError, match="expected detections of this sequence"):
+        check_matches(PATH, images(14, 15), ImageIds.FROM_ZERO, PREFIXED, warns=True)
+
+
 def test_check_matches_unmatched_ids_are_counted(caplog: pytest.LogCaptureFixture) -> None:
     check_matches(PATH, images("000002.jpg", "000003.jpg", "x.jpg"), ImageIds.AUTO, GAPS, warns=True)
     [record] = [record for record in caplog.records if record.levelname == "WARNING"]
