@@ -20,6 +20,7 @@ from framework.vocabulary.category_ids import CategoryIds, label_ids
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
 
 CONFIDENT = 0.5  # minimum score of detections that must have valid boxes and labels
+LARGEST_UNIT = 2.0  # boxes in 0..1 may slightly exceed the image; boxes in px are never all within 2 px of its corner
 END_TO_END_COLUMNS = 6  # x1 y1 x2 y2, score, label
 YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows
 
@@ -37,7 +38,7 @@ class OutputLayout(Enum):
     ssd_tensorflow = "ssd_tensorflow"  # boxes (K, 4) y1 x1 y2 x2 in 0..1; scores and labels, or class scores
     ssd_torchvision = "ssd_torchvision"  # boxes (K, 4) x1 y1 x2 y2 in px; scores and labels, or class scores
     ssd_unit = "ssd_unit"  # boxes (K, 4) x1 y1 x2 y2 in 0..1; scores and labels, or class scores
-    end_to_end = "end_to_end"  # (K, 6): x1 y1 x2 y2 in px, score, label from 0 (YOLOv10, YOLO26)
+    end_to_end = "end_to_end"  # (K, 6): x1 y1 x2 y2 in px or 0..1, score, label from 0 (YOLOv10, YOLO26)
     auto = "auto"  # end_to_end, RF-DETR, torchvision or Detectron2 if the outputs are theirs, otherwise yolox
 
 
@@ -107,7 +108,9 @@ def decode(
     if layout is OutputLayout.end_to_end:
         rows = _rows(output, END_TO_END_COLUMNS, "")
         class_scores = class_scores_of_labels(rows[:, 4], rows[:, 5], range(classes) if ids is None else ids)
-        return Candidates(rows[:, :4], spread_evenly(class_scores))
+        unit = 0 < np.abs(rows[:, :4]).max(initial=0) <= LARGEST_UNIT
+        boxes = rows[:, :4] * np.array([shape[1], shape[0]] * 2, np.float32) if unit else rows[:, :4]
+        return Candidates(boxes, spread_evenly(class_scores))
     if layout is OutputLayout.yolo:
         rows = _rows(output, 4 + classes, "yolo_objectness")
         return _checked(corners(rows[:, :4]), rows[:, 4:])
@@ -142,7 +145,9 @@ def recognize_table(outputs: Mapping[str, Float32], shape: tuple[int, int]) -> O
     cells = sum((shape[0] // stride) * (shape[1] // stride) for stride in YOLOX_STRIDES)
     if table.ndim != 2 or table.shape[1] != END_TO_END_COLUMNS or len(table) == cells:
         return OutputLayout.yolox
-    return OutputLayout.end_to_end
+    scores, labels = table[:, 4], table[:, 5]
+    are_detections = ((scores >= 0) & (scores <= 1) & (labels == np.rint(labels)) & (labels >= 0)).all()
+    return OutputLayout.end_to_end if are_detections else OutputLayout.yolox
 
 
 def label_numbers(

@@ -23,6 +23,7 @@ import numpy as np
 from framework.data import Bool, Float32, Int32
 from framework.detection.candidates import (
     CONFIDENT,
+    LARGEST_UNIT,
     Candidates,
     check_scores,
     class_scores_of_labels,
@@ -33,7 +34,7 @@ from framework.detection.candidates import (
 from framework.detection.masks.binary_masks import masks_from_grids, paste_masks
 from framework.detection.masks.letterbox import ImageFormat, ImageFormatChoice, Letterbox, Level, Placement
 from framework.detection.runtimes.onnx_network import Outputs
-from framework.detection.segmentation_output import LARGEST_UNIT, BoxKind
+from framework.detection.segmentation_output import BoxKind
 from framework.errors import DataError
 from framework.vocabulary.category_ids import CategoryIds, column_ids, label_ids
 

@@ -12,7 +12,7 @@ from enum import Enum
 import numpy as np
 
 from framework.data import Bool, Float32, Int32
-from framework.detection.candidates import CONFIDENT, Candidates, check_scores, corners, described
+from framework.detection.candidates import CONFIDENT, LARGEST_UNIT, Candidates, check_scores, corners, described
 from framework.detection.masks.binary_masks import masks_from_prototypes
 from framework.detection.masks.letterbox import Letterbox
 from framework.detection.runtimes.onnx_network import ExportMetadata, Outputs
@@ -21,7 +21,6 @@ from framework.errors import DataError
 MIN_ORDERED_CORNERS = 0.9  # minimum fraction of boxes with x2 >= x1 and y2 >= y1, if boxes are corners
 MAX_ORDERED_CENTERS = 0.5  # maximum fraction of such boxes, if boxes are centers and sizes; typically a few percent
 MIN_ROWS = 20  # minimum number of detections to evaluate these fractions
-LARGEST_UNIT = 2.0  # boxes in 0..1 may slightly exceed the image; boxes in px are never all within 2 px of its corner
 STRIDES = (8, 16, 32, 64)  # px per cell in the YOLO family, the last only in large networks
 BOXES_PER_CELL = (1, 3)  # 3 up to YOLOv7
 SCORE, LABEL, COEFFICIENTS = 4, 5, 6  # columns of a table with suppression, after x1 y1 x2 y2

@@ -100,8 +100,9 @@ def test_onnx_segmentation_end_to_end_yolo_finds_chair(tmp_path: Path) -> None:
         (WIDE, {name: value for name, value in mask_rcnn(62, WIDE[1:]).items() if name != "masks"}),
         (WIDE, {name: value for name, value in detectron2(56, WIDE[1:]).items() if name != "6903"}),
         ((1, 3, 480, 640), {"output0": yolo26(56)["output0"][..., :6] * [1, 0.75, 1, 0.75, 1, 1]}),
+        ((1, 3, 480, 640), {"output0": yolo26(56)["output0"][..., :6] / [640, 640, 640, 640, 1, 1]}),
     ],
-    ids=["rf_detr", "torchvision", "detectron2", "yolo26"],
+    ids=["rf_detr", "torchvision", "detectron2", "yolo26", "yolo26_unit"],
 )
 def test_onnx_boxes_published_export_finds_chair(tmp_path: Path, shape: Any, outputs: Any) -> None:
     detector = OnnxBoxes(weights=export(tmp_path / "n.onnx", shape, outputs), device="cpu")
