@@ -80,7 +80,7 @@ class BagWriter:
             "d": np.array(lens, float),
             "k": camera.K.ravel(),
             "r": np.eye(3).ravel(),
-            "p": np.eye(3, 4).ravel(),
+            "p": np.pad(camera.K, ((0, 0), (0, 1))).ravel(),
         }
         region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
         self.add(
