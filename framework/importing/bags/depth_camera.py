@@ -13,7 +13,7 @@ import numpy as np
 from framework.data import Camera, Float32
 from framework.errors import DataError, FrameError
 from framework.importing.bags.ros_camera import Lens, is_rectified, ros_camera
-from framework.importing.bags.ros_images import MILLIMETER, depth_of
+from framework.importing.bags.ros_images import MILLIMETER, decode_ros_depth
 from framework.importing.bags.ros_messages import Message, RosBag
 from framework.importing.bags.ros_topics import BagOptions, Topics, camera_info_of
 from framework.importing.bags.transform_tree import REALSENSE, TransformTree
@@ -46,7 +46,7 @@ class DepthCamera:
         Raises:
             FrameError: The image is invalid.
         """
-        depth = depth_of(f"{where}: {message.topic}", self.bag.decoded(message), self.unit, self.float_unit)
+        depth = decode_ros_depth(f"{where}: {message.topic}", self.bag.decoded(message), self.unit, self.float_unit)
         middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
         if middle > FARTHEST:
             raise FrameError(
@@ -140,7 +140,7 @@ def _check_proportions(bag: RosBag, topic: str, color: Camera) -> None:
     if message is None:
         return
     try:
-        height, width = depth_of(topic, bag.decoded(message)).shape
+        height, width = decode_ros_depth(topic, bag.decoded(message)).shape
     except FrameError:
         return  # a damaged image is counted when the frame is read
     if abs(width * color.height / (height * color.width) - 1) > SAME_PROPORTIONS:

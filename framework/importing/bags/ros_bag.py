@@ -34,7 +34,7 @@ from framework.importing.bags.accelerometer import Accelerometer, find_accelerom
 from framework.importing.bags.camera_poses import MAX_POSE_INTERVAL, CameraPoses, find_camera_poses, pose_lines
 from framework.importing.bags.depth_camera import DepthCamera, find_depth_camera
 from framework.importing.bags.ros_camera import Lens, is_rectified, ros_camera
-from framework.importing.bags.ros_images import color_of
+from framework.importing.bags.ros_images import decode_ros_color
 from framework.importing.bags.ros_messages import Message, RosBag
 from framework.importing.bags.ros_topics import BagOptions, Topics, found_topics
 from framework.importing.bags.transform_tree import TransformTree
@@ -123,7 +123,7 @@ class Device:
             DataError: An image or the pose is invalid.
         """
         where = f"{self.bag.path}, {pair.timestamp:.6f} s"
-        image = color_of(f"{where}: {color.topic}", self.bag.decoded(color))
+        image = decode_ros_color(f"{where}: {color.topic}", self.bag.decoded(color))
         return DeviceFrame(
             name=where,
             timestamp=pair.timestamp,
@@ -159,6 +159,10 @@ def _pairs(bag: RosBag, topics: Topics, max_difference: float) -> list[Pair]:
             f"images on {topics.color} and {depths} on {topics.depth}; set --max-difference to a larger time in s, or "
             "--color and --depth to topics of one camera"
         )
+    largest = max(abs(pair.timestamp - pair.depth_timestamp) for pair in pairs)
+    if largest > MAX_PAIR_INTERVAL:
+        message = "%s: color and depth images are up to %.3g s apart; --max-difference S sets another limit"
+        log.warning(message, bag.path, largest)
     if len(pairs) < max(colors, depths):
         log.warning(
             "%s: skipped %d of %d color images and %d of %d depth images without a partner within %.3g s; "

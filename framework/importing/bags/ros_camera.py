@@ -119,4 +119,4 @@ def _rectified(where: str, info: Any) -> Camera:
 
 def _numbers(info: Any, name: str) -> list[float]:
     """Return the values of a CameraInfo field, which has an upper-case name in ROS 1."""
-    return [float(value) for value in getattr(info, name.upper() if hasattr(info, name.upper()) else name)]
+    return [float(value) for value in getattr(info, name if hasattr(info, name) else name.upper())]

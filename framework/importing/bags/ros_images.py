@@ -42,7 +42,7 @@ COMPRESSED_DEPTH = "compressedDepth"  # in the format field of depth images, aft
 DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: unused integer, quantization A and B
 
 
-def color_of(where: str, message: Any) -> UInt8:
+def decode_ros_color(where: str, message: Any) -> UInt8:
     """Decode a color image (H, W, 3), RGB.
 
     Args:
@@ -52,7 +52,7 @@ def color_of(where: str, message: Any) -> UInt8:
     Raises:
         FrameError: The image is invalid. The message contains `where`.
     """
-    if hasattr(message, "format"):
+    if not hasattr(message, "encoding"):
         return decode_color(where, bytes(message.data))
     if message.encoding in CONVERTED:
         channels, conversion = CONVERTED[message.encoding]
@@ -69,7 +69,7 @@ def color_of(where: str, message: Any) -> UInt8:
     return np.ascontiguousarray(_pixels(where, message, np.dtype(np.uint8), channels)[..., order])
 
 
-def depth_of(where: str, message: Any, unit: float = MILLIMETER, float_unit: float = 1.0) -> Float32:
+def decode_ros_depth(where: str, message: Any, unit: float = MILLIMETER, float_unit: float = 1.0) -> Float32:
     """Decode a depth image (H, W), m, 0 = no reading.
 
     Args:
@@ -81,7 +81,7 @@ def depth_of(where: str, message: Any, unit: float = MILLIMETER, float_unit: flo
     Raises:
         FrameError: The image is invalid.
     """
-    if hasattr(message, "format"):
+    if not hasattr(message, "encoding"):
         return _compressed_depth(where, message, unit, float_unit)
     if message.encoding in MILLIMETERS:
         return _whole(_pixels(where, message, np.dtype(f"{_byte_order(message)}u2"), 1)[..., 0], unit)

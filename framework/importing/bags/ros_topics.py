@@ -35,6 +35,7 @@ OPTIONS = {
     "poses": "--poses",
     "odometry": "--odometry",
 }
+TRANSPORT = ("/compressed", "/compressedDepth")  # ends of the topics of supported transports, preferred last
 NO_POSES = "none"  # value of --poses: import without poses
 IMAGES, POSES = (IMAGE, COMPRESSED), (ODOMETRY, POSE)
 KINDS = {
@@ -158,6 +159,9 @@ def _one(bag: RosBag, name: str, candidates: Sequence[str], preferred: re.Patter
     """Return the only topic among the candidates, after filtering by preferred names and uncompressed images."""
     fitting = [topic for topic in candidates if preferred.search(topic)] or list(candidates)
     left = [topic for topic in fitting if bag.kinds[topic] == IMAGE] or fitting
+    transports = [topic.rpartition("/") for topic in left]
+    if len({base for base, _, _ in transports}) == 1:  # several transports of one image
+        left = [topic for topic in left if topic.endswith(TRANSPORT)][-1:] or left
     if len(left) == 1:
         return left[0]
     expected = f"expected one {name} topic, got {', '.join(left) or 'none'}"
