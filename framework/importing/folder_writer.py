@@ -140,7 +140,7 @@ def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int
         try:
             frame = stored()
             if source.posed and frame.T_world_camera is None:
-                raise DataError(f"{frame.name}: expected a pose, got none")
+                raise DataError(f"{frame.name}: expected a pose, got none; --poses none imports without poses")
             if written.timestamps and frame.timestamp <= written.timestamps[-1]:
                 expected = f"expected a timestamp > {written.timestamps[-1]:.6f} s"
                 raise DataError(f"{frame.name}: {expected}, got {frame.timestamp:.6f} s")

@@ -236,6 +236,26 @@ def test_ros_bag_realsense_depth_is_registered_to_color(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "out/camera.json").read_text())["sensor"] == "REALSENSE_D435"
 
 
+@pytest.mark.parametrize("ends", [("", ""), ("/compressed", "/compressedDepth")])
+def test_ros_bag_realsense_compressed_images_are_imported(tmp_path: Path, ends: tuple[str, str]) -> None:
+    bag = BagWriter()
+    add_realsense(bag, DEPTH_CAMERA)
+    for k, (time, topic, _, message) in enumerate(bag.messages):
+        if topic.endswith("Color_0/image/data"):
+            color = message.data.reshape(message.height, message.width, 3)
+            packed = BagWriter()
+            packed.add_compressed(time, topic + ends[0], png(color[..., ::-1]), "rgb8; png compressed bgr8")
+            bag.messages[k] = packed.messages[0]
+        elif topic.endswith("Depth_0/image/data"):
+            depth = np.ascontiguousarray(message.data).view(np.uint16).reshape(message.height, message.width)
+            packed = BagWriter()
+            packed.add_compressed(time, topic + ends[1], bytes(12) + png(depth), "16UC1; compressedDepth png")
+            bag.messages[k] = packed.messages[0]
+    [file] = bag.write(tmp_path / "bag").glob("*.db3")
+    assert not imported(file, tmp_path / "out")
+    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)
+
+
 def test_ros_bag_topics_of_unknown_driver_write_no_sensor(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag, "depth_registered")
