@@ -96,7 +96,13 @@ class TumRgbd(Recording):
                 f"({self.max_time_difference:g} s) of each other, got none"
             )
         if len(pairs) < len(color):
-            log.info("%s: %d of %d color images have no depth image", self.name, len(color) - len(pairs), len(color))
+            log.info(
+                "%s: %d of %d color images have no depth image within dataset.max_time_difference=%g s",
+                self.name,
+                len(color) - len(pairs),
+                len(color),
+                self.max_time_difference,
+            )
         path = self.folder / "groundtruth.txt"
         truth = Trajectory.of(path, read_tum_lines(path) if path_exists(path) else [], self.max_time_difference)
         frames = []

@@ -51,7 +51,7 @@ def _depth_array(path: Path, image: Array) -> UInt16 | Float32:
     if image.ndim != 2 or not 0 < image.size <= MAX_PIXELS or not (is_integer or is_float):
         shape = "x".join(map(str, image.shape))
         raise FrameError(f"{path}: expected one channel of uint16 or floats, got {shape} values of {image.dtype}")
-    return np.ascontiguousarray(image) if is_integer else np.ascontiguousarray(image, np.float32)
+    return np.ascontiguousarray(image, np.uint16) if is_integer else np.ascontiguousarray(image, np.float32)
 
 
 def _read_tiff(path: Path) -> Array:

@@ -65,7 +65,7 @@ class Edge:
         if self.error:
             raise DataError(self.error)
         if self.is_fixed:
-            return self.T_parent_child[0]
+            return np.asarray(self.T_parent_child[0])
         after = int(np.searchsorted(self.times, timestamp, side="right"))
         around = slice(max(after - 1, 0), after + 1)
         times, poses = self.times[around], self.T_parent_child[around]
