@@ -27,7 +27,7 @@ FIX = "record registered depth, such as aligned_depth_to_color"
 
 
 @dataclass(frozen=True)
-class DepthCamera:
+class BagDepth:
     """The depth camera of a bag."""
 
     bag: RosBag
@@ -66,7 +66,7 @@ class DepthCamera:
 
 def find_depth_camera(
     bag: RosBag, topics: Topics, tree: TransformTree, options: BagOptions, color: Camera, color_lens: Lens | None
-) -> DepthCamera:
+) -> BagDepth:
     """Return the depth camera of a bag.
 
     Args:
@@ -87,7 +87,7 @@ def find_depth_camera(
     info = None if own in ("", topics.camera_info) else bag.first(own)
     frames = [tree.frame_of(name) for name in (topics.color, topic)]
     has_same_frame = frames[0] == frames[1] != ""
-    plain = DepthCamera(bag, integer, single, color_lens, None)
+    plain = BagDepth(bag, integer, single, color_lens, None)
     if info is None and not (topics.depth_is_registered or options.depth_registered or has_same_frame):
         _check_proportions(bag, topic, color)
         raise DataError(
@@ -102,7 +102,7 @@ def find_depth_camera(
         depth, lens = ros_camera(f"{bag.path}: {topics.camera_info}", info or color_info, is_rectified(topic))
         if lens is None and _is_same(depth, color):
             return plain
-        return DepthCamera(bag, integer, single, lens, DepthRegistration(depth, color, np.eye(4)))
+        return BagDepth(bag, integer, single, lens, DepthRegistration(depth, color, np.eye(4)))
     depth, lens = ros_camera(f"{bag.path}: {own}", info, is_rectified(topic))
     T_color_depth = None if has_same_frame else tree.fixed(to=frames[0], of=frames[1])
     if T_color_depth is None and _is_same(depth, color):
@@ -117,7 +117,7 @@ def find_depth_camera(
         )
     if _is_same(depth, color) and np.allclose(T_color_depth, np.eye(4), atol=1e-6):
         return plain
-    return DepthCamera(bag, integer, single, lens, DepthRegistration(depth, color, T_color_depth))
+    return BagDepth(bag, integer, single, lens, DepthRegistration(depth, color, T_color_depth))
 
 
 def _has_equal_rectification(topics: Topics) -> bool:

@@ -32,7 +32,7 @@ from framework.datasets.tum_rgbd import Trajectory, associate
 from framework.errors import DataError, FrameError
 from framework.importing.bags.accelerometer import Accelerometer, find_accelerometer
 from framework.importing.bags.camera_poses import MAX_POSE_INTERVAL, CameraPoses, find_camera_poses, pose_lines
-from framework.importing.bags.depth_camera import DepthCamera, find_depth_camera
+from framework.importing.bags.depth_camera import BagDepth, find_depth_camera
 from framework.importing.bags.ros_camera import Lens, is_rectified, ros_camera
 from framework.importing.bags.ros_images import decode_ros_color
 from framework.importing.bags.ros_messages import Message, RosBag
@@ -112,7 +112,7 @@ class Device:
     topics: Topics
     camera: Camera  # of color
     lens: Lens | None  # of color, corrected on import; None = pinhole camera, or corrected on reading
-    depth_camera: DepthCamera
+    depth_camera: BagDepth
     accelerometer: Accelerometer | None
     poses: CameraPoses | None  # None = no poses
 

@@ -79,7 +79,7 @@ class Edge:
 
 
 @dataclass(frozen=True)
-class Chain:
+class FrameChain:
     """The transforms between two frames."""
 
     steps: Sequence[tuple[Edge, bool]]  # edges from the target frame to the source frame; True = from parent to child
@@ -140,7 +140,7 @@ class TransformTree:
             )
         return chain.at()
 
-    def chain(self, to: str, of: str) -> Chain | None:
+    def chain(self, to: str, of: str) -> FrameChain | None:
         """Return the transforms from one frame to another, or None if they are not in the bag.
 
         Rigid transforms are preferred.
@@ -172,18 +172,18 @@ class TransformTree:
             seen.append(parents[0].parent)
         return seen[-1] if moves else ""
 
-    def _search(self, start: str, end: str, edges: Sequence[Edge]) -> Chain | None:
+    def _search(self, start: str, end: str, edges: Sequence[Edge]) -> FrameChain | None:
         neighbors: dict[str, list[tuple[str, Edge, bool]]] = defaultdict(list)
         for edge in edges:
             neighbors[edge.parent].append((edge.child, edge, True))
             neighbors[edge.child].append((edge.parent, edge, False))
-        chains = {start: Chain(())}
-        others: dict[str, Chain] = {}  # second path to a frame
+        chains = {start: FrameChain(())}
+        others: dict[str, FrameChain] = {}  # second path to a frame
         waiting = [start]
         while waiting:
             reached = waiting.pop(0)
             for name, edge, is_down in neighbors[reached]:
-                chain = Chain((*chains[reached].steps, (edge, is_down)))
+                chain = FrameChain((*chains[reached].steps, (edge, is_down)))
                 if name not in chains:
                     chains[name] = chain
                     waiting.append(name)
@@ -194,7 +194,7 @@ class TransformTree:
             self._check_equal(start, name, chains[name], others[name])
         return found
 
-    def _check_equal(self, start: str, end: str, chain: Chain, other: Chain) -> None:
+    def _check_equal(self, start: str, end: str, chain: FrameChain, other: FrameChain) -> None:
         """Raise DataError if two paths of rigid transforms contradict each other."""
         transforms = [T for one in (chain, other) if one.is_fixed and (T := one.at()) is not None]
         if len(transforms) == 2 and not _are_equal(np.array(transforms)):
