@@ -67,6 +67,7 @@ _SHARED_WITH_PLUGINS = {
     "Int64": "framework.data",
     "LabelRule": "framework.mapping.labels.label_rule",
     "LabeledVoxels": "framework.mapping.labels.label_rule",
+    "RosLens": "framework.importing.bags.ros_camera",
     "SceneTruth": "framework.data",
     "SurfaceView": "framework.data",
     "TO_THE_END": "framework.datasets.frames.sequence_reader",
@@ -99,7 +100,7 @@ if TYPE_CHECKING:
     from framework.datasets.frames.sequence_reader import TO_THE_END, choose_frames
     from framework.files.search_paths import folder_of
     from framework.geometry import back_project, exp_se3, inverse, project, transform
-    from framework.importing.bags.ros_camera import is_rectified, ros_camera
+    from framework.importing.bags.ros_camera import RosLens, is_rectified, ros_camera
     from framework.importing.bags.ros_images import decode_ros_color, decode_ros_depth
     from framework.mapping.instance_map import InstanceMap
     from framework.mapping.instances.association import Association

@@ -12,7 +12,7 @@ import numpy as np
 
 from framework.data import Camera, Float32
 from framework.errors import DataError, FrameError
-from framework.importing.bags.ros_camera import Lens, is_rectified, ros_camera
+from framework.importing.bags.ros_camera import RosLens, is_rectified, ros_camera
 from framework.importing.bags.ros_images import MILLIMETER, decode_ros_depth
 from framework.importing.bags.ros_messages import Message, RosBag
 from framework.importing.bags.ros_topics import BagOptions, Topics, camera_info_of
@@ -33,7 +33,7 @@ class BagDepth:
     bag: RosBag
     unit: float  # m, of integer depth
     float_unit: float  # m, of float depth
-    lens: Lens | None  # of depth; None = pinhole camera
+    lens: RosLens | None  # of depth; None = pinhole camera
     registration: DepthRegistration | None  # None = depth is registered to color, possibly at another resolution
 
     def depth(self, where: str, message: Message) -> Float32:
@@ -65,7 +65,7 @@ class BagDepth:
 
 
 def find_depth_camera(
-    bag: RosBag, topics: Topics, tree: TransformTree, options: BagOptions, color: Camera, color_lens: Lens | None
+    bag: RosBag, topics: Topics, tree: TransformTree, options: BagOptions, color: Camera, color_lens: RosLens | None
 ) -> BagDepth:
     """Return the depth camera of a bag.
 

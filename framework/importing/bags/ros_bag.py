@@ -33,7 +33,7 @@ from framework.errors import DataError, FrameError
 from framework.importing.bags.accelerometer import Accelerometer, find_accelerometer
 from framework.importing.bags.camera_poses import MAX_POSE_INTERVAL, CameraPoses, find_camera_poses, pose_lines
 from framework.importing.bags.depth_camera import BagDepth, find_depth_camera
-from framework.importing.bags.ros_camera import Lens, is_rectified, ros_camera
+from framework.importing.bags.ros_camera import RosLens, is_rectified, ros_camera
 from framework.importing.bags.ros_images import decode_ros_color
 from framework.importing.bags.ros_messages import Message, RosBag
 from framework.importing.bags.ros_topics import BagOptions, Topics, found_topics
@@ -111,7 +111,7 @@ class Device:
     bag: RosBag
     topics: Topics
     camera: Camera  # of color
-    lens: Lens | None  # of color, corrected on import; None = pinhole camera, or corrected on reading
+    lens: RosLens | None  # of color, corrected on import; None = pinhole camera, or corrected on reading
     depth_camera: BagDepth
     accelerometer: Accelerometer | None
     poses: CameraPoses | None  # None = no poses

@@ -33,8 +33,11 @@ def is_rectified(topic: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Lens:
-    """A lens with distortion. It converts images to the pinhole camera with the same intrinsics."""
+class RosLens:
+    """A lens with distortion.
+
+    `smooth(color)` and `exact(depth)` convert images to the pinhole camera with the same intrinsics.
+    """
 
     camera: Camera
     model: str
@@ -58,7 +61,7 @@ class Lens:
 
 
 @lru_cache(maxsize=4)
-def _maps(lens: Lens, width: int, height: int) -> tuple[Float64, Float64]:
+def _maps(lens: RosLens, width: int, height: int) -> tuple[Float64, Float64]:
     """Return the positions (H, W), px, in the recorded image for each pixel of the pinhole image."""
     camera, size = lens.camera, (width, height)
     if camera.shape != (height, width):
@@ -75,7 +78,7 @@ def _maps(lens: Lens, width: int, height: int) -> tuple[Float64, Float64]:
     return u, v
 
 
-def ros_camera(where: str, info: Any, rectified: bool) -> tuple[Camera, Lens | None]:
+def ros_camera(where: str, info: Any, rectified: bool) -> tuple[Camera, RosLens | None]:
     """Return the camera of the images that belong to a CameraInfo, and its lens; None = pinhole camera.
 
     Args:
@@ -96,9 +99,9 @@ def ros_camera(where: str, info: Any, rectified: bool) -> tuple[Camera, Lens | N
     if not np.isfinite(values).all():
         raise DataError(f"{where}: expected finite coefficients of the lens, got {values}")
     if info.distortion_model in FISHEYE and len(values) >= 4:
-        return camera, Lens(camera, info.distortion_model, tuple(values[:4]))
+        return camera, RosLens(camera, info.distortion_model, tuple(values[:4]))
     if info.distortion_model in (*BROWN, *INVERSE) and len(values) in COEFFICIENTS:
-        return camera, Lens(camera, info.distortion_model, tuple(values))
+        return camera, RosLens(camera, info.distortion_model, tuple(values))
     raise DataError(
         f"{where}: expected one of the lens models {', '.join(filter(None, (*BROWN, *INVERSE, *FISHEYE)))}, got "
         f"{info.distortion_model!r} with {len(values)} coefficients; use rectified images, such as image_rect_color"
