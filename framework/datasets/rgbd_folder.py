@@ -11,7 +11,8 @@ This is the format for your own data:
     poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw; only
                         zeros = unknown
     pose/000000.txt     optional, without poses.txt; T_world_camera, a 4x4 matrix per frame
-    timestamps.txt      optional; color depth, one line per frame: timestamps of the two images, s, or one for both
+    timestamps.txt      optional; color depth, one line per frame: timestamps of the two images, s, or one for both;
+                        or times.txt
     gravity.txt         optional; x y z, one line per frame: up direction in the camera frame, from a sensor;
                         nan nan nan = unknown
     instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class = a
@@ -48,6 +49,7 @@ from framework.files.image_files import UPRIGHT, decode_uint16, exif_orientation
 from framework.files.number_lines import read_gravity, read_image_times
 from framework.files.tum_trajectory import TumLine, read_tum_lines
 
+TIMES = ("timestamps.txt", "times.txt")  # names of the file with timestamps, in order of preference
 LARGEST_ID = 2**16 - 1  # maximum instance id; instance-ID images are uint16
 
 _POSES = re.compile("traj|.*pose", re.IGNORECASE)  # matches names of files that probably contain poses
@@ -82,7 +84,9 @@ class RgbdFolder(Recording):
         self._class_names, self._instances = self._read_instances(color)
         lines = _read_optional(self.folder / "poses.txt", read_tum_lines, "poses", len(color))
         ups = _read_optional(self.folder / "gravity.txt", read_gravity, "directions", len(color))
-        times = _read_optional(self.folder / "timestamps.txt", read_image_times, "timestamps", len(color))
+        times = None
+        for name in TIMES:
+            times = times or _read_optional(self.folder / name, read_image_times, "timestamps", len(color))
         poses = self._read_poses(lines, list(color))
         self._has_poses = poses is not None
         frames = []

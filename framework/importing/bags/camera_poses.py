@@ -66,7 +66,9 @@ def _mounting(
     if given is not None:
         return lambda _: given
     if base is None:  # PoseStamped does not name the moving frame
-        log.info("%s: %s: poses are used as poses of the camera in optical axes", bag.path, topics.poses)
+        level = logging.WARNING if bag.topics(*TRANSFORMS) else logging.INFO  # a robot may publish poses of its base
+        message = "%s: %s: poses are used as poses of the camera in optical axes; --camera-pose sets another frame"
+        log.log(level, message, bag.path, topics.poses)
         return lambda _: np.eye(4)
     if base == camera != "":
         return lambda _: np.eye(4)
@@ -94,6 +96,9 @@ def _poses_on_tf(bag: RosBag, tree: TransformTree, camera: str, chosen: str) -> 
             raise DataError(
                 f"{bag.path}: {chosen}: expected moving frames above the camera {camera!r}, got none; set --poses none"
             )
+        if tree.moves:
+            message = "%s: no frame of /tf moves the camera %r; imported without poses"
+            log.warning(message, bag.path, camera)
         return None
     if not chosen and world.rpartition("/")[2] not in FIXED_FRAMES:
         message = "%s: /tf contains the motion of the camera in the frame %r; set --poses /tf if this frame is fixed"

@@ -6,6 +6,7 @@ or similar, belong to the projection matrix P and have no distortion.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -23,13 +24,16 @@ BROWN = ("plumb_bob", "rational_polynomial", "Brown Conrady", "")  # lens models
 INVERSE = ("Inverse Brown Conrady",)  # RealSense: the polynomial maps the recorded image to the pinhole image
 FISHEYE = ("equidistant", "fisheye", "Kannala Brandt4")  # lens models of cv2.fisheye
 COEFFICIENTS = (4, 5, 8, 12, 14)  # numbers of coefficients that OpenCV supports
+_RECTIFIED = re.compile("(?<!un)rect", re.IGNORECASE)
 TRANSPORTS = ("compressed", "compressedDepth", "theora", "ffmpeg", "zstd")  # ends of topics of image_transport
 
 
 def is_rectified(topic: str) -> bool:
-    """Return True if the name of an image topic indicates rectified images."""
-    name, _, end = topic.rpartition("/")
-    return "rect" in (name.rpartition("/")[2] if end in TRANSPORTS else end)
+    """Return True if the name of an image topic indicates rectified images, such as `image_rect` or `rect/image`."""
+    *folders, name = [part for part in topic.split("/") if part not in TRANSPORTS]
+    if _RECTIFIED.search(name):
+        return True
+    return "raw" not in name and any(part in ("rect", "rectified") for part in folders)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from framework.importing.bags.transform_tree import TransformTree
 COLOR = re.compile("color|rgb", re.IGNORECASE)
 DEPTH = re.compile("depth", re.IGNORECASE)
 NEITHER = re.compile("infra|(^|/|_)ir(/|_|$)|disparity|confidence|mask|label|fisheye|theora|points", re.IGNORECASE)
-REGISTERED = re.compile("aligned|registered|to_color|to_rgb", re.IGNORECASE)  # depth in the color camera
+REGISTERED = re.compile("(?<!un)(aligned|registered)|to_color|to_rgb", re.IGNORECASE)  # depth in the color camera
 OPTIONS = {
     "color": "--color",
     "depth": "--depth",

@@ -172,6 +172,11 @@ class TransformTree:
             seen.append(parents[0].parent)
         return seen[-1] if moves else ""
 
+    @cached_property
+    def moves(self) -> bool:
+        """True if some frames move relative to each other."""
+        return any(not edge.is_fixed and not edge.error for edge in self._edges)
+
     def _search(self, start: str, end: str, edges: Sequence[Edge]) -> FrameChain | None:
         neighbors: dict[str, list[tuple[str, Edge, bool]]] = defaultdict(list)
         for edge in edges:

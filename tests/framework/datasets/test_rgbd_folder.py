@@ -775,9 +775,10 @@ def test_rgbd_folder_zero_poses_count_as_unknown(folder, caplog):
     assert [frame.timestamp for frame in sequence] == [0, 1, 2, 3]
 
 
-def test_rgbd_folder_one_column_timestamps_are_of_both_images(folder):
+@pytest.mark.parametrize("name", ["timestamps.txt", "times.txt"])
+def test_rgbd_folder_one_column_timestamps_are_of_both_images(folder, name):
     (folder / "poses.txt").unlink()
-    (folder / "timestamps.txt").write_text("".join(f"{1700000000 + k / 10}\n" for k in range(FRAMES)))
+    (folder / name).write_text("".join(f"{1700000000 + k / 10}\n" for k in range(FRAMES)))
     frame = RgbdFolder(folder)[1]
     assert frame.timestamp == frame.depth_time == pytest.approx(1700000000.1)
 
