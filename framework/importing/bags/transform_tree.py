@@ -9,6 +9,7 @@ One tree contains the transforms of /tf_static, /tf and RealSense's recorder. De
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -30,6 +31,8 @@ SMALLEST_QUATERNION = 0.5  # minimum norm of a valid quaternion
 SAME_POSITION, SAME_ANGLE = 1e-3, 2e-3  # m, radians; maximum difference between equal transforms
 LONGEST_INTERVAL = 0.1  # s, maximum time to the nearest transform of a moving frame
 FIXED_FRAMES = ("map", "odom", "world", "earth")  # names of world frames (REP 105)
+
+log = logging.getLogger(__name__)
 
 _STREAM = re.compile(rf"({REALSENSE}.+)/tf/0")
 _DATA = re.compile("/(image|imu)/data(/|$)")
@@ -235,16 +238,20 @@ class TransformTree:
                 T_stream_reference = _motion(self.bag.first(topic))
                 T_reference_stream = None if T_stream_reference is None else inverse(T_stream_reference)
                 yield REALSENSE, match[1], 0.0, T_reference_stream, True
-        for message in self.bag.messages(self.bag.topics(*TRANSFORMS)):
-            try:
-                content = self.bag.decoded(message)
-            except FrameError:
-                continue
-            for one in content.transforms:
-                stamp = one.header.stamp
-                names = _name(one.header.frame_id), _name(one.child_frame_id)
-                is_static = message.topic.endswith(STATIC)
-                yield *names, stamp.sec + 1e-9 * stamp.nanosec, _motion(one.transform), is_static
+        try:
+            for message in self.bag.messages(self.bag.topics(*TRANSFORMS)):
+                try:
+                    content = self.bag.decoded(message)
+                except FrameError as error:
+                    log.warning("%s; message skipped", error)
+                    continue
+                for one in content.transforms:
+                    stamp = one.header.stamp
+                    names = _name(one.header.frame_id), _name(one.child_frame_id)
+                    is_static = message.topic.endswith(STATIC)
+                    yield *names, stamp.sec + 1e-9 * stamp.nanosec, _motion(one.transform), is_static
+        except DataError as error:
+            log.warning("%s; using the transforms before the error", error)
 
 
 def _name(frame_id: str) -> str:

@@ -601,6 +601,45 @@ def test_ros_bag_tf_with_unknown_root_needs_choice(tmp_path: Path, caplog: pytes
     check_room(tmp_path / "out")
 
 
+def test_ros_bag_tf_without_camera_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    for k in range(COUNT):
+        bag.add_tf(time_of(k), ("odom", "base_link", pose_at(k)))
+    assert not open_source(bag.write(tmp_path / "bag")).posed
+    assert "no frame of /tf moves the camera 'camera_color_optical_frame'; imported without poses" in caplog.text
+
+
+def test_ros_bag_pose_stamped_of_robot_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_poses(bag)
+    bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
+    path = bag.write(tmp_path / "bag")
+    assert not imported(path, tmp_path / "out")
+    check_room(tmp_path / "out")
+    assert "/pose: poses are used as poses of the camera in optical axes; --camera-pose sets" in caplog.text
+    bag.messages = [entry for entry in bag.messages if entry[1] != "/pose"]
+    for k in range(COUNT):
+        bag.add_pose(time_of(k), "/pose", pose_at(k) @ T_CAMERA_ROS)
+    assert not imported_with(bag.write(tmp_path / "base"), tmp_path / "of_base", camera_pose=ROS_AXES)
+    check_room(tmp_path / "of_base")
+
+
+def test_ros_bag_damaged_transforms_are_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_separate_depth(bag)
+    bag.add_static((OPTICAL, DEPTH_FRAME, T_COLOR_DEPTH))
+    bag.add_tf(time_of(1), ("odom", "base_link", np.eye(4)))
+    path = bag.write(tmp_path / "bag")
+    [file] = path.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        [[topic]] = database.execute("SELECT id FROM topics WHERE name = '/tf'")
+        database.execute("UPDATE messages SET data = x'0001' WHERE topic_id = ?", [topic])
+    assert not imported(path, tmp_path / "out")
+    assert "/tf: expected a valid message" in caplog.text
+
+
 def test_ros_bag_frame_with_two_parents_raises(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
