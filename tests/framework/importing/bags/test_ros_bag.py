@@ -16,22 +16,29 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rosbags")
 
-from framework.data import Camera
 from framework.datasets.frames.odometry import OdometryFile
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError
 from framework.files.tum_trajectory import read_tum
 from framework.geometry import exp_se3, interpolate, inverse
-from framework.importing.bags.camera_poses import ROS_AXES
 from framework.importing.bags.ros_topics import BagOptions, Topics
 from framework.importing.bags.transform_tree import stream_of
-from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.formats import open_source
+from tests.support.recordings.imported_bags import (
+    DEPTH_CAMERA,
+    KINDS,
+    T_BASE_CAMERA,
+    add_odometry_of_base,
+    add_poses,
+    add_separate_depth,
+    check_room,
+    imported,
+    imported_with,
+)
 from tests.support.recordings.phone_exports import ROOM, T_COLOR_DEPTH, write_jpeg
 from tests.support.recordings.ros_bags import (
     COUNT,
     START,
-    T_CAMERA_ROS,
     BagWriter,
     add_camera_of_ros,
     add_realsense,
@@ -42,38 +49,6 @@ from tests.support.recordings.ros_bags import (
     time_of,
 )
 from tests.support.scenes.corner_room import look, pose_at
-
-KINDS = {"ros1.bag": True, "ros2_folder": False, "mcap_folder": False}
-DEPTH_CAMERA = Camera(424, 240, 210.0, 210.0, 211.0, 119.0)
-
-
-def check_room(folder: Path, posed: bool = True, within: float = 2e-3, holes: float = 0.0) -> RgbdFolder:
-    sequence = RgbdFolder(folder)
-    assert (sequence.camera, len(sequence)) == (ROOM, COUNT)
-    for k, frame in enumerate(sequence):
-        color, depth = seen(k)
-        if posed:
-            assert frame.timestamp == pytest.approx(time_of(k), abs=1e-6)
-            np.testing.assert_allclose(frame.T_world_camera, pose_at(k), atol=1e-6)
-        assert np.abs(frame.color.astype(int) - color).mean() < 4
-        read = frame.depth > 0
-        assert read.mean() >= 1 - holes
-        assert np.median(np.abs(frame.depth - depth)[read]) < within
-        assert (np.abs(frame.depth - depth)[read] > 0.03).mean() < 0.05
-    return sequence
-
-
-def imported(path: Path, out: Path, **topics: str) -> list[str]:
-    return write_folder(open_source(path, Topics(**topics)), out, Writing()).errors
-
-
-def add_poses(bag: BagWriter, topic: str = "/pose") -> None:
-    for k in range(COUNT):
-        bag.add_pose(time_of(k), topic, pose_at(k))
-
-
-def imported_with(path: Path, out: Path, **options: Any) -> list[str]:
-    return write_folder(open_source(path, None, BagOptions(**options)), out, Writing()).errors
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -102,16 +77,6 @@ def test_ros_bag_odometry_of_camera_frame_is_camera_pose(tmp_path: Path) -> None
         bag.add_odometry(time_of(k), "/odom", pose_at(k), "camera_color_optical_frame")
     assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
     check_room(tmp_path / "out")
-
-
-T_BASE_CAMERA = (
-    exp_se3(np.array([0.2, -0.1, 0.5, 0, 0, 0])) @ T_CAMERA_ROS.T
-)  # the camera looks along the x axis of the base
-
-
-def add_odometry_of_base(bag: BagWriter) -> None:
-    for k in range(COUNT + 1):
-        bag.add_odometry(time_of(k), "/odom", pose_at(k) @ inverse(T_BASE_CAMERA), "base_link")
 
 
 def test_ros_bag_odometry_of_base_is_written_for_camera(tmp_path: Path) -> None:
@@ -345,333 +310,6 @@ def test_ros_bag_images_without_time_match_are_dropped(tmp_path: Path) -> None:
         DataError, match=r"within 0\.02 s of each other, got none among 4 images on /camera/color/image_raw and 1 on"
     ):
         open_source(far.write(tmp_path / "far"))
-
-
-# Cameras and transforms
-
-OPTICAL, DEPTH_FRAME = "camera_color_optical_frame", "camera_depth_optical_frame"
-
-
-def add_separate_depth(
-    bag: BagWriter, topic: str = "/camera/depth/image_rect_raw", info: bool = True, camera: Camera = DEPTH_CAMERA
-) -> None:
-    """Add color, and depth of another camera, as realsense2_camera without align_depth does."""
-    for k in range(COUNT):
-        bag.add_image(time_of(k), "/camera/color/image_raw", seen(k)[0], "rgb8")
-        depth = look(camera, pose_at(k) @ T_COLOR_DEPTH)[0]
-        bag.add_image(time_of(k), topic, millimeters(depth), "16UC1", frame_id=DEPTH_FRAME)
-    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM)
-    if info:
-        bag.add_camera(time_of(0), f"{topic.rpartition('/')[0]}/camera_info", camera)
-
-
-T_LINK_DEPTH = exp_se3(np.array([0.0, 0.01, 0.02, 0.1, -0.2, 0.3])) @ T_CAMERA_ROS.T
-T_LINK_COLOR = T_LINK_DEPTH @ inverse(T_COLOR_DEPTH)
-
-
-def split(name: str, T_link_depth: np.ndarray, T_link_color: np.ndarray, bag: BagWriter) -> None:
-    """Add the transforms between the cameras in one of several layouts."""
-    if name == "direct":
-        bag.add_static((OPTICAL, DEPTH_FRAME, T_COLOR_DEPTH))
-    elif name == "inverse":
-        bag.add_static((DEPTH_FRAME, OPTICAL, inverse(T_COLOR_DEPTH)))
-    elif name == "link":
-        bag.add_static(("camera_link", DEPTH_FRAME, T_link_depth), ("camera_link", OPTICAL, T_link_color))
-    elif name == "messages":
-        bag.add_static(("camera_link", DEPTH_FRAME, T_link_depth))
-        bag.add_static(("/camera_link", f"/{OPTICAL}", T_link_color))
-    elif name == "tf":  # static_transform_publisher of early ROS 1 repeats the transforms on /tf
-        for n in range(4):
-            for child, T in ((DEPTH_FRAME, T_link_depth), (OPTICAL, T_link_color)):
-                bag.add_tf(time_of(0) + n, ("camera_link", child, T))
-
-
-@pytest.mark.parametrize("name", ["ros1.bag", "ros2_folder"])
-@pytest.mark.parametrize("layout", ["direct", "inverse", "link", "messages", "tf"])
-def test_ros_bag_depth_is_registered_by_transform_tree(tmp_path: Path, name: str, layout: str) -> None:
-    bag = BagWriter(ros1=KINDS[name])
-    add_separate_depth(bag)
-    split(layout, T_LINK_DEPTH, T_LINK_COLOR, bag)
-    assert not imported(bag.write(tmp_path / name), tmp_path / "out")
-    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)
-
-
-def test_ros_bag_contradicting_transforms_raise(tmp_path: Path) -> None:
-    bag = BagWriter()
-    add_separate_depth(bag)
-    bag.add_static((OPTICAL, DEPTH_FRAME, T_COLOR_DEPTH))
-    bag.add_static((OPTICAL, DEPTH_FRAME, np.eye(4)))
-    path = bag.write(tmp_path / "bag")
-    with pytest.raises(DataError, match="expected one transform on /tf_static, got several that contradict"):
-        open_source(path)
-
-
-def test_ros_bag_contradicting_paths_raise(tmp_path: Path) -> None:
-    bag = BagWriter()
-    add_separate_depth(bag)
-    bag.add_static(
-        (OPTICAL, DEPTH_FRAME, T_COLOR_DEPTH), (OPTICAL, "link", np.eye(4)), ("link", DEPTH_FRAME, np.eye(4))
-    )
-    path = bag.write(tmp_path / "bag")
-    with pytest.raises(DataError, match=r"expected one transform .*, got two paths that contradict each other"):
-        open_source(path)
-
-
-def test_ros_bag_moving_joint_between_cameras_raises(tmp_path: Path) -> None:
-    bag = BagWriter()
-    add_separate_depth(bag)
-    for k in range(COUNT):
-        bag.add_tf(time_of(k), (OPTICAL, DEPTH_FRAME, exp_se3(np.array([0, 0, 0, 0.1 * k, 0, 0]))))
-    path = bag.write(tmp_path / "bag")
-    with pytest.raises(DataError, match=r"expected a rigid transform .*, got a moving joint"):
-        open_source(path)
-
-
-@pytest.mark.parametrize(
-    ("topic", "size", "output"),
-    [
-        ("/camera/depth/image_rect_raw", (424, 240), "expected the aspect ratio of color"),
-        ("/camera/depth/image_raw", (424, 240), "expected the aspect ratio of color"),
-        ("/camera/depth/image_rect_raw", (160, 120), "no CameraInfo; set --depth-registered"),
-        ("/camera/aligned_depth_to_color/image_raw", (424, 240), "expected the aspect ratio of color"),
-        ("/depth/image", (320, 320), "expected the aspect ratio of color"),
-    ],
-)
-def test_ros_bag_depth_without_camera_info_raises(
-    tmp_path: Path, topic: str, size: tuple[int, int], output: str
-) -> None:
-    bag = BagWriter()
-    add_separate_depth(bag, topic, info=False, camera=Camera(*size, 210.0, 210.0, size[0] / 2, size[1] / 2))
-    path = bag.write(tmp_path / "bag")
-    with pytest.raises(DataError, match=output):
-        open_source(path)
-
-
-def test_ros_bag_depth_registered_option_is_applied(tmp_path: Path) -> None:
-    bag = BagWriter()
-    for k in range(COUNT):
-        color, depth = seen(k)
-        bag.add_image(time_of(k), "/camera/color/image_raw", color, "rgb8")
-        bag.add_image(time_of(k), "/camera/depth/image_raw", millimeters(depth), "16UC1", frame_id=DEPTH_FRAME)
-    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM)
-    path = bag.write(tmp_path / "bag")
-    assert not imported_with(path, tmp_path / "out", depth_registered=True)
-    check_room(tmp_path / "out", posed=False)
-
-
-def test_ros_bag_camera_info_of_depth_alone_raises(tmp_path: Path) -> None:
-    bag = BagWriter()
-    add_separate_depth(bag)
-    bag.messages = [entry for entry in bag.messages if entry[1] != "/camera/color/camera_info"]
-    for _, _, kind, message in bag.messages:
-        if kind.endswith("CameraInfo"):
-            message.header.frame_id = DEPTH_FRAME
-    path = bag.write(tmp_path / "bag")
-    with pytest.raises(DataError, match="got only /camera/depth/camera_info, which belongs to /camera/depth/image"):
-        open_source(path)
-
-
-RAW_LENS = Camera(ROOM.width, ROOM.height, 1.2 * ROOM.fx, 1.2 * ROOM.fy, ROOM.cx + 5, ROOM.cy - 5)
-
-
-@pytest.mark.parametrize(
-    "topic",
-    [
-        "/rgb/image_rect_color",
-        "/rgb/image_rect",
-        "/kinect2/qhd/image_color_rect",
-        "/zed/left/image_rect_color",
-        "/rgb/image_rect_color/compressed",
-    ],
-)
-@pytest.mark.parametrize("ros1", [True, False])
-def test_ros_bag_rectified_color_uses_projection_matrix(tmp_path: Path, topic: str, ros1: bool) -> None:
-    bag = BagWriter(ros1)
-    for k in range(COUNT):
-        color, depth = seen(k)
-        if topic.endswith("compressed"):
-            bag.add_compressed(time_of(k), topic, png(color[..., ::-1]), "rgb8; png compressed bgr8")
-        else:
-            bag.add_image(time_of(k), topic, color, "rgb8")
-        bag.add_image(time_of(k), "/depth_registered/image_rect", millimeters(depth), "16UC1")
-    name = f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
-    bag.add_camera(time_of(0), name, RAW_LENS, lens=[0.05, -0.1, 0.001, 0.001, 0], rectified=ROOM)
-    assert not imported(bag.write(tmp_path / ("a.bag" if ros1 else "bag")), tmp_path / "out")
-    assert "distortion" not in json.loads((tmp_path / "out/camera.json").read_text())
-    check_room(tmp_path / "out", posed=False)
-
-
-def test_ros_bag_raw_depth_is_moved_to_rectified_color(tmp_path: Path) -> None:
-    """Hardware-registered depth of OpenNI is in the raw camera, and the recorded color is rectified."""
-    bag = BagWriter()
-    for k in range(COUNT):
-        raw_depth = look(RAW_LENS, pose_at(k))[0]
-        bag.add_image(time_of(k), "/camera/rgb/image_rect_color", seen(k)[0], "rgb8")
-        bag.add_image(time_of(k), "/camera/depth_registered/image_raw", millimeters(raw_depth), "16UC1")
-    bag.add_camera(time_of(0), "/camera/rgb/camera_info", RAW_LENS, rectified=ROOM)
-    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
-    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.4)
-
-
-# Poses of other frames
-
-
-def check_poses(bag: BagWriter, path: Path, out: Path, **options: Any) -> None:
-    assert not imported_with(bag.write(path), out, **options)
-    check_room(out)
-
-
-@pytest.mark.parametrize("layout", ["direct", "mast", "inverse", "tf", "moving mast"])
-def test_ros_bag_odometry_of_base_becomes_camera_poses(tmp_path: Path, layout: str) -> None:
-    bag = BagWriter(ros1=layout == "tf")
-    add_camera_of_ros(bag)
-    T_base_mast = exp_se3(np.array([0.1, 0.2, 0.3, 0.1, 0.2, 0.3]))
-    if layout == "moving mast":
-        add_odometry_of_base(bag)
-        for k in range(COUNT + 1):
-            T_mast = exp_se3(np.array([0, 0, 0.01 * k, 0, 0, 0.1 * k]))
-            bag.add_tf(time_of(k), ("base_link", "mast", T_mast))
-        bag.add_static(("mast", OPTICAL, T_BASE_CAMERA))
-        bag.messages = [entry for entry in bag.messages if entry[1] != "/odom"]
-        for k in range(COUNT):
-            T_mast = exp_se3(np.array([0, 0, 0.01 * k, 0, 0, 0.1 * k]))
-            bag.add_odometry(time_of(k), "/odom", pose_at(k) @ inverse(T_mast @ T_BASE_CAMERA), "base_link")
-    else:
-        add_odometry_of_base(bag)
-    if layout == "direct":
-        bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
-    elif layout == "inverse":
-        bag.add_static((OPTICAL, "base_link", inverse(T_BASE_CAMERA)))
-    elif layout == "mast":
-        T_mast_camera = inverse(T_base_mast) @ T_BASE_CAMERA
-        bag.add_static(("base_link", "mast", T_base_mast), ("mast", OPTICAL, T_mast_camera))
-    elif layout == "tf":
-        for n in range(3):
-            bag.add_tf(time_of(0) + 0.05 * n, ("base_link", OPTICAL, T_BASE_CAMERA))
-    check_poses(bag, tmp_path / ("a.bag" if bag.ros1 else "bag"), tmp_path / "out")
-
-
-def test_ros_bag_odometry_of_unconnected_base_raises(tmp_path: Path) -> None:
-    bag = BagWriter()
-    add_camera_of_ros(bag)
-    add_odometry_of_base(bag)
-    path = bag.write(tmp_path / "bag")
-    expected = (
-        "expected a transform from 'base_link' to the camera 'camera_color_optical_frame' on /tf_static, got none"
-    )
-    with pytest.raises(DataError, match=f"{expected}; set --camera-pose .* or --poses none"):
-        open_source(path)
-
-
-def test_ros_bag_camera_pose_option_is_applied(tmp_path: Path) -> None:
-    bag = BagWriter()
-    add_camera_of_ros(bag)
-    for k in range(COUNT):
-        bag.add_odometry(time_of(k), "/odom", pose_at(k) @ T_CAMERA_ROS, "base_link")
-    check_poses(bag, tmp_path / "bag", tmp_path / "out", camera_pose=ROS_AXES)
-
-
-@pytest.mark.parametrize("layout", ["map", "map and odom", "slow map", "world", "ros1"])
-def test_ros_bag_poses_on_tf_are_imported(tmp_path: Path, layout: str) -> None:
-    bag = BagWriter(ros1=layout == "ros1")
-    add_camera_of_ros(bag)
-    bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
-    T_map_odom = exp_se3(np.array([1.0, 2.0, 0, 0, 0, 0.5])) if layout in ("map and odom", "slow map") else np.eye(4)
-    root = {"world": "/world", "map and odom": "odom", "slow map": "odom"}.get(layout, "map")
-    for k in range(-1, COUNT + 1):
-        bag.add_tf(START + k / 30, (root, "base_link", inverse(T_map_odom) @ pose_at(k) @ inverse(T_BASE_CAMERA)))
-    if layout == "map and odom":
-        for n in range(20):
-            bag.add_tf(START - 0.1 + 0.02 * n, ("map", "odom", T_map_odom))
-    if layout == "slow map":
-        for n in (-1, 1):
-            bag.add_tf(START + n, ("map", "odom", T_map_odom))
-    check_poses(bag, tmp_path / ("a.bag" if bag.ros1 else "bag"), tmp_path / "out")
-
-
-def test_ros_bag_tf_with_unknown_root_needs_choice(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    bag = BagWriter()
-    add_camera_of_ros(bag)
-    for k in range(COUNT):
-        bag.add_tf(time_of(k), ("pan_base", OPTICAL, pose_at(k)))
-    path = bag.write(tmp_path / "bag")
-    assert not open_source(path).posed
-    assert "in the frame 'pan_base'; set --poses /tf if this frame is fixed" in caplog.text
-    assert not imported(path, tmp_path / "out", poses="/tf")
-    check_room(tmp_path / "out")
-
-
-def test_ros_bag_tf_without_camera_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    bag = BagWriter()
-    add_camera_of_ros(bag)
-    for k in range(COUNT):
-        bag.add_tf(time_of(k), ("odom", "base_link", pose_at(k)))
-    assert not open_source(bag.write(tmp_path / "bag")).posed
-    assert "no frame of /tf moves the camera 'camera_color_optical_frame'; imported without poses" in caplog.text
-
-
-def test_ros_bag_pose_stamped_of_robot_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    bag = BagWriter()
-    add_camera_of_ros(bag)
-    add_poses(bag)
-    bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
-    path = bag.write(tmp_path / "bag")
-    assert not imported(path, tmp_path / "out")
-    check_room(tmp_path / "out")
-    assert "/pose: poses are used as poses of the camera in optical axes; --camera-pose sets" in caplog.text
-    bag.messages = [entry for entry in bag.messages if entry[1] != "/pose"]
-    for k in range(COUNT):
-        bag.add_pose(time_of(k), "/pose", pose_at(k) @ T_CAMERA_ROS)
-    assert not imported_with(bag.write(tmp_path / "base"), tmp_path / "of_base", camera_pose=ROS_AXES)
-    check_room(tmp_path / "of_base")
-
-
-def test_ros_bag_damaged_transforms_are_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    bag = BagWriter()
-    add_separate_depth(bag)
-    bag.add_static((OPTICAL, DEPTH_FRAME, T_COLOR_DEPTH))
-    bag.add_tf(time_of(1), ("odom", "base_link", np.eye(4)))
-    path = bag.write(tmp_path / "bag")
-    [file] = path.glob("*.db3")
-    with sqlite3.connect(file) as database:
-        [[topic]] = database.execute("SELECT id FROM topics WHERE name = '/tf'")
-        database.execute("UPDATE messages SET data = x'0001' WHERE topic_id = ?", [topic])
-    assert not imported(path, tmp_path / "out")
-    assert "/tf: expected a valid message" in caplog.text
-
-
-def test_ros_bag_frame_with_two_parents_raises(tmp_path: Path) -> None:
-    bag = BagWriter()
-    add_camera_of_ros(bag)
-    for k in range(COUNT):
-        bag.add_tf(time_of(k), ("odom", OPTICAL, pose_at(k)), ("map", OPTICAL, pose_at(k + 1)))
-    path = bag.write(tmp_path / "bag")
-    with pytest.raises(DataError, match="expected one parent frame on /tf, got map and odom"):
-        open_source(path)
-
-
-def test_ros_bag_poses_none_imports_without_poses(tmp_path: Path) -> None:
-    bag = BagWriter()
-    add_camera_of_ros(bag)
-    add_odometry_of_base(bag)
-    add_poses(bag)
-    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out", poses="none")
-    assert not (tmp_path / "out/poses.txt").exists()
-    assert RgbdFolder(tmp_path / "out")[1].timestamp == pytest.approx(time_of(1), abs=1e-6)
-
-
-def test_ros_bag_zero_poses_count_as_none(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    bag = BagWriter()
-    add_camera_of_ros(bag)
-    add_poses(bag)
-    for _, _, kind, message in bag.messages:
-        if kind.endswith("PoseStamped"):
-            for part in (message.pose.position, message.pose.orientation):
-                vars(part).update(dict.fromkeys(set(vars(part)) & set("xyzw"), 0.0))
-    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
-    check_room(tmp_path / "out", posed=False)
-    assert not (tmp_path / "out/poses.txt").exists()
-    assert "/pose: expected camera poses, got only zeros; imported without poses" in caplog.text
 
 
 # Times and units
