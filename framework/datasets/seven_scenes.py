@@ -54,7 +54,7 @@ class SevenScenes(Recording):
 def _recorded(folder: Path, number: int) -> RecordedFrame:
     stem = f"frame-{number:06d}"
     files = StoredImages.of_files(folder / f"{stem}.color.png", folder / f"{stem}.depth.png")
-    images = replace(files, depth=lambda: register(files.depth()))
+    images = replace(files, depth=lambda: register(np.asarray(files.depth(), np.uint16)))
     return RecordedFrame.posed(images, number / FRAME_RATE, lambda: _color_pose(folder / f"{stem}.pose.txt"))
 
 

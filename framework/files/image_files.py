@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import simplejpeg
+from PIL import ExifTags, Image
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
@@ -23,7 +24,17 @@ from framework.files.atomic_write import read_bytes
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 JPEG_PADDING = b"\0\r\n"  # bytes after the end marker; some cameras append zeros; some programs append a line break
+UPRIGHT = 1  # EXIF orientation of an image whose pixels are stored as displayed
 LARGEST_FILE = 2**28  # bytes, size of MAX_PIXELS with four 16-bit channels
+
+
+def exif_orientation(path: Path) -> int:
+    """Return the EXIF orientation of an image file, from 1 (UPRIGHT) to 8, or UPRIGHT if the file has none."""
+    try:
+        with Image.open(path) as image:
+            return int(image.getexif().get(ExifTags.Base.Orientation, UPRIGHT))
+    except Exception:  # Pillow has no common base exception; reading the pixels reports damage
+        return UPRIGHT
 
 
 def read_color(path: Path) -> UInt8:

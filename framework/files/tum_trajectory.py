@@ -37,6 +37,11 @@ class TumLine:
     position: tuple[float, ...]  # (3,) m, may be NaN
     quat_xyzw: tuple[float, ...]  # (4,), may be NaN
 
+    @property
+    def is_zero(self) -> bool:
+        """True if all numbers of the pose are 0, as some programs write for an unknown pose."""
+        return not any((*self.position, *self.quat_xyzw))
+
     def pose(self) -> Float64:
         """Return the pose T_world_camera (4, 4).
 

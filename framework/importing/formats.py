@@ -6,7 +6,7 @@ from pathlib import Path
 
 from framework.errors import ConfigError, DataError
 from framework.importing.bags import ros_bag
-from framework.importing.bags.ros_topics import Topics
+from framework.importing.bags.ros_topics import BagOptions, Topics
 from framework.importing.phones import polycam, record3d, scanner_app, stray_scanner
 from framework.importing.source import Source
 
@@ -20,12 +20,13 @@ FORMATS = (
 )
 
 
-def open_source(path: Path, topics: Topics | None = None) -> Source:
+def open_source(path: Path, topics: Topics | None = None, options: BagOptions | None = None) -> Source:
     """Open a recording in any supported format.
 
     Args:
         path: The file or folder of the recording.
         topics: The topics of a ROS bag; None = selected by type and name.
+        options: The options of a ROS bag; None = defaults.
 
     Raises:
         DataError: The format is unknown, or the recording is unreadable.
@@ -42,9 +43,10 @@ def open_source(path: Path, topics: Topics | None = None) -> Source:
             if not kind.recognized(place):
                 continue
             if kind.has_topics:
-                return kind.open(place, topics or Topics())
-            if topics and topics.given:
-                raise ConfigError(f"{', '.join(topics.given)}: expected a ROS bag, got {path}; omit these options")
+                return kind.open(place, topics or Topics(), options or BagOptions())
+            given = [*(topics.given if topics else ()), *(options.given if options else ())]
+            if given:
+                raise ConfigError(f"{', '.join(given)}: expected a ROS bag, got {path}; omit these options")
             return kind.open(place)
     if (path / "camera.json").exists() and (path / "depth").is_dir():
         command = f"instancemap dataset=rgbd_folder dataset.root={path}"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -91,8 +92,17 @@ class Format:
     name: str  # for the command line
     needs: str  # characteristic files, for messages
     recognized: Callable[[Path], bool]  # True for a recording in this format
-    open: Callable[..., Source]  # parameters: path, and topics if has_topics; raises DataError
-    has_topics: bool = False  # True if `open` has the parameter topics
+    open: Callable[..., Source]  # parameters: path, and topics and options if has_topics; raises DataError
+    has_topics: bool = False  # True if `open` has the parameters topics and options
+
+
+def without_poses(source: Source) -> Source:
+    """Return a recording without its poses. Up directions are kept."""
+
+    def read(stored: StoredFrame) -> DeviceFrame:
+        return replace(stored(), T_world_camera=None)
+
+    return replace(source, frames=(partial(read, stored) for stored in source.frames), posed=False)
 
 
 def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
