@@ -7,7 +7,7 @@ from pathlib import Path
 from framework.errors import ConfigError, DataError
 from framework.importing.bags import ros_bag
 from framework.importing.bags.ros_topics import Topics
-from framework.importing.phones import polycam, record3d, scanner_app, stray_scanner
+from framework.importing.phones import arkit_scenes, polycam, record3d, scanner_app, stray_scanner
 from framework.importing.source import Source
 
 FORMATS = (
@@ -16,6 +16,7 @@ FORMATS = (
     record3d.FOLDER_FORMAT,
     polycam.FORMAT,
     scanner_app.FORMAT,
+    arkit_scenes.FORMAT,
     ros_bag.FORMAT,
 )
 
