@@ -8,7 +8,7 @@ from framework.errors import ConfigError, DataError
 from framework.importing.bags import ros_bag
 from framework.importing.bags.ros_topics import Topics
 from framework.importing.phones import arkit_scenes, polycam, record3d, scanner_app, stray_scanner
-from framework.importing.reconstructions import transforms_json
+from framework.importing.reconstructions import colmap_model, transforms_json
 from framework.importing.source import Source
 
 FORMATS = (
@@ -19,6 +19,7 @@ FORMATS = (
     scanner_app.FORMAT,
     arkit_scenes.FORMAT,
     transforms_json.FORMAT,
+    colmap_model.FORMAT,
     ros_bag.FORMAT,
 )
 

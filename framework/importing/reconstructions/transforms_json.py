@@ -17,7 +17,6 @@ nerfstudio.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -28,6 +27,7 @@ import numpy as np
 from framework.data import Camera
 from framework.datasets.calibration.camera_json import number_list, numbers_of, pinhole, read_json_object
 from framework.datasets.calibration.undistortion import Distortion
+from framework.datasets.frames.numbered_images import natural_order
 from framework.datasets.frames.sequence_reader import FRAME_RATE
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint16
@@ -156,12 +156,7 @@ def _in_order(file: Path, frames: Sequence[dict[str, Any]]) -> list[dict[str, An
     if all("timestamp" in frame for frame in frames):
         return sorted(frames, key=lambda frame: numbers_of(file, frame, "timestamp")[0])
     untimed = [{key: value for key, value in frame.items() if key != "timestamp"} for frame in frames]
-    return sorted(untimed, key=lambda frame: _natural(str(frame.get("file_path"))))
-
-
-def _natural(name: str) -> list[tuple[int, int | str]]:
-    """Return a sort key by which frame 10 follows frame 9."""
-    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split("([0-9]{1,18})", name) if part]
+    return sorted(untimed, key=lambda frame: natural_order(str(frame.get("file_path"))))
 
 
 NEEDS = "a folder with transforms.json and its color and depth images, from nerfstudio or NeRFCapture"
