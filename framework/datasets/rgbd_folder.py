@@ -7,7 +7,8 @@ This is the format for your own data:
                         optional "sensor": kind of the depth sensor, such as "REALSENSE_D435"; default "KINECT_V1"
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
-    poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw
+    poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw;
+                        or EuRoC or KITTI format
     timestamps.txt      optional; color depth, one line per frame: timestamps of the two images, s
     gravity.txt         optional; x y z, one line per frame: up direction in the camera frame, from a sensor;
                         nan nan nan = unknown
@@ -23,6 +24,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,7 +42,7 @@ from framework.errors import DataError, FrameError
 from framework.files.atomic_write import path_exists
 from framework.files.image_files import decode_uint16, read_image_file
 from framework.files.number_lines import read_gravity, read_image_times
-from framework.files.tum_trajectory import TumLine, read_tum_lines
+from framework.files.pose_lines import PoseLine, read_pose_lines
 
 LARGEST_ID = 2**16 - 1  # maximum instance id; instance-ID images are uint16
 
@@ -68,7 +70,7 @@ class RgbdFolder(Recording):
         depth = numbered_images(self.folder / "depth", (".png",))
         _check_same_frames(color, depth)
         self._class_names, self._instances = self._read_instances(color)
-        lines = _read_optional(self.folder / "poses.txt", read_tum_lines, "poses", len(color))
+        lines = _read_optional(self.folder / "poses.txt", _read_poses, "poses", len(color))
         ups = _read_optional(self.folder / "gravity.txt", read_gravity, "directions", len(color))
         times = _read_optional(self.folder / "timestamps.txt", read_image_times, "timestamps", len(color))
         self._has_poses = lines is not None
@@ -135,7 +137,7 @@ class RgbdFolder(Recording):
 
 
 def _recorded(
-    images: StoredImages, index: int, line: TumLine | None, times: tuple[float, float] | None
+    images: StoredImages, index: int, line: PoseLine | None, times: tuple[float, float] | None
 ) -> RecordedFrame:
     """Return a frame with its pose and timestamps.
 
@@ -146,11 +148,16 @@ def _recorded(
         times: The timestamps of color and depth, s; None = no timestamps.
     """
     color, depth = times or (None, None)
+    without_line = index / FRAME_RATE if color is None else color
     if line is None:
-        frame = RecordedFrame(images, index / FRAME_RATE if color is None else color)
+        frame = RecordedFrame(images, without_line)
     else:
-        frame = RecordedFrame.posed(images, line.timestamp, line.pose)
+        frame = RecordedFrame.posed(images, without_line if math.isnan(line.timestamp) else line.timestamp, line.pose)
     return replace(frame, color_timestamp=color, depth_timestamp=depth)
+
+
+def _read_poses(path: Path) -> list[PoseLine]:
+    return list(read_pose_lines(path)[1])
 
 
 def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
