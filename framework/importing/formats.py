@@ -8,7 +8,7 @@ from framework.errors import ConfigError, DataError
 from framework.importing.bags import ros_bag
 from framework.importing.bags.ros_topics import Topics
 from framework.importing.phones import arkit_scenes, polycam, record3d, scanner_app, stray_scanner
-from framework.importing.reconstructions import colmap_model, transforms_json
+from framework.importing.reconstructions import colmap_model, rtabmap_database, transforms_json
 from framework.importing.source import Source
 
 FORMATS = (
@@ -20,6 +20,7 @@ FORMATS = (
     arkit_scenes.FORMAT,
     transforms_json.FORMAT,
     colmap_model.FORMAT,
+    rtabmap_database.FORMAT,
     ros_bag.FORMAT,
 )
 

@@ -22,8 +22,8 @@ WRITERS = {
 TIMES = [frame.timestamp for frame in desk_frames()]
 POSES = [frame.T_world_camera for frame in desk_frames()]
 
-# first lines of state_groundtruth_estimate0/data.csv of MH_01_easy (EuRoC MAV dataset), with its header
-EUROC = """#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_RS_R_x []\r
+# first lines of state_groundtruth_estimate0/data.csv of MH_01_easy (EuRoC MAV dataset), with the start of its header
+EUROC = """#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_RS_R_x\r
 1403636580838555648,4.688319,-1.786938,0.783338,0.534108,-0.153029,-0.827383,-0.082152,-0.027876\r
 1403636580843555328,4.688177,-1.786770,0.787350,0.534640,-0.152990,-0.826976,-0.082863,-0.029272\r
 """
