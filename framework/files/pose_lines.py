@@ -73,7 +73,7 @@ PoseLine = TumLine | MatrixLine
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class StoredTrajectory:
     """Poses of a file."""
 
     format: TrajectoryFormat
@@ -81,7 +81,7 @@ class Trajectory:
     poses: Float64  # (F, 4, 4) T_world_camera
 
 
-def read_trajectory(path: Path) -> Trajectory:
+def read_trajectory(path: Path) -> StoredTrajectory:
     """Read a trajectory in TUM, EuRoC or KITTI format.
 
     Raises:
@@ -90,11 +90,11 @@ def read_trajectory(path: Path) -> Trajectory:
     kind, lines = read_pose_lines(path)
     poses = np.array([line.pose() for line in lines], np.float64).reshape(-1, 4, 4)
     if kind is TrajectoryFormat.KITTI:
-        return Trajectory(kind, None, poses)
+        return StoredTrajectory(kind, None, poses)
     for before, line in pairwise(lines):
         if isinstance(line, TumLine) and line.timestamp <= before.timestamp:
             raise line.error(f"expected a timestamp > {before.timestamp:.12g} s, got {line.timestamp:.12g} s")
-    return Trajectory(kind, np.array([line.timestamp for line in lines], np.float64), poses)
+    return StoredTrajectory(kind, np.array([line.timestamp for line in lines], np.float64), poses)
 
 
 def read_pose_lines(path: Path) -> tuple[TrajectoryFormat, Sequence[PoseLine]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from framework.errors import ConfigError, DataError
 from framework.importing.bags import ros_bag
 from framework.importing.bags.ros_topics import Topics
-from framework.importing.phones import arkit_scenes, polycam, record3d, scanner_app, stray_scanner
+from framework.importing.phones import arkit_scenes, polycam, record3d, scanner_app, scannetpp_iphone, stray_scanner
 from framework.importing.reconstructions import colmap_model, rtabmap_database, transforms_json
 from framework.importing.source import Source
 
@@ -18,6 +18,7 @@ FORMATS = (
     polycam.FORMAT,
     scanner_app.FORMAT,
     arkit_scenes.FORMAT,
+    scannetpp_iphone.FORMAT,
     transforms_json.FORMAT,
     colmap_model.FORMAT,
     rtabmap_database.FORMAT,

@@ -43,7 +43,7 @@ _NAME = re.compile(r"[0-9]+_([0-9]{1,12}\.[0-9]{1,9})")
 
 
 @dataclass(frozen=True)
-class PoseLine:
+class AxisAngleLine:
     """A line of the trajectory."""
 
     where: str  # file and line, for messages
@@ -105,14 +105,14 @@ def open_source(path: Path) -> Source:
     return Source("ARKitScenes", frames, len(frames), posed=True, sensor=SensorKind.PHONE_LIDAR)
 
 
-def _read_trajectory(path: Path) -> Sequence[PoseLine]:
+def _read_trajectory(path: Path) -> Sequence[AxisAngleLine]:
     numbered = [(f"{path}, line {n}", line.split()) for n, line in enumerate(read_lines(path), start=1) if line.strip()]
     lines = []
     for where, words in numbered:
         timestamp, *pose = numbers(where, words, 7, POSE_COLUMNS)
         if not math.isfinite(timestamp):
             raise DataError(f"{where}: expected a finite timestamp, got {words[0]!r}")
-        lines.append(PoseLine(where, timestamp, tuple(pose)))
+        lines.append(AxisAngleLine(where, timestamp, tuple(pose)))
     if not lines:
         raise DataError(f"{path}: expected poses, got an empty file")
     return lines

@@ -61,7 +61,7 @@ class RegisteredImage:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ImageFolders:
     """Folders of a recording."""
 
     model: Path
@@ -90,7 +90,7 @@ def open_source(path: Path) -> Source:
     assert depth is not None
     camera_json = path / "camera.json"
     units = read_camera(camera_json).depth_scale if camera_json.is_file() else UNITS_PER_METER
-    layout = Layout(model, color, depth, units)
+    folders = ImageFolders(model, color, depth, units)
     images = _read_model(model)
     lenses = {image.lens for image in images}
     if len(lenses) > 1:
@@ -98,54 +98,54 @@ def open_source(path: Path) -> Source:
             f"{model}: expected one lens distortion for all images, got {len(lenses)}; undistort the images"
         )
     [lens] = lenses
-    unit = _unit(layout, images)
-    frames = [partial(_read, layout, image, k / FRAME_RATE, unit) for k, image in enumerate(images)]
+    unit = _unit(folders, images)
+    frames = [partial(_read, folders, image, k / FRAME_RATE, unit) for k, image in enumerate(images)]
     return Source("COLMAP", frames, len(frames), posed=True, distortion=None if lens == Distortion() else lens)
 
 
-def _read(layout: Layout, image: RegisteredImage, timestamp: float, unit: float) -> DeviceFrame:
-    depth = layout.depth_of(image)
+def _read(folders: ImageFolders, image: RegisteredImage, timestamp: float, unit: float) -> DeviceFrame:
+    depth = folders.depth_of(image)
     T_camera_world = np.vstack([image.T_camera_world, [0.0, 0.0, 0.0, 1.0]])
     T_camera_world[:3, 3] *= unit
-    with errors_of(f"{layout.model}: {image.name}"):
+    with errors_of(f"{folders.model}: {image.name}"):
         T_world_camera = inverse(nearest_rigid(T_camera_world))
     return DeviceFrame(
         name=depth,
         timestamp=timestamp,
         camera=image.camera,
-        color=read_color(layout.color / image.name),
-        depth=meters(read_uint16(depth), layout.units_per_meter),
+        color=read_color(folders.color / image.name),
+        depth=meters(read_uint16(depth), folders.units_per_meter),
         T_world_camera=T_world_camera,
     )
 
 
-def _unit(layout: Layout, images: Sequence[RegisteredImage]) -> float:
+def _unit(folders: ImageFolders, images: Sequence[RegisteredImage]) -> float:
     """Return the length of the unit of the model, m."""
     chosen = np.unique(np.linspace(0, len(images) - 1, UNIT_IMAGES).astype(int))
-    ratios = np.concatenate([_depth_ratios(layout, images[k]) for k in chosen])
+    ratios = np.concatenate([_depth_ratios(folders, images[k]) for k in chosen])
     if len(ratios) < MIN_RATIOS:
         log.warning(
             "%s: expected at least %d 3D points with depth to determine the unit of the poses, got %d; using 1 m",
-            *(layout.model, MIN_RATIOS, len(ratios)),
+            *(folders.model, MIN_RATIOS, len(ratios)),
         )
         return 1.0
     unit = float(np.median(ratios))
     spread = float(np.median(np.abs(ratios - unit))) / unit
     if spread > MAX_SPREAD:
         raise DataError(
-            f"{layout.depth}: expected depth along z that is proportional to the depth in {layout.model}, got a median "
+            f"{folders.depth}: expected depth along z that is proportional to the depth in {folders.model}, got a median "
             f"deviation of {spread:.0%}; register depth to color"
         )
     if abs(unit - 1) <= METRIC_WITHIN:
         return 1.0
-    log.warning("%s: the unit of the poses is %.4g m, determined from %d 3D points", layout.model, unit, len(ratios))
+    log.warning("%s: the unit of the poses is %.4g m, determined from %d 3D points", folders.model, unit, len(ratios))
     return unit
 
 
-def _depth_ratios(layout: Layout, image: RegisteredImage) -> Float64:
+def _depth_ratios(folders: ImageFolders, image: RegisteredImage) -> Float64:
     """Return the ratio (R,) of measured depth, m, to depth in the model at each 3D point with a reading."""
     try:
-        depth = meters(read_uint16(layout.depth_of(image)), layout.units_per_meter)
+        depth = meters(read_uint16(folders.depth_of(image)), folders.units_per_meter)
     except FrameError:
         return np.zeros(0)
     expected = image.points_world @ image.T_camera_world[2, :3] + image.T_camera_world[2, 3]
@@ -202,7 +202,7 @@ def _image(path: Path, model: Any, image: Any) -> RegisteredImage:
 
 @dataclass(frozen=True)
 class Records:
-    """Layout of the records of a binary file: fixed bytes, a name in some files, and a counted list."""
+    """ImageFolders of the records of a binary file: fixed bytes, a name in some files, and a counted list."""
 
     fixed: int  # bytes
     counter: str  # struct format of the length of the list
