@@ -133,8 +133,8 @@ def _unit(folders: ImageFolders, images: Sequence[RegisteredImage]) -> float:
     spread = float(np.median(np.abs(ratios - unit))) / unit
     if spread > MAX_SPREAD:
         raise DataError(
-            f"{folders.depth}: expected depth along z that is proportional to the depth in {folders.model}, got a median "
-            f"deviation of {spread:.0%}; register depth to color"
+            f"{folders.depth}: expected depth along z that is proportional to the depth in {folders.model}, got a "
+            f"median deviation of {spread:.0%}; register depth to color"
         )
     if abs(unit - 1) <= METRIC_WITHIN:
         return 1.0
@@ -202,7 +202,7 @@ def _image(path: Path, model: Any, image: Any) -> RegisteredImage:
 
 @dataclass(frozen=True)
 class Records:
-    """ImageFolders of the records of a binary file: fixed bytes, a name in some files, and a counted list."""
+    """Layout of the records of a binary file: fixed bytes, a name in some files, and a counted list."""
 
     fixed: int  # bytes
     counter: str  # struct format of the length of the list
