@@ -55,5 +55,6 @@ def open_source(path: Path, topics: Topics | None = None) -> Source:
     if (path / "camera.json").exists() and (path / "depth").is_dir():
         command = f"instancemap dataset=rgbd_folder dataset.root={path}"
         raise DataError(f"{path}: expected a recording, got an RGB-D folder; run {command}")
-    known = "; ".join(f"{kind.name}: {kind.needs}" for kind in FORMATS)
-    raise DataError(f"{path}: expected a supported format, got an unknown format; supported: {known}")
+    known = ", ".join(kind.name for kind in FORMATS)
+    found = "got an unknown format; run instancemap import --help for the files of each format"
+    raise DataError(f"{path}: expected a supported format ({known}), {found}")

@@ -176,5 +176,5 @@ def test_rtabmap_node_outside_of_optimized_graph_is_skipped(path: Path, tmp_path
 
 def test_rtabmap_other_file_with_suffix_db_is_not_recognized(tmp_path: Path) -> None:
     (tmp_path / "thumbs.db").write_bytes(b"\xd0\xcf\x11\xe0")
-    with pytest.raises(DataError, match=r"thumbs.db: expected a supported format, got an unknown format"):
+    with pytest.raises(DataError, match=r"thumbs.db: expected a supported format .*, got an unknown format"):
         open_source(tmp_path / "thumbs.db")
