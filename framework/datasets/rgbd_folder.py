@@ -70,7 +70,7 @@ class RgbdFolder(Recording):
         depth = numbered_images(self.folder / "depth", (".png",))
         _check_same_frames(color, depth)
         self._class_names, self._instances = self._read_instances(color)
-        lines = _read_optional(self.folder / "poses.txt", _read_poses, "poses", len(color))
+        lines = _read_optional(self.folder / "poses.txt", _pose_lines, "poses", len(color))
         ups = _read_optional(self.folder / "gravity.txt", read_gravity, "directions", len(color))
         times = _read_optional(self.folder / "timestamps.txt", read_image_times, "timestamps", len(color))
         self._has_poses = lines is not None
@@ -156,7 +156,7 @@ def _recorded(
     return replace(frame, color_timestamp=color, depth_timestamp=depth)
 
 
-def _read_poses(path: Path) -> list[PoseLine]:
+def _pose_lines(path: Path) -> list[PoseLine]:
     return list(read_pose_lines(path)[1])
 
 

@@ -15,7 +15,7 @@ from framework.importing.phones.image_rotation import QUARTER, upright
 def main() -> None:
     """Run the command `instancemap import`."""
     default = Writing()
-    listed = "\n".join(f"  {kind.name:<15} {kind.needs}" for kind in FORMATS)
+    listed = "\n".join(f"  {kind.name:<16} {kind.needs}" for kind in FORMATS)
     parser = argparse.ArgumentParser(
         description="Convert a phone or sensor recording to an RGB-D folder for dataset=rgbd_folder.\n"
         f"The format of SOURCE is detected. Supported formats:\n{listed}",
