@@ -13,6 +13,7 @@ development kit of the KITTI odometry benchmark, and https://github.com/MichaelG
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from collections.abc import Sequence
@@ -33,6 +34,8 @@ EUROC_COLUMNS = "timestamp tx ty tz qw qx qy qz"
 KITTI_NUMBERS = 12
 NANOSECONDS = 1e9  # per second
 EARLIEST = 1e15  # ns, minimum Unix time by which a file without a header is recognized
+
+log = logging.getLogger(__name__)
 
 _NANOSECOND_COLUMN = re.compile(r"#\s*timestamp\s*\[ns\]", re.IGNORECASE)
 _EUROC_COLUMNS = re.compile(r"#\s*timestamp\s*,\s*p_RS", re.IGNORECASE)  # headers of the published files, also in ns
@@ -108,8 +111,10 @@ def read_pose_lines(path: Path) -> tuple[TrajectoryFormat, Sequence[PoseLine]]:
     first = numbered[0][1] if numbered else ""
     if "," in first:
         _check_euroc(path, lines, first)
+        log.info("%s: read as camera poses in EuRoC format, with times in ns and quaternions w x y z", path)
         return TrajectoryFormat.EUROC, [_euroc_line(path, n, text, first.count(",")) for n, text in numbered]
     if _is_matrix(first):
+        log.info("%s: read as camera poses in KITTI format; line k, from 0, belongs to frame k", path)
         return TrajectoryFormat.KITTI, [_matrix_line(path, n, text) for n, text in numbered]
     return TrajectoryFormat.TUM, read_tum_lines(path)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +41,12 @@ RTABMAP = (
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_trajectory_desk_round_trip_preserves_poses(tmp_path: Path, kind: TrajectoryFormat) -> None:
+def test_trajectory_desk_round_trip_preserves_poses(tmp_path: Path, kind: TrajectoryFormat, caplog) -> None:
+    caplog.set_level(logging.INFO)
     WRITERS[kind](tmp_path / "poses.txt", TIMES, POSES)
     trajectory = read_trajectory(tmp_path / "poses.txt")
     assert trajectory.format is kind
+    assert (f"read as camera poses in {kind.value} format" in caplog.text) == (kind is not TrajectoryFormat.TUM)
     np.testing.assert_allclose(trajectory.poses, POSES, atol=2e-6)
     if kind is TrajectoryFormat.KITTI:
         assert trajectory.timestamps is None
