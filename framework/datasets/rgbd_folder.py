@@ -8,8 +8,8 @@ This is the format for your own data:
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading; or .tif, .tiff or .npy of
                         uint16; or .tif, .tiff, .npy or .exr of floats, which are in meters
-    poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw; only
-                        zeros = unknown
+    poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw; or
+                        EuRoC or KITTI format; only zeros = unknown
     pose/000000.txt     optional, without poses.txt; T_world_camera, a 4x4 matrix per frame
     timestamps.txt      optional; color depth, one line per frame: timestamps of the two images, s, or one for both;
                         or times.txt
@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +48,7 @@ from framework.files.atomic_write import path_exists
 from framework.files.depth_files import DEPTH_SUFFIXES, FARTHEST, read_depth
 from framework.files.image_files import UPRIGHT, decode_uint16, exif_orientation, read_image_file
 from framework.files.number_lines import read_gravity, read_image_times
-from framework.files.tum_trajectory import TumLine, read_tum_lines
+from framework.files.pose_lines import PoseLine, read_pose_lines
 
 TIMES = ("timestamps.txt", "times.txt")  # names of the file with timestamps, in order of preference
 LARGEST_ID = 2**16 - 1  # maximum instance id; instance-ID images are uint16
@@ -82,7 +83,7 @@ class RgbdFolder(Recording):
         if self._is_float(list(depth.values())):
             depth_scale = 1.0
         self._class_names, self._instances = self._read_instances(color)
-        lines = _read_optional(self.folder / "poses.txt", read_tum_lines, "poses", len(color))
+        lines = _read_optional(self.folder / "poses.txt", _pose_lines, "poses", len(color))
         ups = _read_optional(self.folder / "gravity.txt", read_gravity, "directions", len(color))
         times = None
         for name in TIMES:
@@ -94,7 +95,7 @@ class RgbdFolder(Recording):
             images = StoredImages.of_files(color[number], depth[number])
             color_time, depth_time = times[k] if times else (None, None)
             timestamp = k / FRAME_RATE if color_time is None else color_time
-            if lines:
+            if lines and not math.isnan(lines[k].timestamp):
                 timestamp = lines[k].timestamp
             frame = RecordedFrame.posed(images, timestamp, poses[k] if poses else lambda: None)
             up = ups[k] if ups else None
@@ -102,7 +103,7 @@ class RgbdFolder(Recording):
         return Contents(camera, path, depth_scale, frames, distortion, sensor)
 
     def _read_poses(
-        self, lines: Sequence[TumLine] | None, numbers: Sequence[int]
+        self, lines: Sequence[PoseLine] | None, numbers: Sequence[int]
     ) -> Sequence[Callable[[], Float64 | None]] | None:
         """Return the pose of each frame from poses.txt or from a folder of matrices, or None without poses.
 
@@ -204,7 +205,7 @@ class RgbdFolder(Recording):
         return class_names, list(images.values())
 
 
-def _pose_of(line: TumLine) -> Callable[[], Float64 | None]:
+def _pose_of(line: PoseLine) -> Callable[[], Float64 | None]:
     return (lambda: None) if line.is_zero else line.pose
 
 
@@ -213,6 +214,10 @@ def _log_orientation(path: Path) -> None:
     orientation = exif_orientation(path)
     if orientation != UPRIGHT:
         log.warning("%s: the EXIF orientation %d is not applied; the pixels are used as stored", path, orientation)
+
+
+def _pose_lines(path: Path) -> list[PoseLine]:
+    return list(read_pose_lines(path)[1])
 
 
 def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:

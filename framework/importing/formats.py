@@ -7,7 +7,8 @@ from pathlib import Path
 from framework.errors import ConfigError, DataError
 from framework.importing.bags import ros_bag
 from framework.importing.bags.ros_topics import BagOptions, Topics
-from framework.importing.phones import polycam, record3d, scanner_app, stray_scanner
+from framework.importing.phones import arkit_scenes, polycam, record3d, scanner_app, scannetpp_iphone, stray_scanner
+from framework.importing.reconstructions import colmap_model, rtabmap_database, transforms_json
 from framework.importing.source import Source
 
 FORMATS = (
@@ -16,6 +17,11 @@ FORMATS = (
     record3d.FOLDER_FORMAT,
     polycam.FORMAT,
     scanner_app.FORMAT,
+    arkit_scenes.FORMAT,
+    scannetpp_iphone.FORMAT,
+    transforms_json.FORMAT,
+    colmap_model.FORMAT,
+    rtabmap_database.FORMAT,
     ros_bag.FORMAT,
 )
 
@@ -51,5 +57,6 @@ def open_source(path: Path, topics: Topics | None = None, options: BagOptions | 
     if (path / "camera.json").exists() and (path / "depth").is_dir():
         command = f"instancemap dataset=rgbd_folder dataset.root={path}"
         raise DataError(f"{path}: expected a recording, got an RGB-D folder; run {command}")
-    known = "; ".join(f"{kind.name}: {kind.needs}" for kind in FORMATS)
-    raise DataError(f"{path}: expected a supported format, got an unknown format; supported: {known}")
+    known = ", ".join(kind.name for kind in FORMATS)
+    found = "got an unknown format; run instancemap import --help for the files of each format"
+    raise DataError(f"{path}: expected a supported format ({known}), {found}")

@@ -121,10 +121,10 @@ def arkit_up(T_world_camera: Float64) -> Float64:
     return np.array(T_world_camera[1, :3])
 
 
-def meters(raw: NDArray[np.uint16]) -> Float32:
-    """Convert depth (h, w) from mm to m."""
+def meters(raw: NDArray[np.uint16], units_per_meter: float = 1000.0) -> Float32:
+    """Convert stored depth (h, w) to m."""
     # some sensors write 65535 for pixels without a reading
-    return np.where(raw == np.iinfo(np.uint16).max, 0, raw).astype(np.float32) / np.float32(1000)
+    return np.where(raw == np.iinfo(np.uint16).max, 0, raw).astype(np.float32) / np.float32(units_per_meter)
 
 
 def readings(depth: NDArray[np.floating]) -> Float32:

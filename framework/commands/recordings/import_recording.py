@@ -16,7 +16,7 @@ from framework.importing.source import without_poses
 def main() -> None:
     """Run the command `instancemap import`."""
     default = Writing()
-    listed = "\n".join(f"  {kind.name:<15} {kind.needs}" for kind in FORMATS)
+    listed = "\n".join(f"  {kind.name:<16} {kind.needs}" for kind in FORMATS)
     parser = argparse.ArgumentParser(
         description="Convert a phone or sensor recording to an RGB-D folder for dataset=rgbd_folder.\n"
         f"The format of SOURCE is detected. Supported formats:\n{listed}",

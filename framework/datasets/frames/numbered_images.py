@@ -89,6 +89,11 @@ def number_of(path: Path) -> int | None:
     return int(digits) if digits else None
 
 
+def natural_order(name: str) -> list[tuple[int, int | str]]:
+    """Return a sort key for names, by which frame 10 follows frame 9."""
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split("([0-9]{1,18})", name) if part]
+
+
 def check_one_number(files: Sequence[Path]) -> None:
     """Raise DataError if the names of images differ in digits before the frame number."""
     for path in files:

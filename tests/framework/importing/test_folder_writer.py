@@ -138,7 +138,9 @@ def test_folder_writer_resamples_images_to_first_camera(tmp_path: Path) -> None:
 
 
 def test_open_source_unknown_format_error_lists_formats(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"expected a supported format, got an unknown format; supported: stray"):
+    with pytest.raises(
+        DataError, match=r"expected a supported format \(stray_scanner, .*\), got an unknown format; run instancemap"
+    ):
         open_source(tmp_path)
     with pytest.raises(DataError, match="expected a recording, got no such file or folder"):
         open_source(tmp_path / "nowhere")
