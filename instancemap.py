@@ -67,6 +67,7 @@ _SHARED_WITH_PLUGINS = {
     "Int64": "framework.data",
     "LabelRule": "framework.mapping.labels.label_rule",
     "LabeledVoxels": "framework.mapping.labels.label_rule",
+    "RosLens": "framework.importing.bags.ros_camera",
     "SceneTruth": "framework.data",
     "SurfaceView": "framework.data",
     "TO_THE_END": "framework.datasets.frames.sequence_reader",
@@ -75,13 +76,17 @@ _SHARED_WITH_PLUGINS = {
     "back_project": "framework.geometry",
     "check_bounds": "framework.config.validation",
     "choose_frames": "framework.datasets.frames.sequence_reader",
+    "decode_ros_color": "framework.importing.bags.ros_images",
+    "decode_ros_depth": "framework.importing.bags.ros_images",
     "exp_se3": "framework.geometry",
     "folder_of": "framework.files.search_paths",
     "inverse": "framework.geometry",
+    "is_rectified": "framework.importing.bags.ros_camera",
     "keep_points": "framework.refinement.refine",
     "list_points_by_pixel": "framework.mapping.labels.pixel_lists",
     "normals_of": "framework.tracking.pyramid",
     "project": "framework.geometry",
+    "ros_camera": "framework.importing.bags.ros_camera",
     "transform": "framework.geometry",
     "vote_for_best": "framework.mapping.labels.label_rule",
 }
@@ -95,6 +100,8 @@ if TYPE_CHECKING:
     from framework.datasets.frames.sequence_reader import TO_THE_END, choose_frames
     from framework.files.search_paths import folder_of
     from framework.geometry import back_project, exp_se3, inverse, project, transform
+    from framework.importing.bags.ros_camera import RosLens, is_rectified, ros_camera
+    from framework.importing.bags.ros_images import decode_ros_color, decode_ros_depth
     from framework.mapping.instance_map import InstanceMap
     from framework.mapping.instances.association import Association
     from framework.mapping.labels.label_evidence_kernels import Combine

@@ -3,8 +3,10 @@ r"""ROS 2 node that maps the images of a depth camera and publishes the objects 
     python examples/ros2_node.py --ros-args -r color:=/camera/color/image_raw \
         -r depth:=/camera/aligned_depth_to_color/image_raw -r camera_info:=/camera/color/camera_info
 
-Depth must be registered to color. Each marker on the topic `objects` is the axis-aligned bounding box of one object in
-the world frame, `map`. The text of a marker is the class name.
+Depth must be registered to color. Images of topics named `image_rect` or similar are rectified. All other images are
+undistorted with the lens model of the camera info. Publishers may be reliable or best effort. Each marker on the topic
+`objects` is the axis-aligned bounding box of one object in the world frame, `map`. The text of a marker is the class
+name.
 """
 
 from __future__ import annotations
@@ -17,27 +19,36 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 from visualization_msgs.msg import Marker, MarkerArray
 
-from instancemap import Camera, FrameError, Mapper
+from instancemap import DataError, Mapper, decode_ros_color, decode_ros_depth, is_rectified, ros_camera
 
 
 class InstanceMapNode(Node):
     """Node that maps synchronized color and depth images. `overrides` are config overrides such as "device=cuda"."""
 
+    rectified = False  # True = the images belong to the matrix P of the camera info, without distortion
+
     def __init__(self, *overrides: str) -> None:
+        from rclpy.qos import qos_profile_sensor_data  # best effort, which also receives from reliable publishers
+
         super().__init__("instancemap")
         self.mapper = Mapper(*overrides)
         self.markers = self.create_publisher(MarkerArray, "objects", 1)
         topics = (("color", Image), ("depth", Image), ("camera_info", CameraInfo))
-        subscribers = [message_filters.Subscriber(self, kind, name) for name, kind in topics]
+        subscribers = [
+            message_filters.Subscriber(self, kind, name, qos_profile=qos_profile_sensor_data) for name, kind in topics
+        ]
         synchronizer = message_filters.ApproximateTimeSynchronizer(subscribers, queue_size=2, slop=0.02)
         synchronizer.registerCallback(self.map)  # while a frame is mapped, the queue keeps the two newest frames
 
     def map(self, color: Image, depth: Image, info: CameraInfo) -> None:
-        camera = Camera(info.width, info.height, info.k[0], info.k[4], info.k[2], info.k[5])
         stamp = color.header.stamp.sec + 1e-9 * color.header.stamp.nanosec
         try:
-            result = self.mapper.add(rgb(color), meters(depth), camera=camera, timestamp=stamp)
-        except FrameError as error:
+            camera, lens = ros_camera("camera_info", info, self.rectified)
+            image, metric = rgb(color), meters(depth)
+            if lens is not None:
+                image, metric = lens.smooth(image), lens.exact(metric)
+            result = self.mapper.add(image, metric, camera=camera, timestamp=stamp)
+        except DataError as error:  # for example an unsupported encoding
             self.get_logger().warning(str(error))
             return
         if result.lost:
@@ -58,23 +69,21 @@ class InstanceMapNode(Node):
 
 
 def rgb(image: Image) -> np.ndarray:
-    """Convert an image message to an RGB image (H, W, 3), uint8."""
-    pixels = np.frombuffer(bytes(image.data), np.uint8).reshape(image.height, image.step)[:, : 3 * image.width]
-    pixels = pixels.reshape(image.height, image.width, 3)
-    return pixels[..., ::-1] if image.encoding == "bgr8" else pixels
+    """Convert an image message in any common encoding to an RGB image (H, W, 3), uint8."""
+    return decode_ros_color("color", image)
 
 
 def meters(image: Image) -> np.ndarray:
     """Convert an image message to depth (H, W), float32, m; 0 = no reading."""
-    kind, unit = (np.float32, 1.0) if image.encoding == "32FC1" else (np.uint16, 0.001)
-    values = np.frombuffer(bytes(image.data), kind).reshape(image.height, -1)[:, : image.width] * np.float32(unit)
-    return np.nan_to_num(values, nan=0.0, posinf=0.0).astype(np.float32)
+    return decode_ros_depth("depth", image)
 
 
 def main() -> None:
     """Run the node."""
     rclpy.init()
-    rclpy.spin(InstanceMapNode("fuser.voxel_size=0.02"))
+    node = InstanceMapNode("fuser.voxel_size=0.02")
+    node.rectified = is_rectified(node.resolve_topic_name("color"))
+    rclpy.spin(node)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.checking import Finding, Verdict
-from framework.data import UInt16
+from framework.data import Array
 from framework.datasets.frames.sequence_reader import Recording
 from framework.errors import FrameError
 from framework.interfaces import RGBDSequence
@@ -37,8 +37,10 @@ class _Range:
     at_limit: float  # fraction of readings with the largest value
 
     @classmethod
-    def of(cls, raw: UInt16) -> _Range | None:
-        """Return the range of an image, or None with fewer than two values."""
+    def of(cls, raw: Array) -> _Range | None:
+        """Return the range of a uint16 image, or None for another type or with fewer than two values."""
+        if raw.dtype != np.uint16:
+            return None
         values, counts = np.unique(raw[raw > 0], return_counts=True)
         if len(values) < 2:
             return None

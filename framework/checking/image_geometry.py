@@ -67,7 +67,7 @@ def check_orientation(sequence: RGBDSequence, chosen: Sequence[int]) -> Finding 
         return None
     names = [sequence.contents.frames[sequence.chosen[k]].images.color_name for k in chosen]
     tags = Counter(exif_orientation(name) if isinstance(name, Path) else UPRIGHT for name in names)
-    del tags[UPRIGHT]
+    tags = Counter({tag: count for tag, count in tags.items() if tag in TURNS})
     if not tags:
         return None
     [(tag, count)] = tags.most_common(1)

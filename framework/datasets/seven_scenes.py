@@ -102,7 +102,7 @@ def _paths(folder: Path, stem: str) -> tuple[Path, Path]:
 
 
 def _registered(images: StoredImages) -> UInt16:
-    return register(images.depth())
+    return register(np.asarray(images.depth(), np.uint16))
 
 
 def _pose(path: Path) -> Float64:

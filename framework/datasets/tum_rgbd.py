@@ -98,7 +98,13 @@ class TumRgbd(Recording):
                 f"({self.max_time_difference:g} s) of each other, got none"
             )
         if len(pairs) < len(color):
-            log.info("%s: %d of %d color images have no depth image", self.name, len(color) - len(pairs), len(color))
+            log.info(
+                "%s: %d of %d color images have no depth image within dataset.max_time_difference=%g s",
+                self.name,
+                len(color) - len(pairs),
+                len(color),
+                self.max_time_difference,
+            )
         path = self.folder / "groundtruth.txt"
         truth = Trajectory.of(path, read_tum_lines(path) if path_exists(path) else [], tolerance)
         frames = []
@@ -151,8 +157,12 @@ class Trajectory:
     def of(cls, path: Path, lines: Sequence[TumLine], max_difference: float) -> Trajectory:
         """Return the trajectory that consists of the lines of a file.
 
-        If a timestamp is repeated, only its first line is used.
+        If a timestamp is repeated, only its first line is used. Poses of zeros count as unknown.
         """
+        zeros = sum(line.is_zero for line in lines)
+        if zeros:
+            log.warning("%s: %d of %d poses contain only zeros and count as unknown", path, zeros, len(lines))
+            lines = [line for line in lines if not line.is_zero]
         ordered = sorted(_first_of_each(path, lines, "poses"), key=lambda line: line.timestamp)
         return cls(ordered, np.array([line.timestamp for line in ordered]), max_difference)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import simplejpeg
-from PIL import Image
+from PIL import ExifTags, Image
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
@@ -24,8 +24,17 @@ from framework.files.atomic_write import read_bytes
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 JPEG_PADDING = b"\0\r\n"  # bytes after the end marker; some cameras append zeros; some programs append a line break
-ORIENTATION_TAG, UPRIGHT = 0x0112, 1  # EXIF tag, and its value for upright images
+UPRIGHT = 1  # EXIF orientation of an image whose pixels are stored as displayed
 LARGEST_FILE = 2**28  # bytes, size of MAX_PIXELS with four 16-bit channels
+
+
+def exif_orientation(path: Path) -> int:
+    """Return the EXIF orientation of an image file, from 1 (UPRIGHT) to 8, or UPRIGHT if the file has none."""
+    try:
+        with Image.open(path) as image:
+            return int(image.getexif().get(ExifTags.Base.Orientation, UPRIGHT))
+    except Exception:  # Pillow has no common base exception; reading the pixels reports damage
+        return UPRIGHT
 
 
 def read_color(path: Path) -> UInt8:
@@ -111,16 +120,6 @@ def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
     if image is None:
         raise FrameError(f"{name}: expected a decodable PNG, got corrupt data")
     return np.asarray(image)
-
-
-def exif_orientation(path: Path) -> int:
-    """Return the EXIF orientation of an image file, 1 to 8; 1 = upright, also for files without or with a bad tag."""
-    try:
-        with Image.open(path) as image:
-            tag = image.getexif().get(ORIENTATION_TAG, UPRIGHT)
-    except Exception:  # Pillow has no common base exception; damaged files are reported when they are read
-        return UPRIGHT
-    return tag if tag in range(1, 9) else UPRIGHT
 
 
 def check_image(name: Path | str, data: bytes) -> None:

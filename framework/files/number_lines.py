@@ -95,17 +95,19 @@ def write_gravity(path: Path, ups: Sequence[Float64 | None]) -> None:
 def read_image_times(path: Path) -> list[tuple[float, float]]:
     """Read the timestamps of color and depth of each frame, s.
 
-    A line contains `color depth`. Empty lines and comments after `#` are skipped.
+    A line contains `color depth`; or all lines contain one timestamp of both images. Empty lines and comments after `#`
+    are skipped.
 
     Raises:
         DataError: A line is invalid.
     """
     words = [(n, COMMENT.sub("", line).split()) for n, line in enumerate(read_lines(path), start=1)]
+    has_one_column = all(len(found) <= 1 for _, found in words)
     times = []
     for n, found in words:
         if not found:
             continue
-        color, depth = numbers(f"{path}, line {n}", found, 2, IMAGE_TIME_COLUMNS)
+        color, depth = numbers(f"{path}, line {n}", found * 2 if has_one_column else found, 2, IMAGE_TIME_COLUMNS)
         if not (math.isfinite(color) and math.isfinite(depth)):
             raise DataError(f"{path}, line {n}: expected finite timestamps, got {' '.join(found)!r}")
         times.append((color, depth))

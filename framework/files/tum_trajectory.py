@@ -1,7 +1,7 @@
 """Trajectories in the TUM format.
 
-A line contains one pose T_world_camera: `timestamp tx ty tz qx qy qz qw`, in s and m. evo is not used because of its
-GPL license.
+A line contains one pose T_world_camera: `timestamp tx ty tz qx qy qz qw`, in s and m. If all lines have the same number
+of further columns, such as the ids of RTAB-Map, these are ignored. evo is not used because of its GPL license.
 """
 
 from __future__ import annotations
@@ -36,6 +36,11 @@ class TumLine:
     timestamp: float  # s
     position: tuple[float, ...]  # (3,) m, may be NaN
     quat_xyzw: tuple[float, ...]  # (4,), may be NaN
+
+    @property
+    def is_zero(self) -> bool:
+        """True if all numbers of the pose are 0, as some programs write for an unknown pose."""
+        return not any((*self.position, *self.quat_xyzw))
 
     def pose(self) -> Float64:
         """Return the pose T_world_camera (4, 4).
@@ -94,11 +99,12 @@ def read_tum_lines(path: Path) -> list[TumLine]:
     """Read the lines of a TUM file, except comments.
 
     Raises:
-        DataError: A line does not contain eight numbers.
+        DataError: A line does not contain eight numbers, or it has more or fewer columns than the first line.
     """
     lines = read_lines(path, missing="expected a trajectory in TUM format, got no such file")
     words = [COMMENT.sub("", line).split() for line in lines]
-    return [_line(path, number, found) for number, found in enumerate(words, start=1) if found]
+    columns = max(len(COLUMNS.split()), len(next(filter(None, words), [])))
+    return [_line(path, number, found, columns) for number, found in enumerate(words, start=1) if found]
 
 
 def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence[Float64] | Float64) -> None:
@@ -124,8 +130,12 @@ def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence
             file.write(f"{timestamp:.9f} " + " ".join(f"{value:.12g}" for value in row) + "\n")
 
 
-def _line(path: Path, number: int, words: list[str]) -> TumLine:
-    values = numbers(f"{path}, line {number}", words, len(COLUMNS.split()), COLUMNS)
+def _line(path: Path, number: int, words: list[str], columns: int) -> TumLine:
+    pose = len(COLUMNS.split())
+    if pose < columns != len(words):
+        expected = f"expected {columns} columns, as in the first line"
+        raise DataError(f"{path}, line {number}: {expected}, got {len(words)}")
+    values = numbers(f"{path}, line {number}", words[:pose] if pose < columns else words, pose, COLUMNS)
     if not math.isfinite(values[0]):
         raise DataError(f"{path}, line {number}: expected a finite timestamp, got {words[0][:SHOWN]!r}")
     return TumLine(path, number, values[0], tuple(values[1:4]), tuple(values[4:]))

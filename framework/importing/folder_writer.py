@@ -120,7 +120,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
     if source.odometry is not None:
         poses = [turn.pose(T) if source.odometry.of_camera else T for T in source.odometry.poses]
         write_tum(directory / ODOMETRY, source.odometry.timestamps, poses)
-    if any(time is not None for time in written.depth_timestamps):
+    if not source.posed or any(time is not None for time in written.depth_timestamps):
         pairs = zip(written.timestamps, written.depth_timestamps, strict=True)
         times = [(color, color if depth is None else depth) for color, depth in pairs]
         write_image_times(directory / "timestamps.txt", times)
@@ -140,7 +140,7 @@ def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int
         try:
             frame = stored()
             if source.posed and frame.T_world_camera is None:
-                raise DataError(f"{frame.name}: expected a pose, got none")
+                raise DataError(f"{frame.name}: expected a pose, got none; --poses none imports without poses")
             if written.timestamps and frame.timestamp <= written.timestamps[-1]:
                 expected = f"expected a timestamp > {written.timestamps[-1]:.6f} s"
                 raise DataError(f"{frame.name}: {expected}, got {frame.timestamp:.6f} s")

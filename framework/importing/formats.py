@@ -7,8 +7,9 @@ from pathlib import Path
 from framework.config.text_values import typed
 from framework.errors import ConfigError, DataError
 from framework.importing.bags import ros_bag
-from framework.importing.bags.ros_topics import Topics
-from framework.importing.phones import polycam, record3d, scanner_app, stray_scanner
+from framework.importing.bags.ros_topics import BagOptions, Topics
+from framework.importing.phones import arkit_scenes, polycam, record3d, scanner_app, scannetpp_iphone, stray_scanner
+from framework.importing.reconstructions import colmap_model, rtabmap_database, transforms_json
 from framework.importing.source import Source
 
 FORMATS = (
@@ -17,16 +18,22 @@ FORMATS = (
     record3d.FOLDER_FORMAT,
     polycam.FORMAT,
     scanner_app.FORMAT,
+    arkit_scenes.FORMAT,
+    scannetpp_iphone.FORMAT,
+    transforms_json.FORMAT,
+    colmap_model.FORMAT,
+    rtabmap_database.FORMAT,
     ros_bag.FORMAT,
 )
 
 
-def open_source(path: Path, topics: Topics | None = None) -> Source:
+def open_source(path: Path, topics: Topics | None = None, options: BagOptions | None = None) -> Source:
     """Open a recording in any supported format.
 
     Args:
         path: The file or folder of the recording.
         topics: The topics of a ROS bag; None = selected by type and name.
+        options: The options of a ROS bag; None = defaults.
 
     Raises:
         DataError: The format is unknown, or the recording is unreadable.
@@ -43,12 +50,14 @@ def open_source(path: Path, topics: Topics | None = None) -> Source:
             if not kind.recognized(place):
                 continue
             if kind.has_topics:
-                return kind.open(place, topics or Topics())
-            if topics and topics.given:
-                raise ConfigError(f"{', '.join(topics.given)}: expected a ROS bag, got {path}; omit these options")
+                return kind.open(place, topics or Topics(), options or BagOptions())
+            given = [*(topics.given if topics else ()), *(options.given if options else ())]
+            if given:
+                raise ConfigError(f"{', '.join(given)}: expected a ROS bag, got {path}; omit these options")
             return kind.open(place)
     if (path / "camera.json").exists() and (path / "depth").is_dir():
         command = f"instancemap dataset=rgbd_folder {typed('dataset.root', path)}"
         raise DataError(f"{path}: expected a recording, got an RGB-D folder; run {command}")
-    known = "; ".join(f"{kind.name}: {kind.needs}" for kind in FORMATS)
-    raise DataError(f"{path}: expected a supported format, got an unknown format; supported: {known}")
+    known = ", ".join(kind.name for kind in FORMATS)
+    found = "got an unknown format; run instancemap import --help for the files of each format"
+    raise DataError(f"{path}: expected a supported format ({known}), {found}")

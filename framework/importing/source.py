@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -91,8 +92,17 @@ class Format:
     name: str  # for the command line
     needs: str  # characteristic files, for messages
     recognized: Callable[[Path], bool]  # True for a recording in this format
-    open: Callable[..., Source]  # parameters: path, and topics if has_topics; raises DataError
-    has_topics: bool = False  # True if `open` has the parameter topics
+    open: Callable[..., Source]  # parameters: path, and topics and options if has_topics; raises DataError
+    has_topics: bool = False  # True if `open` has the parameters topics and options
+
+
+def without_poses(source: Source) -> Source:
+    """Return a recording without its poses. Up directions are kept."""
+
+    def read(stored: StoredFrame) -> DeviceFrame:
+        return replace(stored(), T_world_camera=None)
+
+    return replace(source, frames=(partial(read, stored) for stored in source.frames), posed=False)
 
 
 def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
@@ -111,10 +121,10 @@ def arkit_up(T_world_camera: Float64) -> Float64:
     return np.array(T_world_camera[1, :3])
 
 
-def meters(raw: NDArray[np.uint16]) -> Float32:
-    """Convert depth (h, w) from mm to m."""
+def meters(raw: NDArray[np.uint16], units_per_meter: float = 1000.0) -> Float32:
+    """Convert stored depth (h, w) to m."""
     # some sensors write 65535 for pixels without a reading
-    return np.where(raw == np.iinfo(np.uint16).max, 0, raw).astype(np.float32) / np.float32(1000)
+    return np.where(raw == np.iinfo(np.uint16).max, 0, raw).astype(np.float32) / np.float32(units_per_meter)
 
 
 def readings(depth: NDArray[np.floating]) -> Float32:

@@ -13,7 +13,7 @@ from framework.config.validation import check_bounds
 from framework.data import Array, Float64, Frame, Pose
 from framework.datasets.frames.conventions import TIME_UNITS
 from framework.errors import DataError, NoPoseError
-from framework.files.tum_trajectory import read_tum
+from framework.files.pose_lines import read_trajectory
 from framework.geometry import inverse
 from framework.interfaces import PoseTracker, SceneMap
 
@@ -27,15 +27,16 @@ class World(Enum):
 
 @dataclass
 class TrajectoryFile(PoseTracker):
-    """Poses from a trajectory file in TUM format.
+    """Poses from a trajectory file in TUM, EuRoC or KITTI format.
 
-    Each frame gets the pose nearest in time. Frames without such a pose are skipped. By default, the trajectory is
-    moved rigidly, so that the first frame with a pose defines the world frame. `world_frame=FILE` keeps the world frame
-    of the file. The ground-truth poses of the sequence are then invalid, because they have another world frame. The
-    tracker raises DataError if a pose is not finite or not rigid, or if timestamps do not increase.
+    Each frame gets the pose nearest in time. KITTI files have no timestamps: line k, from 0, is the pose of frame k of
+    the recording. Frames without such a pose are skipped. By default, the trajectory is moved rigidly, so that the
+    first frame with a pose defines the world frame. `world_frame=FILE` keeps the world frame of the file. The
+    ground-truth poses of the sequence are then invalid, because they have another world frame. The tracker raises
+    DataError if a pose is not finite or not rigid, or if timestamps do not increase.
     """
 
-    path: Path  # trajectory in TUM format
+    path: Path  # trajectory in TUM, EuRoC or KITTI format
     # maximum time difference between a frame and its pose, s, >= 0; frames without a pose are skipped
     max_time_difference: float = 0.02
     time_unit: float = 1.0  # length of one unit of the timestamps of the file, s, in [1e-9, 1]; 1e-9 = nanoseconds
@@ -45,10 +46,12 @@ class TrajectoryFile(PoseTracker):
     def __post_init__(self) -> None:
         check_bounds(self, max_time_difference=(0.0, 1e6), time_unit=(1e-9, 1.0), time_offset=(-1e12, 1e12))
         self.path = Path(self.path).expanduser()
-        timestamps, self._T_file_camera = read_tum(self.path)
-        if len(timestamps) == 0:
+        trajectory = read_trajectory(self.path)
+        self._T_file_camera = trajectory.poses
+        if len(self._T_file_camera) == 0:
             raise DataError(f"{self.path}: expected poses in TUM format, got none")
-        self._timestamps = timestamps * self.time_unit + self.time_offset
+        stored = trajectory.timestamps
+        self._timestamps = None if stored is None else stored * self.time_unit + self.time_offset
         self._T_world_file: Float64 | None = np.eye(4) if self.world_frame is World.FILE else None
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
@@ -57,27 +60,36 @@ class TrajectoryFile(PoseTracker):
         Raises:
             NoPoseError: If the file has no pose for the frame.
         """
+        T_file_camera = self._T_file_camera[self._pose_index(frame)]
+        if self._T_world_file is None:
+            T_world_first = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
+            self._T_world_file = T_world_first @ inverse(T_file_camera)
+        return Pose(self._T_world_file @ T_file_camera)
+
+    def _pose_index(self, frame: Frame) -> int:
+        """Return the index of the pose of a frame."""
+        if self._timestamps is None:
+            if frame.index >= len(self._T_file_camera):
+                expected = f"expected a line for each frame, got {len(self._T_file_camera)} lines"
+                raise NoPoseError(f"frame {frame.index}: {self.path.name}: {expected}")
+            return frame.index
         nearest = int(np.abs(self._timestamps - frame.timestamp).argmin())
         difference = abs(float(self._timestamps[nearest]) - frame.timestamp)
         if difference > self.max_time_difference:
             raise NoPoseError(
                 f"frame {frame.index}: {self.path.name}: expected a pose within {self.max_time_difference:g} s "
                 f"(tracker.max_time_difference) of {frame.timestamp:.3f} s, got the nearest pose {difference:.3f} s "
-                f"away{self._time_fix(frame.timestamp)}"
+                f"away{self._time_fix(self._timestamps, frame.timestamp)}"
             )
-        T_file_camera = self._T_file_camera[nearest]
-        if self._T_world_file is None:
-            T_world_first = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
-            self._T_world_file = T_world_first @ inverse(T_file_camera)
-        return Pose(self._T_world_file @ T_file_camera)
+        return nearest
 
-    def _time_fix(self, timestamp: float) -> str:
-        """Return the setting that brings the poses to the clock of a frame at `timestamp`, s, or ""."""
-        stored = (self._timestamps - self.time_offset) / self.time_unit
+    def _time_fix(self, times: Float64, timestamp: float) -> str:
+        """Return the setting that brings poses at `times` to the clock of a frame at `timestamp`, s, or ""."""
+        stored = (times - self.time_offset) / self.time_unit
         for unit, name in TIME_UNITS.items():
             if unit != self.time_unit and np.abs(stored * unit - timestamp).min() <= self.max_time_difference:
                 return f"; set tracker.time_unit={unit:g} (the timestamps are in {name})"
-        first, last = self._timestamps[[0, -1]]
+        first, last = times[[0, -1]]
         if first <= timestamp <= last:
             return ""
         offset = timestamp - first + self.time_offset

@@ -56,6 +56,7 @@ OPTIONAL = {
     "pyorbbecsdk",
     "pyrealsense2",
     "OpenEXR",
+    "lz4",
     "lzfse",
     "rosbags",
     "pxr",

@@ -56,6 +56,15 @@ def _replica_nice_slam(root: Path) -> list[str]:
     return [f"dataset.root={root}", "dataset.scene=room0"]
 
 
+def _icl_nuim(root: Path) -> list[str]:
+    scene = root / "living_room_traj0_frei_png"
+    for k in range(FRAMES):
+        write_color(scene / f"rgb/{k}.png", (40 * k, 100, 200))
+        write_depth(scene / f"depth/{k}.png", 10000)
+    write_tum(scene / "livingRoom0.gt.freiburg", list(range(FRAMES)), [pose_at(k) for k in range(FRAMES)])
+    return [f"dataset.root={root}", f"dataset.scene={scene.name}"]
+
+
 def _folder_watch(root: Path) -> list[str]:
     _rgbd_folder(root)
     (root / "end").touch()
@@ -209,6 +218,7 @@ def _wandb(_: Path) -> list[str]:
 
 WRITERS: dict[tuple[str, str], Callable[[Path], list[str]]] = {
     ("dataset", "folder_watch"): _folder_watch,
+    ("dataset", "icl_nuim"): _icl_nuim,
     ("dataset", "orbbec"): _camera,
     ("dataset", "realsense"): _camera,
     ("dataset", "replica_nice_slam"): _replica_nice_slam,

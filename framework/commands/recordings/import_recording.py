@@ -7,16 +7,17 @@ from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.config.text_values import typed
-from framework.importing.bags.ros_topics import Topics
+from framework.importing.bags.ros_topics import NO_POSES, BagOptions, Topics
 from framework.importing.folder_writer import LONGER_SIDE, ODOMETRY, Writing, check_new, write_folder
 from framework.importing.formats import FORMATS, open_source
 from framework.importing.phones.image_rotation import QUARTER, upright
+from framework.importing.source import without_poses
 
 
 def main() -> None:
     """Run the command `instancemap import`."""
     default = Writing()
-    listed = "\n".join(f"  {kind.name:<15} {kind.needs}" for kind in FORMATS)
+    listed = "\n".join(f"  {kind.name:<16} {kind.needs}" for kind in FORMATS)
     parser = argparse.ArgumentParser(
         description="Convert a phone or sensor recording to an RGB-D folder for dataset=rgbd_folder.\n"
         f"The format of SOURCE is detected. Supported formats:\n{listed}",
@@ -39,8 +40,8 @@ def main() -> None:
     add("--depth", metavar="TOPIC", default="", help="depth images")
     add("--camera-info", metavar="TOPIC", default="", help="intrinsics of the color camera")
     poses = (
-        "camera poses: geometry_msgs/PoseStamped (optical axes), or nav_msgs/Odometry (optical axes if child_frame_id "
-        'contains "optical", otherwise ROS axes with x forward)'
+        "camera poses: geometry_msgs/PoseStamped (optical axes), nav_msgs/Odometry of the camera or of a frame that "
+        f"/tf_static connects with it, or /tf; {NO_POSES}: import without poses (all formats)"
     )
     add("--poses", metavar="TOPIC", default="", help=poses)
     odometry = (
@@ -48,12 +49,28 @@ def main() -> None:
         "/tf_static contains its transform; default: none"
     )
     add("--odometry", metavar="TOPIC", default="", help=odometry)
+    add = parser.add_argument_group("ROS bag contents (default: as recorded)").add_argument
+    bag = BagOptions()
+    difference = (
+        "maximum time between a color image and its depth image, s; default: half the interval between frames, at "
+        "least 0.02 s"
+    )
+    add("--max-difference", metavar="S", type=float, default=bag.max_difference, help=difference)
+    unit = "unit of the depth images, m; default: 0.001 for integers, 1 for floats"
+    add("--depth-unit", metavar="M", type=float, default=bag.depth_unit, help=unit)
+    registered = "depth is registered to color although the bag does not show it"
+    add("--depth-registered", action="store_true", help=registered)
+    mounting = 'pose of the camera in the frame of the poses, "TX TY TZ QX QY QZ QW", m; default: from /tf_static'
+    add("--camera-pose", metavar="POSE", default=bag.camera_pose, help=mounting)
     parsed = arguments(parser)
     with one_line_errors():
         writing = Writing(parsed.width, parsed.stride, parsed.confidence, parsed.rotate)
         check_new(parsed.directory)
         topics = Topics(parsed.color, parsed.depth, parsed.camera_info, parsed.poses, parsed.odometry)
-        source = open_source(parsed.source, topics)
+        options = BagOptions(parsed.max_difference, parsed.depth_unit, parsed.depth_registered, parsed.camera_pose)
+        source = open_source(parsed.source, topics, options)
+        if parsed.poses == NO_POSES:
+            source = without_poses(source)
         written = write_folder(source, parsed.directory, writing)
         root = parsed.directory.resolve()
         print(f"{root}: from {source.format}, {written}")

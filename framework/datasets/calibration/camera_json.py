@@ -89,7 +89,7 @@ def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float
     Raises:
         DataError: The image size or the intrinsics are invalid. The message contains `where`.
     """
-    if width != int(width) or height != int(height):
+    if not (width % 1 == 0 and height % 1 == 0):  # False for NaN and infinity
         raise DataError(f"{where}: width, height: expected whole numbers of px, got {width:g}x{height:g}")
     with errors_of(where):
         return Camera(int(width), int(height), fx, fy, cx, cy)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -54,8 +55,12 @@ class Calibration:
         self.check_size(name, raw.shape)
         return self.lens.smooth(raw) if self.lens else raw
 
-    def depth(self, raw: UInt16, name: Path | str) -> Float32:
+    def depth(self, raw: UInt16 | Float32, name: Path | str) -> Float32:
         """Return the undistorted depth (H, W), m, 0 = no reading.
+
+        Args:
+            raw: The stored depth (H, W) in depth units; floats that are not finite or negative are no readings.
+            name: The file, for error messages.
 
         Raises:
             FrameError: The image has the wrong size.
@@ -63,7 +68,7 @@ class Calibration:
         self.check_size(name, raw.shape)
         depth = raw.astype(np.float32)
         depth /= np.float32(self.depth_scale)
-        depth[raw == NO_READING] = 0
+        depth[raw == NO_READING if raw.dtype == np.uint16 else ~(np.isfinite(raw) & (raw > 0))] = 0
         if self.max_depth:
             depth[depth > self.max_depth] = 0
         return self.lens.exact(depth) if self.lens else depth
@@ -81,6 +86,13 @@ class Calibration:
         """Raise FrameError if an image does not have the size of the camera."""
         if shape[:2] != self.camera.shape:
             expected = f"expected {self.camera.width}x{self.camera.height} px as in {self.source}"
-            tag = exif_orientation(name) if isinstance(name, Path) else UPRIGHT
-            fix = "" if tag == UPRIGHT else f" with the EXIF orientation {tag}, which is not applied; rotate the pixels"
-            raise FrameError(f"{name}: {expected}, got {shape[1]}x{shape[0]} px{fix}")
+            raise FrameError(f"{name}: {expected}, got {shape[1]}x{shape[0]} px{_orientation_hint(name)}")
+
+
+def _orientation_hint(name: Path | str) -> str:
+    """Return the end of an error message that reports the EXIF orientation of an image, which is not applied."""
+    orientation = exif_orientation(name) if isinstance(name, Path) else UPRIGHT
+    if orientation == UPRIGHT or not isinstance(name, Path):
+        return ""
+    rotate = f"mogrify -auto-orient {shlex.quote(str(name.parent / f'*{name.suffix}'))}"
+    return f" with the EXIF orientation {orientation}, which is not applied; rotate the pixels: {rotate}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
@@ -36,8 +37,14 @@ def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
         files[number] = path
     check_one_number(list(files.values()))
     if not files:
-        raise DataError(f"{folder}: expected images ({', '.join(suffixes)}), got none")
+        raise DataError(f"{folder}: expected files ({', '.join(suffixes)}), got {_other_files(folder)}")
     return dict(sorted(files.items()))
+
+
+def _other_files(folder: Path) -> str:
+    """Return the number of files by suffix, for messages."""
+    counts = Counter(path.suffix for path in folder.iterdir() if path.suffix and not path.name.startswith("."))
+    return ", ".join(f"{count} {suffix} files" for suffix, count in counts.most_common(3)) or "none"
 
 
 def paired_images(colors: dict[int, Path], depths: dict[int, Path]) -> dict[int, StoredImages]:
@@ -80,6 +87,11 @@ def number_of(path: Path) -> int | None:
     """Return the number at the end of a file name, or None without a number."""
     digits = path.stem[len(_before_number(path)) :]
     return int(digits) if digits else None
+
+
+def natural_order(name: str) -> list[tuple[int, int | str]]:
+    """Return a sort key for names, by which frame 10 follows frame 9."""
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split("([0-9]{1,18})", name) if part]
 
 
 def check_one_number(files: Sequence[Path]) -> None:

@@ -6,7 +6,7 @@ import logging
 import math
 import zlib
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
@@ -40,7 +40,8 @@ from framework.datasets.frames.odometry import Odometry, OdometryFile
 from framework.datasets.ground_truth.labeled_mesh import unseen
 from framework.datasets.ground_truth.named_truth import KEY, NamedTruth, read_named_truth
 from framework.errors import ConfigError, DataError, FrameError
-from framework.files.image_files import read_color, read_uint16
+from framework.files.depth_files import read_depth
+from framework.files.image_files import read_color
 from framework.files.search_paths import folder_of
 from framework.interfaces import RGBDSequence
 from framework.sensors.noise_models import SensorChoice, SensorKind
@@ -64,12 +65,17 @@ class StoredImages:
     color_name: Path | str  # file, and position in the file, for messages
     depth_name: Path | str
     color: Callable[[], UInt8]  # (H, W, 3) RGB
-    depth: Callable[[], UInt16]  # (H, W) in depth units of the recording; 0 or 65535 = no reading
+    depth: Callable[[], UInt16 | Float32]  # (H, W) in depth units of the recording; no reading = 0, 65535 or no number
 
     @classmethod
     def of_files(cls, color: Path, depth: Path) -> StoredImages:
-        """Return the images in two JPEG or PNG files."""
-        return cls(color, depth, partial(read_color, color), partial(read_uint16, depth))
+        """Return the images in a JPEG or PNG file and a depth file."""
+        return cls(color, depth, partial(read_color, color), partial(read_depth, depth))
+
+    @property
+    def image_name(self) -> str:
+        """File name of the color image, "" for an image without a file of its own."""
+        return self.color_name.name if isinstance(self.color_name, Path) else ""
 
 
 @dataclass(frozen=True)
@@ -244,7 +250,11 @@ class Recording(RGBDSequence):
             depth_timestamp=recorded.depth_timestamp,
             sensor=self.sensor_kind,
             T_odom_camera=None if self.odometry is None else self.odometry.at(recorded.depth_time),
+            image_name=recorded.images.image_name,
         )
+
+    def image_names(self) -> Mapping[int, str]:
+        return {k: recorded.images.image_name for k, recorded in enumerate(self.contents.frames)}
 
     def metric_depth(self, index: int) -> Float32:
         """Return the depth (H, W), m, of a frame, 0 = no reading.

@@ -8,13 +8,17 @@ Rooms were scanned with an iPad and an attached depth sensor:
     scene0000_00/pose/0.txt             T_world_camera, four lines of four numbers, m
     scene0000_00/intrinsic/             4x4 matrices: intrinsic_color.txt, intrinsic_depth.txt; optional
                                         extrinsic_color.txt, extrinsic_depth.txt
+    scene0000_00/00000.jpg, 00000.png, 00000.txt, intrinsic.txt     `posed_images` of MMDetection3D: color, depth, pose
+                                        and intrinsics of color (data/scannet/extract_posed_images.py in
+                                        open-mmlab/mmdetection3d); optional depth_intrinsic.txt
     scene0000_00/scene0000_00_vh_clean_2.ply, _vh_clean_2.0.010000.segs.json, .aggregation.json
                                         optional: mesh, segments, and objects as sets of segments
     scannetv2-labels.combined.tsv       optional, in the folder of the scenes or in its parent: the class of each
                                         annotated name; without this file, fewer objects are evaluated
     scannet-labels.combined.tsv         optional, in the same folders: for annotations of the first release
 
-Frames have the camera of the depth images (640x480 px). Color (1296x968 px) is registered to this camera.
+Frames have the camera of the depth images (640x480 px). Color (1296x968 px) is registered to this camera. If the
+intrinsics of one image are unknown, the two images are assumed to have the same field of view.
 """
 
 from __future__ import annotations
@@ -48,6 +52,7 @@ from framework.geometry import inverse, rotation_angle
 MESH_FILES = ("_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json")  # suffixes of the scene name
 DEPTH_SCALE = 1000.0  # units per meter, of exported depth
 MICROSECONDS = 1e6  # per second
+ONE_INTRINSICS, DEPTH_INTRINSICS = "intrinsic.txt", "depth_intrinsic.txt"  # in posed_images
 COLOR_SIZE = (1296, 968)  # px, image size of the exported intrinsics; exported color images may be smaller
 NEAR = 2.0  # m, depth at which the logged parallax is computed
 LARGEST_SHIFT = 0.5  # px of the depth camera, maximum shift of color without a warning
@@ -81,7 +86,9 @@ class ScanNet(LabeledRecording):
             return _sens_contents(sens[0])
         if exported.is_dir():
             return _exported_contents(self.folder)
-        expected = f"expected {self.name}.sens or color/, got neither"
+        if (self.folder / ONE_INTRINSICS).is_file():
+            return _posed_contents(self.folder)
+        expected = f"expected {self.name}.sens, color/ or {ONE_INTRINSICS}, got none of them"
         raise DataError(f"{self.folder}: {expected}; set dataset.scene to a scene such as scene0000_00")
 
     def _read_mesh(self, mesh: Path, segments: Path, objects: Path) -> LabeledMesh:
@@ -136,8 +143,31 @@ def _exported_contents(folder: Path) -> Contents:
 def _exported_frame(folder: Path, k: int, images: StoredImages) -> RecordedFrame:
     if not (folder / "pose").is_dir():
         return RecordedFrame(images, k / FRAME_RATE)
-    pose = folder / "pose" / f"{Path(images.depth_name).stem}.txt"
+    return _posed_frame(folder / "pose", k, images)
+
+
+def _posed_frame(folder: Path, k: int, images: StoredImages) -> RecordedFrame:
+    pose = folder / f"{Path(images.depth_name).stem}.txt"
     return RecordedFrame.posed(images, k / FRAME_RATE, lambda: read_matrix(pose).pose())
+
+
+def _posed_contents(folder: Path) -> Contents:
+    colors, depths = numbered_images(folder, (".jpg", ".jpeg")), numbered_images(folder, (".png",))
+    color_size, depth_size = first_size(colors.values(), read_color), first_size(depths.values(), read_uint16)
+    path, depth_path = folder / ONE_INTRINSICS, folder / DEPTH_INTRINSICS
+    if path_exists(depth_path):
+        color_camera, depth_camera = _color_camera(path, *color_size), _camera(depth_path, *depth_size)
+    elif not _fits(read_matrix(path).camera(*COLOR_SIZE)) and _fits(read_matrix(path).camera(*depth_size)):
+        depth_path, depth_camera = path, _camera(path, *depth_size)
+        color_camera = _resized(depth_camera, *color_size)
+    else:
+        depth_path, color_camera = path, _color_camera(path, *color_size)
+        depth_camera = _resized(color_camera, *depth_size)
+    with errors_of(path):
+        registration = ColorRegistration(color_camera, depth_camera)
+    images = paired_images(colors, depths)
+    frames = [_posed_frame(folder, k, registered_images(pair, registration)) for k, pair in images.items()]
+    return Contents(depth_camera, depth_path, DEPTH_SCALE, frames)
 
 
 def _camera(path: Path, width: int, height: int) -> Camera:
@@ -156,6 +186,11 @@ def _color_camera(path: Path, width: int, height: int) -> Camera:
     matrix = read_matrix(path)
     if _fits(matrix.camera(width, height)) or not _fits(camera := matrix.camera(*COLOR_SIZE)):
         return _camera(path, width, height)
+    return _resized(camera, width, height)
+
+
+def _resized(camera: Camera, width: int, height: int) -> Camera:
+    """Return the camera of images with the same field of view and the given size, px."""
     u, v = width / camera.width, height / camera.height
     # pixel centers are at integers
     return Camera(width, height, u * camera.fx, v * camera.fy, u * (camera.cx + 0.5) - 0.5, v * (camera.cy + 0.5) - 0.5)

@@ -1,7 +1,7 @@
 """Up directions from the accelerometer in a ROS bag.
 
 At rest, an accelerometer measures an upward vector of 9.8 m/s^2 (REP 145). Its rotation to the camera is taken from
-/tf_static, or from the stream of a RealSense recording.
+the transform tree of the bag.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from framework.data import Float64
 from framework.errors import DataError, FrameError
 from framework.importing.bags.ros_messages import IMU, RosBag
-from framework.importing.bags.ros_transforms import REALSENSE, static_motion, stream_motion
+from framework.importing.bags.transform_tree import REALSENSE, TransformTree
 
 NEAR = 0.05  # s, averaging window before and after a frame, which reduces the effect of hand tremor
 GRAVITY = 9.81  # m/s^2
@@ -43,11 +43,14 @@ class Accelerometer:
         return mean / length if length > 0 else None
 
 
-def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> Accelerometer | None:
+def find_accelerometer(
+    bag: RosBag, tree: TransformTree, color: str, timestamps: Sequence[float]
+) -> Accelerometer | None:
     """Return the first usable accelerometer in a bag, or None if no accelerometer is usable.
 
     Args:
         bag: The bag.
+        tree: The coordinate frames of the bag.
         color: The topic of the color images.
         timestamps: The timestamps of the color images, s.
     """
@@ -55,7 +58,7 @@ def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> 
     for topic in bag.topics(IMU):
         if GYROSCOPE.search(topic):
             continue
-        found = _accelerometer(bag, topic, color)
+        found = _accelerometer(bag, tree, topic, color)
         if isinstance(found, str):
             reasons.append(found)
         elif all(found.up(timestamp) is None for timestamp in timestamps):
@@ -67,7 +70,7 @@ def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> 
     return None
 
 
-def _accelerometer(bag: RosBag, topic: str, color: str) -> Accelerometer | str:
+def _accelerometer(bag: RosBag, tree: TransformTree, topic: str, color: str) -> Accelerometer | str:
     """Return the accelerometer of a topic, or the reason why it cannot be used."""
     times, measured, frame_id = _read(bag, topic)
     if not len(times):
@@ -75,28 +78,15 @@ def _accelerometer(bag: RosBag, topic: str, color: str) -> Accelerometer | str:
     length = float(np.median(np.linalg.norm(measured, axis=1)))
     if abs(length - GRAVITY) > MAX_DEVIATION * GRAVITY:
         return f"{topic}: expected a median acceleration of {GRAVITY:g} m/s^2, got {length:.3g} m/s^2"
+    imu = tree.frame_of(topic) if topic.startswith(REALSENSE) else frame_id
     try:
-        R_camera_imu = _rotation(bag, topic, frame_id, color)
+        T_camera_imu = tree.fixed(to=tree.frame_of(color), of=imu)
     except DataError as error:
-        log.warning("%s", error)
-        R_camera_imu = None
-    if R_camera_imu is None:
+        return f"{topic}: {error}"
+    if T_camera_imu is None:
         return f"{topic}: expected the rotation from this sensor to the camera of {color} in the bag, got none"
     order = np.argsort(times, kind="stable")
-    return Accelerometer(times[order], measured[order] @ R_camera_imu.T)
-
-
-def _rotation(bag: RosBag, topic: str, frame_id: str, color: str) -> Float64 | None:
-    """Return the rotation (3, 3) from the accelerometer to the camera, or None if it is not in the bag."""
-    if topic.startswith(REALSENSE):
-        T_imu_reference = stream_motion(bag, topic.removesuffix("/imu/data"))
-        T_color_reference = stream_motion(bag, color.removesuffix("/image/data"))
-        if T_imu_reference is None or T_color_reference is None:
-            return None
-        return np.asarray(T_color_reference[:3, :3] @ T_imu_reference[:3, :3].T)
-    image = bag.first(color)
-    T_camera_imu = None if image is None else static_motion(bag, image.header.frame_id, frame_id)
-    return None if T_camera_imu is None else T_camera_imu[:3, :3]
+    return Accelerometer(times[order], measured[order] @ T_camera_imu[:3, :3].T)
 
 
 def _read(bag: RosBag, topic: str) -> tuple[Float64, Float64, str]:

@@ -1,4 +1,4 @@
-"""Reader of ROS bags and decoder of image messages.
+"""Reader of ROS bags.
 
 Only standard message types are supported. Message definitions in a bag are ignored, because rosbags would generate code
 from them.
@@ -12,32 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from framework.data import Array, Float32, UInt8
 from framework.errors import DataError, FrameError, import_optional, in_one_line
-from framework.files.image_files import decode_color, decode_uint16
 from framework.files.number_lines import SHOWN
-from framework.importing.source import readings
 
 NANOSECONDS = 1e-9  # s
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-IMU, TRANSFORMS = "sensor_msgs/msg/Imu", "tf2_msgs/msg/TFMessage"
+IMU = "sensor_msgs/msg/Imu"
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the second type is of early ROS 1
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
-
-COLOR_CHANNELS = {  # by encoding: number of 8-bit channels, and indices of R, G and B
-    "rgb8": (3, (0, 1, 2)),
-    "bgr8": (3, (2, 1, 0)),
-    "8UC3": (3, (2, 1, 0)),
-    "rgba8": (4, (0, 1, 2)),
-    "bgra8": (4, (2, 1, 0)),
-    "mono8": (1, (0, 0, 0)),
-    "8UC1": (1, (0, 0, 0)),
-}
-MILLIMETERS, METERS = ("16UC1", "mono16", "Z16"), ("32FC1",)
-COMPRESSED_DEPTH = "compressedDepth"  # in the format field of depth images, after the encoding
-DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: unused integer, quantization A and B
 
 
 @dataclass(frozen=True)
@@ -66,9 +49,10 @@ class RosBag:
 
         self._is_ros1 = path.suffix.lower() == ".bag"
         self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self._is_ros1 else typesys.Stores.LATEST)
-        if TRANSFORMS not in self._types.types:  # rosbags does not define this type for ROS 1
-            definition = "geometry_msgs/TransformStamped[] transforms"
-            self._types.register(typesys.get_types_from_msg(definition, TRANSFORMS))
+        for name in TRANSFORMS:
+            if name not in self._types.types:  # rosbags does not define these types for ROS 1
+                definition = "geometry_msgs/TransformStamped[] transforms"
+                self._types.register(typesys.get_types_from_msg(definition, name))
         try:
             self._reader = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
             self._reader.open()
@@ -137,76 +121,3 @@ class RosBag:
         except (struct.error, IndexError) as error:
             raise FrameError(f"{self.path}: expected a header in a message of {message.topic}, got none") from error
         return (int(seconds) * 10**9 + int(nanoseconds)) * NANOSECONDS
-
-
-def color_of(where: str, message: Any) -> UInt8:
-    """Decode a color image (H, W, 3), RGB.
-
-    Raises:
-        FrameError: The image is invalid. The message contains `where`.
-    """
-    if hasattr(message, "format"):
-        return decode_color(where, message.data.tobytes())
-    if message.encoding not in COLOR_CHANNELS:
-        expected = f"expected one of the color encodings {', '.join(COLOR_CHANNELS)}"
-        raise FrameError(f"{where}: {expected}, got {message.encoding[:60]!r}")
-    channels, order = COLOR_CHANNELS[message.encoding]
-    return np.ascontiguousarray(_pixels(where, message, np.dtype(np.uint8), channels)[..., order])
-
-
-def depth_of(where: str, message: Any, unit: float) -> Float32:
-    """Decode a depth image (H, W), m, 0 = no reading.
-
-    Args:
-        where: The location in the bag, for messages.
-        message: The decoded Image or CompressedImage message.
-        unit: The unit of integer depth, m.
-
-    Raises:
-        FrameError: The image is invalid.
-    """
-    if hasattr(message, "format"):
-        return _compressed_depth(where, message, unit)
-    order = ">" if message.is_bigendian else "<"
-    if message.encoding in MILLIMETERS:
-        return _whole(_pixels(where, message, np.dtype(f"{order}u2"), 1)[..., 0], unit)
-    if message.encoding in METERS:
-        return readings(_pixels(where, message, np.dtype(f"{order}f4"), 1)[..., 0].astype(np.float32))
-    known = ", ".join((*MILLIMETERS, *METERS))
-    raise FrameError(f"{where}: expected one of the depth encodings {known}, got {message.encoding[:60]!r}")
-
-
-def _whole(stored: Array, unit: float) -> Float32:
-    return np.where(stored == np.iinfo(np.uint16).max, 0, stored).astype(np.float32) * np.float32(unit)
-
-
-def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
-    """Decode a compressed depth image (H, W), m, 0 = no reading."""
-    encoding, _, codec = message.format.partition(";")
-    data = message.data.tobytes()
-    if COMPRESSED_DEPTH not in codec:
-        return _whole(decode_uint16(where, data), unit)
-    if "rvl" in codec.lower():
-        raise FrameError(f"{where}: expected PNG or uncompressed depth, got RVL; record depth as PNG or uncompressed")
-    if len(data) < DEPTH_HEADER.size:
-        raise FrameError(f"{where}: expected a header of {DEPTH_HEADER.size} bytes and an image, got {len(data)} bytes")
-    # for float depth, the header contains the quantization of inverse depth: depth = A / (value - B)
-    _, quantization_a, quantization_b = DEPTH_HEADER.unpack_from(data)
-    stored = decode_uint16(where, data[DEPTH_HEADER.size :])
-    if encoding.strip() not in METERS:
-        return _whole(stored, unit)
-    with np.errstate(all="ignore"):
-        return readings(np.where(stored == 0, 0, quantization_a / (stored.astype(np.float64) - quantization_b)))
-
-
-def _pixels(where: str, message: Any, dtype: np.dtype[Any], channels: int) -> Array:
-    """Return the pixels (H, W, channels) of an Image."""
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    row = width * channels * dtype.itemsize
-    if not 0 < row <= step or height < 1 or len(message.data) != height * step:
-        layout = f"{width}x{height} px of {message.encoding[:60]!r} with {step} bytes per row"
-        raise FrameError(
-            f"{where}: expected {height * max(row, step)} bytes for {layout}, got {len(message.data)} bytes"
-        )
-    rows = np.asarray(message.data, np.uint8).reshape(height, step)[:, :row]
-    return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)

@@ -4,17 +4,30 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import PurePosixPath
 from posixpath import commonpath
 
+from framework.config.validation import require
+from framework.data import Float64
 from framework.errors import ConfigError, DataError
-from framework.importing.bags.ros_messages import CAMERA_INFO, COMPRESSED, IMAGE, ODOMETRY, POSE, RosBag
+from framework.files.number_lines import numbers
+from framework.files.tum_trajectory import rigid_pose
+from framework.importing.bags.ros_messages import (
+    CAMERA_INFO,
+    COMPRESSED,
+    IMAGE,
+    ODOMETRY,
+    POSE,
+    TRANSFORMS,
+    RosBag,
+)
+from framework.importing.bags.transform_tree import TransformTree
 
 COLOR = re.compile("color|rgb", re.IGNORECASE)
 DEPTH = re.compile("depth", re.IGNORECASE)
 NEITHER = re.compile("infra|(^|/|_)ir(/|_|$)|disparity|confidence|mask|label|fisheye|theora|points", re.IGNORECASE)
-REGISTERED = re.compile("aligned|registered|to_color|to_rgb", re.IGNORECASE)  # depth in the color camera
+REGISTERED = re.compile("(?<!un)(aligned|registered)|to_color|to_rgb", re.IGNORECASE)  # depth in the color camera
 OPTIONS = {
     "color": "--color",
     "depth": "--depth",
@@ -22,8 +35,16 @@ OPTIONS = {
     "poses": "--poses",
     "odometry": "--odometry",
 }
+TRANSPORT = ("/compressed", "/compressedDepth")  # ends of the topics of supported transports, preferred last
+NO_POSES = "none"  # value of --poses: import without poses
 IMAGES, POSES = (IMAGE, COMPRESSED), (ODOMETRY, POSE)
-KINDS = {"color": IMAGES, "depth": IMAGES, "camera_info": (CAMERA_INFO,), "poses": POSES, "odometry": POSES}
+KINDS = {
+    "color": IMAGES,
+    "depth": IMAGES,
+    "camera_info": (CAMERA_INFO,),
+    "poses": (*POSES, *TRANSFORMS),
+    "odometry": POSES,
+}
 
 
 @dataclass(frozen=True)
@@ -36,13 +57,13 @@ class Topics:
     color: str = ""
     depth: str = ""
     camera_info: str = ""  # of color
-    poses: str = ""  # optional; "" after the selection = no poses
+    poses: str = ""  # optional; "none" = no poses
     odometry: str = ""  # optional; never selected by type; "" = no odometry
 
     @property
     def given(self) -> list[str]:
         """Command-line options of the topics that are set."""
-        return [option for name, option in OPTIONS.items() if getattr(self, name)]
+        return [option for name, option in OPTIONS.items() if getattr(self, name) not in ("", NO_POSES)]
 
     @property
     def depth_is_registered(self) -> bool:
@@ -50,7 +71,35 @@ class Topics:
         return bool(REGISTERED.search(self.depth))
 
 
-def found_topics(bag: RosBag, given: Topics) -> Topics:
+@dataclass(frozen=True)
+class BagOptions:
+    """Facts about a bag that are not recorded in it."""
+
+    max_difference: float = 0.0  # s, maximum time between a color image and its depth image; 0 = from the frame rate
+    depth_unit: float = 0.0  # m, unit of the depth images; 0 = as recorded, else 0.001 for integers and 1 for floats
+    depth_registered: bool = False  # True = depth is registered to color although the bag does not show it
+    camera_pose: str = ""  # T_base_camera, "tx ty tz qx qy qz qw", m, of the frame of the poses; "" = from /tf_static
+
+    def __post_init__(self) -> None:
+        require(0 <= self.max_difference <= 1, "--max-difference", self.max_difference, "a value in [0, 1] s")
+        unit = self.depth_unit
+        require(unit == 0 or 1e-6 <= unit <= 1, "--depth-unit", unit, "a value in [1e-6, 1] m")
+        self.T_base_camera()
+
+    @property
+    def given(self) -> list[str]:
+        """Command-line options that are set."""
+        return [f"--{field.name.replace('_', '-')}" for field in fields(self) if getattr(self, field.name)]
+
+    def T_base_camera(self) -> Float64 | None:
+        """Return the pose (4, 4) of the camera in the frame of the poses, or None if it is not set."""
+        if not self.camera_pose:
+            return None
+        values = numbers("--camera-pose", self.camera_pose.split(), 7, "tx ty tz qx qy qz qw")
+        return rigid_pose("--camera-pose", values[:3], values[3:])
+
+
+def found_topics(bag: RosBag, given: Topics, tree: TransformTree) -> Topics:
     """Select the topics that are not set by the user.
 
     Raises:
@@ -61,18 +110,22 @@ def found_topics(bag: RosBag, given: Topics) -> Topics:
     depth = given.depth or _one(bag, "depth", [topic for topic in images if DEPTH.search(topic)], REGISTERED)
     color = given.color or _one(bag, "color", [topic for topic in images if not DEPTH.search(topic)], COLOR)
     info = given.camera_info or camera_info_of(bag, color)
+    if not given.camera_info and info and _is_of_depth(bag, tree, info, color, depth):
+        expected = f"expected a {CAMERA_INFO} topic of {color}"
+        found = f"got only {info}, which belongs to {depth}"
+        raise DataError(f"{bag.path}: {expected}, {found}; set --camera-info {info} if both have the same intrinsics")
     if not info:
         expected = f"expected a {CAMERA_INFO} topic next to {color}"
         raise DataError(f"{bag.path}: {expected}, got none{_choice(bag, 'camera_info')}")
     posed = [topic for topic in bag.topics(*POSES) if topic != given.odometry]
     if len(posed) > 1 and not given.poses:
         raise ConfigError(
-            f"{bag.path}: expected one topic with poses, got {', '.join(posed)}; set --poses to one of them"
+            f"{bag.path}: expected one topic with poses, got {', '.join(posed)}; set --poses to one of them or to none"
         )
     topics = replace(given, color=color, depth=depth, camera_info=info, poses=given.poses or "".join(posed))
     for name, kinds in KINDS.items():
         topic = getattr(topics, name)
-        if topic and bag.kinds.get(topic) not in kinds:
+        if topic and (name, topic) != ("poses", NO_POSES) and bag.kinds.get(topic) not in kinds:
             found = f"{topic} of type {bag.kinds[topic]}" if topic in bag.kinds else f"unknown topic {topic}"
             expected = f"{OPTIONS[name]}: expected a topic of type {' or '.join(kinds)}"
             raise ConfigError(f"{expected}, got {found}{_choice(bag, name)}")
@@ -81,19 +134,34 @@ def found_topics(bag: RosBag, given: Topics) -> Topics:
 
 def camera_info_of(bag: RosBag, image: str) -> str:
     """Return the CameraInfo topic of an image topic, or "" if the bag has no such topic."""
-    infos = bag.topics(CAMERA_INFO)
-    folders = {topic: f"/{topic.strip('/').rpartition('/')[0]}" for topic in (image, *infos)}
-    shared = {topic: len(PurePosixPath(commonpath([folders[topic], folders[image]])).parts) for topic in infos}
+    shared = {topic: _shared_parts(topic, image) for topic in bag.topics(CAMERA_INFO)}
     if len(shared) == 1:
         return next(iter(shared))
     best = max(shared.values(), default=1)  # 1 = only the root is shared
     return min((topic for topic, count in shared.items() if count == best), key=len) if best > 1 else ""
 
 
+def _shared_parts(topic: str, other: str) -> int:
+    """Return the number of leading path components that two topics share, with the root."""
+    folders = [f"/{name.strip('/').rpartition('/')[0]}" for name in (topic, other)]
+    return len(PurePosixPath(commonpath(folders)).parts)
+
+
+def _is_of_depth(bag: RosBag, tree: TransformTree, info: str, color: str, depth: str) -> bool:
+    """Return True if a CameraInfo belongs to unregistered depth images, and not to the color images."""
+    if REGISTERED.search(depth) or _shared_parts(info, depth) <= _shared_parts(info, color):
+        return False
+    frame = tree.frame_of(color)
+    return not frame or tree.frame_of(info) != frame
+
+
 def _one(bag: RosBag, name: str, candidates: Sequence[str], preferred: re.Pattern[str]) -> str:
     """Return the only topic among the candidates, after filtering by preferred names and uncompressed images."""
     fitting = [topic for topic in candidates if preferred.search(topic)] or list(candidates)
     left = [topic for topic in fitting if bag.kinds[topic] == IMAGE] or fitting
+    transports = [topic.rpartition("/") for topic in left]
+    if len({base for base, _, _ in transports}) == 1:  # several transports of one image
+        left = [topic for topic in left if topic.endswith(TRANSPORT)][-1:] or left
     if len(left) == 1:
         return left[0]
     expected = f"expected one {name} topic, got {', '.join(left) or 'none'}"

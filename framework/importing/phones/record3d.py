@@ -16,6 +16,7 @@ the first pose is the identity, and the up direction is unknown. Newer versions 
 from __future__ import annotations
 
 import io
+import logging
 import math
 import zipfile
 from collections.abc import Mapping
@@ -44,6 +45,8 @@ BYTES_A_BLOCK = 20_000  # minimum block size; blocks of data without repetitions
 # maximum sine of half the rotation angle of an unrotated pose; a hand-held phone is never aligned this exactly
 UNTURNED = 1e-3
 MAX_BLOCKS = 8  # number of additional blocks; limited, because a block may decompress to 27 MB
+
+log = logging.getLogger(__name__)
 
 _load_openexr = partial(import_optional, "OpenEXR", "reads Record3D's depth", "phone")
 _load_lzfse = partial(import_optional, "lzfse", "unpacks Record3D's .r3d files", "phone")
@@ -168,7 +171,7 @@ def _source(where: Path | str, content: Mapping[str, Any], files: ExrFolder | R3
     cameras = [pinhole(where, *size, *of_frame) for of_frame in _intrinsics(where, content, len(poses))]
     shape = _depth_shape(where, content, cameras[0])
     times = _times(where, content, len(poses))
-    knows_up = _is_turned(poses[0])
+    knows_up = _is_turned(next((pose for pose in poses if not _is_unknown(pose)), None))
 
     def read(k: int) -> DeviceFrame:
         T_world_camera = _pose(f"{where}: pose {k}", poses[k])
@@ -180,15 +183,25 @@ def _source(where: Path | str, content: Mapping[str, Any], files: ExrFolder | R3
             depth=files.depth(k, shape),
             confidence=files.confidence(k, shape),
             T_world_camera=T_world_camera,
-            up=arkit_up(T_world_camera) if knows_up else None,
+            up=arkit_up(T_world_camera) if knows_up and T_world_camera is not None else None,
         )
 
-    return Source(
-        "Record3D", [partial(read, k) for k in range(len(poses))], len(poses), posed=True, sensor=SensorKind.PHONE_LIDAR
-    )
+    posed = not all(_is_unknown(pose) for pose in poses)
+    if not posed:
+        log.warning("%s: poses: expected camera poses, got only zeros; imported without poses", where)
+    frames = [partial(read, k) for k in range(len(poses))]
+    return Source("Record3D", frames, len(poses), posed=posed, sensor=SensorKind.PHONE_LIDAR)
 
 
-def _pose(where: str, values: Any) -> Float64:
+def _is_unknown(pose: Any) -> bool:
+    """Return True if a stored pose contains only zeros."""
+    return isinstance(pose, list) and len(pose) == 7 and all(value == 0 for value in pose)
+
+
+def _pose(where: str, values: Any) -> Float64 | None:
+    """Return T_world_camera (4, 4), or None if it is unknown."""
+    if _is_unknown(values):
+        return None
     quat_xyzw, position = np.split(np.array(number_list(where, values, 7)), [4])
     length = float(np.linalg.norm(quat_xyzw))
     if abs(length - 1) > QUATERNION_TOLERANCE:

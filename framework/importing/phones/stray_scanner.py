@@ -13,6 +13,7 @@ confirm this.
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass
 from functools import partial
@@ -37,6 +38,8 @@ INTRINSICS = ("fx", "fy", "cx", "cy")  # next columns, in newer versions
 KIND_AT, KIND = 4, b"ftyp"
 QUIET = "-8"  # FFmpeg's AV_LOG_QUIET; damage is reported by DataError instead
 LAST_FRAME = 10**6 - 1  # largest frame number of six digits
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -63,13 +66,16 @@ def open_source(path: Path) -> Source:
     rows = _read_odometry(path / "odometry.csv", _read_camera(path / "camera_matrix.csv", video))
     confident = (path / "confidence").is_dir()
     frames = [partial(_read, path, row, video, confident) for row in rows]
-    return Source("Stray Scanner", frames, len(frames), posed=True, sensor=SensorKind.PHONE_LIDAR)
+    posed = not rows or not all(isinstance(row, OdometryRow) and row.line.is_zero for row in rows)
+    if not posed:
+        log.warning("%s: expected camera poses, got only zeros; imported without poses", path / "odometry.csv")
+    return Source("Stray Scanner", frames, len(frames), posed=posed, sensor=SensorKind.PHONE_LIDAR)
 
 
 def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: bool) -> DeviceFrame:
     if isinstance(row, DataError):
         raise row
-    name, T_world_camera = f"{row.frame:06d}.png", row.line.pose()
+    name, T_world_camera = f"{row.frame:06d}.png", None if row.line.is_zero else row.line.pose()
     return DeviceFrame(
         name=folder / "depth" / name,
         timestamp=row.line.timestamp,
@@ -78,7 +84,7 @@ def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: b
         depth=meters(read_uint16(folder / "depth" / name)),
         confidence=read_uint8(folder / "confidence" / name) if confident else None,
         T_world_camera=T_world_camera,
-        up=arkit_up(T_world_camera),
+        up=None if T_world_camera is None else arkit_up(T_world_camera),
     )
 
 

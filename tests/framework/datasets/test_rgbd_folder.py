@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from framework.datasets.frames.conventions import DepthReading
 from framework.datasets.rgbd_folder import RgbdFolder
@@ -59,6 +60,16 @@ def set_pose_line(folder, k, line):
 
 def change_camera(folder, **changes):
     (folder / "camera.json").write_text(json.dumps(CAMERA | changes))
+
+
+def test_rgbd_folder_frames_know_their_file_names(folder):
+    for name in ("color", "depth", "instance"):
+        for k in reversed(range(FRAMES)):
+            (folder / name / f"{k:06d}.png").rename(folder / name / f"frame_{3 * k + 1:06d}.png")
+    sequence = RgbdFolder(folder, start=1, stride=2)
+    names = {0: "frame_000001.png", 1: "frame_000004.png", 2: "frame_000007.png", 3: "frame_000010.png"}
+    assert sequence.image_names() == names
+    assert [(frame.index, frame.image_name) for frame in sequence] == [(1, names[1]), (3, names[3])]
 
 
 def test_rgbd_folder_frame_matches_files(folder):
@@ -434,7 +445,7 @@ def test_rgbd_folder_non_uint16_depth_raises_for_its_frame(folder):
         ("0.1 0 0 inf 0 0 0 1", "expected a finite pose"),
         ("0.1 -1.#IND -1.#IND -1.#IND 0 0 0 1", "expected a finite pose"),
         ("0.1 0 0 0 0 0 0 0.5", "expected a quaternion qx qy qz qw of length 1, got 0.5"),
-        ("0.1 0 0 0 0 0 0 0", "expected a quaternion qx qy qz qw of length 1, got 0"),
+        ("0.1 1 0 0 0 0 0 0", "expected a quaternion qx qy qz qw of length 1, got 0"),
     ],
 )
 def test_rgbd_folder_invalid_pose_raises_for_its_frame(folder, line, message):
@@ -600,3 +611,208 @@ def test_rgbd_folder_unknown_sensor_in_camera_json_raises(folder, name):
     names = "EXACT, KINECT_V1, REALSENSE_D435, TIME_OF_FLIGHT, PHONE_LIDAR"
     with pytest.raises(DataError, match=rf"camera\.json: sensor: expected one of {names}, got {name}; set the kind"):
         RgbdFolder(folder)
+
+
+# Other depth files, pose folders and orientations
+
+
+def write_tiff(path, image):
+    cv2.imwrite(f"{path}.tiff", image)
+
+
+def write_npy(path, image):
+    np.save(f"{path}.npy", image)
+
+
+def write_exr(path, image, channel="Z"):
+    OpenEXR = pytest.importorskip("OpenEXR")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    other = {"A": np.ones_like(image)} if channel == "ViewLayer.Depth.Z" else {}
+    OpenEXR.File(header, {channel: np.ascontiguousarray(image)} | other).write(f"{path}.exr")
+
+
+def in_meters(k):
+    return depth_mm(k).astype(np.float32) / np.float32(1000)
+
+
+def with_depth(folder, write, image_of):
+    for k in range(FRAMES):
+        (folder / f"depth/{k:06d}.png").unlink()
+        write(folder / f"depth/{k:06d}", image_of(k))
+    return RgbdFolder(folder)
+
+
+@pytest.mark.parametrize(
+    ("write", "image_of", "tolerance"),
+    [
+        (write_tiff, depth_mm, 0),
+        (write_npy, depth_mm, 0),
+        (write_npy, lambda k: depth_mm(k)[..., None], 0),
+        (write_tiff, in_meters, 0),
+        (write_npy, in_meters, 0),
+        (write_npy, lambda k: in_meters(k).astype(np.float64), 0),
+        (write_npy, lambda k: in_meters(k).astype(np.float16), 1e-3),
+        (write_exr, in_meters, 0),
+        (lambda path, image: write_exr(path, image, "R"), lambda k: in_meters(k).astype(np.float16), 1e-3),
+        (lambda path, image: write_exr(path, image, "ViewLayer.Depth.Z"), in_meters, 0),
+    ],
+)
+def test_rgbd_folder_depth_of_other_formats_is_read(folder, write, image_of, tolerance):
+    sequence = with_depth(folder, write, image_of)
+    for k, frame in enumerate(sequence):
+        np.testing.assert_allclose(frame.depth, in_meters(k), rtol=tolerance)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -1.0, 0.0])
+def test_rgbd_folder_float_depth_without_reading_is_0(folder, value):
+    image = in_meters(0)
+    image[3, 4] = value
+    depth = with_depth(folder, write_npy, lambda k: image)[0].depth
+    assert depth[3, 4] == 0
+    assert np.count_nonzero(depth) == WIDTH * HEIGHT - 1
+
+
+def test_rgbd_folder_float_depth_in_millimeters_needs_scale(folder):
+    with pytest.raises(DataError, match=r"expected float depth in meters, got a median of .*; set dataset.depth_scale"):
+        with_depth(folder, write_npy, lambda k: depth_mm(k).astype(np.float32))
+    frame = RgbdFolder(folder, depth_reading=DepthReading(depth_scale=1000))[1]
+    np.testing.assert_allclose(frame.depth, in_meters(1))
+
+
+def spoil_npy(path):
+    path.write_bytes(path.read_bytes()[:-9])
+
+
+@pytest.mark.parametrize(
+    ("write", "suffix", "spoil"),
+    [
+        (write_npy, ".npy", spoil_npy),
+        (write_npy, ".npy", lambda path: np.save(path, np.array([{}]), allow_pickle=True)),
+        (write_npy, ".npy", lambda path: np.save(path, np.zeros((HEIGHT, WIDTH, 3), np.float32))),
+        (write_tiff, ".tiff", lambda path: path.write_bytes(path.read_bytes()[:60])),
+        (write_exr, ".exr", lambda path: path.write_bytes(path.read_bytes()[:90])),
+    ],
+)
+def test_rgbd_folder_damaged_depth_skips_one_frame(folder, write, suffix, spoil):
+    with_depth(folder, write, in_meters)
+    spoil(folder / f"depth/000002{suffix}")
+    assert f"000002{suffix}: expected" in read_all_but(folder, 2)
+
+
+def test_rgbd_folder_unsupported_depth_suffix_is_named(folder):
+    for path in (folder / "depth").iterdir():
+        path.rename(path.with_suffix(".pgm"))
+    with pytest.raises(DataError, match=r"expected files \(\.png, .*\), got 4 \.pgm files"):
+        RgbdFolder(folder)
+
+
+def T_world_camera(k):
+    T = np.array([[0.28, 0, 0.96, 0], [0, 1, 0, 0], [-0.96, 0, 0.28, -0.5], [0, 0, 0, 1]])
+    T[0, 3] = 0.1 * k
+    return T
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("pose/{:06d}.txt", (4, 4)),
+        ("pose/{}.txt", (4, 4)),
+        ("poses/frame_{:04d}.txt", (4, 4)),
+        ("pose/{:06d}.txt", (3, 4)),
+        ("pose/{:06d}.txt", (1, 16)),
+    ],
+)
+def test_rgbd_folder_pose_folder_is_read(folder, caplog, name, shape):
+    (folder / "poses.txt").unlink()
+    (folder / name).parent.mkdir()
+    for k in range(FRAMES):
+        np.savetxt(folder / name.format(k), T_world_camera(k).ravel()[: np.prod(shape)].reshape(shape))
+    with caplog.at_level("INFO"):
+        sequence = RgbdFolder(folder)
+    assert sequence.has_poses()
+    for k, frame in enumerate(sequence):
+        np.testing.assert_allclose(frame.T_world_camera, T_world_camera(k), atol=1e-12)
+    assert "read T_world_camera of 4 of 4 frames" in caplog.text
+
+
+def test_rgbd_folder_pose_folder_keeps_unknown_and_invalid_poses(folder):
+    (folder / "poses.txt").unlink()
+    (folder / "pose").mkdir()
+    for k in range(3):
+        np.savetxt(folder / f"pose/{k:06d}.txt", [T_world_camera(k), np.zeros((4, 4)), np.full((4, 4), -np.inf)][k])
+    sequence = RgbdFolder(folder)
+    np.testing.assert_allclose(sequence[0].T_world_camera, T_world_camera(0))
+    assert sequence[1].T_world_camera is None
+    assert sequence[3].T_world_camera is None
+    with pytest.raises(FrameError, match=r"000002\.txt"):
+        sequence[2]
+
+
+def test_rgbd_folder_pose_folder_of_other_frames_raises(folder):
+    (folder / "poses.txt").unlink()
+    (folder / "pose").mkdir()
+    np.savetxt(folder / "pose/000100.txt", np.eye(4))
+    with pytest.raises(DataError, match=r"pose: expected a pose of frame 0, got 1 files from 000100\.txt"):
+        RgbdFolder(folder)
+
+
+def test_rgbd_folder_poses_file_precedes_pose_folder(folder, caplog):
+    (folder / "pose").mkdir()
+    np.savetxt(folder / "pose/000000.txt", np.eye(4))
+    with caplog.at_level("INFO"):
+        np.testing.assert_allclose(RgbdFolder(folder)[1].T_world_camera, T_world_camera(1), atol=1e-12)
+    assert "poses are read from poses.txt; pose/ is not read" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["traj.txt", "trajectory.log", "camera_poses.json"])
+def test_rgbd_folder_unread_pose_file_is_logged(folder, caplog, name):
+    (folder / "poses.txt").unlink()
+    (folder / name).touch()
+    assert not RgbdFolder(folder).has_poses()
+    assert f"expected poses in poses.txt or pose/, got {name}, which is not read" in caplog.text
+
+
+def test_rgbd_folder_zero_poses_count_as_unknown(folder, caplog):
+    set_pose_line(folder, 1, "0.1 0 0 0 0 0 0 0")
+    sequence = RgbdFolder(folder)
+    assert sequence[1].T_world_camera is None
+    assert sequence[2].T_world_camera is not None
+    assert "1 of 4 poses contain only zeros and count as unknown" in caplog.text
+    for k in range(FRAMES):
+        set_pose_line(folder, k, f"{k} 0 0 0 0 0 0 0")
+    sequence = RgbdFolder(folder)
+    assert not sequence.has_poses()
+    assert [frame.timestamp for frame in sequence] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("name", ["timestamps.txt", "times.txt"])
+def test_rgbd_folder_one_column_timestamps_are_of_both_images(folder, name):
+    (folder / "poses.txt").unlink()
+    (folder / name).write_text("".join(f"{1700000000 + k / 10}\n" for k in range(FRAMES)))
+    frame = RgbdFolder(folder)[1]
+    assert frame.timestamp == frame.depth_time == pytest.approx(1700000000.1)
+
+
+def write_oriented(folder, k, orientation, pixels):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    (folder / f"color/{k:06d}.png").unlink()
+    Image.fromarray(pixels).save(folder / f"color/{k:06d}.jpg", exif=exif, quality=95)
+
+
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+def test_rgbd_folder_size_error_names_exif_orientation(folder, orientation):
+    for k in range(FRAMES):
+        write_oriented(folder, k, orientation, np.rot90(picture(k)).copy())
+    expected = (
+        f"expected 24x16 px .*, got 16x24 px with the EXIF orientation {orientation}, which is not applied; rotate"
+    )
+    with pytest.raises(FrameError, match=f"{expected} the pixels: mogrify -auto-orient"):
+        RgbdFolder(folder)
+
+
+def test_rgbd_folder_exif_orientation_is_logged_once(folder, caplog):
+    for k in range(FRAMES):
+        write_oriented(folder, k, 3, picture(k))
+    assert len(RgbdFolder(folder)) == FRAMES
+    assert caplog.text.count("the EXIF orientation 3 is not applied; the pixels are used as stored") == 1

@@ -260,9 +260,19 @@ def test_tum_rgbd_duplicate_pose_timestamps_keep_first(folder: Path, caplog: pyt
 
 def test_tum_rgbd_invalid_pose_raises_for_its_frame(folder: Path) -> None:
     lines = [f"{color_time(k):.6f} 0 0 0 0 0 0 1" for k in range(FRAMES)]
-    lines[1] = f"{color_time(1):.6f} 0 0 0 0 0 0 0"
+    lines[1] = f"{color_time(1):.6f} 1 0 0 0 0 0 0"
     write_poses(folder, lines)
     assert "groundtruth.txt, line 5: expected a quaternion" in fault_of(TumRgbd(folder), 1)
+
+
+def test_tum_rgbd_zero_pose_counts_as_unknown(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    lines = [f"{color_time(k):.6f} 0 0 0 0 0 0 1" for k in range(FRAMES)]
+    lines[1] = f"{color_time(1):.6f} 0 0 0 0 0 0 0"
+    write_poses(folder, lines)
+    sequence = TumRgbd(folder)
+    assert sequence[0].T_world_camera is not None
+    assert sequence[1].T_world_camera is None
+    assert f"groundtruth.txt: 1 of {FRAMES} poses contain only zeros and count as unknown" in caplog.text
 
 
 # Errors

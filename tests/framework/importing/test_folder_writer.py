@@ -13,7 +13,7 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError, FrameError
 from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.formats import open_source
-from framework.importing.source import DeviceFrame, Source
+from framework.importing.source import DeviceFrame, Source, without_poses
 from tests.support.recordings.phone_exports import room_frames, write_scanner_app
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -40,7 +40,8 @@ def source(*frames: DeviceFrame | DataError, posed: bool = True) -> Source:
 def test_folder_writer_skips_and_counts_unusable_frames(tmp_path: Path) -> None:
     stored = source(frame(0), FrameError("one is torn"), frame(2, T_world_camera=None), frame(3))
     written = write_folder(stored, tmp_path / "out", Writing())
-    assert written.errors == ["one is torn", "frame 2: expected a pose, got none"]
+    expected = "frame 2: expected a pose, got none; --poses none imports without poses"
+    assert written.errors == ["one is torn", expected]
     assert str(written) == "2 frames; skipped 2, first error: one is torn"
     assert [seen.timestamp for seen in RgbdFolder(tmp_path / "out")] == pytest.approx([0, 0.1])
 
@@ -49,6 +50,14 @@ def test_folder_writer_frames_without_poses_write_no_pose_file(tmp_path: Path) -
     write_folder(source(*(frame(k, T_world_camera=None) for k in range(3)), posed=False), tmp_path / "out", Writing())
     assert not (tmp_path / "out/poses.txt").exists()
     assert len(RgbdFolder(tmp_path / "out")) == 3
+
+
+def test_folder_writer_keeps_times_without_poses(tmp_path: Path) -> None:
+    posed = source(*(frame(k, timestamp=1.7e9 + k / 10) for k in range(3)))
+    write_folder(without_poses(posed), tmp_path / "out", Writing())
+    assert not (tmp_path / "out/poses.txt").exists()
+    found = [seen.timestamp for seen in RgbdFolder(tmp_path / "out")]
+    assert found == pytest.approx([1.7e9, 1.7e9 + 0.1, 1.7e9 + 0.2], abs=1e-6)
 
 
 def test_folder_writer_without_usable_frame_leaves_no_folder(tmp_path: Path) -> None:
@@ -129,7 +138,9 @@ def test_folder_writer_resamples_images_to_first_camera(tmp_path: Path) -> None:
 
 
 def test_open_source_unknown_format_error_lists_formats(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"expected a supported format, got an unknown format; supported: stray"):
+    with pytest.raises(
+        DataError, match=r"expected a supported format \(stray_scanner, .*\), got an unknown format; run instancemap"
+    ):
         open_source(tmp_path)
     with pytest.raises(DataError, match="expected a recording, got no such file or folder"):
         open_source(tmp_path / "nowhere")

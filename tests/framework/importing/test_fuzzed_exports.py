@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import DataError
 from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.formats import open_source
+from tests.support.recordings.arkit_scenes_files import write_arkit_scenes
+from tests.support.recordings.colmap_files import write_colmap
 from tests.support.recordings.damaged_files import EXAMPLES, damaged
 from tests.support.recordings.phone_exports import (
     room_frames,
@@ -24,6 +27,9 @@ from tests.support.recordings.phone_exports import (
     write_scanner_app,
     write_stray_scanner,
 )
+from tests.support.recordings.rtabmap_files import write_rtabmap
+from tests.support.recordings.scannetpp_files import write_scannetpp, zlib_blocks
+from tests.support.recordings.transforms_files import write_nerfcapture
 
 pytestmark = pytest.mark.integration
 
@@ -35,6 +41,13 @@ WRITERS: dict[str, tuple[str, Callable[..., None]]] = {
     "room.r3d": ("lzfse", write_r3d),
     "app": ("", write_scanner_app),
     "polycam": ("", write_polycam),
+    "arkit_scenes": ("", write_arkit_scenes),
+    "transforms": ("", write_nerfcapture),
+    "colmap": ("", partial(write_colmap, unit=2.0)),
+    "colmap_text": ("", partial(write_colmap, unit=2.0, binary=False)),
+    "room.db": ("", write_rtabmap),
+    "scannetpp": ("", write_scannetpp),
+    "scannetpp_binary": ("lz4", partial(write_scannetpp, step=1, write_depth=zlib_blocks)),
 }
 
 

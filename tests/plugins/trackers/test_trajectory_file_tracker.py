@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from framework.files.tum_trajectory import write_tum
 from framework.geometry import exp_se3
 from plugins.trackers.trajectory_file import TrajectoryFile, World
 from tests.support import registered
+from tests.support.recordings.trajectory_files import write_euroc, write_kitti, write_tum_with_ids
 from tests.support.scenes.corner_room import CornerRoom, GridMap, pose_at
 
 SCENE = GridMap()
@@ -133,3 +135,22 @@ def test_trajectory_file_of_other_clock_names_offset(tmp_path: Path, stored: flo
         TrajectoryFile(path).track(first, SCENE)
     offset = float(re.findall(r"set tracker\.time_offset=(\S+)", str(caught.value))[0])
     TrajectoryFile(path, time_offset=offset).track(first, SCENE)
+
+
+def test_trajectory_file_kitti_line_belongs_to_frame_index(tmp_path: Path) -> None:
+    write_kitti(tmp_path / "poses.txt", [], [T_FILE_WORLD @ pose_at(k) for k in range(4)])
+    tracker = TrajectoryFile(tmp_path / "poses.txt")
+    frames = list(CornerRoom(frames=5))
+    for k in (1, 3):  # with dataset.start=1 dataset.stride=2
+        np.testing.assert_allclose(tracker.track(frames[k], SCENE).T_world_camera, pose_at(k), atol=1e-5)
+    with pytest.raises(NoPoseError, match=r"frame 4: poses.txt: expected a line for each frame, got 4 lines"):
+        tracker.track(frames[4], SCENE)
+
+
+@pytest.mark.parametrize("write", [write_euroc, write_tum_with_ids])
+def test_trajectory_file_other_formats_match_timestamps(tmp_path: Path, write: Callable[..., None]) -> None:
+    frames = [replace(frame, timestamp=frame.timestamp + 1.7e9) for frame in CornerRoom(frames=3)]
+    write(tmp_path / "poses.csv", [frame.timestamp for frame in frames], [pose_at(k) for k in range(3)])
+    tracker = TrajectoryFile(tmp_path / "poses.csv", world_frame=World.FILE)
+    for k, frame in enumerate(frames):
+        np.testing.assert_allclose(tracker.track(frame, SCENE).T_world_camera, pose_at(k), atol=1e-8)

@@ -52,7 +52,14 @@ class BagWriter:
         self.messages.append((time, topic, kind, self.made(kind, **fields)))
 
     def add_image(
-        self, time: float, topic: str, image: np.ndarray, encoding: str, padding: int = 0, stamp: float | None = None
+        self,
+        time: float,
+        topic: str,
+        image: np.ndarray,
+        encoding: str,
+        padding: int = 0,
+        stamp: float | None = None,
+        frame_id: str = "camera_color_optical_frame",
     ) -> None:
         rows = np.ascontiguousarray(image).view(np.uint8).reshape(len(image), -1)
         rows = np.pad(rows, ((0, 0), (0, padding)))
@@ -60,7 +67,7 @@ class BagWriter:
             time,
             topic,
             "sensor_msgs/msg/Image",
-            header=self.header(time if stamp is None else stamp),
+            header=self.header(time if stamp is None else stamp, frame_id),
             height=image.shape[0],
             width=image.shape[1],
             encoding=encoding,
@@ -74,13 +81,19 @@ class BagWriter:
         self.add(time, topic, "sensor_msgs/msg/CompressedImage", header=self.header(time), format=named, data=packed)
 
     def add_camera(
-        self, time: float, topic: str, camera: Camera, model: str = "plumb_bob", lens: Sequence[float] = (0,) * 5
+        self,
+        time: float,
+        topic: str,
+        camera: Camera,
+        model: str = "plumb_bob",
+        lens: Sequence[float] = (0,) * 5,
+        rectified: Camera | None = None,
     ) -> None:
         matrices = {
             "d": np.array(lens, float),
             "k": camera.K.ravel(),
             "r": np.eye(3).ravel(),
-            "p": np.eye(3, 4).ravel(),
+            "p": np.pad((rectified or camera).K, ((0, 0), (0, 1))).ravel(),
         }
         region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
         self.add(
@@ -136,16 +149,20 @@ class BagWriter:
 
     def add_static(self, *transforms: tuple[str, str, Float64]) -> None:
         """Add static transforms. Each is a tuple of parent, child and T_parent_child."""
+        self.add_tf(START, *transforms, topic="/tf_static")
+
+    def add_tf(self, time: float, *transforms: tuple[str, str, Float64], topic: str = "/tf") -> None:
+        """Add transforms at one time. Each is a tuple of parent, child and T_parent_child."""
         stamped = [
             self.made(
                 "geometry_msgs/msg/TransformStamped",
-                header=self.header(START, parent),
+                header=self.header(time, parent),
                 child_frame_id=child,
                 transform=self.made("geometry_msgs/msg/Transform", **self.transform(T)),
             )
             for parent, child, T in transforms
         ]
-        self.add(START, "/tf_static", TF_MESSAGE, transforms=stamped)
+        self.add(time, topic, TF_MESSAGE, transforms=stamped)
 
     def add_imu(self, time: float, topic: str, acceleration: Float64, frame_id: str) -> None:
         unknown = np.zeros(9)

@@ -89,6 +89,17 @@ def write_exported(folder: Path, frames: list[Shot], suffix: str = ".png") -> No
         np.savetxt(folder / "intrinsic" / f"extrinsic_{name}.txt", np.eye(4), fmt="%f")
 
 
+def write_posed_images(folder: Path, frames: list[Shot], camera: Camera = COLOR_CAMERA) -> None:
+    """Write the output of `data/scannet/extract_posed_images.py` of MMDetection3D, with depth and JPEG color."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, shot in enumerate(frames):
+        jpeg = [cv2.IMWRITE_JPEG_QUALITY, 100]
+        assert cv2.imwrite(str(folder / f"{k:05d}.jpg"), shot.color[..., ::-1], jpeg)
+        assert cv2.imwrite(str(folder / f"{k:05d}.png"), shot.depth)
+        np.savetxt(folder / f"{k:05d}.txt", shot.T_world_camera, fmt="%f")
+    np.savetxt(folder / "intrinsic.txt", intrinsics(camera), fmt="%f")
+
+
 def intrinsics(camera: Camera) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3] = camera.K

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from framework.api import begin
+from framework.api import begin, run
 from framework.checking.recording_check import check
 from framework.commands.recordings import import_recording
 from framework.config.composition import composed
 from framework.datasets.rgbd_folder import RgbdFolder
+from framework.files.tum_trajectory import read_tum, write_tum
 from framework.geometry import inverse
 from framework.interfaces import RGBDSequence
 from framework.registry import build
@@ -63,6 +64,61 @@ def test_import_odometry_is_used_by_printed_command(
     R_turned_camera = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     moved = pose_at(COUNT - 1)[:3, 3] - pose_at(0)[:3, 3]
     np.testing.assert_allclose((inverse(first) @ last)[:3, 3], R_turned_camera @ moved, atol=1e-3)
+
+
+def test_import_poses_none_keeps_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_stray_scanner(tmp_path / "export", room_frames())
+    command(monkeypatch, tmp_path / "export", tmp_path / "out", "--poses", "none")
+    assert not (tmp_path / "out/poses.txt").exists()
+    found = [frame.timestamp for frame in RgbdFolder(tmp_path / "out")]
+    assert found == pytest.approx([frame.timestamp for frame in room_frames()], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        (("--max-difference", "2"), "--max-difference: expected a value in [0, 1] s, got 2.0"),
+        (("--depth-unit", "1000"), "--depth-unit: expected a value in [1e-6, 1] m, got 1000.0"),
+        (("--camera-pose", "0 0 0"), "--camera-pose: expected 7 numbers (tx ty tz qx qy qz qw), got 3"),
+        (("--camera-pose", "0 0 0 1 1 1 1"), "--camera-pose: expected a quaternion qx qy qz qw of length 1, got 2"),
+        (("--depth-registered",), "--depth-registered: expected a ROS bag, got "),
+    ],
+)
+def test_import_invalid_bag_option_raises(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    option: tuple[str, ...],
+    expected: str,
+) -> None:
+    write_stray_scanner(tmp_path / "export", room_frames()[:1])
+    with pytest.raises(SystemExit):
+        command(monkeypatch, tmp_path / "export", tmp_path / "out", *option)
+    assert capsys.readouterr().err.startswith(f"error: {expected}")
+
+
+def test_import_bag_without_poses_maps_with_trajectory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The trajectory of another SLAM system has the header times of the bag."""
+    pytest.importorskip("rosbags")
+    from tests.support.recordings.ros_bags import COUNT, BagWriter, add_camera_of_ros, time_of
+
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    command(monkeypatch, bag.write(tmp_path / "bag"), tmp_path / "out")
+    write_tum(tmp_path / "slam.txt", [time_of(k) for k in range(COUNT)], [pose_at(k) for k in range(COUNT)])
+    run(
+        tmp_path / "run",
+        f"dataset.root={tmp_path}/out",
+        "tracker=trajectory_file",
+        f"tracker.path={tmp_path}/slam.txt",
+        "detector=none",
+        dataset="rgbd_folder",
+    )
+    timestamps, poses = read_tum(tmp_path / "run/trajectory.txt")
+    assert timestamps == pytest.approx([time_of(k) for k in range(COUNT)], abs=1e-6)
+    np.testing.assert_allclose(poses, [pose_at(k) for k in range(COUNT)], atol=1e-6)
 
 
 def test_import_rotated_images_have_rotated_poses(

@@ -218,7 +218,7 @@ def test_scannet_camera_offset_is_logged_in_pixels(tmp_path: Path, caplog: pytes
 
 def test_scannet_folder_without_scan_error_names_files(tmp_path: Path) -> None:
     (tmp_path / SCENE).mkdir()
-    with pytest.raises(DataError, match=rf"expected {SCENE}\.sens or color/, got neither"):
+    with pytest.raises(DataError, match=rf"expected {SCENE}\.sens, color/ or intrinsic\.txt, got none of them"):
         ScanNet(tmp_path, SCENE)
     for name in ("a.sens", "b.sens"):
         write_sens(tmp_path / SCENE / name, shots(1))

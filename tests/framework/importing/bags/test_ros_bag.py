@@ -16,20 +16,29 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rosbags")
 
-from framework.data import Camera
 from framework.datasets.frames.odometry import OdometryFile
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError
 from framework.files.tum_trajectory import read_tum
 from framework.geometry import exp_se3, interpolate, inverse
-from framework.importing.bags.ros_topics import Topics
-from framework.importing.folder_writer import Writing, write_folder
+from framework.importing.bags.ros_topics import BagOptions, Topics
+from framework.importing.bags.transform_tree import stream_of
 from framework.importing.formats import open_source
+from tests.support.recordings.imported_bags import (
+    DEPTH_CAMERA,
+    KINDS,
+    T_BASE_CAMERA,
+    add_odometry_of_base,
+    add_poses,
+    add_separate_depth,
+    check_room,
+    imported,
+    imported_with,
+)
 from tests.support.recordings.phone_exports import ROOM, T_COLOR_DEPTH, write_jpeg
 from tests.support.recordings.ros_bags import (
     COUNT,
     START,
-    T_CAMERA_ROS,
     BagWriter,
     add_camera_of_ros,
     add_realsense,
@@ -40,34 +49,6 @@ from tests.support.recordings.ros_bags import (
     time_of,
 )
 from tests.support.scenes.corner_room import look, pose_at
-
-KINDS = {"ros1.bag": True, "ros2_folder": False, "mcap_folder": False}
-DEPTH_CAMERA = Camera(424, 240, 210.0, 210.0, 211.0, 119.0)
-
-
-def check_room(folder: Path, posed: bool = True, within: float = 2e-3, holes: float = 0.0) -> RgbdFolder:
-    sequence = RgbdFolder(folder)
-    assert (sequence.camera, len(sequence)) == (ROOM, COUNT)
-    for k, frame in enumerate(sequence):
-        color, depth = seen(k)
-        if posed:
-            assert frame.timestamp == pytest.approx(time_of(k), abs=1e-6)
-            np.testing.assert_allclose(frame.T_world_camera, pose_at(k), atol=1e-6)
-        assert np.abs(frame.color.astype(int) - color).mean() < 4
-        read = frame.depth > 0
-        assert read.mean() >= 1 - holes
-        assert np.median(np.abs(frame.depth - depth)[read]) < within
-        assert (np.abs(frame.depth - depth)[read] > 0.03).mean() < 0.05
-    return sequence
-
-
-def imported(path: Path, out: Path, **topics: str) -> list[str]:
-    return write_folder(open_source(path, Topics(**topics)), out, Writing()).errors
-
-
-def add_poses(bag: BagWriter, topic: str = "/pose") -> None:
-    for k in range(COUNT):
-        bag.add_pose(time_of(k), topic, pose_at(k))
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -89,28 +70,13 @@ def test_ros_bag_single_file_of_folder_is_imported(tmp_path: Path, folder: str, 
     check_room(tmp_path / "out", posed=False)
 
 
-@pytest.mark.parametrize(
-    ("child", "T_camera_child"), [("camera_color_optical_frame", np.eye(4)), ("base", T_CAMERA_ROS)]
-)
-def test_ros_bag_odometry_is_read_in_axes_of_child_frame(
-    tmp_path: Path, child: str, T_camera_child: np.ndarray
-) -> None:
+def test_ros_bag_odometry_of_camera_frame_is_camera_pose(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     for k in range(COUNT):
-        bag.add_odometry(time_of(k), "/odom", pose_at(k) @ T_camera_child, child)
+        bag.add_odometry(time_of(k), "/odom", pose_at(k), "camera_color_optical_frame")
     assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
     check_room(tmp_path / "out")
-
-
-T_BASE_CAMERA = (
-    exp_se3(np.array([0.2, -0.1, 0.5, 0, 0, 0])) @ T_CAMERA_ROS.T
-)  # the camera looks along the x axis of the base
-
-
-def add_odometry_of_base(bag: BagWriter) -> None:
-    for k in range(COUNT + 1):
-        bag.add_odometry(time_of(k), "/odom", pose_at(k) @ inverse(T_BASE_CAMERA), "base_link")
 
 
 def test_ros_bag_odometry_of_base_is_written_for_camera(tmp_path: Path) -> None:
@@ -235,6 +201,26 @@ def test_ros_bag_realsense_depth_is_registered_to_color(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "out/camera.json").read_text())["sensor"] == "REALSENSE_D435"
 
 
+@pytest.mark.parametrize("ends", [("", ""), ("/compressed", "/compressedDepth")])
+def test_ros_bag_realsense_compressed_images_are_imported(tmp_path: Path, ends: tuple[str, str]) -> None:
+    bag = BagWriter()
+    add_realsense(bag, DEPTH_CAMERA)
+    for k, (time, topic, _, message) in enumerate(bag.messages):
+        if topic.endswith("Color_0/image/data"):
+            color = message.data.reshape(message.height, message.width, 3)
+            packed = BagWriter()
+            packed.add_compressed(time, topic + ends[0], png(color[..., ::-1]), "rgb8; png compressed bgr8")
+            bag.messages[k] = packed.messages[0]
+        elif topic.endswith("Depth_0/image/data"):
+            depth = np.ascontiguousarray(message.data).view(np.uint16).reshape(message.height, message.width)
+            packed = BagWriter()
+            packed.add_compressed(time, topic + ends[1], bytes(12) + png(depth), "16UC1; compressedDepth png")
+            bag.messages[k] = packed.messages[0]
+    [file] = bag.write(tmp_path / "bag").glob("*.db3")
+    assert not imported(file, tmp_path / "out")
+    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)
+
+
 def test_ros_bag_topics_of_unknown_driver_write_no_sensor(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag, "depth_registered")
@@ -244,12 +230,11 @@ def test_ros_bag_topics_of_unknown_driver_write_no_sensor(tmp_path: Path) -> Non
 
 def test_ros_bag_unregistered_depth_raises(tmp_path: Path) -> None:
     bag = BagWriter()
-    add_camera_of_ros(bag, "depth")
-    bag.messages = [entry for entry in bag.messages if entry[1] != "/camera/depth/camera_info"]
-    bag.add_camera(time_of(0), "/camera/depth/camera_info", DEPTH_CAMERA)
+    add_separate_depth(bag)
     path = bag.write(tmp_path / "bag")
     with pytest.raises(
-        DataError, match=r"expected depth in the camera of /camera/color/image_raw.*; record registered depth"
+        DataError,
+        match=r"expected depth in the camera of /camera/color/image_raw.*; record /tf_static, .* --depth-registered",
     ):
         open_source(path)
 
@@ -276,13 +261,25 @@ def test_ros_bag_lens_distortion_is_written_to_camera_json(tmp_path: Path) -> No
     assert RgbdFolder(tmp_path / "out").calibration.lens is not None
 
 
-def test_ros_bag_unsupported_lens_model_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_ros_bag_unsupported_lens_model_raises(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     bag.messages = [entry for entry in bag.messages if not entry[1].endswith("camera_info")]
-    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM, "equidistant", [0.1] * 4)
+    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM, "F-Theta", [0.1] * 5)
+    path = bag.write(tmp_path / "bag")
+    with pytest.raises(DataError, match=r"expected one of the lens models .*, got 'F-Theta' with 5 coefficients; use"):
+        open_source(path)
+
+
+def test_ros_bag_fisheye_lens_is_corrected_on_import(tmp_path: Path) -> None:
+    """The lens of an identity mapping, r = tan(theta), has approximately these coefficients."""
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    bag.messages = [entry for entry in bag.messages if not entry[1].endswith("camera_info")]
+    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM, "equidistant", [1 / 3, 2 / 15, 17 / 315, 62 / 2835])
     imported(bag.write(tmp_path / "bag"), tmp_path / "out")
-    assert "expected a Brown-Conrady lens model, got 'equidistant'; images are not undistorted" in caplog.text
+    assert "distortion" not in json.loads((tmp_path / "out/camera.json").read_text())
+    check_room(tmp_path / "out", posed=False, holes=0.02)
 
 
 def test_ros_bag_invalid_stamps_fall_back_to_recording_times(tmp_path: Path) -> None:
@@ -313,6 +310,69 @@ def test_ros_bag_images_without_time_match_are_dropped(tmp_path: Path) -> None:
         DataError, match=r"within 0\.02 s of each other, got none among 4 images on /camera/color/image_raw and 1 on"
     ):
         open_source(far.write(tmp_path / "far"))
+
+
+# Times and units
+
+
+def add_late_depth(bag: BagWriter, rate: float, late: float) -> None:
+    for k in range(COUNT):
+        color, depth = seen(k)
+        bag.add_image(START + k / rate, "/camera/color/image_raw", color, "rgb8")
+        bag.add_image(START + k / rate + late, "/camera/depth_registered/image", millimeters(depth), "16UC1")
+    bag.add_camera(START, "/camera/color/camera_info", ROOM)
+
+
+@pytest.mark.parametrize(("rate", "late"), [(10, 0.03), (10, -0.045), (15, 0.03), (5, 0.09), (2, 0.15)])
+def test_ros_bag_pairs_within_half_a_frame(tmp_path: Path, rate: float, late: float) -> None:
+    bag = BagWriter()
+    add_late_depth(bag, rate, late)
+    assert open_source(bag.write(tmp_path / "bag")).count == COUNT
+
+
+def test_ros_bag_max_difference_option_is_applied(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_late_depth(bag, 30, 0.025)
+    path = bag.write(tmp_path / "bag")
+    open_source(path)  # the previous depth image is nearer
+    assert "skipped 1 of 4 color images and 1 of 4 depth images without a partner within 0.02 s" in caplog.text
+    assert open_source(path, None, BagOptions(max_difference=0.03)).count == COUNT - 1
+    with pytest.raises(DataError, match=r"within 0.001 s .* got none .*; set --max-difference to a larger time"):
+        open_source(path, None, BagOptions(max_difference=0.001))
+
+
+def test_ros_bag_float_depth_in_millimeters_needs_unit(tmp_path: Path) -> None:
+    bag = BagWriter()
+    for k in range(COUNT):
+        color, depth = seen(k)
+        bag.add_image(time_of(k), "/rgb/image", color, "rgb8")
+        bag.add_image(time_of(k), "/depth/image", (1000 * depth).astype("<f4"), "32FC1")
+    bag.add_camera(time_of(0), "/rgb/camera_info", ROOM)
+    path = bag.write(tmp_path / "bag")
+    with pytest.raises(DataError, match=r"expected depth up to 65\.535 m, got a median of .*; set --depth-unit 0\.001"):
+        imported(path, tmp_path / "failed")
+    assert not imported_with(path, tmp_path / "out", depth_unit=0.001)
+    check_room(tmp_path / "out", posed=False)
+
+
+@pytest.mark.parametrize("transports", ["compressedDepth", "compressed compressedDepth"])
+def test_ros_bag_image_transports_of_one_topic_are_merged(tmp_path: Path, transports: str) -> None:
+    bag = BagWriter()
+    for k in range(COUNT):
+        color, depth = seen(k)
+        bag.add_compressed(time_of(k), "/camera/color/image_raw/compressed", png(color[..., ::-1]), "rgb8; png")
+        for name in transports.split():
+            data = bytes(12 * (name == "compressedDepth")) + png(millimeters(depth))
+            codec = "compressedDepth png" if name == "compressedDepth" else "png compressed"
+            bag.add_compressed(time_of(k), f"/camera/aligned_depth/image_raw/{name}", data, f"16UC1; {codec}")
+    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM)
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    check_room(tmp_path / "out", posed=False)
+
+
+@pytest.mark.parametrize("ends", ["", "/compressed", "/compressedDepth", "/zstd"])
+def test_stream_of_ignores_transport(ends: str) -> None:
+    assert stream_of(f"/device_0/sensor_0/Depth_0/image/data{ends}") == "/device_0/sensor_0/Depth_0"
 
 
 # Topics
@@ -506,7 +566,7 @@ def test_ros_bag_damaged_accelerometer_messages_are_counted(tmp_path: Path, capl
 
 def spoilt(message: Any, name: str) -> Any:
     fields = {
-        "encoding": {"encoding": "yuv422"},
+        "encoding": {"encoding": "nv21"},
         "height": {"height": 10_000},
         "step": {"step": 5},
         "width": {"width": 2**31},

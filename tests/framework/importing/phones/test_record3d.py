@@ -80,6 +80,15 @@ def test_record3d_identity_first_pose_writes_no_gravity_file(export: Path, tmp_p
     assert not (tmp_path / "out/gravity.txt").exists()
 
 
+def test_record3d_zero_poses_count_as_none(export: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    changed(export, lambda m: m.update(poses=[[0.0] * 7] * 4))
+    assert not write_folder(open_source(export), tmp_path / "out", Writing()).errors
+    assert not (tmp_path / "out/poses.txt").exists()
+    found = [frame.timestamp for frame in RgbdFolder(tmp_path / "out")]
+    assert found == pytest.approx([frame.timestamp for frame in FRAMES], abs=1e-6)
+    assert "expected camera poses, got only zeros; imported without poses" in caplog.text
+
+
 def changed(export: Path, change: Callable[[dict[str, Any]], Any]) -> None:
     metadata = record3d_metadata(FRAMES)
     change(metadata)
@@ -93,6 +102,7 @@ def changed(export: Path, change: Callable[[dict[str, Any]], Any]) -> None:
             lambda m: m["poses"].__setitem__(1, [0, 0, 0, 2, 0, 0, 0]),
             "pose 1: expected a quaternion .* of length 1, got 2",
         ),
+        (lambda m: m["poses"].__setitem__(1, [0] * 7), "expected a pose, got none; --poses none"),
         (lambda m: m["poses"].__setitem__(1, [0, 0, 0, 1]), "pose 1: expected a list of 7 numbers"),
         (lambda m: m["poses"].__setitem__(1, [None] * 7), "pose 1: expected a list of 7 numbers"),
         (lambda m: m["frameTimestamps"].__setitem__(1, 0.0), "expected a timestamp > "),

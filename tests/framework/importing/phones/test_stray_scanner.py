@@ -62,6 +62,13 @@ def spoil_row(folder: Path, number: int, change) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
+def test_stray_scanner_zero_poses_count_as_none(folder: Path, tmp_path: Path) -> None:
+    for number in range(1, len((folder / "odometry.csv").read_text().splitlines())):
+        spoil_row(folder, number, lambda words: [*words[:2], *["0.0"] * 7, *words[9:]])
+    assert not write_folder(open_source(folder), tmp_path / "out", Writing()).errors
+    assert not (tmp_path / "out/poses.txt").exists()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -1,0 +1,102 @@
+"""Readers of depth images in PNG, TIFF, NPY and EXR files.
+
+.png                16 bits, in depth units of the recording
+.tif, .tiff, .npy   16 bits, in depth units of the recording, or floats in meters
+.exr                floats in meters, in the only channel, or in the one named Z, V or Y
+"""
+
+from __future__ import annotations
+
+import io
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL.TiffImagePlugin import TiffImageFile
+
+from framework.data import MAX_PIXELS, Array, Float32, UInt16
+from framework.errors import FrameError, import_optional, in_one_line
+from framework.files.image_files import read_image_file, read_uint16
+from framework.files.number_lines import SHOWN
+
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
+CHANNELS = ("Z", "V", "Y")  # names of depth channels in EXR files, in order of preference
+FARTHEST = 65.535  # m, maximum plausible median of float depth; larger values are not meters
+
+_load_openexr = partial(import_optional, "OpenEXR", "reads EXR files", "phone")
+
+
+def read_depth(path: Path) -> UInt16 | Float32:
+    """Read a depth image (H, W): uint16 in depth units of the recording, or float32 in meters.
+
+    Raises:
+        FrameError: The file is damaged or has another type.
+        ConfigError: The package OpenEXR is required, but not installed.
+    """
+    match path.suffix.lower():
+        case ".tif" | ".tiff":
+            return _depth_array(path, _read_tiff(path))
+        case ".npy":
+            return _depth_array(path, _read_npy(path))
+        case ".exr":
+            return _depth_array(path, _read_exr(path))
+    return read_uint16(path)
+
+
+def _depth_array(path: Path, image: Array) -> UInt16 | Float32:
+    if image.ndim == 3 and image.shape[2] == 1:
+        image = image[..., 0]
+    is_integer, is_float = image.dtype == np.uint16, np.issubdtype(image.dtype, np.floating)
+    if image.ndim != 2 or not 0 < image.size <= MAX_PIXELS or not (is_integer or is_float):
+        shape = "x".join(map(str, image.shape))
+        raise FrameError(f"{path}: expected one channel of uint16 or floats, got {shape} values of {image.dtype}")
+    return np.ascontiguousarray(image, np.uint16) if is_integer else np.ascontiguousarray(image, np.float32)
+
+
+def _read_tiff(path: Path) -> Array:
+    data = read_image_file(path)
+    try:
+        image = TiffImageFile(io.BytesIO(data))
+        pages, (width, height) = image.n_frames, image.size
+        if pages > 1 or width * height > MAX_PIXELS:
+            raise ValueError(f"{pages} pages of {width}x{height} px")
+        return np.asarray(image)
+    except Exception as error:  # Pillow has no common base exception
+        raise FrameError(f"{path}: expected a TIFF of one page, got an error ({in_one_line(error)[:SHOWN]})") from error
+
+
+def _read_npy(path: Path) -> Array:
+    try:  # a memory map checks the size in the header against the file
+        return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise FrameError(f"{path}: expected a NumPy array, got an error ({in_one_line(error)[:SHOWN]})") from error
+
+
+def _read_exr(path: Path) -> Array:
+    OpenEXR: Any = _load_openexr()
+    data = read_image_file(path)
+    try:  # the header is checked first, because it determines the required memory
+        header = OpenEXR.File(io.BytesIO(data), header_only=True).header()
+        low, high = header["dataWindow"]
+        names = [channel.name for channel in header["channels"]]
+        if int(np.prod((high - low + 1).astype(np.int64))) > MAX_PIXELS:
+            raise ValueError(f"data window {low} to {high}")
+        name = _depth_channel(path, names)
+        return np.array(OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()[name].pixels)
+    except FrameError:
+        raise
+    except Exception as error:  # OpenEXR has no common base exception
+        raise FrameError(f"{path}: expected an EXR file, got an error ({in_one_line(error)[:SHOWN]})") from error
+
+
+def _depth_channel(path: Path, names: list[str]) -> str:
+    """Return the name of the depth channel; layers precede the names of channels, as in `ViewLayer.Depth.Z`."""
+    if len(names) == 1:
+        return names[0]
+    for channel in CHANNELS:
+        found = [name for name in names if name.rpartition(".")[2] == channel]
+        if len(found) == 1:
+            return found[0]
+    expected = f"expected one channel, or one of the channels {', '.join(CHANNELS)}"
+    raise FrameError(f"{path}: {expected}, got {', '.join(names)[:SHOWN]}")

@@ -1,0 +1,1 @@
+"""Import of RGB-D images with the poses of a reconstruction program."""

@@ -1,0 +1,197 @@
+"""Tests for camera poses in ROS bags, from topics of other frames and from /tf."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.errors import DataError
+from framework.geometry import exp_se3, inverse
+from framework.importing.bags.camera_poses import ROS_AXES
+from framework.importing.formats import open_source
+from tests.support.recordings.imported_bags import (
+    DEPTH_FRAME,
+    OPTICAL,
+    T_BASE_CAMERA,
+    add_odometry_of_base,
+    add_poses,
+    add_separate_depth,
+    check_room,
+    imported,
+    imported_with,
+)
+from tests.support.recordings.phone_exports import T_COLOR_DEPTH
+from tests.support.recordings.ros_bags import (
+    COUNT,
+    START,
+    T_CAMERA_ROS,
+    BagWriter,
+    add_camera_of_ros,
+    time_of,
+)
+from tests.support.scenes.corner_room import pose_at
+
+
+def check_poses(bag: BagWriter, path: Path, out: Path, **options: Any) -> None:
+    assert not imported_with(bag.write(path), out, **options)
+    check_room(out)
+
+
+@pytest.mark.parametrize("layout", ["direct", "mast", "inverse", "tf", "moving mast"])
+def test_ros_bag_odometry_of_base_becomes_camera_poses(tmp_path: Path, layout: str) -> None:
+    bag = BagWriter(ros1=layout == "tf")
+    add_camera_of_ros(bag)
+    T_base_mast = exp_se3(np.array([0.1, 0.2, 0.3, 0.1, 0.2, 0.3]))
+    if layout == "moving mast":
+        add_odometry_of_base(bag)
+        for k in range(COUNT + 1):
+            T_mast = exp_se3(np.array([0, 0, 0.01 * k, 0, 0, 0.1 * k]))
+            bag.add_tf(time_of(k), ("base_link", "mast", T_mast))
+        bag.add_static(("mast", OPTICAL, T_BASE_CAMERA))
+        bag.messages = [entry for entry in bag.messages if entry[1] != "/odom"]
+        for k in range(COUNT):
+            T_mast = exp_se3(np.array([0, 0, 0.01 * k, 0, 0, 0.1 * k]))
+            bag.add_odometry(time_of(k), "/odom", pose_at(k) @ inverse(T_mast @ T_BASE_CAMERA), "base_link")
+    else:
+        add_odometry_of_base(bag)
+    if layout == "direct":
+        bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
+    elif layout == "inverse":
+        bag.add_static((OPTICAL, "base_link", inverse(T_BASE_CAMERA)))
+    elif layout == "mast":
+        T_mast_camera = inverse(T_base_mast) @ T_BASE_CAMERA
+        bag.add_static(("base_link", "mast", T_base_mast), ("mast", OPTICAL, T_mast_camera))
+    elif layout == "tf":
+        for n in range(3):
+            bag.add_tf(time_of(0) + 0.05 * n, ("base_link", OPTICAL, T_BASE_CAMERA))
+    check_poses(bag, tmp_path / ("a.bag" if bag.ros1 else "bag"), tmp_path / "out")
+
+
+def test_ros_bag_odometry_of_unconnected_base_raises(tmp_path: Path) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_odometry_of_base(bag)
+    path = bag.write(tmp_path / "bag")
+    expected = (
+        "expected a transform from 'base_link' to the camera 'camera_color_optical_frame' on /tf_static, got none"
+    )
+    with pytest.raises(DataError, match=f"{expected}; set --camera-pose .* or --poses none"):
+        open_source(path)
+
+
+def test_ros_bag_camera_pose_option_is_applied(tmp_path: Path) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    for k in range(COUNT):
+        bag.add_odometry(time_of(k), "/odom", pose_at(k) @ T_CAMERA_ROS, "base_link")
+    check_poses(bag, tmp_path / "bag", tmp_path / "out", camera_pose=ROS_AXES)
+
+
+@pytest.mark.parametrize("layout", ["map", "map and odom", "slow map", "world", "ros1"])
+def test_ros_bag_poses_on_tf_are_imported(tmp_path: Path, layout: str) -> None:
+    bag = BagWriter(ros1=layout == "ros1")
+    add_camera_of_ros(bag)
+    bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
+    T_map_odom = exp_se3(np.array([1.0, 2.0, 0, 0, 0, 0.5])) if layout in ("map and odom", "slow map") else np.eye(4)
+    root = {"world": "/world", "map and odom": "odom", "slow map": "odom"}.get(layout, "map")
+    for k in range(-1, COUNT + 1):
+        bag.add_tf(START + k / 30, (root, "base_link", inverse(T_map_odom) @ pose_at(k) @ inverse(T_BASE_CAMERA)))
+    if layout == "map and odom":
+        for n in range(20):
+            bag.add_tf(START - 0.1 + 0.02 * n, ("map", "odom", T_map_odom))
+    if layout == "slow map":
+        for n in (-1, 1):
+            bag.add_tf(START + n, ("map", "odom", T_map_odom))
+    check_poses(bag, tmp_path / ("a.bag" if bag.ros1 else "bag"), tmp_path / "out")
+
+
+def test_ros_bag_tf_with_unknown_root_needs_choice(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    for k in range(COUNT):
+        bag.add_tf(time_of(k), ("pan_base", OPTICAL, pose_at(k)))
+    path = bag.write(tmp_path / "bag")
+    assert not open_source(path).posed
+    assert "in the frame 'pan_base'; set --poses /tf if this frame is fixed" in caplog.text
+    assert not imported(path, tmp_path / "out", poses="/tf")
+    check_room(tmp_path / "out")
+
+
+def test_ros_bag_tf_without_camera_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    for k in range(COUNT):
+        bag.add_tf(time_of(k), ("odom", "base_link", pose_at(k)))
+    assert not open_source(bag.write(tmp_path / "bag")).posed
+    assert "no frame of /tf moves the camera 'camera_color_optical_frame'; imported without poses" in caplog.text
+
+
+def test_ros_bag_pose_stamped_of_robot_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_poses(bag)
+    bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
+    path = bag.write(tmp_path / "bag")
+    assert not imported(path, tmp_path / "out")
+    check_room(tmp_path / "out")
+    assert "/pose: poses are used as poses of the camera in optical axes; --camera-pose sets" in caplog.text
+    bag.messages = [entry for entry in bag.messages if entry[1] != "/pose"]
+    for k in range(COUNT):
+        bag.add_pose(time_of(k), "/pose", pose_at(k) @ T_CAMERA_ROS)
+    assert not imported_with(bag.write(tmp_path / "base"), tmp_path / "of_base", camera_pose=ROS_AXES)
+    check_room(tmp_path / "of_base")
+
+
+def test_ros_bag_damaged_transforms_are_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_separate_depth(bag)
+    bag.add_static((OPTICAL, DEPTH_FRAME, T_COLOR_DEPTH))
+    bag.add_tf(time_of(1), ("odom", "base_link", np.eye(4)))
+    path = bag.write(tmp_path / "bag")
+    [file] = path.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        [[topic]] = database.execute("SELECT id FROM topics WHERE name = '/tf'")
+        database.execute("UPDATE messages SET data = x'0001' WHERE topic_id = ?", [topic])
+    assert not imported(path, tmp_path / "out")
+    assert "/tf: expected a valid message" in caplog.text
+
+
+def test_ros_bag_frame_with_two_parents_raises(tmp_path: Path) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    for k in range(COUNT):
+        bag.add_tf(time_of(k), ("odom", OPTICAL, pose_at(k)), ("map", OPTICAL, pose_at(k + 1)))
+    path = bag.write(tmp_path / "bag")
+    with pytest.raises(DataError, match="expected one parent frame on /tf, got map and odom"):
+        open_source(path)
+
+
+def test_ros_bag_poses_none_imports_without_poses(tmp_path: Path) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_odometry_of_base(bag)
+    add_poses(bag)
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out", poses="none")
+    assert not (tmp_path / "out/poses.txt").exists()
+    assert RgbdFolder(tmp_path / "out")[1].timestamp == pytest.approx(time_of(1), abs=1e-6)
+
+
+def test_ros_bag_zero_poses_count_as_none(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_poses(bag)
+    for _, _, kind, message in bag.messages:
+        if kind.endswith("PoseStamped"):
+            for part in (message.pose.position, message.pose.orientation):
+                vars(part).update(dict.fromkeys(set(vars(part)) & set("xyzw"), 0.0))
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    check_room(tmp_path / "out", posed=False)
+    assert not (tmp_path / "out/poses.txt").exists()
+    assert "/pose: expected camera poses, got only zeros; imported without poses" in caplog.text

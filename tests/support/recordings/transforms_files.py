@@ -1,0 +1,89 @@
+"""Writers of a transforms.json with images.
+
+Sources: docs/quickstart/data_conventions.md, process_data/polycam_utils.py and nerfstudio_dataparser.py in
+nerfstudio-project/nerfstudio; scripts/nerfcapture_dataset.py in jc211/NeRFCapture.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tests.support.recordings.phone_exports import PhoneFrame, write_jpeg, write_png
+
+NERFCAPTURE_DEPTH_SCALE = 10.0  # m, parameter --depth_scale of the script
+
+
+def write_nerfstudio(folder: Path, frames: Sequence[PhoneFrame]) -> None:
+    """Write one set of intrinsics, JPEG images and depth in millimeters, without timestamps."""
+    camera = frames[0].camera
+    content: dict[str, object] = {
+        "camera_model": "OPENCV",
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx + 0.5,
+        "cy": camera.cy + 0.5,
+        "w": camera.width,
+        "h": camera.height,
+        "k1": 0.0,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+    }
+    entries = []
+    for k, frame in enumerate(frames, start=1):
+        write_jpeg(folder / f"images/frame_{k:05d}.jpg", frame.color)
+        write_png(folder / f"depth/frame_{k:05d}.png", frame.depth_mm)
+        entries.append(
+            {
+                "file_path": f"images/frame_{k:05d}.jpg",
+                "depth_file_path": f"depth/frame_{k:05d}.png",
+                "transform_matrix": _opengl(frame),
+            }
+        )
+    content["frames"] = entries[::-1]  # nerfstudio sorts frames by name
+    (folder / "transforms.json").write_text(json.dumps(content, indent=4))
+
+
+def write_nerfcapture(folder: Path, frames: Sequence[PhoneFrame]) -> None:
+    """Write intrinsics of each frame and depth in units of a 65535th of the depth scale, resized to color."""
+    first = frames[0].camera
+    content: dict[str, object] = {
+        "fl_x": first.fx,
+        "fl_y": first.fy,
+        "cx": first.cx + 0.5,
+        "cy": first.cy + 0.5,
+        "w": first.width,
+        "h": first.height,
+        "integer_depth_scale": NERFCAPTURE_DEPTH_SCALE / 65535.0,
+    }
+    entries = []
+    for k, frame in enumerate(frames):
+        alpha = np.full((*frame.color.shape[:2], 1), 255, np.uint8)
+        write_png(folder / f"images/{k}.png", np.concatenate([frame.color[..., ::-1], alpha], axis=2))
+        units = frame.depth_mm / 1000 * 65535 / NERFCAPTURE_DEPTH_SCALE
+        write_png(folder / f"images/{k}.depth.png", units.astype(np.uint16))
+        camera = frame.camera
+        entries.append(
+            {
+                "transform_matrix": _opengl(frame),
+                "file_path": f"images/{k}",
+                "fl_x": camera.fx,
+                "fl_y": camera.fy,
+                "cx": camera.cx + 0.5,
+                "cy": camera.cy + 0.5,
+                "w": camera.width,
+                "h": camera.height,
+                "depth_path": f"images/{k}.depth.png",
+            }
+        )
+    content["frames"] = entries
+    (folder / "transforms.json").write_text(json.dumps(content, indent=4))
+
+
+def _opengl(frame: PhoneFrame) -> list[list[float]]:
+    x, y, z, t = frame.T_world_camera.T
+    return np.stack([x, -y, -z, t], axis=1).tolist()
