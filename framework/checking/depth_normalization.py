@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.checking import Finding, Verdict
-from framework.data import Array
+from framework.data import Array, UInt16
 from framework.datasets.frames.sequence_reader import Recording
 from framework.errors import FrameError
 from framework.interfaces import RGBDSequence
@@ -41,7 +41,8 @@ class _Range:
         """Return the range of a uint16 image, or None for another type or with fewer than two values."""
         if raw.dtype != np.uint16:
             return None
-        values, counts = np.unique(raw[raw > 0], return_counts=True)
+        pixels: UInt16 = raw.astype(np.uint16)
+        values, counts = np.unique(pixels[pixels > 0], return_counts=True)
         if len(values) < 2:
             return None
         largest = int(values[-1])
