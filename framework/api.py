@@ -131,6 +131,7 @@ def begin(config: DictConfig) -> Pipeline:
     tracker = build(PoseTracker, config.get("tracker"))
     viewer = build(Viewer, config.get("viewer"))
     classes: tuple[str, ...] = ()
+    resumed = False
     chosen = {key: config.get(key) for key in ("resume_from", "localize_in") if config.get(key) is not None}
     if len(chosen) > 1:
         raise ConfigError("resume_from and localize_in: expected at most one of these keys, got both; remove one")
@@ -139,12 +140,14 @@ def begin(config: DictConfig) -> Pipeline:
         scene = scene_of(key, run)
         if key == "resume_from":
             fuser.resume(scene)
-            classes = scene.classes
+            classes, resumed = scene.classes, True
         tracker.load_keyframes(read_keyframes(run / KEYFRAMES), scene)
     detector = build(Detector, config.get("detector"))  # last, because loading a network is slow
     detector = with_cache(with_classes_of_map(detector, classes), config)
     compile_for_run()
-    return Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval)
+    pipeline = Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval)
+    pipeline.resumed = resumed
+    return pipeline
 
 
 def scene_of(key: str, run: Path) -> SceneMap:

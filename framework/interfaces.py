@@ -148,6 +148,7 @@ class PoseTracker(ABC):
     """Tracker of the camera pose."""
 
     pose_source: str = "tracked"  # source of the poses, for tables; `ground_truth` = the poses of the sequence
+    poses_given: bool = False  # True = the poses are read, not estimated; the pipeline compares them with the map
 
     @abstractmethod
     def track(self, frame: Frame, scene: SceneMap) -> Pose:

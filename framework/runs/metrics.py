@@ -53,6 +53,8 @@ def run_metrics(result: RunResult) -> Metrics:
         "pose_source": result.pose_source,
         **{f"map.{name}": value for name, value in asdict(result.scene.statistics).items()},
     }
+    if result.disagreeing is not None:
+        metrics["frames_disagreeing"] = len(result.disagreeing)
     for stage in dict.fromkeys([*STAGES, *(time.stage for time in result.timings)]):
         milliseconds = [time.milliseconds for time in result.timings if time.stage == stage]
         metrics[f"stage_ms.{stage}.median"] = float(np.median(milliseconds)) if milliseconds else None

@@ -284,7 +284,12 @@ def likely_labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -
     }
 
 
-_DROPPED = {"frames_lost": "lost", "frames_skipped": "skipped", "frames_dropped": "dropped"}
+_DROPPED = {
+    "frames_lost": "lost",
+    "frames_skipped": "skipped",
+    "frames_dropped": "dropped",
+    "frames_disagreeing": "disagree with the map",
+}
 _QUALITY = {"instances.ap50": "AP50", "instances.ap25": "AP25"}
 
 
