@@ -50,6 +50,14 @@ class PoseJumps:
     revisits: tuple[PoseJump, ...]  # between distant frames
     compared: int  # number of compared pairs
 
+    def without(self, pairs: Sequence[MatchedPair]) -> list[MatchedPair]:
+        """Return the pairs without a jump between their frames."""
+        return [
+            pair
+            for pair in pairs
+            if not any(pair.first.index <= one.first and one.second <= pair.second.index for one in self.neighbors)
+        ]
+
     def finding(self) -> Finding | None:
         """Return the check result, or None without a jump."""
         jumps = self.neighbors or self.revisits

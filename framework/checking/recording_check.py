@@ -13,7 +13,7 @@ from framework.checking import Finding, Verdict, pose_fit, registration
 from framework.checking.color_timing import check_color_delay
 from framework.checking.matched_pairs import MatchedPair, Matcher
 from framework.checking.pose_delay import delayed, find_delay
-from framework.checking.pose_fit import PLAUSIBLE, UNPOSED, USUAL_SCALES, PoseJudgment
+from framework.checking.pose_fit import PLAUSIBLE, USUAL_SCALES, PoseJudgment
 from framework.checking.pose_jumps import find_jumps
 from framework.checking.registration import EdgeAlignment, EdgeComparison, color_gradient
 from framework.data import Camera, Float64, Frame
@@ -97,7 +97,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     if any(frame.T_world_camera is not None for frame in frames):
         judgment, pose_delay = _judge_poses(sequence, posed, given, median_depth)
         if not (late or pose_delay):
-            judgment = _with_jumps(judgment, matcher, given)
+            judgment = _with_jumps(judgment, matcher, posed, given, median_depth)
     else:
         no_poses = Finding(Verdict.FINE, "poses", "none in the recording; the camera is tracked")
         judgment, pose_delay = PoseJudgment((no_poses,), None, None), 0
@@ -141,15 +141,19 @@ def _judge_poses(
     return replace(then, findings=findings, given=judgment.given), late.frames
 
 
-def _with_jumps(judgment: PoseJudgment, matcher: Matcher, given: PoseReading) -> PoseJudgment:
+def _with_jumps(
+    judgment: PoseJudgment, matcher: Matcher, pairs: Sequence[MatchedPair], given: PoseReading, median_depth: float
+) -> PoseJudgment:
     """Return the judgment with the jumps of the poses, unless another error explains them."""
-    if any(finding.verdict is Verdict.ERROR and finding.setting != UNPOSED for finding in judgment.findings):
-        return judgment
     jumps = find_jumps(matcher, _chosen_poses(matcher.sequence), given)
     finding = jumps.finding()
-    # without valid poses, all pairs differ
-    if finding is None or len(jumps.neighbors) + len(jumps.revisits) > jumps.compared // 2:
+    if finding is None:
         return judgment
+    if any(one.verdict is Verdict.ERROR for one in judgment.findings):  # may be an effect of the jumps
+        judged = pose_fit.judge(jumps.without(pairs), given, _scale_of(matcher.sequence), median_depth)
+        if any(one.verdict is not Verdict.FINE for one in judged.findings):
+            return judgment
+        judgment = judged
     return replace(judgment, findings=(finding,))
 
 

@@ -21,7 +21,7 @@ MIN_VISIBLE = 0.05  # minimum fraction of samples on the map for a comparison
 MIN_SAMPLES = 50  # minimum number of samples on the map for a comparison
 # maximum fraction of samples that disagree; real sequences have at most 0.26, jumps of 0.3 m 0.8 (median)
 MAX_DISAGREEING = 0.35
-MAX_DISAGREEING_RESUMED = 0.5  # maximum fraction for the first frame on a resumed map, whose scene may have changed
+MAX_DISAGREEING_RESUMED = 0.4  # maximum fraction for the first frame on a resumed map, whose scene may have changed
 
 
 class MapAgreement(NamedTuple):
