@@ -96,7 +96,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     posed = [pair for pair in pairs if _is_posed(pair)]
     if any(frame.T_world_camera is not None for frame in frames):
         judgment, pose_delay = _judge_poses(sequence, posed, given, median_depth)
-        if not (late or pose_delay):
+        if not (late or pose_delay or depth_finding.verdict is Verdict.ERROR):
             judgment = _with_jumps(judgment, matcher, posed, given, median_depth)
     else:
         no_poses = Finding(Verdict.FINE, "poses", "none in the recording; the camera is tracked")
