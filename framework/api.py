@@ -236,8 +236,7 @@ class Mapper(Map):
             depth: Depth image (H, W), float32, m along z; 0 = no reading.
             pose: Camera pose T_world_camera (4, 4); None = unknown. Most trackers use only the pose of the first frame,
                 which defines the world frame. `tracker="ground_truth"` uses all poses.
-            camera: The camera, or the intrinsic matrix (3, 3), px, of images of this size; None = the camera of the last
-                frame.
+            camera: The camera, or the intrinsic matrix (3, 3) of this image, px; None = the camera of the last frame.
             timestamp: Time of the color image, s; None = the frame number (from 0) / 30.
             up: Up direction (3,) in the camera frame, a unit vector; None = unknown.
             depth_timestamp: Time of the depth image, s; None = the time of the color image.
@@ -291,7 +290,7 @@ class Mapper(Map):
         self._posed_frames += 1
         if self._posed_frames == 2 and tracker.pose_source != "ground_truth":
             log.warning(
-                'Mapper.add: pose: expected a tracker that uses given poses, got %s, which ignores all except the first; '
+                "Mapper.add: pose: expected a tracker that uses given poses, got %s, which uses only the first; "
                 'set tracker="ground_truth", or omit pose after the first frame',
                 type(tracker).__name__,
             )

@@ -24,7 +24,9 @@ def box(low: tuple[float, ...], high: tuple[float, ...], spacing: float = 0.03) 
     return np.concatenate(faces)
 
 
-ROOM = np.concatenate([box((0, 0, 0), (4, 3, 2.5)), box((1, 1, 0), (2.2, 1.6, 0.75)), box((3, 0.3, 0), (3.5, 0.8, 1.2))])
+ROOM = np.concatenate(
+    [box((0, 0, 0), (4, 3, 2.5)), box((1, 1, 0), (2.2, 1.6, 0.75)), box((3, 0.3, 0), (3.5, 0.8, 1.2))]
+)
 
 
 def moved(shift: tuple[float, ...] = (0, 0, 0), turn: tuple[float, ...] = (0, 0, 0)) -> Float32:
