@@ -67,6 +67,8 @@ class RGBDVideo(ABC):
     name: str  # name of the scene, for tables
     annotation: str = ""  # release of the ground truth, for tables; "" = only one release exists
     domain: str = ""  # image domain, such as "rendered rooms", for `Detector.domain`; "" = photographs or unknown
+    # origin of the world frame of the poses in the world frame of the recording, m; nonzero for distant coordinates
+    world_origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def has_poses(self) -> bool:
         """Return True if frames may have ground-truth poses. Called before any frame is read."""
