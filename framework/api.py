@@ -35,6 +35,7 @@ from framework.detection.map_classes import with_classes_of_map
 from framework.detection.stored.cache import with_cache
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.files.atomic_write import atomic_write
+from framework.files.directory_lock import locked
 from framework.geometry import camera_of
 from framework.interfaces import (
     ClusterRefiner,
@@ -368,7 +369,9 @@ def open_dataset(name: str, **parameters: object) -> RGBDSequence:
 
 
 def run(directory: Path | str, *overrides: str, **named: object) -> Path:
-    """Map a sequence and write a run directory, as the command `instancemap` does.
+    """Map a sequence and write a run directory, like the command `instancemap`.
+
+    The global random generators of Python, numpy and torch are seeded, because plugins may use them.
 
     Example: `run("outputs/demo", "fuser.voxel_size=0.02", dataset="desk")`.
 
@@ -397,7 +400,9 @@ def run(directory: Path | str, *overrides: str, **named: object) -> Path:
             )
     check_new(Path(directory))
     config, choices = composed_with_choices(*words)
-    with limited_threads(Settings.of(config).threads):
+    settings = Settings.of(config)
+    with locked(Path(directory)), limited_threads(settings.threads):
+        settings.seed_generators()
         write_run(begin(config), config, Path(directory), choices).check()
     return Path(directory)
 

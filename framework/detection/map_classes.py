@@ -1,6 +1,6 @@
 """Detections with the classes of a stored map, which may have more classes than the detector.
 
-A map gets further classes when its instances are renamed (`instancemap edit`).
+Renaming instances (`instancemap edit`) can add classes to a map.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from framework.interfaces import Detector
 
 @dataclass
 class DetectorOfMap(Detector):
-    """A detector with further classes, which have the probability 0 in all detections."""
+    """Detector with additional classes of probability 0."""
 
     detector: Detector
     classes: tuple[str, ...]  # all classes of the detector, and others

@@ -4,7 +4,7 @@ The names of the map and of the ground truth are converted to the classes of the
 first rule that applies:
 
 1. The config key `evaluation.names` contains the name.
-2. The label space contains the name. Case is ignored.
+2. The label space contains the name. Other spellings in upper and lower case are also accepted.
 3. The label space has a class with the same COCO name, such as sofa for couch. Of several, the first is used.
 
 Objects with other names are ignored: they are neither correct nor wrong. Walls and floors are background, as in the
@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from framework.data import Int32, SceneTruth
+from framework.data import AnnotatedObjects, Int32, SceneTruth
 from framework.errors import ConfigError
 from framework.evaluation.instances import MAX_DISTANCE, PredictedInstances, transfer_labels
-from framework.vocabulary.label_spaces import AGNOSTIC, OBJECT, coco_name, label_key, read_labels
+from framework.vocabulary.label_spaces import AGNOSTIC, NO_CLASS, OBJECT, SPACES, coco_name, label_key, read_class_ids
 
 BACKGROUND = ("wall", "floor")
 OF_DATASET = (None, "coco")  # label spaces with the class names of the dataset
@@ -54,7 +54,7 @@ class Compared:
 class ComparedClasses:
     """The label space of an evaluation."""
 
-    label_space: str | None = None  # coco, nyu40, scannet20, ..., agnostic, or a text file; None = names of both sides
+    label_space: str | None = None  # coco, nyu40, scannet20, ..., agnostic, or a file; None = names are not converted
     classes: tuple[str, ...] = ()  # all classes of the label space; () if `label_space` is None
     names: Mapping[str, str | None] = field(default_factory=dict)  # class by name; None = ignored
 
@@ -74,11 +74,13 @@ class ComparedClasses:
             ConfigError: The label space is unknown, or a name is invalid.
         """
         block = config.get("evaluation") or {}
+        if not isinstance(block, Mapping):
+            raise ConfigError(f"evaluation: expected the keys label_space and names, got {block!r:.60}")
         names = block.get("names") or {}
         if not isinstance(names, Mapping):
             raise ConfigError(f"evaluation.names: expected the class of each name, got {names!r:.60}")
         for name, chosen in names.items():
-            if not isinstance(name, str) or not (chosen is None or isinstance(chosen, str)):
+            if not isinstance(name, str) or not (chosen is None or (isinstance(chosen, str) and chosen.strip())):
                 raise ConfigError(f"evaluation.names: expected a class or null for each name, got {name!r}: {chosen!r}")
         space = block.get("label_space")
         return cls(None, (), names) if space is None else cls(str(space), classes_of_space(str(space)), names)
@@ -89,21 +91,25 @@ class ComparedClasses:
         return json.dumps(dict(self.names), ensure_ascii=False) if self.names else None
 
     @property
+    def file_text(self) -> str | None:
+        """`classes` as JSON if they are from a file, otherwise None."""
+        is_file = self.label_space not in (None, AGNOSTIC, *SPACES)
+        return json.dumps(self.classes, ensure_ascii=False) if is_file else None
+
+    @property
     def object_classes(self) -> tuple[str, ...]:
         """The classes of objects, which are all classes except BACKGROUND."""
-        return tuple(name for name in self.classes if name not in BACKGROUND)
+        return tuple(name for name in self.classes if label_key(name) not in BACKGROUND)
 
     def class_of(self, name: str) -> str | None:
         """Return the class of a name, or None if objects with this name are ignored."""
         if name in self.names:
             return self.names[name]
-        if self.label_space is None:
+        if self.label_space is None or name in self.classes:
             return name
         if self.label_space == AGNOSTIC:
-            return OBJECT
-        if label_key(name) in self._by_key:
-            return self._by_key[label_key(name)]
-        return self._by_coco_name.get(coco_name(name))
+            return None if label_key(name) in BACKGROUND else OBJECT
+        return self._by_key.get(label_key(name)) or self._by_coco_name.get(coco_name(name))
 
     @cached_property
     def _by_key(self) -> dict[str, str]:
@@ -118,39 +124,70 @@ class ComparedClasses:
         found = [self.class_of(name) for name in predictions.class_names]
         converted = replace(predictions, class_names=tuple(OUTSIDE if name is None else name for name in found))
         ignored = Counter(name for name, one in zip(predictions.class_names, found, strict=True) if one is None)
-        ids, names = self._annotation(truth)
-        classes = {key: name and self.class_of(name) for key, name in names.items()}
-        background = {key for key, name in names.items() if self.label_space is not None and name in BACKGROUND}
-        objects = {key: one for key, one in classes.items() if key not in background}
-        known = self.object_classes or None
-        if truth.classes is not None and (truth.annotated is None or self.label_space in OF_DATASET):
-            known = tuple(dict.fromkeys(one for name in truth.classes if (one := self.class_of(name)) is not None))
+        objects = self._true_objects(truth)
+        background = [key for key, one in objects.items() if one.is_background]
+        classes = {key: one.class_name for key, one in objects.items()}
+        annotated = self._annotation(truth)
+        ids = truth.instance_ids if annotated is None else annotated.instance_ids
         in_space = replace(
             truth,
-            instance_ids=np.where(np.isin(ids, list(background)), 0, ids).astype(np.int32),
-            class_names=objects,
-            classes=known,
+            instance_ids=np.where(np.isin(ids, background), 0, ids).astype(np.int32),
+            class_names={key: name for key, name in classes.items() if key not in background},
+            classes=self._known_classes(truth),
         )
-        ignored_truths = Counter(name for key, one in objects.items() if one is None and (name := names[key]))
+        ignored_truths = Counter(
+            one.own_name for one in objects.values() if one.own_name and not one.class_name and not one.is_background
+        )
         return Compared(converted, in_space, indices(ids, classes, self.classes), ignored, ignored_truths)
 
-    def _annotation(self, truth: SceneTruth) -> tuple[Int32, Mapping[int, str | None]]:
-        """Return the instance ids (V,) of the ground truth, and the name of each instance."""
-        if truth.annotated is None or self.label_space in OF_DATASET:
-            return truth.instance_ids, truth.class_names
-        # the names of the annotation, because COCO has no class for most objects
-        own_names = truth.annotated.own_names
-        of_space = truth.annotated.names.get(str(self.label_space), own_names)
-        return truth.annotated.instance_ids, {key: of_space.get(key) for key in own_names}
+    def _annotation(self, truth: SceneTruth) -> AnnotatedObjects | None:
+        """Return the annotation if its names are used, because COCO has no class for most of its objects."""
+        return None if self.label_space in OF_DATASET else truth.annotated
+
+    def _true_objects(self, truth: SceneTruth) -> Mapping[int, _TrueObject]:
+        """Return the ground-truth objects by id."""
+        annotated = self._annotation(truth)
+        if annotated is None:
+            return {key: self._true_object(name, name) for key, name in truth.class_names.items()}
+        of_space = annotated.names.get(str(self.label_space), annotated.own_names)
+        return {key: self._true_object(own, of_space.get(key)) for key, own in annotated.own_names.items()}
+
+    def _true_object(self, own_name: str | None, name: str | None) -> _TrueObject:
+        """Return an object with its name in the annotation and its name in the label space, if it has one."""
+        if own_name is not None and own_name in self.names:
+            name = own_name
+        class_name = None if name is None else self.class_of(name)
+        shown = name if class_name is None else class_name
+        is_background = self.label_space is not None and shown is not None and label_key(shown) in BACKGROUND
+        return _TrueObject(own_name, class_name, is_background)
+
+    def _known_classes(self, truth: SceneTruth) -> tuple[str, ...] | None:
+        """Return the annotated classes in the label space; None = unknown."""
+        if truth.classes is None or self._annotation(truth) is not None:
+            return self.object_classes or None
+        return tuple(dict.fromkeys(one for name in truth.classes if (one := self.class_of(name)) is not None))
+
+
+@dataclass(frozen=True)
+class _TrueObject:
+    """A ground-truth object in a label space."""
+
+    own_name: str | None  # name in the annotation; None = unnamed
+    class_name: str | None  # None = ignored
+    is_background: bool
 
 
 def classes_of_space(label_space: str) -> tuple[str, ...]:
-    """Return the classes of a label space, a text file or AGNOSTIC.
+    """Return the classes of a label space, a text or JSON file, or AGNOSTIC.
 
     Raises:
         ConfigError: The label space or file does not exist.
+        DataError: The JSON file is invalid.
     """
-    return (OBJECT,) if label_space == AGNOSTIC else read_labels(label_space, KEY, also=(AGNOSTIC,))
+    if label_space == AGNOSTIC:
+        return (OBJECT,)
+    names = read_class_ids(label_space, KEY, also=(AGNOSTIC,)).values()
+    return tuple(dict.fromkeys(name for name in names if label_key(name) != NO_CLASS))
 
 
 def indices(ids: Int32, names: Mapping[int, str | None], classes: Sequence[str]) -> Int32:

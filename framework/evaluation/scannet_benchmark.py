@@ -3,7 +3,7 @@
 The rules are those of the benchmark scripts (Dai et al. 2017, kaldir.vc.in.tum.de/scannet_benchmark, and Rozenberszki
 et al. 2022 for ScanNet200). Instances:
 
-1. A prediction of a benchmark class with at least MIN_POINTS points is evaluated, and so is a ground-truth instance.
+1. Predictions of benchmark classes and ground-truth instances are evaluated if they have at least MIN_POINTS points.
 2. A ground-truth instance, in the order of the ids, is matched with the first unmatched prediction of its class whose
    IoU is above the threshold. Further unmatched predictions above the threshold are false positives; the match gets the
    highest of their confidences.
@@ -11,10 +11,10 @@ et al. 2022 for ScanNet200). Instances:
    on ignored points is above the threshold. Ignored points are those without an instance of a benchmark class, and
    those of instances below MIN_POINTS of the class of the prediction.
 4. AP is the area under the precision-recall curve, by the trapezoidal rule between its points. Predictions of equal
-   confidence are one point, and the last point is precision 1 at recall 0.
+   confidence form one point of the curve, and the last point is precision 1 at recall 0.
 5. AP is averaged over THRESHOLDS and the classes with a ground-truth instance. AP50 and AP25 have one threshold.
 
-Semantics: the IoU of each class over all ground-truth points of benchmark classes, averaged over classes.
+Semantic segmentation: the IoU of each class over all ground-truth points of benchmark classes, averaged over classes.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def benchmark_metrics(scenes: Sequence[BenchmarkScene], classes: Sequence[str]) 
 def semantic_metrics(predicted: Int32, true: Int32, classes: Sequence[str]) -> dict[str, float]:
     """Return the semantic metrics by their names in metrics.json: `semantic.miou` and `semantic.iou.<class>`.
 
-    Classes without points in the ground truth and in the prediction are omitted.
+    Classes that occur in neither the ground truth nor the prediction are omitted.
 
     Args:
         predicted: The index in `classes` of each ground-truth point (V,), -1 = no class of the benchmark.

@@ -16,6 +16,8 @@ evaluate ScanNet200 and Replica with masks in an array:
 
 from __future__ import annotations
 
+import logging
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,13 +26,14 @@ import numpy as np
 
 from framework.data import Int32, Int64, SceneTruth
 from framework.errors import DataError
-from framework.evaluation.compared_classes import Compared, ComparedClasses
+from framework.evaluation.compared_classes import Compared, ComparedClasses, listed
 from framework.files.atomic_write import atomic_write
-from framework.runs.external_maps.class_labels import ClassIdNames
 from framework.runs.external_maps.external_map import read_surface
 from framework.runs.reevaluation import Truth, classes_of, read_predictions
 from framework.runs.stored_runs import Record, read_record
-from framework.vocabulary.label_spaces import BENCHMARK_IDS
+from framework.vocabulary.label_spaces import AGNOSTIC, BENCHMARK_IDS, OBJECT, read_class_ids
+
+log = logging.getLogger(__name__)
 
 SCANNET20 = "scannet20"  # default label space
 PER_CLASS = 1000  # factor of the class id in ground-truth files; instance numbers are below
@@ -62,24 +65,31 @@ class BenchmarkPredictions:
         """
         record = read_record(run)
         evaluated = classes_of(record)
-        space = evaluated.label_space
-        default = space if space is not None and space in BENCHMARK_IDS else SCANNET20
-        class_id_names = ClassIdNames.of(label_space or default)
-        if (least := min(class_id_names.names)) < 1:
+        space = label_space or evaluated.label_space or SCANNET20
+        if label_space is None and space not in (*BENCHMARK_IDS, AGNOSTIC):
+            space = SCANNET20
+        names_by_id = {1: OBJECT} if space == AGNOSTIC else read_class_ids(space, "label_space", also=(AGNOSTIC,))
+        if (least := min(names_by_id)) < 1:
             raise DataError(
-                f"label_space: expected class ids of at least 1, got {least} in {class_id_names.source}; write a "
-                "JSON file with the name of each id"
+                f"label_space: expected {', '.join([*BENCHMARK_IDS, AGNOSTIC])} or a JSON file with class ids of at "
+                f"least 1, got the id {least} in {space}; write a JSON file with the name of each id"
             )
-        names = evaluated.names if evaluated.label_space == class_id_names.source else {}
-        classes = ComparedClasses(class_id_names.source, tuple(class_id_names.names.values()), names)
+        names = evaluated.names if evaluated.label_space == space else {}
+        classes = ComparedClasses(space, tuple(names_by_id.values()), names)
         predictions = read_predictions(record)
         truth = _truth(record, points)
         compared = classes.compare(predictions, truth)
-        id_of = {name: key for key, name in class_id_names.names.items()}
+        id_of = {name: key for key, name in names_by_id.items()}
         found = compared.predictions.class_names
+        if compared.ignored_predictions:
+            log.warning(
+                "%s: instances outside of %s are left out: %s", run, space, listed(compared.ignored_predictions)
+            )
         kept = [k for k in np.argsort(predictions.ids).tolist() if found[k] in classes.object_classes]
+        if not kept:
+            raise DataError(f"{run}: expected an instance with a class of {space}, got none; set another label_space")
         return cls(
-            scene=str(record.metrics["sequence"]),
+            scene=re.sub(r"[^\w.-]", "_", str(record.metrics["sequence"])),  # scripts split lines at spaces
             instance_ids=compared.predicted_ids(),
             ids=predictions.ids[kept].tolist(),
             class_ids=[id_of[found[k]] for k in kept],
@@ -123,33 +133,39 @@ class BenchmarkPredictions:
 
 def _truth(record: Record, points: Path | None) -> SceneTruth:
     """Return the ground truth of a run, or points without labels in its place, in the world frame of the map."""
-    truth = Truth.of(record.dataset)
     if points is None:
+        truth = Truth.of(record.dataset)
         found = truth.in_world_of(record)
         if found is None:
             raise DataError(f"{record.directory}: expected ground-truth instances of the dataset, got none; set points")
         return found
     vertices = read_surface(points).vertices
     unlabeled = SceneTruth(vertices, np.zeros(len(vertices), np.int32))
+    if record.is_imported:
+        return unlabeled
+    truth = Truth.of({**record.dataset, "ground_truth": None})  # of the dataset, to which the points belong
     if truth.scene is not None:
         return (
             replace(truth, scene=replace(unlabeled, trajectory=truth.scene.trajectory)).in_world_of(record) or unlabeled
         )
-    if not record.is_imported and record.metrics.get("pose_source") != "ground_truth":
+    if record.metrics.get("pose_source") != "ground_truth":
         raise DataError(
-            f"{record.directory}: expected given poses or ground-truth instances, to place the points of {points} in "
-            "the map, got neither; repeat the run with tracker=ground_truth"
+            f"{record.directory}: expected given poses or ground-truth instances to align {points} with the map, got "
+            "neither; repeat the run with tracker=ground_truth"
         )
     return unlabeled
 
 
 def _encoded(compared: Compared, class_ids: Sequence[int]) -> Int64:
     """Return the class and the instance of each ground-truth point (V,) as one number, 0 = no class."""
-    present, numbers = np.unique(compared.truth.instance_ids, return_inverse=True)
-    if len(present) > PER_CLASS:
-        raise DataError(f"ground truth: expected at most {PER_CLASS - 1} instances, got {len(present) - 1}")
-    if present[0] != 0:
-        numbers = numbers + 1
+    ids = compared.truth.instance_ids
+    present = np.unique(ids[ids > 0])
+    if len(present) >= PER_CLASS:
+        raise DataError(
+            f"ground truth: expected at most {PER_CLASS - 1} instances for the format scannet, got {len(present)}; "
+            "export npz"
+        )
+    numbers = np.where(ids > 0, 1 + np.searchsorted(present, ids), 0)
     of_class = np.append(np.array(class_ids, np.int64), 0)[compared.true_classes]
     return np.where(of_class > 0, PER_CLASS * of_class + numbers, 0)
 

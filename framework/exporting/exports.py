@@ -137,6 +137,11 @@ def export(
         check_usd()
     directory = run / "export" if out is None else out
     predictions = [one for one in formats if one in PREDICTIONS]
+    if predictions and chosen.objects:
+        raise ConfigError(
+            f"objects: expected no selection for {predictions[0].value}, which contains all instances, got "
+            f"{', '.join(chosen.objects)}; export it separately"
+        )
     written = _write_predictions(run, predictions, directory, chosen) if predictions else []
     formats = [one for one in formats if one not in PREDICTIONS]
     if not formats:

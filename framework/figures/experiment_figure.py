@@ -20,7 +20,7 @@ from framework.figures.map_figure import CaptionedLine, map_figure, panel_size
 from framework.figures.map_panels import panel_line
 from framework.figures.stage_times import COLUMNS, WINDOW, MeanTimes, stage_times_figure
 from framework.figures.tradeoff_figure import tradeoff_figure
-from framework.runs.reevaluation import Truth
+from framework.runs.reevaluation import Truth, classes_of, read_predictions
 from framework.runs.run_rows import Run, RunRow
 from framework.runs.stored_map import StoredMap
 from framework.runs.stored_runs import Record
@@ -112,7 +112,9 @@ DRAWN: Mapping[str, Callable[[Pictured], Page]] = {
 
 
 def _truth(record: Record) -> SceneTruth | None:
-    return Truth.of(record.dataset).in_world_of(record)
+    """Return the ground truth in the label space of the evaluation, or None for an unlabeled dataset."""
+    truth = Truth.of(record.dataset).in_world_of(record)
+    return None if truth is None else classes_of(record).compare(read_predictions(record), truth).truth
 
 
 def _caption(stored: StoredMap | None, with_frames: bool) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from framework.data import Bool, Camera, Float32, Float64, Instance, InstanceMesh, Int32
+from framework.data import Bool, Camera, Float32, Float64, Instance, InstanceMesh, Int32, Int64
 from framework.errors import DataError
 from framework.geometry import inverse, project, transform
 
@@ -123,7 +123,7 @@ def changes(before: Visit, after: Visit) -> list[Change]:
     Moved, vanished and appeared objects come first. Both groups are sorted by decreasing probability.
     """
     old, new = _observe(before, after), _observe(after, before)
-    pairs = _moved(old, new) if before.scene.classes == after.scene.classes else []
+    pairs = _moved(old, new, _shared(before.scene.classes, after.scene.classes))
     found = []
     for a, b, probability in pairs:
         start, end = a.instance.obb.center, b.instance.obb.center
@@ -225,12 +225,24 @@ def _match(labels: Int32) -> int | None:
     return int(ids[counts.argmax()])
 
 
-def _moved(old: Sequence[_Object], new: Sequence[_Object]) -> list[tuple[_Object, _Object, float]]:
-    """Return pairs of a vanished and a similar appeared object, with the probability of a move."""
+def _shared(before: Sequence[str], after: Sequence[str]) -> tuple[Int64, Int64]:
+    """Return the indices of the common class names in two lists of classes."""
+    common = [name for name in before if name in after]
+    first, second = ([classes.index(name) for name in common] for classes in (before, after))
+    return np.array(first, np.int64), np.array(second, np.int64)
+
+
+def _moved(
+    old: Sequence[_Object], new: Sequence[_Object], shared: tuple[Int64, Int64]
+) -> list[tuple[_Object, _Object, float]]:
+    """Return pairs of a vanished and a similar appeared object, with the probability of a move.
+
+    `shared` are the indices of the common classes in the class probabilities of both visits.
+    """
     vanished, appeared = [one for one in old if one.is_gone], [one for one in new if one.is_gone]
     if not vanished or not appeared:
         return []
-    alike = np.array([[_similarity(a.instance, b.instance) for b in appeared] for a in vanished])
+    alike = np.array([[_similarity(a.instance, b.instance, shared) for b in appeared] for a in vanished])
     rows, columns = linear_sum_assignment(-alike)
     pairs = []
     for i, j in zip(rows, columns, strict=True):
@@ -240,9 +252,10 @@ def _moved(old: Sequence[_Object], new: Sequence[_Object]) -> list[tuple[_Object
     return pairs
 
 
-def _similarity(a: Instance, b: Instance) -> float:
-    """Return the similarity of two objects in class and size, in [0, 1]."""
-    same_class = float(np.sqrt(a.class_probabilities * b.class_probabilities).sum())  # Bhattacharyya coefficient
+def _similarity(a: Instance, b: Instance, shared: tuple[Int64, Int64]) -> float:
+    """Return the similarity of two objects in class and size, in [0, 1]. `shared` is described in `_moved`."""
+    probabilities = a.class_probabilities[shared[0]] * b.class_probabilities[shared[1]]
+    same_class = float(np.sqrt(probabilities).sum())  # Bhattacharyya coefficient
     sizes = np.sort(a.obb.extent), np.sort(b.obb.extent)
     ratio = float(np.abs(np.log(np.maximum(sizes[0], 0.02) / np.maximum(sizes[1], 0.02))).mean())
     return same_class * float(np.exp(-ratio))

@@ -18,6 +18,7 @@ from framework.reporting.markup import page
 from framework.reporting.run_contents import RunContents
 from framework.reporting.run_source import Footage
 from framework.reporting.visibility import NOT_CAMERA
+from framework.runs.metrics import LABEL_SPACE
 from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
@@ -140,6 +141,10 @@ class Comparison:
         ]
         if len(self.runs) > MAX_MAPS:
             notices.append(f"Only the maps of the first {MAX_MAPS} runs are shown; see the pages of the other runs.")
+        spaces = {name: run.record.metrics.get(LABEL_SPACE) for name, run in zip(self.names, self.runs, strict=True)}
+        if len(set(spaces.values())) > 1:
+            listed = ", ".join(f"{name}: {space or 'names unchanged'}" for name, space in spaces.items())
+            notices.append(f"The evaluation label spaces differ, so AP and IoU are not comparable: {listed}.")
         return notices
 
     def _metrics(self) -> Table:

@@ -9,7 +9,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from framework.data import Float64, Instance, InstanceMesh, Pose, SceneTruth
+from framework.data import AnnotatedObjects, Float64, Instance, InstanceMesh, Pose, SceneTruth
 from framework.errors import DataError
 from framework.evaluation import instances, trajectory
 from framework.evaluation.compared_classes import Compared, ComparedClasses, indices, listed
@@ -37,8 +37,10 @@ MAIN_FIGURES = (
 COVERAGE = "coverage."  # prefix of the fractions of the ground truth and of the map near each other
 CLASSES = "evaluated_classes."  # prefix of the keys about the label space of the evaluation
 LABEL_SPACE, CLASS_NAMES = CLASSES + "label_space", CLASSES + "names"
+OF_FILE = CLASSES + "of_file"  # classes of a label space in a file, as JSON, because the file may change
 IGNORED_IN_MAP, IGNORED_IN_TRUTH = CLASSES + "ignored_in_map", CLASSES + "ignored_in_ground_truth"
 TRUTH = "truth_sha256"  # key of the ground-truth hash in metrics.json
+ANNOTATED = "annotated_sha256"  # key of the hash of the names outside of COCO, for datasets that have them
 
 
 def run_metrics(result: RunResult) -> Metrics:
@@ -170,10 +172,12 @@ def evaluation_metrics(
         **{f"{COVERAGE}{name}": value for name, value in asdict(coverage).items()},
         LABEL_SPACE: compared_classes.label_space,
         CLASS_NAMES: compared_classes.names_text,
+        OF_FILE: compared_classes.file_text,
         IGNORED_IN_MAP: listed(compared.ignored_predictions) or None,
         IGNORED_IN_TRUTH: listed(compared.ignored_truths) or None,
         "annotation_release": annotation or None,
         TRUTH: truth_sha256(truth),
+        **({} if truth.annotated is None else {ANNOTATED: annotated_sha256(truth.annotated)}),
     }
 
 
@@ -199,10 +203,18 @@ def truth_sha256(truth: SceneTruth) -> str:
     return digest.hexdigest()
 
 
+def annotated_sha256(annotated: AnnotatedObjects) -> str:
+    """Return the SHA-256 (hex) of the annotated objects with their names."""
+    names = {space: sorted(of.items()) for space, of in sorted(annotated.names.items())}
+    digest = hashlib.sha256(repr((sorted(annotated.own_names.items()), names)).encode())
+    add_values(digest, annotated.instance_ids)
+    return digest.hexdigest()
+
+
 def is_evaluation(key: str) -> bool:
     """Return True for the key of a metric from `evaluation_metrics`."""
     prefixes = ("instances.", "semantic.", COVERAGE, CLASSES)
-    return key in ("annotation_release", TRUTH) or (key.startswith(prefixes) and key != "instances.count")
+    return key in ("annotation_release", TRUTH, ANNOTATED) or (key.startswith(prefixes) and key != "instances.count")
 
 
 def class_name(instance: Instance, classes: tuple[str, ...]) -> str | None:

@@ -13,7 +13,13 @@ from omegaconf import ListConfig
 from framework.errors import ConfigError
 from framework.runs.stored_runs import METRICS, is_number, read_metrics
 
-OF_GROUND_TRUTH = ("instances.ap", "instances.mean_iou", "trajectory.")  # prefixes of metrics
+OF_GROUND_TRUTH = (
+    "instances.ap",
+    "instances.scannet.",
+    "instances.mean_iou",
+    "semantic.",
+    "trajectory.",
+)  # prefixes of metrics
 
 
 def objective_keys(objective: Any) -> list[str]:

@@ -21,6 +21,7 @@ WITHOUT_EFFECT = (
     *("hydra", "debug", "skip_completed", "prefetch", "detection_cache", "detection_cache_dir", "viewer", "objective"),
     "threads",  # affects only the last digits of network outputs
     *("row", "rows", "sequences", "table", "figure"),  # settings of an experiment
+    "evaluation",  # label space of the evaluation, which can be repeated without mapping again
 )
 """Config keys that do not affect results."""
 

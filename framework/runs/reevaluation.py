@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -22,10 +24,20 @@ from framework.files.tum_trajectory import read_tum
 from framework.interfaces import RGBDVideo
 from framework.registry import build
 from framework.runs.manifest import MANIFEST, Manifest
-from framework.runs.metrics import CLASS_NAMES, LABEL_SPACE, TRUTH, evaluation_metrics, is_evaluation
+from framework.runs.metrics import (
+    ANNOTATED,
+    CLASS_NAMES,
+    LABEL_SPACE,
+    OF_FILE,
+    TRUTH,
+    evaluation_metrics,
+    is_evaluation,
+)
 from framework.runs.provenance import code_version, leaves
 from framework.runs.stored_map import read_objects
-from framework.runs.stored_runs import CONFIG, EVALUATION, GROUND_TRUTH, METRICS, TRAJECTORY, Record
+from framework.runs.stored_runs import CONFIG, EVALUATION, GROUND_TRUTH, METRICS, TRAJECTORY, Record, read_record
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -105,12 +117,13 @@ class Reevaluation:
         assert aligned is not None
         chosen = classes_of(record) if classes is None else classes
         found = evaluation_metrics(read_predictions(record), truth.scene, aligned, truth.annotation, chosen)
-        if not allow_changed and record.metrics.get(TRUTH) not in (None, found[TRUTH]):
-            raise DataError(
-                f"{record.directory}: expected the ground truth of the run ({TRUTH} {record.metrics[TRUTH]!s:.8}), got "
-                f"{found[TRUTH]!s:.8} from {record.dataset['_target_']}; check the dataset and a relative "
-                "dataset.root, or set --allow-changed-ground-truth to evaluate anyway"
-            )
+        for key in (TRUTH, ANNOTATED):
+            if not allow_changed and record.metrics.get(key) not in (None, found.get(key)):
+                raise DataError(
+                    f"{record.directory}: expected the ground truth of the run ({key} {record.metrics[key]!s:.8}), got "
+                    f"{found.get(key)!s:.8} from {record.dataset['_target_']}; check the dataset and a relative "
+                    "dataset.root, or set --allow-changed-ground-truth to evaluate anyway"
+                )
         metrics: dict[str, Any] = {}
         for key, value in record.metrics.items():
             if not is_evaluation(key) and not key.startswith(EVALUATION):
@@ -142,21 +155,25 @@ class Reevaluation:
         Raises:
             DataError: The run has been restarted.
         """
-        path = self.record.directory / METRICS
         with locked(self.record.directory):  # a new run in this directory waits
-            try:
-                before = path.stat()
-            except OSError:
-                before = None
-            if before is None or before.st_mtime != self.record.written:
-                raise DataError(
-                    f"{path}: expected an unchanged file, got a file of a restarted run; evaluate it after the run ends"
-                )
-            write_json(path, self.metrics)
-            os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-            if (self.record.directory / MANIFEST).exists():
-                stored = Manifest.read(self.record.directory)
-                stored.with_files(self.record.directory, stored.files).write(self.record.directory)
+            self.write_locked()
+
+    def write_locked(self) -> None:
+        """Replace metrics.json as `write` does, in a directory that this process has locked."""
+        path = self.record.directory / METRICS
+        try:
+            before = path.stat()
+        except OSError:
+            before = None
+        if before is None or before.st_mtime != self.record.written:
+            raise DataError(
+                f"{path}: expected an unchanged file, got a file of a restarted run; evaluate it after the run ends"
+            )
+        write_json(path, self.metrics)
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+        if (self.record.directory / MANIFEST).exists():
+            stored = Manifest.read(self.record.directory)
+            stored.with_files(self.record.directory, stored.files).write(self.record.directory)
 
 
 def benchmark_scene(found: Reevaluation, truth: Truth) -> BenchmarkScene | None:
@@ -194,17 +211,36 @@ def classes_of(record: Record) -> ComparedClasses:
     """Return the label space of the last evaluation of a run.
 
     Raises:
-        ConfigError: The label space no longer exists.
-        DataError: The stored names are invalid.
+        ConfigError: The label space of a run without evaluation does not exist.
+        DataError: The stored label space is invalid.
     """
     if LABEL_SPACE not in record.metrics:  # a run of an older version, or without ground truth
         return ComparedClasses.of(record.config)
-    stored = record.metrics.get(CLASS_NAMES)
+    space, names, classes = (record.metrics.get(key) for key in (LABEL_SPACE, CLASS_NAMES, OF_FILE))
     try:
-        names = {} if stored is None else json.loads(stored)
+        table = {} if names is None else dict(json.loads(names))
+        if classes is not None:
+            return ComparedClasses(str(space), tuple(map(str, json.loads(classes))), table)
     except (TypeError, ValueError) as error:
-        raise DataError(f"{record.directory}: {CLASS_NAMES}: expected names as JSON, got {stored!r:.60}") from error
-    return ComparedClasses.of({"evaluation": {"label_space": record.metrics[LABEL_SPACE], "names": names}})
+        raise DataError(
+            f"{record.directory}: expected {CLASS_NAMES} and {OF_FILE} as JSON, got {names!r:.60} and {classes!r:.60}; "
+            "set --label-space"
+        ) from error
+    return ComparedClasses.of({"evaluation": {"label_space": space, "names": table}})
+
+
+def evaluate_as_configured(directory: Path, config: Mapping[str, Any]) -> None:
+    """Evaluate a completed run again if its last evaluation has another label space than a resolved config.
+
+    This process must have locked the directory.
+
+    Raises:
+        InstanceMapError: The run or its ground truth cannot be read.
+    """
+    record, classes = read_record(directory), ComparedClasses.of(config)
+    if LABEL_SPACE in record.metrics and classes_of(record) != classes:
+        log.info("%s: evaluated again in the label space %s", directory, classes.label_space)
+        Reevaluation.of(record, Truth.of(record.dataset), classes=classes).write_locked()
 
 
 def dataset_of(record: Record, ground_truth: str | None = None) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from framework.registry import STAGES
 from framework.runs.metrics import CLASS_NAMES, LABEL_SPACE, TRUTH
-from framework.runs.stored_runs import CHOICE, Record, is_number
+from framework.runs.stored_runs import CHOICE, EVALUATION, Record, is_number
 
 DATA = "dataset.root"  # config key of the dataset folder
 ANNOTATION = "annotation"  # name of the ground-truth release in the variant of a row
@@ -110,7 +110,7 @@ def data_of(record: Record) -> tuple[Any, ...]:
 
 def is_of_data(part: str) -> bool:
     """Return True if a part of a variant, such as dataset=desk, is about the data."""
-    return is_below(part.partition("=")[0], ("dataset", ANNOTATION, "seed"))
+    return is_below(part.partition("=")[0], ("dataset", ANNOTATION, "seed", "evaluation"))
 
 
 def value_of(record: Record, key: str) -> str:
@@ -208,7 +208,7 @@ class _Variant:
     record: Record
     row: str
     run: Run
-    choices: Mapping[str, Any]  # option of each stage, and the annotation
+    choices: Mapping[str, Any]  # option of each stage, the annotation, and the label space of the evaluation
     parameters: Mapping[str, Any]  # by dotted key
 
     @classmethod
@@ -216,6 +216,8 @@ class _Variant:
         stages = ("dataset",) if record.is_imported else STAGES
         choices = {stage: option for stage, option in record.choices.items() if stage in stages}
         choices[ANNOTATION] = record.annotation or "unknown"
+        choices |= {f"{EVALUATION}label_space": record.metrics.get(LABEL_SPACE) or "null"}
+        choices |= {f"{EVALUATION}names": record.metrics.get(CLASS_NAMES) or "null"}
         return cls(record, record.row, tuple(value_of(record, key) for key in over), choices, record.parameters)
 
     @property

@@ -60,7 +60,15 @@ EDITED_FROM = "edited_from"  # key with the path of the run that `instancemap ed
 EXTERNAL = "external"  # value of `pose_source` and of the chosen stages of an imported map
 CHOICE = "choice."  # prefix of the chosen options in metrics.json
 GROUPS = (*STAGES, "preset", "sequences")  # config groups whose chosen option is stored
-FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # prefixes of numeric metrics
+FIGURES = (
+    "instances.",
+    "semantic.",
+    "trajectory.",
+    "stage_ms.",
+    "map.",
+    "frames",
+    "fps",
+)  # prefixes of numeric metrics
 
 _LOG_LINE = re.compile(r"\S+ (?P<level>DEBUG|INFO|WARNING|ERROR|CRITICAL) +(?P<message>.*)")
 

@@ -28,6 +28,11 @@ HEADS = {
         for key, name in (("ap50", "AP50"), ("ap25", "AP25"), ("ap", "AP"), ("mean_iou", "mean IoU"))
     },
     "instances.to_map.ap50_agnostic": "AP50 agnostic, to map",
+    **{
+        f"instances.scannet.{key}": f"{name} (ScanNet)"
+        for key, name in (("ap", "AP"), ("ap50", "AP50"), ("ap25", "AP25"))
+    },
+    "semantic.miou": "mIoU",
     "fps": "Hz",
     "fps_median": "Hz (median)",
     "frames_lost": "frames lost",
@@ -41,11 +46,19 @@ HEADS = {
 CLASS_HEADS = {"ap": ", AP", "ap25": ", AP25", "ap50": "", "true_count": ", ground truth"}
 """Ends of the headings of the metrics of one class, by the second part of the key."""
 
+OF_CLASS = {
+    "instances.scannet.ap.": "AP (ScanNet)",
+    "instances.scannet.ap50.": "AP50 (ScanNet)",
+    "instances.scannet.ap25.": "AP25 (ScanNet)",
+    "semantic.iou.": "IoU",
+}
+"""Ends of the headings of benchmark metrics of one class, by prefix of the key."""
+
 SCENENN_NAMES = {coco: name for name, coco in SCENENN_TO_COCO.items()}
 
 DIRECTIONS = {
     **dict.fromkeys(("instances.count", "instances.true_count", "instances.ignored_count"), Direction.NONE),
-    **dict.fromkeys(("instances", "coverage", "fps", "fps_median"), Direction.HIGHER),
+    **dict.fromkeys(("instances", "semantic", "coverage", "fps", "fps_median"), Direction.HIGHER),
     **dict.fromkeys(("trajectory", "stage_ms", "latency_ms", "map.bytes", "peak_rss_bytes"), Direction.LOWER),
     **dict.fromkeys(("frames_lost", "frames_skipped", "frames_dropped", "frames_disagreeing"), Direction.LOWER),
 }
@@ -61,6 +74,8 @@ def head(key: str) -> str:
         return HEADS.get(key, key)
     if parts[0] == "stage_ms":
         return f"{parts[1]} (ms{'' if parts[2] == 'median' else f', {parts[2]}'})"
+    if prefix := next((prefix for prefix in OF_CLASS if key.startswith(prefix)), None):
+        return f"{key.removeprefix(prefix)}, {OF_CLASS[prefix]}"
     if parts[0] == "instances" and parts[1] in CLASS_HEADS:
         return SCENENN_NAMES.get(parts[2], parts[2]) + CLASS_HEADS[parts[1]]
     return key

@@ -17,8 +17,14 @@ from framework.tables.comparison import ComparisonTable, as_text
 from framework.tables.metric_columns import Direction, direction, head
 from framework.tables.statistics import ALPHA
 
-OF_RESULTS = ("instances.", "trajectory.", "map.", "frames")  # prefixes of metrics that do not depend on the machine
-NAMES_OF_MAP = "names of the map and the ground truth"  # evaluation without conversion of names
+OF_RESULTS = (
+    "instances.",
+    "semantic.",
+    "trajectory.",
+    "map.",
+    "frames",
+)  # prefixes of metrics that do not depend on the machine
+UNCHANGED = "names unchanged"  # evaluation without conversion of names
 MOST_NAMES = 12  # maximum number of sequences that a note names
 
 
@@ -49,7 +55,7 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
     yield from _published(comparison)
     yield f"Data: {data(comparison.records)}."
     if known := [str(space) for record in comparison.records if (space := record.metrics.get("label_space"))]:
-        yield f"Label space of the maps: {counted(known)}."
+        yield f"Map label space: {counted(known)}."
     yield f"Code: {counted(record.code for record in comparison.records)}."
     yield from _mixed_code(comparison)
     if used := machines(comparison.records):
@@ -182,7 +188,7 @@ def _protocol(comparison: ComparisonTable) -> Iterator[str]:
         )
     spaces = [record.metrics.get(LABEL_SPACE) for record in comparison.records]
     if any(spaces):
-        yield f"Evaluation in the label space: {counted(str(space or NAMES_OF_MAP) for space in spaces)}."
+        yield f"Evaluation label space: {counted(str(space or UNCHANGED) for space in spaces)}."
     if ignored := [text for text in map(_ignored, comparison.records) if text]:
         yield f"Ignored objects: {counted(ignored)}."
     if True in kinds:

@@ -19,8 +19,10 @@ import yaml
 from framework.data import Bool, Float32, Int32
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import read_text
+from framework.files.json_file import read_json
 from framework.files.search_paths import expanded
 
+MAX_DIGITS = 10  # maximum number of digits of a class id
 LARGEST_FILE = 2**20  # bytes, maximum size of a list of labels
 LONGEST_CLASS_NAME = 100  # characters
 _OTHER_NAMES = "other_names"  # section for spellings outside of all spaces
@@ -133,6 +135,47 @@ def read_labels(name_or_path: str, key: str = "detector.label_space", also: Sequ
     if not names:
         raise ConfigError(f"{key}: {path}: expected one name per line, got an empty file")
     return names
+
+
+def read_class_ids(name_or_path: str, key: str, also: Sequence[str] = ()) -> dict[int, str]:
+    """Return the name of each class id in a label space or file.
+
+    NYU40, ScanNet20 and ScanNet200 have the ids of ScanNet's benchmarks. The ids of another label space or a text file
+    start at 0. A JSON file contains an object with the name of each id, or a list of names from id 0.
+
+    Args:
+        name_or_path: The name of a label space, or the path of a text or JSON file.
+        key: The config key or option, for messages.
+        also: Other values of the key, for messages.
+
+    Raises:
+        ConfigError: The label space or text file does not exist, or the file is invalid.
+        DataError: The JSON file is invalid.
+    """
+    if Path(name_or_path).suffix.lower() != ".json":
+        labels = read_labels(name_or_path, key, also)
+        return dict(zip(BENCHMARK_IDS.get(name_or_path, range(len(labels))), labels, strict=True))
+    path = expanded(Path(name_or_path))
+    content = read_json(path)
+    if isinstance(content, list):
+        content = {str(k): name for k, name in enumerate(content)}
+    if not isinstance(content, dict) or not content:
+        raise DataError(f"{path}: expected a JSON object or array of names, got {content!r:.40}")
+    found = {}
+    for text, name in content.items():
+        class_id = whole_number(text)
+        if class_id is None or not isinstance(name, str) or not name:
+            raise DataError(f"{path}: expected a name for each class id, got {text!r:.40}: {name!r:.40}")
+        found[class_id] = name
+    return found
+
+
+def whole_number(value: object) -> int | None:
+    """Return an integer that is given as a number or text, or None for another value."""
+    if isinstance(value, str):
+        digits = value.strip().removeprefix("-")
+        return int(value) if digits.isascii() and digits.isdigit() and len(digits) <= MAX_DIGITS else None
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
 
 
 def to_class_names(labels: Sequence[str], class_names: ClassNames, key: str = "detector.label_space") -> LabelMapping:

@@ -16,7 +16,8 @@ from framework.errors import ConfigError, DataError
 from framework.evaluation.compared_classes import ComparedClasses
 from framework.evaluation.instances import Transfer
 from framework.evaluation.scannet_benchmark import BenchmarkScene, benchmark_metrics
-from framework.runs.metrics import IGNORED_IN_MAP, IGNORED_IN_TRUTH, MAIN_FIGURES
+from framework.registry import STAGES
+from framework.runs.metrics import CLASS_NAMES, IGNORED_IN_MAP, IGNORED_IN_TRUTH, LABEL_SPACE, MAIN_FIGURES
 from framework.runs.reevaluation import Reevaluation, Truth, benchmark_scene, dataset_of
 from framework.runs.stored_runs import Record, find_records
 from framework.tables.metric_columns import head
@@ -56,12 +57,12 @@ def main() -> None:
         help=argparse.SUPPRESS,
     )
     space = (
-        "label space, as in evaluation.label_space: coco, nyu40, scannet20, scannet200, agnostic or a text file; '' = "
-        "names of the map and the ground truth; default: label space of the last evaluation"
+        "label space, as in evaluation.label_space: coco, nyu40, scannet20, scannet200, agnostic or a file; '' = names "
+        "are compared unchanged; default: label space of the last evaluation"
     )
     parser.add_argument("--label-space", metavar="SPACE", help=space)
     named = (
-        "class in the label space of a name, as in evaluation.names; empty CLASS = ignored; repeatable; only with "
+        "convert NAME to CLASS of the label space, as in evaluation.names; empty CLASS = ignore; repeatable; requires "
         "--label-space"
     )
     parser.add_argument("--name", metavar="NAME=CLASS", action="append", default=[], help=named)
@@ -84,7 +85,9 @@ def chosen_classes(label_space: str | None, names: Sequence[str]) -> ComparedCla
     if label_space is None and not names:
         return None
     if label_space is None:
-        raise ConfigError("--name: expected also --label-space, got none; set --label-space ('' = unchanged names)")
+        raise ConfigError(
+            "--name: expected --label-space, got none; add --label-space SPACE ('' = names are compared unchanged)"
+        )
     pairs = [word.partition("=") for word in names]
     if wrong := [name + sign + chosen for name, sign, chosen in pairs if not name or not sign]:
         raise ConfigError(f"--name: expected NAME=CLASS, got {wrong[0]!r:.60}")
@@ -117,8 +120,7 @@ def evaluate_runs(
     for failure in failures:
         print_error(failure, REFUSED)
     failed = len(failures)
-    scenes: dict[str, BenchmarkScene] = {}
-    evaluated = 0
+    pooled: list[tuple[Reevaluation, BenchmarkScene]] = []
 
     def key(record: Record) -> str:
         return str(dataset_of(record, ground_truth))
@@ -137,15 +139,28 @@ def evaluate_runs(
                     for line in ignored(found):
                         tqdm.write(f"  {line}")
                     if len(records) > 1 and (scene := benchmark_scene(found, truth)):
-                        scenes[str(record.metrics.get("sequence"))] = scene
-                        evaluated += 1
+                        pooled.append((found, scene))
                 except KNOWN_ERRORS as error:
                     print_error(error, f"{REFUSED}{record.directory}: " if truth is None else REFUSED)
                     failed += 1
                 bar.update()
-    if len(scenes) == evaluated > 1:  # one run per scene
-        print(over_scenes(list(scenes.values())))
+    if len(pooled) > 1:
+        why_not = differing([found for found, _ in pooled])
+        scenes = [scene for _, scene in pooled]
+        print(f"no metrics over all scenes: {why_not}" if why_not else over_scenes(scenes))
     return failed
+
+
+def differing(found: Sequence[Reevaluation]) -> str:
+    """Return the reason why runs are not the scenes of one method in one label space, or "" if they are."""
+    sequences = {one.metrics.get("sequence") for one in found}
+    if len(sequences) < len(found):
+        return "several runs have the same sequence"
+    if len({(one.metrics.get(LABEL_SPACE), one.metrics.get(CLASS_NAMES)) for one in found}) > 1:
+        return "the label spaces of the runs differ"
+    stages = {stage for stage in STAGES if stage != "dataset"}
+    methods = {(one.record.row, *(one.record.choices.get(stage) for stage in sorted(stages))) for one in found}
+    return "the stages of the runs differ" if len(methods) > 1 else ""
 
 
 def ignored(found: Reevaluation) -> list[str]:
@@ -159,7 +174,7 @@ def over_scenes(scenes: Sequence[BenchmarkScene]) -> str:
     classes = sorted({name for scene in scenes for name in scene.truth_classes})
     found = benchmark_metrics(scenes, classes)
     means = ", ".join(f"{name} {found[f'instances.scannet.{key}']:.3f}" for key, name in SCANNET.items() if found)
-    return f"all {len(scenes)} scenes together, by the rules of ScanNet's benchmark: {means or 'no ground truth'}"
+    return f"{len(scenes)} scenes, ScanNet benchmark metrics: {means or 'no ground truth'}"
 
 
 def summary(found: Reevaluation, transfer: Transfer) -> str:

@@ -38,7 +38,8 @@ def main() -> None:
     add("--label-space", metavar="SPACE", help=space)
     names = (
         "class names of the map: COCO (other classes are left out), OWN (the given names), or AUTO (OWN if a name is "
-        "in no known label space, otherwise COCO); default: AUTO"
+        "in no known label space, if none has a COCO class, or if evaluation.label_space is not COCO; otherwise COCO); "
+        "default: AUTO"
     )
     add("--class-names", choices=[*ClassNames.__members__], default=ClassNames.AUTO.name, help=names)
     add = parser.add_argument_group("properties of a PLY file").add_argument

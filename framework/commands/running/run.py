@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from framework.commands.command_line import Jobs, is_of_sweep
 from framework.commands.running.choices import error_of_first_run, with_row
 from framework.commands.running.sweep import by_joblib, ending
+from framework.config.composition import resolved
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.runs.objective import objective_keys, objective_of
@@ -44,7 +45,11 @@ def run_job(config: DictConfig, hydra_config: HydraConf) -> float | list[float] 
     objective_keys(config.objective)
     # workers of a killed sweep may still be writing here; a single run has already locked its directory
     with locked(directory, wait=True) if is_of_sweep(hydra_config) else nullcontext():
-        if not (config.skip_completed and is_recorded(directory, config)):
+        if config.skip_completed and is_recorded(directory, config):
+            from framework.runs.reevaluation import evaluate_as_configured  # slow import
+
+            evaluate_as_configured(directory, resolved(config))
+        else:
             interruption = run(config, directory, choices)
             if is_of_sweep(hydra_config):  # a sweep would continue after this run
                 interruption.check()

@@ -43,7 +43,7 @@ class EditingMode {
       if (this.on && event.key === "Escape") this.clear();
     });
     addEventListener("beforeunload", (event) => {
-      if (this.edits.length && editsFile(this.edits) !== this.saved) event.preventDefault(); // the browser asks before it drops the edits
+      if (this.edits.length && editsFile(this.edits) !== this.saved) event.preventDefault(); // the browser asks before discarding the edits
     });
   }
 

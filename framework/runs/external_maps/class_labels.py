@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from framework.errors import DataError
 from framework.files.atomic_write import read_text
 from framework.files.json_file import read_json
 from framework.runs.external_maps.external_map import UNLABELED
-from framework.vocabulary.label_spaces import BENCHMARK_IDS, SPACES, read_labels
+from framework.vocabulary.label_spaces import SPACES, read_class_ids, whole_number
 
 KEY = "label_space"
 NYU40 = "nyu40"  # label space of ScanNet predictions
@@ -37,10 +37,7 @@ class ClassIdNames:
             ConfigError: The label space or text file does not exist, or the file is invalid.
             DataError: The JSON file is invalid.
         """
-        if Path(label_space).suffix.lower() == ".json":
-            return cls(_names_in_json(Path(label_space)), label_space)
-        labels = read_labels(label_space, KEY)
-        return cls(dict(zip(BENCHMARK_IDS.get(label_space, range(len(labels))), labels, strict=True)), label_space)
+        return cls(read_class_ids(label_space, KEY), label_space)
 
     @property
     def all(self) -> tuple[str, ...]:
@@ -124,7 +121,7 @@ def read_labels_by_id(path: Path, names: ClassIdNames | None) -> dict[int, Insta
     """
     found: dict[int, InstanceLabel] = {}
     for where, entry in read_entries(path):
-        key = _whole(entry.get("id"))
+        key = whole_number(entry.get("id"))
         if key is None:
             raise DataError(f"{where}: id: expected an integer, got {entry.get('id')!r:.40}")
         if key in found:
@@ -161,7 +158,7 @@ def class_of_id(where: str, class_id: int, names: ClassIdNames | None) -> str:
 
 
 def _class_name(where: str, value: Any, names: ClassIdNames | None) -> str:
-    class_id = _whole(value)
+    class_id = whole_number(value)
     if class_id is not None:
         return class_of_id(f"{where}: class", class_id, names)
     if value is None or value == "":
@@ -169,28 +166,3 @@ def _class_name(where: str, value: Any, names: ClassIdNames | None) -> str:
     if not isinstance(value, str):
         raise DataError(f"{where}: class: expected a name, an id or null, got {value!r:.40}")
     return value
-
-
-def _whole(value: Any) -> int | None:
-    """Return an integer that is given as a number or text, or None for another value."""
-    if isinstance(value, str):
-        digits = value.strip().removeprefix("-")
-        return int(value) if digits.isascii() and digits.isdigit() and len(digits) <= MAX_DIGITS else None
-    return value if isinstance(value, int) and not isinstance(value, bool) else None
-
-
-def _names_in_json(path: Path) -> dict[int, str]:
-    content = read_json(path)
-    if isinstance(content, list):
-        content = {str(k): name for k, name in enumerate(content)}
-    if not isinstance(content, dict) or not content:
-        raise DataError(f"{path}: expected a JSON object or array of names, got {content!r:.40}")
-    return dict(_named_ids(path, content))
-
-
-def _named_ids(path: Path, content: Mapping[str, Any]) -> Iterator[tuple[int, str]]:
-    for key, name in content.items():
-        class_id = _whole(key)
-        if class_id is None or not isinstance(name, str) or not name:
-            raise DataError(f"{path}: expected a name for each class id, got {key!r:.40}: {name!r:.40}")
-        yield class_id, name

@@ -60,7 +60,8 @@ def read_ply_instances(
     if instance_name is None:
         raise DataError(
             f"{path}: expected a property with instance ids ({', '.join(INSTANCE_NAMES[:4])}, ...), got only "
-            f"{', '.join(properties) or 'coordinates'}; set instance_property, or labels to predictions or masks"
+            f"{', '.join(properties) or 'coordinates'}; set instance_property, or set labels to ScanNet predictions or "
+            "a mask folder"
         )
     ids, offset = _ids(path, instance_name, properties[instance_name], chosen.no_instance)
     members = {key - offset: vertices for key, vertices in vertices_by_id(ids).items()}

@@ -139,7 +139,7 @@ def relocalized(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("relocalized")
 def test_map_with_new_class_can_be_resumed(run: Path, tmp_path: Path) -> None:
-    """The detector does not know the new class. The instance keeps it, and other instances keep theirs."""
+    """The detector lacks the new class. The instance keeps it, and other instances keep theirs."""
     edited = instancemap.edit(run, [{"rename": [2, "forklift"]}], tmp_path / "edited")
     stored = {one.id: one for one in read_instances(edited / "instances.json")}
     assert (stored[2].class_name, stored[1].class_probabilities["forklift"]) == ("forklift", 0.0)

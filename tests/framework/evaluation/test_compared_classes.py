@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from framework.config.composition import composed, resolved
 from framework.data import AnnotatedObjects, SceneTruth
 from framework.errors import ConfigError
 from framework.evaluation.compared_classes import OUTSIDE, ComparedClasses, listed
@@ -19,7 +20,7 @@ def classes_in(label_space: str | None, **names: str | None) -> ComparedClasses:
 
 
 def predictions_of(*names: str) -> PredictedInstances:
-    """Return one instance of 200 points for each name, beside each other."""
+    """Return one instance of 200 points for each name, side by side."""
     ids = np.repeat(np.arange(1, len(names) + 1), 200).astype(np.int32)
     points = np.zeros((len(ids), 3), np.float32)
     points[:, 0] = np.arange(len(ids))
@@ -131,3 +132,43 @@ def test_annotated_classes_of_dataset_are_converted() -> None:
 def test_long_list_of_ignored_names_is_shortened() -> None:
     assert listed({f"name {k:02d}": 1 for k in range(14)}).endswith("name 11 (1) and 2 more")
     assert listed({}) == ""
+
+
+def test_names_of_config_are_read_from_overrides() -> None:
+    config = composed("evaluation.label_space=scannet200", "evaluation.names={dining table: table, cup: null}")
+    classes = ComparedClasses.of(resolved(config))
+    assert classes.label_space == "scannet200"
+    assert classes.names == {"dining table": "table", "cup": None}
+
+
+def test_label_space_of_json_file_has_its_names(tmp_path: Path) -> None:
+    (tmp_path / "names.json").write_text('{"20": "chair", "80": "table"}')
+    assert classes_in(str(tmp_path / "names.json")).classes == ("chair", "table")
+
+
+def test_names_that_differ_in_case_or_synonyms_stay_apart(tmp_path: Path) -> None:
+    (tmp_path / "names.txt").write_text("Cup\ncup\nshelf, big\nshelf, small\nn/a\n")
+    classes = classes_in(str(tmp_path / "names.txt"))
+    assert classes.classes == ("Cup", "cup", "shelf, big", "shelf, small")
+    assert [classes.class_of(name) for name in classes.classes] == list(classes.classes)
+
+
+def test_walls_and_floors_are_background_after_conversion() -> None:
+    truth = truth_of("Wall", "carpet", "chair")
+    for space, names, found_as in (("nyu40", {"carpet": "floor"}, "floor"), ("agnostic", {}, "carpet")):
+        compared = classes_in(space, **names).compare(predictions_of("wall", found_as, "chair"), truth)
+        found = evaluate(compared.predictions, compared.truth)
+        assert "floor" not in found.by_class[0.5]
+        assert "wall" not in found.by_class[0.5]
+        assert found.ap(0.5) == 1.0
+
+
+def test_annotated_name_in_config_takes_precedence_over_label_space() -> None:
+    ids = np.repeat([1, 2, 3], 200).astype(np.int32)
+    own = {1: "office chair", 2: "ping pong set", 3: "gizmo"}
+    annotated = AnnotatedObjects(ids, own, {"nyu40": {1: "chair"}})
+    truth = truth_of("chair", None, None, annotated=annotated)
+    classes = classes_in("nyu40", **{"office chair": "sofa", "ping pong set": "table"})
+    compared = classes.compare(predictions_of("chair", "bed", "bed"), truth)
+    assert compared.truth.class_names == {1: "sofa", 2: "table", 3: None}
+    assert compared.ignored_truths == {"gizmo": 1}

@@ -87,7 +87,7 @@ def test_scannet_ap_of_hit_before_false_positive_is_its_recall() -> None:
     assert np.isnan(scannet_ap([scene], "table", 0.5))
 
 
-def test_scannet_ap_ignores_prediction_on_void_but_not_on_other_class() -> None:
+def test_scannet_ap_prediction_on_void_is_ignored() -> None:
     true = np.repeat([1, 0], 200)
     predicted = np.repeat([3, 4], 200)
     claims = {3: ("chair", 0.5), 4: ("chair", 0.9)}

@@ -122,11 +122,30 @@ def test_predictions_of_given_points_need_no_ground_truth(scannet_run: Path, tmp
 
 def test_class_ids_below_one_are_error(scannet_run: Path, tmp_path: Path) -> None:
     (tmp_path / "names.json").write_text('["chair", "table"]')
-    with pytest.raises(DataError, match="label_space: expected class ids of at least 1, got 0"):
+    with pytest.raises(DataError, match="a JSON file with class ids of at least 1, got the id 0"):
         export(scannet_run, [ExportFormat.NPZ], tmp_path, Chosen(label_space=str(tmp_path / "names.json")))
     (tmp_path / "names.json").write_text('{"20": "chair", "80": "table"}')
     [path] = export(scannet_run, [ExportFormat.NPZ], tmp_path, Chosen(label_space=str(tmp_path / "names.json")))
     assert set(np.load(path)["pred_classes"].tolist()) <= {20, 80}
+
+
+def test_class_agnostic_predictions_have_one_class(scannet_run: Path, tmp_path: Path) -> None:
+    [path] = export(scannet_run, [ExportFormat.NPZ], tmp_path, Chosen(label_space="agnostic"))
+    found = np.load(path)
+    assert found["pred_classes"].tolist() == [1] * len(json.loads((scannet_run / "instances.json").read_text()))
+
+
+def test_predictions_without_class_of_label_space_are_error(scannet_run: Path, tmp_path: Path) -> None:
+    (tmp_path / "names.json").write_text('{"7": "forklift"}')
+    with pytest.raises(DataError, match=r"expected an instance with a class of .*names\.json, got none"):
+        export(scannet_run, [ExportFormat.SCANNET], tmp_path, Chosen(label_space=str(tmp_path / "names.json")))
+
+
+def test_left_out_predictions_are_reported(scannet_run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "names.json").write_text('{"20": "chair", "80": "table"}')
+    export(scannet_run, [ExportFormat.NPZ], tmp_path, Chosen(label_space=str(tmp_path / "names.json")))
+    assert "names.json are left out: " in caplog.text
+    assert "refrigerator (" in caplog.text
 
 
 def test_predictions_without_ground_truth_are_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import DataError
 from framework.files.tum_trajectory import write_tum
 from framework.interfaces import RGBDSequence
-from framework.queries.changes import STAY_PROBABILITY, Kind, Visit, changes, look_for, probability_gone
+from framework.queries.changes import STAY_PROBABILITY, Kind, Visit, _shared, changes, look_for, probability_gone
 from framework.synthetic.renderer import Renderer
 from framework.synthetic.room import RoomKind
 from framework.synthetic.sequence import Synthetic
@@ -102,6 +102,14 @@ def test_changes_displaced_object_has_moved(before: Visit) -> None:
     )
     assert None not in (moved.before, moved.after)
     assert expected(found, Kind.VANISHED) == expected(found, Kind.APPEARED) == []
+
+
+def test_moved_object_is_found_if_one_map_has_more_classes() -> None:
+    """Renaming an instance (`edit`) can add classes to a map."""
+    first, second = _shared(("chair", "couch", "tv"), ("bed", "tv", "chair"))
+    assert (first.tolist(), second.tolist()) == ([0, 2], [2, 1])
+    found = _shared(("chair",), ("forklift",))
+    assert [one.tolist() for one in found] == [[], []]
 
 
 @pytest.mark.acceptance

@@ -153,7 +153,7 @@ def test_instance_metrics_have_both_transfers_and_truth_release(
     assert len(str(metrics.pop("truth_sha256"))) == 64
     for name in ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou"):
         assert metrics.pop(f"instances.to_map.{name}") == to_map[f"instances.{name}"]
-    for name in ("label_space", "names", "ignored_in_map", "ignored_in_ground_truth"):
+    for name in ("label_space", "names", "of_file", "ignored_in_map", "ignored_in_ground_truth"):
         assert metrics.pop(f"evaluated_classes.{name}") is None
     assert metrics == to_truth
 
