@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import takewhile
@@ -20,7 +20,6 @@ from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
 from framework.runtime.digests import StageDigest, digest_of
 from framework.runtime.progress import Progress
 from framework.sensors.noise_models import SensorKind
-from framework.tracking.map_agreement import MapAgreement, frame_ranges
 
 log = logging.getLogger(__name__)
 
@@ -227,14 +226,21 @@ class Journal:
             log.warning("frame %d: tracked again after %d lost frames", frame.index, self.lost_for)
             self.lost_for = 0
 
-    def frame_compared(self, frame: Frame, agreement: MapAgreement) -> None:
-        """Record the comparison of a frame with the map. Log the first frame that disagrees."""
+    def frame_compared(self, frame: Frame, disagrees: bool, fraction: float) -> None:
+        """Record the comparison of a frame with the map. Log the first frame that disagrees.
+
+        Args:
+            frame: The frame.
+            disagrees: True if the given pose contradicts the map.
+            fraction: Fraction of the pixels whose depth differs from the map.
+        """
         self.compared += 1
-        if agreement.disagrees:
-            if not self.disagreeing:
-                text = "frame %d: depth differs from the map at %.0f %% of the pixels; its given pose may be wrong"
-                log.warning(text, frame.index, 100 * agreement.disagreeing)
-            self.disagreeing.append(frame.index)
+        if not disagrees:
+            return
+        if not self.disagreeing:
+            text = "frame %d: depth differs from the map at %.0f%% of the pixels; its given pose may be wrong"
+            log.warning(text, frame.index, 100 * fraction)
+        self.disagreeing.append(frame.index)
 
     def frame_fused(self, frame: Frame) -> None:
         """Record the latency of a frame if the video is live."""
@@ -257,3 +263,14 @@ class Journal:
             disagreeing=tuple(self.disagreeing) if self.compared else None,
             live=LiveFigures(self.frames_dropped, tuple(self.latencies)) if self.frames_expected is None else None,
         )
+
+
+def frame_ranges(indices: Sequence[int]) -> str:
+    """Return increasing frame numbers as text, such as "3, 7 to 9"."""
+    parts: list[list[int]] = []
+    for index in indices:
+        if parts and index == parts[-1][1] + 1:
+            parts[-1][1] = index
+        else:
+            parts.append([index, index])
+    return ", ".join(f"{first}" if first == last else f"{first} to {last}" for first, last in parts)

@@ -6,7 +6,6 @@ the frame on a coarse grid of pixels, so its run time does not depend on the ima
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -93,17 +92,6 @@ def check_resumed(frame: Frame, agreement: MapAgreement) -> str:
             "tracker=voxel_hashing_icp"
         )
     return ""
-
-
-def frame_ranges(indices: Sequence[int]) -> str:
-    """Return increasing frame numbers as text, such as "3, 7 to 9"."""
-    parts: list[list[int]] = []
-    for index in indices:
-        if parts and index == parts[-1][1] + 1:
-            parts[-1][1] = index
-        else:
-            parts.append([index, index])
-    return ", ".join(f"{first}" if first == last else f"{first} to {last}" for first, last in parts)
 
 
 def _sampled(camera: Camera, step: int) -> Camera:

@@ -17,7 +17,8 @@ from framework.mapping.labels.label_rule import LabeledVoxels
 from framework.mapping.voxels.tsdf_volume import Tsdf, VoxelHashing
 from framework.pipeline import Pipeline
 from framework.refinement.lifting import lift
-from framework.tracking.map_agreement import check_resumed, frame_ranges, map_agreement
+from framework.runtime.run_log import frame_ranges
+from framework.tracking.map_agreement import check_resumed, map_agreement
 from plugins.detectors.none import NoDetections
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.refiners.identity import Identity
