@@ -179,6 +179,7 @@ class Frame:
     depth_timestamp: float | None = None  # s, of the depth image; None = timestamp
     sensor: SensorKind = SensorKind.KINECT_V1  # kind of depth sensor, which determines the noise model
     T_odom_camera: Float64 | None = None  # (4, 4) pose of odometry, at the time of depth; None = unknown
+    image_name: str = ""  # file name of the color image, without folders; "" = no file of its own
 
     def __post_init__(self) -> None:
         index, camera = cast(object, self.index), cast(object, self.camera)  # the caller may pass any type

@@ -111,6 +111,10 @@ class RGBDSequence(RGBDVideo):
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
 
+    def image_names(self) -> Mapping[int, str]:
+        """Return `Frame.image_name` by `Frame.index`, also for frames that are not selected; empty = unknown."""
+        return {}
+
 
 class LiveVideo(RGBDVideo):
     """The stream of a running camera. If mapping falls behind, frames are dropped."""
@@ -143,6 +147,13 @@ class Detector(ABC):
         """Return the objects in `frame`. The result depends on the frame alone, not on the order of frames.
 
         A detector that reads the ground truth of the frame raises DataError for a frame without it.
+        """
+
+    def check_sequence(self, sequence: RGBDSequence) -> None:  # noqa: B027  # optional
+        """Check that the detector fits a sequence. Called before its first frame. By default, accept any sequence.
+
+        Raises:
+            DataError: The detector does not fit, for example because its detections belong to another sequence.
         """
 
 

@@ -113,6 +113,8 @@ class Pipeline:
             frames = "its frames" if frames_expected is None else f"the {frames_expected} frames"
             raise DataError(f"{video.name}: expected ground-truth poses, got none for {frames}; {WITHOUT_POSES}")
         warn_outside_domain(self.detector, video)
+        if isinstance(video, RGBDSequence):
+            self.detector.check_sequence(video)
         self.color_to_depth = ColorToDepth(video.constant_color_delay())
         journal = Journal(self.fuser.scene, frames_expected, self.tracker.pose_source)
         with (

@@ -5,16 +5,23 @@ A box is x1 y1 x2 y2 in px of the network's input. The left border of the first 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
+from framework.config.validation import require
 from framework.data import Float32, Int32
 from framework.detection.masks.boxes import LARGEST_LOG_SCALE, suppress_boxes
+from framework.detection.masks.letterbox import ImageFormat, Placement
 from framework.errors import DataError
+from framework.vocabulary.category_ids import CategoryIds, label_ids
+from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
 
+CONFIDENT = 0.5  # minimum score of detections that must have valid boxes and labels
+LARGEST_UNIT = 2.0  # boxes in 0..1 may slightly exceed the image; boxes in px are never all within 2 px of its corner
+END_TO_END_COLUMNS = 6  # x1 y1 x2 y2, score, label
 YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows
 
 
@@ -31,6 +38,18 @@ class OutputLayout(Enum):
     ssd_tensorflow = "ssd_tensorflow"  # boxes (K, 4) y1 x1 y2 x2 in 0..1; scores and labels, or class scores
     ssd_torchvision = "ssd_torchvision"  # boxes (K, 4) x1 y1 x2 y2 in px; scores and labels, or class scores
     ssd_unit = "ssd_unit"  # boxes (K, 4) x1 y1 x2 y2 in 0..1; scores and labels, or class scores
+    end_to_end = "end_to_end"  # (K, 6): x1 y1 x2 y2 in px or 0..1, score, label from 0 (YOLOv10, YOLO26)
+    auto = "auto"  # end_to_end, RF-DETR, torchvision or Detectron2 if the outputs are theirs, otherwise yolox
+
+
+# numbering of published networks; other networks with ssd_unit count from 0 or from 1, with or without gaps
+PUBLISHED_IDS: Mapping[OutputLayout, CategoryIds | None] = {
+    OutputLayout.ssd_tensorflow: CategoryIds.COCO_91,
+    OutputLayout.ssd_torchvision: CategoryIds.COCO_91,
+    OutputLayout.ssd_unit: None,
+    OutputLayout.end_to_end: CategoryIds.FROM_ZERO,
+}
+END_TO_END_FORMAT = ImageFormat(Placement.center, bgr=False, black=0.0, white=1.0)  # as in Ultralytics' exports
 
 
 @dataclass(frozen=True)
@@ -62,29 +81,96 @@ class Candidates:
         return chosen[kept].astype(np.int32)
 
 
-def decode(layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int) -> Candidates:
+def decode(
+    layout: OutputLayout,
+    outputs: Mapping[str, Float32],
+    shape: tuple[int, int],
+    classes: int,
+    ids: Sequence[int] | None = None,
+) -> Candidates:
     """Decode the outputs of a network to candidate boxes.
 
     Args:
-        layout: The output format of the network.
+        layout: The output format of the network, except auto.
         outputs: The output arrays by name.
         shape: The size of the input (height, width), px.
         classes: The number of classes.
+        ids: The label of each class in label outputs; None = 1 to `classes`, or 0 to `classes` - 1 for end_to_end.
 
     Raises:
         DataError: The outputs do not have this layout.
     """
-    if layout not in (OutputLayout.yolox, OutputLayout.yolo, OutputLayout.yolo_objectness):
-        return _decode_ssd(layout, outputs, shape, classes)
+    if layout in (OutputLayout.ssd_tensorflow, OutputLayout.ssd_torchvision, OutputLayout.ssd_unit):
+        return _decode_ssd(layout, outputs, shape, range(1, classes + 1) if ids is None else ids)
     if len(outputs) != 1:
         raise DataError(f"detector.layout: expected one output, got {described(outputs)}; choose another layout")
     (output,) = outputs.values()
+    if layout is OutputLayout.end_to_end:
+        rows = _rows(output, END_TO_END_COLUMNS, "")
+        class_scores = class_scores_of_labels(rows[:, 4], rows[:, 5], range(classes) if ids is None else ids)
+        unit = 0 < np.abs(rows[:, :4]).max(initial=0) <= LARGEST_UNIT
+        boxes = rows[:, :4] * np.array([shape[1], shape[0]] * 2, np.float32) if unit else rows[:, :4]
+        return Candidates(boxes, spread_evenly(class_scores))
     if layout is OutputLayout.yolo:
         rows = _rows(output, 4 + classes, "yolo_objectness")
         return _checked(corners(rows[:, :4]), rows[:, 4:])
     rows = _rows(output, 5 + classes, "yolo" if layout is OutputLayout.yolo_objectness else "")
     boxes = rows[:, :4] if layout is OutputLayout.yolo_objectness else _yolox_boxes(rows, shape)
     return _checked(corners(boxes), rows[:, 4:5] * rows[:, 5:])
+
+
+def recognize_table(outputs: Mapping[str, Float32], shape: tuple[int, int]) -> OutputLayout:
+    """Return the layout of a network from its outputs for a black image.
+
+    Args:
+        outputs: The output arrays by name.
+        shape: The size of the input (height, width), px.
+
+    Raises:
+        DataError: The outputs are boxes, scores and labels of an unknown layout.
+    """
+    if len(outputs) > 1:
+        tensorflow = any("detection_boxes" in name for name in outputs)
+        fix = (
+            "ssd_tensorflow detector.placement=stretch detector.bgr=false"
+            if tensorflow
+            else "ssd_unit or ssd_torchvision"
+        )
+        raise DataError(
+            f"detector.layout: expected one output, or outputs of RF-DETR, torchvision or Detectron2, got "
+            f"{described(outputs)}; set detector.layout={fix}"
+        )
+    (output,) = outputs.values()
+    table = output[0] if output.ndim == 3 and output.shape[0] == 1 else output
+    cells = sum((shape[0] // stride) * (shape[1] // stride) for stride in YOLOX_STRIDES)
+    if table.ndim != 2 or table.shape[1] != END_TO_END_COLUMNS or len(table) == cells:
+        return OutputLayout.yolox
+    scores, labels = table[:, 4], table[:, 5]
+    are_detections = ((scores >= 0) & (scores <= 1) & (labels == np.rint(labels)) & (labels >= 0)).all()
+    return OutputLayout.end_to_end if are_detections else OutputLayout.yolox
+
+
+def label_numbers(
+    layout: OutputLayout, outputs: Mapping[str, Float32], labels: Sequence[str], ids: CategoryIds
+) -> list[int] | None:
+    """Return the label of each class in the label output of a network, or None for a network with class scores.
+
+    Args:
+        layout: The layout, except auto.
+        outputs: The output arrays by name.
+        labels: The class names.
+        ids: The numbering; AUTO = that of published networks.
+
+    Raises:
+        ConfigError: The numbering is ambiguous, or does not match the labels.
+    """
+    has_labels = layout is OutputLayout.end_to_end or (
+        layout in PUBLISHED_IDS and not _by_class(_tables(outputs), len(labels))
+    )
+    if has_labels:
+        return label_ids(ids, labels, PUBLISHED_IDS[layout])
+    require(ids is CategoryIds.AUTO, "detector.category_ids", ids.name, "AUTO for a network without labels")
+    return None
 
 
 def _checked(boxes: Float32, class_scores: Float32) -> Candidates:
@@ -156,27 +242,27 @@ def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
 
 
 def _decode_ssd(
-    layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int
+    layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], ids: Sequence[int]
 ) -> Candidates:
     """Decode the outputs of an SSD.
 
     The outputs are identified by name. TensorFlow's object detection API uses detection_boxes, detection_classes,
     detection_scores and detection_multiclass_scores. torchvision uses boxes, labels and scores.
     """
-    # "raw" outputs are the candidates before TensorFlow's non-maximum suppression
-    tables = {name: array for name, array in outputs.items() if "raw" not in name and "num" not in name}
-    boxes = [array for name, array in tables.items() if "box" in name and array.shape[-1] == 4 and array.ndim in (2, 3)]
+    classes = len(ids)
+    tables = _tables(outputs)
+    boxes = [array for name, array in tables.items() if "box" in name and array.shape[1:] == (4,)]
     if len(boxes) == 1:
-        if boxes[0].ndim == 3:
-            tables = {name: array[0] for name, array in tables.items() if array.ndim > 1}
-        # label 0 and the first of C + 1 class scores are the background
-        by_class = [t for name, t in tables.items() if "score" in name and t.shape[1:] in ((classes,), (classes + 1,))]
+        by_class = _by_class(tables, classes)
         scores = [t for name, t in tables.items() if "score" in name and t.ndim == 1]
         labels = [t for name, t in tables.items() if ("label" in name or "class" in name) and t.ndim == 1]
         if len(by_class) == 1:
-            return _checked(_ssd_boxes(layout, boxes[0], shape), by_class[0][:, -classes:])
+            columns = _columns(by_class[0].shape[1], classes)
+            return _checked(_ssd_boxes(layout, boxes[0], shape), by_class[0][:, columns])
         if not by_class and len(scores) == len(labels) == 1:
-            return _checked(_ssd_boxes(layout, boxes[0], shape), _spread(scores[0], labels[0], classes))
+            return _checked(
+                _ssd_boxes(layout, boxes[0], shape), spread_evenly(class_scores_of_labels(scores[0], labels[0], ids))
+            )
     raise DataError(
         f"detector.layout: expected boxes (K, 4) with scores (K, {classes}) or (K, {classes + 1}), or boxes (K, 4) "
         f"with scores (K,) and labels (K,), for {layout.value}, got {described(outputs)}; choose another layout"
@@ -192,24 +278,71 @@ def _ssd_boxes(layout: OutputLayout, boxes: Float32, shape: tuple[int, int]) -> 
     return boxes
 
 
-def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
-    """Return class scores (K, C) for boxes with one score and one label each.
+def _tables(outputs: Mapping[str, Float32]) -> dict[str, Float32]:
+    """Return the outputs of an SSD without a leading axis of length 1 and without additional outputs."""
+    # "raw" outputs are the candidates before TensorFlow's non-maximum suppression
+    tables = {name: array for name, array in outputs.items() if "raw" not in name and "num" not in name}
+    if any("box" in name and array.ndim == 3 for name, array in tables.items()):
+        return {name: array[0] for name, array in tables.items() if array.ndim > 1}
+    return tables
 
-    The remainder 1 - score is distributed evenly over the other classes, but each gets at most the score. Label 0 is
-    the background, and label k is class k - 1. Background and padding (score 0) get 0 for all classes.
+
+def _by_class(tables: Mapping[str, Float32], classes: int) -> list[Float32]:
+    """Return the tables of class scores of an SSD."""
+    # the first of C + 1 class scores is the background; COCO's ids have 90 or, with the background, 91 columns
+    widths = {classes, classes + 1} | ({len(COCO_BY_ID) - 1, len(COCO_BY_ID)} if classes == len(COCO) else set())
+    return [t for name, t in tables.items() if "score" in name and t.ndim == 2 and t.shape[1] in widths]
+
+
+def _columns(width: int, classes: int) -> list[int]:
+    """Return the column of each class in a table of class scores."""
+    if width <= classes + 1:
+        return list(range(width - classes, width))
+    return [k - (len(COCO_BY_ID) - width) for k, name in enumerate(COCO_BY_ID) if name != NO_CLASS]
+
+
+def class_scores_of_labels(scores: Float32, labels: Float32, ids: Sequence[int]) -> Float32:
+    """Return class scores (K, C) that contain the score of each box at its label, and 0 elsewhere.
+
+    Padding (score 0) gets 0 for all classes, and the background (label 0), unless 0 is the label of a class.
+
+    Args:
+        scores: The scores (K,).
+        labels: The labels (K,).
+        ids: The label of each class.
+
+    Raises:
+        DataError: A label is unknown, or a score is not in [0, 1].
     """
-    column = np.rint(labels).astype(np.int64) - 1
-    used = (column != -1) & (scores > 0)
-    if (beyond := column[used & ((column < 0) | (column >= classes))]).size:
+    column = {k: c for c, k in enumerate(ids)}
+    numbers = np.rint(labels).astype(np.int64)
+    is_background = (numbers == 0) & (0 not in column)
+    used = (scores > 0) & ~is_background
+    unknown = [k for k in numbers[used].tolist() if k not in column]
+    has_gaps = max(column) > len(column)
+    # published networks with COCO's ids report no background
+    unknown += [0] * bool(has_gaps and (scores[is_background] >= CONFIDENT).any())
+    if unknown:
+        fix = f", or detector.category_ids={'FROM_ONE' if min(unknown) else 'FROM_ZERO'} if labels have no gaps"
         raise DataError(
-            f"detector.label_space: expected labels 1 to {classes}, got {beyond.max() + 1}; set another label_space"
+            f"detector.category_ids: expected labels {min(column)} to {max(column)} of {len(ids)} classes, got "
+            f"{unknown[0]}; set another detector.label_space{fix if has_gaps else ''}"
         )
     check_scores(scores)
-    own = scores[used]
-    rows = np.zeros((len(scores), classes), np.float32)
-    rows[used] = np.minimum((1 - own) / max(classes - 1, 1), own)[:, None]
-    rows[np.flatnonzero(used), column[used]] = own
+    rows = np.zeros((len(scores), len(ids)), np.float32)
+    rows[np.flatnonzero(used), [column[k] for k in numbers[used].tolist()]] = scores[used]
     return rows
+
+
+def spread_evenly(class_scores: Float32) -> Float32:
+    """Distribute the remainder 1 - score of each box evenly over the other classes, but at most the score each.
+
+    Args:
+        class_scores: The scores (K, C), at most one per row above 0. Rows of zeros are not changed.
+    """
+    own = class_scores.max(axis=1, initial=0.0)[:, None]
+    rest = np.minimum((1 - own) / max(class_scores.shape[1] - 1, 1), own)
+    return np.asarray(np.where(class_scores > 0, class_scores, rest), np.float32)
 
 
 def spread_rest(one_hot: Float32, scores: Float32, spread: float) -> Float32:

@@ -13,7 +13,7 @@ from framework.data import Detections, Frame
 from framework.detection.stored.cache import fields_read, identity_of
 from framework.detection.stored.fingerprint import fingerprint
 from framework.errors import ConfigError
-from framework.interfaces import Detector
+from framework.interfaces import Detector, RGBDSequence
 
 
 @dataclass
@@ -30,6 +30,9 @@ class DetectorOfMap(Detector):
 
     def fingerprint(self) -> str:
         return f"{fingerprint(self)} {identity_of(self.detector)}"
+
+    def check_sequence(self, sequence: RGBDSequence) -> None:
+        self.detector.check_sequence(sequence)
 
     def detect(self, frame: Frame) -> Detections:
         found = self.detector.detect(frame)

@@ -11,16 +11,16 @@ from enum import Enum
 
 import numpy as np
 
-from framework.data import Float32
-from framework.detection.candidates import Candidates, check_scores, corners, described
+from framework.data import Bool, Float32, Int32
+from framework.detection.candidates import CONFIDENT, LARGEST_UNIT, Candidates, check_scores, corners, described
+from framework.detection.masks.binary_masks import masks_from_prototypes
+from framework.detection.masks.letterbox import Letterbox
 from framework.detection.runtimes.onnx_network import ExportMetadata, Outputs
 from framework.errors import DataError
 
 MIN_ORDERED_CORNERS = 0.9  # minimum fraction of boxes with x2 >= x1 and y2 >= y1, if boxes are corners
 MAX_ORDERED_CENTERS = 0.5  # maximum fraction of such boxes, if boxes are centers and sizes; typically a few percent
 MIN_ROWS = 20  # minimum number of detections to evaluate these fractions
-LARGEST_UNIT = 2.0  # boxes in 0..1 may slightly exceed the image; boxes in px are never all within 2 px of its corner
-CONFIDENT = 0.5  # minimum score of the detections that must have x1 <= x2 and y1 <= y2
 STRIDES = (8, 16, 32, 64)  # px per cell in the YOLO family, the last only in large networks
 BOXES_PER_CELL = (1, 3)  # 3 up to YOLOv7
 SCORE, LABEL, COEFFICIENTS = 4, 5, 6  # columns of a table with suppression, after x1 y1 x2 y2
@@ -41,6 +41,20 @@ class SegmentationOutput:
     candidates: Candidates
     coefficients: Float32  # (K, M)
     prototypes: Float32  # (M, h, w)
+
+    def masks(
+        self, chosen: Int32, borders: Float32, letterbox: Letterbox, shape: tuple[int, int], threshold: float
+    ) -> Bool:
+        """Return the masks (N, H, W) of the chosen candidates.
+
+        Args:
+            chosen: The indices (N,) of the candidates.
+            borders: The boxes (N, 4) x1 y1 x2 y2 of the chosen candidates in the image, px.
+            letterbox: The placement of the image in the input of the network.
+            shape: The image size (height, width), px.
+            threshold: The minimum probability of a pixel in the mask.
+        """
+        return masks_from_prototypes(self.coefficients[chosen], self.prototypes, borders, letterbox, shape, threshold)
 
 
 @dataclass(frozen=True)
@@ -167,7 +181,9 @@ def _table_and_prototypes(outputs: Outputs) -> tuple[Float32, Float32]:
     if len(outputs) != 2 or len(tables) != 1 or len(maps) != 1:
         raise DataError(
             "detector.weights: expected two outputs, a table (1, 4 + classes + M, K), or (1, K, 6 + M) with "
-            f"suppression, and prototypes (1, M, h, w), got {described(outputs)}"
+            f"suppression, and prototypes (1, M, h, w), or boxes, classes and masks of RF-DETR, torchvision or "
+            f"Detectron2, got {described(outputs)}; use detector=rf_detr_seg or detector=transformers_segmentation for "
+            "models on huggingface.co"
         )
     return tables[0], maps[0]
 

@@ -1,19 +1,30 @@
-"""Box detectors (YOLO, SSD) in ONNX files, with masks from depth."""
+"""Box detectors (YOLO, SSD, RF-DETR, Faster R-CNN) in ONNX files, with masks from depth."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from framework.config.validation import MAX_DETECTIONS, check_count, check_intervals
 from framework.data import Bool, Detections, Frame
-from framework.detection.candidates import OutputLayout, decode
+from framework.detection.candidates import (
+    END_TO_END_FORMAT,
+    Candidates,
+    OutputLayout,
+    decode,
+    label_numbers,
+    recognize_table,
+)
+from framework.detection.instance_output import recognize_instances
 from framework.detection.masks.binary_masks import without_duplicates
-from framework.detection.masks.letterbox import Placement
+from framework.detection.masks.letterbox import ImageFormatChoice, Placement
 from framework.detection.masks.masks_from_boxes import masks_in_boxes
-from framework.detection.runtimes.onnx_network import ImageNetwork
+from framework.detection.runtimes.onnx_network import ImageNetwork, Outputs
 from framework.interfaces import Detector
+from framework.vocabulary.category_ids import CategoryIds
 from framework.vocabulary.label_spaces import ClassNames, read_labels, to_class_names
 
 log = logging.getLogger(__name__)
@@ -23,12 +34,12 @@ SOURCE = "yolox_nano.onnx (3.7 MB, COCO, Apache-2.0) is at https://github.com/Me
 
 @dataclass
 class OnnxBoxes(Detector):
-    """YOLO or SSD in an ONNX file, with masks from depth; needs the extra `onnx`.
+    """Box detector in an ONNX file, with masks from depth; needs the extra `onnx`.
 
     Each class score of a detection is multiplied by its objectness. The class distribution consists of the normalized
     products, and the score of the detection is the largest product. The mask is the connected foreground in the box;
     see `framework.detection.masks.masks_from_boxes`. Boxes with too few depth readings are dropped and counted in
-    `boxes_without_depth`. The defaults are for YOLOX.
+    `boxes_without_depth`. The defaults are for YOLOX, and for networks that are recognized from their outputs.
     """
 
     weights: Path = field(metadata={"source": SOURCE})  # ONNX file, relative to the working or project folder
@@ -37,12 +48,18 @@ class OnnxBoxes(Detector):
     label_space: str = "coco"
     # class names: COCO, OWN (those of the label space) or AUTO (COCO for names of known label spaces, otherwise OWN)
     class_names: ClassNames = ClassNames.AUTO
-    layout: OutputLayout = OutputLayout.yolox  # layout of the outputs
+    # numbering of the classes in label outputs: AUTO (that of published networks), COCO_91 (1 to 90, with gaps),
+    # FROM_ONE or FROM_ZERO
+    category_ids: CategoryIds = CategoryIds.AUTO
+    layout: OutputLayout = OutputLayout.auto  # layout of the outputs
     # minimum score of a detection, in (0, 1); low, because low-score detections can update existing instances
     score_threshold: float = 0.1
     nms_iou: float = 0.45  # box IoU threshold of non-maximum suppression within a class, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
+    # image format: AUTO (that of the network if recognized with layout=auto, otherwise CUSTOM) or CUSTOM (placement,
+    # padding, bgr, black_level and white_level)
+    preprocessing: ImageFormatChoice = ImageFormatChoice.AUTO
     input_size: int = 0  # side of the square input, px, for networks with variable input size; 0 = size in the file
     placement: Placement = Placement.top_left  # position of the image in the input
     padding: int = 114  # gray value of the padding, in [0, 255]
@@ -67,11 +84,11 @@ class OnnxBoxes(Detector):
         self.classes = self._meaning.classes
         self.boxes_without_depth = 0  # number of boxes dropped since construction
         self._network = ImageNetwork(self)
-        decode(self.layout, self._network.outputs_for_black(), self._network.shape, len(self._labels))
+        self._decode = self._decoder()
 
     def detect(self, frame: Frame) -> Detections:
         outputs, letterbox = self._network(frame.color)
-        candidates = decode(self.layout, outputs, self._network.shape, len(self._labels))
+        candidates = self._decode(outputs)
         best = candidates.best(self.score_threshold, self.nms_iou, self.max_detections)
         class_probabilities, known = self._meaning.apply(candidates.class_scores[best])
         best, class_probabilities = best[known], class_probabilities[known]
@@ -88,6 +105,29 @@ class OnnxBoxes(Detector):
             self._report_dropped(frame, found)
         scores = candidates.class_scores[best].max(axis=1).clip(0, 1)
         return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms_iou)
+
+    def _decoder(self) -> Callable[[Outputs], Candidates]:
+        """Return the decoder of the outputs, and set the image format of a recognized network.
+
+        Raises:
+            DataError: The outputs do not have the layout.
+            ConfigError: The numbering of the classes is ambiguous.
+        """
+        network = self._network
+        outputs = network.outputs_for_black()
+        layout = self.layout
+        if layout is OutputLayout.auto:
+            instances = recognize_instances(outputs, network.integers, network.shape, self._labels, self.category_ids)
+            if instances is not None:
+                network.format = instances.image_format(self.preprocessing, network.format)
+                return instances.candidates_of_boxes
+            layout = recognize_table(outputs, network.shape)
+            if layout is OutputLayout.end_to_end and self.preprocessing is ImageFormatChoice.AUTO:
+                network.format = END_TO_END_FORMAT
+        ids = label_numbers(layout, outputs, self._labels, self.category_ids)
+        decoder = partial(decode, layout, shape=network.shape, classes=len(self._labels), ids=ids)
+        decoder(outputs)
+        return decoder
 
     def _report_dropped(self, frame: Frame, found: Bool) -> None:
         """Count and log dropped boxes."""

@@ -1,4 +1,4 @@
-"""Instance segmentation networks of the YOLO family in ONNX files."""
+"""Instance segmentation networks in ONNX files: the YOLO family, RF-DETR, torchvision and Detectron2."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
-from framework.config.validation import MAX_DETECTIONS, check_count, check_intervals
+from framework.config.validation import MAX_DETECTIONS, check_count, check_intervals, require
 from framework.data import Detections, Frame
 from framework.detection.candidates import spread_rest
-from framework.detection.masks.binary_masks import masks_from_prototypes, without_duplicates
-from framework.detection.masks.letterbox import Placement
+from framework.detection.instance_output import InstanceLayout, recognize_instances
+from framework.detection.masks.binary_masks import without_duplicates
+from framework.detection.masks.letterbox import ImageFormatChoice, Placement
 from framework.detection.runtimes.onnx_network import ImageNetwork
-from framework.detection.segmentation_output import BoxKind, detect_layout
+from framework.detection.segmentation_output import BoxKind, SegmentationLayout, detect_layout
 from framework.interfaces import Detector
+from framework.vocabulary.category_ids import CategoryIds
 from framework.vocabulary.label_spaces import ClassNames, read_labels, to_class_names
 
 log = logging.getLogger(__name__)
@@ -21,13 +23,14 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class OnnxSegmentation(Detector):
-    """YOLO-style instance segmentation with mask coefficients and prototypes; needs the extra `onnx`.
+    """Instance segmentation networks as their authors export them; needs the extra `onnx`.
 
-    The network has K candidates with a box, C class scores and M mask coefficients each. Its outputs have the shapes
+    A YOLO network has K candidates with a box, C class scores and M mask coefficients each. Its outputs have the shapes
     (1, 4 + C + M, K), or transposed, and (1, M, h, w) or (1, h, w, M). If the network includes non-maximum suppression,
     the first output is (1, K, 6 + M) with x1, y1, x2, y2, score and label. Boxes are in px of the input or in [0, 1].
-    The layout is detected automatically; see `framework.detection.segmentation_output`. The detector raises DataError
-    if the layout is ambiguous.
+    RF-DETR, torchvision's Mask R-CNN and Detectron2's networks have separate outputs for boxes, classes and masks. The
+    layout is detected automatically; see `framework.detection.segmentation_output` and
+    `framework.detection.instance_output`. The detector raises an error if the layout is ambiguous.
 
     The class distribution of a detection is its normalized class scores, and its score is the largest class score. If
     the network reports only one class, the other classes share `class_spread` * (1 - score) equally. Uncertain
@@ -41,6 +44,9 @@ class OnnxSegmentation(Detector):
     label_space: str = "coco"
     # class names: COCO, OWN (those of the label space) or AUTO (COCO for names of known label spaces, otherwise OWN)
     class_names: ClassNames = ClassNames.AUTO
+    # numbering of the classes in the outputs: AUTO (that of published networks), COCO_91 (1 to 90, with gaps), FROM_ONE
+    # or FROM_ZERO
+    category_ids: CategoryIds = CategoryIds.AUTO
     objectness: bool = False  # True = an objectness score precedes the class scores in the outputs, as in YOLOv5
     box_format: BoxKind = BoxKind.AUTO  # box format: CENTER, CORNER or AUTO (detected)
     # fraction of (1 - score) distributed over the other classes, for networks that report one class, in [0, 1]; 0 =
@@ -52,6 +58,9 @@ class OnnxSegmentation(Detector):
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
     mask_threshold: float = 0.5  # minimum mask probability of a pixel in the mask, in (0, 1)
+    # image format: AUTO (that of RF-DETR, torchvision or Detectron2 if recognized, otherwise CUSTOM) or CUSTOM
+    # (placement, padding, bgr, black_level and white_level)
+    preprocessing: ImageFormatChoice = ImageFormatChoice.AUTO
     input_size: int = 0  # side of the square input, px, for networks with variable input size; 0 = size in the file
     placement: Placement = Placement.center  # position of the image in the input
     padding: int = 114  # gray value of the padding, in [0, 255]
@@ -69,15 +78,7 @@ class OnnxSegmentation(Detector):
         self._meaning = to_class_names(self._labels, self.class_names)
         self.classes = self._meaning.classes
         self._network = ImageNetwork(self)
-        self._layout = detect_layout(
-            self._network.outputs_for_black(),
-            classes=len(self._labels),
-            objectness=self.objectness,
-            boxes=self.box_format,
-            shape=self._network.shape,
-            input_channels_last=self._network.channels_last,
-            metadata=self._network.metadata,
-        )
+        self._layout = self._detect_layout()
         self._log_classes()
 
     def detect(self, frame: Frame) -> Detections:
@@ -90,15 +91,35 @@ class OnnxSegmentation(Detector):
         scores = candidates.class_scores[best].max(axis=1).clip(0, 1)
         if self._layout.suppressed:
             class_probabilities = spread_rest(class_probabilities, scores, self.class_spread)
-        masks = masks_from_prototypes(
-            output.coefficients[best],
-            output.prototypes,
-            letterbox.to_image(candidates.boxes[best]),
-            letterbox,
-            frame.camera.shape,
-            self.mask_threshold,
-        )
+        borders = letterbox.to_image(candidates.boxes[best])
+        masks = output.masks(best, borders, letterbox, frame.camera.shape, self.mask_threshold)
         return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms_iou)
+
+    def _detect_layout(self) -> SegmentationLayout | InstanceLayout:
+        """Detect the layout of the network, and set the image format of a recognized network."""
+        network = self._network
+        outputs = network.outputs_for_black()
+        instances = recognize_instances(
+            outputs, network.integers, network.shape, self._labels, self.category_ids, self.box_format
+        )
+        if instances is not None:
+            instances.require_masks(outputs)
+            network.format = instances.image_format(self.preprocessing, network.format)
+            instances.read(outputs)  # raises DataError for another layout
+            return instances
+        require(
+            self.category_ids in (CategoryIds.AUTO, CategoryIds.FROM_ZERO),
+            "detector.category_ids", self.category_ids.name, "AUTO or FROM_ZERO for a network of the YOLO family",
+        )  # fmt: skip
+        return detect_layout(
+            outputs,
+            classes=len(self._labels),
+            objectness=self.objectness,
+            boxes=self.box_format,
+            shape=network.shape,
+            input_channels_last=network.channels_last,
+            metadata=network.metadata,
+        )
 
     def _log_classes(self) -> None:
         """Log if the network reports one class per detection, or if its class names differ from `label_space`."""

@@ -15,12 +15,15 @@ from framework.config.validation import check_bounds
 from framework.data import Bool, Detections, Float32, Frame
 from framework.detection.candidates import spread_rest
 from framework.detection.masks.binary_masks import tight_boxes
-from framework.detection.stored.coco_results import CategoryIds, read_results
+from framework.detection.stored.coco_results import read_results
 from framework.detection.stored.fingerprint import fingerprint
+from framework.detection.stored.frame_matching import ImageIds, ImageIndex, check_matches
+from framework.detection.stored.image_names import ImageId, ImageName, shown
 from framework.detection.stored.mask_folder import read_mask_folder
 from framework.detection.stored.stored_detection import StoredDetection
 from framework.errors import ConfigError, DataError
-from framework.interfaces import Detector
+from framework.interfaces import Detector, RGBDSequence
+from framework.vocabulary.category_ids import CategoryIds
 from framework.vocabulary.label_spaces import ClassNames, read_labels, to_class_names
 
 log = logging.getLogger(__name__)
@@ -30,33 +33,37 @@ FRAMES_IN_DOUBT = 30  # number of initial frames without an entry after which a 
 
 @dataclass
 class Precomputed(Detector):
-    """Detections from a COCO results file or a mask folder, by frame number.
+    """Detections from a COCO results file or a mask folder, by file name or frame index.
 
     COCO results files are written by `instancemap detect` and by other programs. A mask folder contains two files for
-    each frame NNNNNN. NNNNNN.png is an image of 16-bit instance ids, and NNNNNN.json is a list of {"id", "class",
-    "score"}.
+    each frame, such as 000012.png and 000012.json. The first is an image of 16-bit instance ids, and the second is a
+    list of {"id", "class", "score"}.
+
+    A file name belongs to the frame whose color image has the same name. Folders, the file type and zeros before the
+    number are ignored. A whole number is the index of the frame; see `image_ids`.
 
     Both formats may contain `class_probabilities` over the names in `label_space`. Without them, a detection with the
     score s gets the probability 1 - class_spread * (1 - s) for its class. The minimum is 1 / (number of classes). The
     other classes share the rest equally. Detections whose best label has no class name are dropped; see `class_names`.
 
-    A frame without an entry has no detections. If a frame after the last entry is requested before any frame with an
-    entry, the detector raises DataError, because the file belongs to another sequence.
+    A frame without an entry has no detections. If no entry belongs to a frame of the sequence, the detector raises
+    DataError, because the file belongs to another sequence.
     """
 
-    # COCO results file (e.g. from `instancemap detect`), or folder with NNNNNN.png and NNNNNN.json
+    # COCO results file (e.g. from `instancemap detect`), or mask folder with 000000.png, 000000.json, ...
     path: Path
     # class names: a label space (coco, nyu40, scenenn, ...), or a text file with one name per line
     label_space: str = "coco"
     # class names: COCO, OWN (those of the label space) or AUTO (COCO for names of known label spaces, otherwise OWN)
     class_names: ClassNames = ClassNames.AUTO
-    category_ids: CategoryIds = CategoryIds.COCO_91  # numbering of category_id
+    category_ids: CategoryIds = CategoryIds.AUTO  # numbering of category_id
+    image_ids: ImageIds = ImageIds.AUTO  # meaning of whole numbers as image ids
     score_threshold: float = 0.0  # minimum score of a detection, in [0, 1]
     # fraction of (1 - score) distributed over the other classes, for detections with one class, in [0, 1]; 0 = certain
     # label
     class_spread: float = 1.0
 
-    reads = ("index", "camera")
+    reads = ("index", "camera", "image_name")
 
     def __post_init__(self) -> None:
         check_bounds(self, score_threshold=(0.0, 1.0), class_spread=(0.0, 1.0))
@@ -81,13 +88,13 @@ class Precomputed(Detector):
             lost = sorted({one.label for one, is_known in zip(stored, known, strict=True) if not is_known})
             log.info("%s: %d of %d detections dropped because their classes have no COCO name: %s",
                      self.path, int((~known).sum()), len(stored), ", ".join(lost))  # fmt: skip
-        self._frames = {one.frame for one in stored}
-        self._of_frame: dict[int, list[tuple[StoredDetection, Float32]]] = defaultdict(list)
+        self._images = list(dict.fromkeys(one.image for one in stored))
+        self._index = ImageIndex(self._images, self.image_ids, self.path)
+        self._complete = all(one.probabilities is not None for one in stored)
+        self._of_image: dict[ImageId, list[tuple[StoredDetection, Float32]]] = defaultdict(list)
         for one, row, is_known in zip(stored, probabilities, known, strict=True):
             if is_known and one.score >= self.score_threshold:
-                self._of_frame[one.frame].append((one, row))
-        for of_frame in self._of_frame.values():
-            of_frame.sort(key=lambda pair: -pair[0].score)  # stable: equal scores keep the order of the file
+                self._of_image[one.image].append((one, row))
         self._matched = False
         self._requested: set[int] = set()
 
@@ -95,11 +102,20 @@ class Precomputed(Detector):
         """Return a hash that includes the labels, which may come from a file."""
         return hashlib.sha256(repr((fingerprint(self), self._labels)).encode()).hexdigest()
 
+    def check_sequence(self, sequence: RGBDSequence) -> None:
+        if frames := sequence.image_names():
+            # files of `instancemap detect` have distributions; their image ids are frame indices
+            check_matches(self.path, self._images, self.image_ids, frames, warns=not self._complete)
+            self._matched = True
+
     def detect(self, frame: Frame) -> Detections:
-        self._expect_a_match(frame.index)
-        stored = self._of_frame.get(frame.index)
+        name = ImageName.of(frame.image_name) if frame.image_name else None
+        images = self._index.of_frame(frame.index, name)
+        self._expect_a_match(frame, bool(images))
+        stored = [pair for image in images for pair in self._of_image.get(image, [])]
         if not stored:
             return Detections.none(frame.camera.shape, self.classes)
+        stored.sort(key=lambda pair: -pair[0].score)  # stable: equal scores keep the order of the file
         masks = np.stack([_mask(one, frame) for one, _ in stored])
         tight = tight_boxes(masks)
         return Detections(
@@ -130,18 +146,27 @@ class Precomputed(Detector):
         rows[only_label] = spread_rest(rows[only_label], scores[only_label], self.class_spread)
         return rows, known
 
-    def _expect_a_match(self, index: int) -> None:
-        if self._matched or index in self._frames:
+    def _expect_a_match(self, frame: Frame, found: bool) -> None:
+        """Raise DataError or log a warning if the frames requested so far have no detections."""
+        if self._matched or found:
             self._matched = True
             return
-        self._requested.add(index)
-        first, last = min(self._frames), max(self._frames)
-        has = f"{self.path} with detections for frames {first} to {last}"
-        if index > last:
+        self._requested.add(frame.index)
+        numbers = [one if isinstance(one, int) else one.number for one in self._images]
+        known = [number for number in numbers if number is not None]
+        if not known and not frame.image_name:
             raise DataError(
-                f"detector.path: expected detections of this sequence, got {has} and none for the frames "
-                f"requested so far, up to {index}; check that the file belongs to this sequence"
+                f"detector.path: expected frame numbers in {self.path}, got only file names (first: "
+                f"{shown(self._images[0])}), but frame {frame.index} has no file; use frame numbers as image ids"
             )
+        has = f"{self.path} with detections for {len(self._images)} images (first: {shown(self._images[0])})"
+        if len(known) == len(numbers) and not frame.image_name:
+            has = f"{self.path} with detections for frames {min(known)} to {max(known)}"
+            if frame.index > max(known):
+                raise DataError(
+                    f"detector.path: expected detections of this sequence, got {has} and none for the frames "
+                    f"requested so far, up to {frame.index}; check that the file belongs to this sequence"
+                )
         if len(self._requested) == FRAMES_IN_DOUBT:
             log.warning(
                 "detector.path: expected detections of this sequence, got %s and none for the first %d frames; "

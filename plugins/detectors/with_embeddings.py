@@ -11,7 +11,7 @@ from framework.data import Detections, Frame
 from framework.detection.hub.image_text import ImageTextModel, square_crops
 from framework.detection.stored.cache import fields_read, identity_of
 from framework.detection.stored.fingerprint import fingerprint
-from framework.interfaces import Detector
+from framework.interfaces import Detector, RGBDSequence
 
 
 @dataclass
@@ -52,6 +52,9 @@ class WithEmbeddings(Detector):
 
     def fingerprint(self) -> str:
         return f"{fingerprint(self)} {identity_of(self.detector)} {self._model.space}"
+
+    def check_sequence(self, sequence: RGBDSequence) -> None:
+        self.detector.check_sequence(sequence)
 
     def detect(self, frame: Frame) -> Detections:
         found = self.detector.detect(frame)

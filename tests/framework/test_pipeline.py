@@ -19,7 +19,7 @@ from tqdm import TMonitor
 
 from framework.data import Array, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
-from framework.interfaces import SceneMap, StageTimer, Viewer, untimed
+from framework.interfaces import RGBDSequence, SceneMap, StageTimer, Viewer, untimed
 from framework.pipeline import Pipeline
 from framework.registry import assemble
 from framework.runtime.run_log import RunResult
@@ -102,6 +102,16 @@ def test_pipeline_map_is_independent_of_prefetch(room: CornerRoom) -> None:
     for mesh in meshes[1:]:
         for name in ("vertices", "triangles", "colors", "instance_ids"):
             np.testing.assert_array_equal(getattr(mesh, name), getattr(meshes[0], name))
+
+
+class _OfOtherSequence(SphereDetector):
+    def check_sequence(self, sequence: RGBDSequence) -> None:
+        raise DataError(f"{len(sequence)} frames of another sequence")
+
+
+def test_pipeline_detector_rejects_sequence_before_first_frame(room: CornerRoom) -> None:
+    with pytest.raises(DataError, match=f"{len(room)} frames of another sequence"):
+        pipeline(detector=_OfOtherSequence()).run(room)
 
 
 def test_pipeline_keeps_sequence_frame_indices() -> None:

@@ -116,6 +116,7 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
     from framework.tables.detection_table import detection_metrics
 
     warn_outside_domain(detector, sequence)
+    detector.check_sequence(sequence)
     errors = DetectionErrors()
     with results_file(path, detector.classes) as results:
         precision = detection_ap(_written(results, detector, sequence, errors), detector.classes, MIN_PIXELS)

@@ -75,6 +75,7 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
     from framework.detection.domain import warn_outside_domain
 
     warn_outside_domain(detector, sequence)
+    detector.check_sequence(sequence)
     if position is not None:
         if isinstance(position, bool) or not isinstance(position, int) or not 0 <= position < len(sequence):
             raise ConfigError(

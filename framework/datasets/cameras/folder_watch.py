@@ -107,7 +107,8 @@ def _read(
         raise FrameError(images)
     color = calibration.color(images.color(), images.color_name)
     depth = calibration.depth(images.depth(), images.depth_name)
-    return Frame(number, timestamp, color, depth, calibration.camera, sensor=sensor)
+    name = images.image_name
+    return Frame(number, timestamp, color, depth, calibration.camera, sensor=sensor, image_name=name)
 
 
 class Arrivals:

@@ -6,7 +6,7 @@ import logging
 import math
 import zlib
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
@@ -70,6 +70,11 @@ class StoredImages:
     def of_files(cls, color: Path, depth: Path) -> StoredImages:
         """Return the images in two JPEG or PNG files."""
         return cls(color, depth, partial(read_color, color), partial(read_uint16, depth))
+
+    @property
+    def image_name(self) -> str:
+        """File name of the color image, "" for an image without a file of its own."""
+        return self.color_name.name if isinstance(self.color_name, Path) else ""
 
 
 @dataclass(frozen=True)
@@ -254,7 +259,11 @@ class Recording(RGBDSequence):
             depth_timestamp=recorded.depth_timestamp,
             sensor=self.sensor_kind,
             T_odom_camera=None if self.odometry is None else self.odometry.at(recorded.depth_time),
+            image_name=recorded.images.image_name,
         )
+
+    def image_names(self) -> Mapping[int, str]:
+        return {k: recorded.images.image_name for k, recorded in enumerate(self.contents.frames)}
 
     def metric_depth(self, index: int) -> Float32:
         """Return the depth (H, W), m, of a frame, 0 = no reading.

@@ -48,6 +48,22 @@ def masks_from_prototypes(
     """
     count, rows, columns = prototypes.shape
     logits = (coefficients @ prototypes.reshape(count, -1)).reshape(len(coefficients), rows, columns)
+    return masks_from_grids(logits, borders, letterbox, shape, math.log(threshold / (1 - threshold)))
+
+
+def masks_from_grids(
+    grids: Float32, borders: Float32, letterbox: Letterbox, shape: tuple[int, int], threshold: float
+) -> Bool:
+    """Resample grids over the complete input of a network to the image, and return the masks (N, H, W).
+
+    Args:
+        grids: The logits or probabilities (N, h, w).
+        borders: The boxes (N, 4) x1 y1 x2 y2 in the image, px. Masks are limited to their boxes.
+        letterbox: The placement of the image in the input of the network.
+        shape: The image size (height, width), px.
+        threshold: The minimum value of a pixel in the mask.
+    """
+    rows, columns = grids.shape[1:]
     cells_y, cells_x = rows / letterbox.input_shape[0], columns / letterbox.input_shape[1]  # cells per px of the input
     # pixel u maps to cell ((u + 0.5) scale + left) cells - 0.5, because centers map to centers
     affine = np.array(
@@ -56,10 +72,9 @@ def masks_from_prototypes(
             [letterbox.scale_y * cells_y, (0.5 * letterbox.scale_y + letterbox.top) * cells_y - 0.5],
         ]
     )
-    masks = np.zeros((len(coefficients), *shape), np.bool_)
-    logit = np.float32(math.log(threshold / (1 - threshold)))
-    logits, borders = np.ascontiguousarray(logits, np.float32), np.ascontiguousarray(borders, np.float64)
-    sample_prototypes(logits, borders, affine, logit, masks)
+    masks = np.zeros((len(grids), *shape), np.bool_)
+    grids, borders = np.ascontiguousarray(grids, np.float32), np.ascontiguousarray(borders, np.float64)
+    sample_prototypes(grids, borders, affine, np.float32(threshold), masks)
     return masks
 
 

@@ -20,6 +20,13 @@ class Placement(Enum):
     stretch = "stretch"  # the image fills the input with a changed aspect ratio
 
 
+class ImageFormatChoice(Enum):
+    """Source of the image format that a network expects."""
+
+    AUTO = "format of the recognized network (RF-DETR, torchvision, Detectron2, YOLO26), otherwise CUSTOM"
+    CUSTOM = "placement, padding, bgr, black_level and white_level"
+
+
 @dataclass(frozen=True)
 class Letterbox:
     """Scale and offset between an image and the input of a network.
@@ -67,7 +74,22 @@ class Letterbox:
         return np.asarray((boxes - shift) / scale - 0.5, np.float32)
 
 
-def network_input(canvas: UInt8, dtype: str, bgr: bool, black: float, white: float) -> np.ndarray[Any, Any]:
+Level = float | tuple[float, float, float]
+"""Network input for one channel value, for all channels or for each channel in the order of the input."""
+
+
+@dataclass(frozen=True)
+class ImageFormat:
+    """Image format that a network expects."""
+
+    placement: Placement
+    bgr: bool  # channel order: True = BGR, False = RGB
+    black: Level  # network input for a channel value of 0
+    white: Level  # network input for a channel value of 255
+    padding: int = 114  # gray value of the padding
+
+
+def network_input(canvas: UInt8, dtype: str, bgr: bool, black: Level, white: Level) -> np.ndarray[Any, Any]:
     """Convert an RGB image to the data type, channel order and value range of a network.
 
     Args:
@@ -80,6 +102,6 @@ def network_input(canvas: UInt8, dtype: str, bgr: bool, black: float, white: flo
     image = canvas[..., ::-1] if bgr else canvas
     if dtype == "uint8":
         return image
-    values = image * np.float32((white - black) / 255)
-    values += np.float32(black)
+    values = image * np.asarray(np.subtract(white, black) / 255, np.float32)
+    values += np.asarray(black, np.float32)
     return values.astype(dtype, copy=False)

@@ -13,7 +13,7 @@ import numpy as np
 
 from framework.config.validation import LONGEST_SIDE, require
 from framework.data import Array, Float32, UInt8
-from framework.detection.masks.letterbox import Letterbox, Placement, network_input
+from framework.detection.masks.letterbox import ImageFormat, Letterbox, Placement, network_input
 from framework.errors import ConfigError, DataError, import_optional, in_one_line
 from framework.files.hashing import path_hash
 from framework.files.search_paths import candidates
@@ -36,7 +36,8 @@ class OnnxNetwork:
     Attributes:
         shape: The size of the input (height, width), px.
         dtype: The NumPy type of the input: float32, float16 or uint8.
-        channels_last: True = the input is (1, H, W, 3), False = (1, 3, H, W).
+        channels_last: True = the input is (1, H, W, 3), False = (1, 3, H, W) or (3, H, W).
+        integers: The names of the integer outputs.
     """
 
     def __init__(self, path: Path, sha256: str, device: str, input_size: int) -> None:
@@ -62,8 +63,10 @@ class OnnxNetwork:
             raise DataError(f"{self.path}: expected one of {wanted} as input, got {_described(image)}")
         self._name = image.name
         self.dtype = INPUT_DTYPES[image.type]
-        self.channels_last = shape[3] == 3 and shape[1] != 3  # (1, H, W, 3), as in TensorFlow networks
+        self._batched = len(shape) == 4  # networks of Detectron2 and torchvision have the input (3, H, W)
+        self.channels_last = shape[-1] == 3 and shape[-3] != 3  # (1, H, W, 3), as in TensorFlow networks
         self.shape = _input_shape(self.path, image, self.channels_last, input_size, self.metadata)
+        self.integers = frozenset(one.name for one in self._session.get_outputs() if "int" in one.type)
 
     def __call__(self, image: Array) -> Outputs:
         """Run the network on an image (H, W, 3) and return the float32 outputs by name.
@@ -71,7 +74,8 @@ class OnnxNetwork:
         Raises:
             DataError: The network fails, or its outputs are not finite.
         """
-        blob = image[None] if self.channels_last else image.transpose(2, 0, 1)[None]
+        blob = image if self.channels_last else image.transpose(2, 0, 1)
+        blob = blob[None] if self._batched else blob
         names = [output.name for output in self._session.get_outputs()]
         try:
             arrays = self._session.run(names, {self._name: np.ascontiguousarray(blob)})
@@ -101,7 +105,12 @@ class ImageNetworkParameters(Protocol):
 
 
 class ImageNetwork:
-    """An ONNX network with preprocessing for images of any size."""
+    """An ONNX network with preprocessing for images of any size.
+
+    Attributes:
+        shape: The size of the input (height, width), px.
+        format: The image format of the input, from the parameters; may be replaced.
+    """
 
     def __init__(self, detector: ImageNetworkParameters) -> None:
         """Load the network.
@@ -130,14 +139,16 @@ class ImageNetwork:
         self.shape = self._network.shape  # (height, width) px
         self.channels_last = self._network.channels_last  # the input is (1, H, W, 3)
         self.metadata = self._network.metadata
-        self._detector = detector
+        self.integers = self._network.integers
+        self.format = ImageFormat(detector.placement, detector.bgr, black, white, detector.padding)
 
     def __call__(self, color: UInt8) -> tuple[Outputs, Letterbox]:
         """Run the network on an RGB image (h, w, 3) and return the outputs by name and the letterbox."""
-        detector = self._detector
-        letterbox = Letterbox.fit(color.shape[:2], self.shape, detector.placement)
-        canvas, levels = letterbox.fill(color, detector.padding), (detector.black_level, detector.white_level)
-        return self._network(network_input(canvas, self._network.dtype, detector.bgr, *levels)), letterbox
+        wanted = self.format
+        letterbox = Letterbox.fit(color.shape[:2], self.shape, wanted.placement)
+        canvas = letterbox.fill(color, wanted.padding)
+        image = network_input(canvas, self._network.dtype, wanted.bgr, wanted.black, wanted.white)
+        return self._network(image), letterbox
 
     def outputs_for_black(self) -> Outputs:
         """Return the outputs for a black image, for example to check their shapes."""
@@ -174,11 +185,12 @@ def _loaded(path: Path, device: str) -> InferenceSession:
 def _image_input(path: Path, inputs: Sequence[NodeArg]) -> tuple[NodeArg, Shape]:
     """Return the single image input of a network and its shape."""
     found = ", ".join(map(_described, inputs))
-    wanted = "expected one image (1, 3, H, W) or (1, H, W, 3)"
+    wanted = "expected one image (1, 3, H, W), (3, H, W) or (1, H, W, 3)"
     if len(inputs) != 1:
         raise DataError(f"{path}: {wanted}, got {len(inputs)} inputs: {found}")
     shape = _shape(inputs[0])
-    if len(shape) != 4 or shape[0] > 1 or 3 not in (shape[1], shape[3]):
+    one_image = shape[0] == 3 if len(shape) == 3 else len(shape) == 4 and shape[0] <= 1 and 3 in (shape[1], shape[3])
+    if not one_image:
         raise DataError(f"{path}: {wanted}, got {found}")
     return inputs[0], shape
 
@@ -188,7 +200,7 @@ def _input_shape(
 ) -> tuple[int, int]:
     """Return the size of the input (height, width), px."""
     shape, described = _shape(image), _described(image)
-    height, width = shape[1:3] if channels_last else shape[2:]
+    height, width = shape[1:3] if channels_last else shape[-2:]
     if height and width:
         if input_size and (height, width) != (input_size, input_size):
             raise ConfigError(
@@ -198,7 +210,8 @@ def _input_shape(
     open_height, open_width = (input_size, input_size) if input_size else metadata.image_size
     if not (open_height and open_width):
         raise ConfigError(
-            f"detector.input_size: expected a size in px, got 0 for {path} with dynamic input size ({described})"
+            f"detector.input_size: expected a size in px, got 0 for {path} with dynamic input size ({described}); set "
+            "detector.input_size=640, or the size of the training images"
         )
     return height or open_height, width or open_width
 

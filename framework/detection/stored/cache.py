@@ -24,7 +24,7 @@ from framework.detection.stored.fingerprint import fingerprint
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import atomic_write, path_exists, read_bytes
 from framework.files.hashing import add_array
-from framework.interfaces import Detector
+from framework.interfaces import Detector, RGBDSequence
 
 log = logging.getLogger(__name__)
 
@@ -99,6 +99,9 @@ class CachedDetector(Detector):
                     f"detection_cache_dir: expected a writable folder, got {self.entries} ({error.strerror}); choose "
                     "another folder"
                 ) from error
+
+    def check_sequence(self, sequence: RGBDSequence) -> None:
+        self.detector.check_sequence(sequence)
 
     def detect(self, frame: Frame) -> Detections:
         path = self.entries / (frame_hash(frame, self.reads) + SUFFIX)

@@ -9,14 +9,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from enum import Enum
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PureWindowsPath
 from typing import Any, TextIO
 
 import numpy as np
 
 from framework.data import MAX_PIXELS, Detections, Float32
 from framework.detection.masks.run_length import check, encode, pack
+from framework.detection.stored.image_names import ImageName, read_image_id
 from framework.detection.stored.stored_detection import (
     Polygons,
     RunLengths,
@@ -26,40 +26,17 @@ from framework.detection.stored.stored_detection import (
     read_probabilities,
     read_score,
 )
-from framework.errors import ConfigError, DataError, errors_of
+from framework.errors import DataError, errors_of
 from framework.files.atomic_write import atomic_write
 from framework.files.json_file import read_json
-from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
-
-MAX_DIGITS = 18  # maximum length of a frame number
-
-
-class CategoryIds(Enum):
-    """Numbering of the classes in `category_id`."""
-
-    COCO_91 = "ids of COCO's annotation files: 1 to 90, with gaps"
-    FROM_ONE = "indices of the labels, from 1"
-    FROM_ZERO = "indices of the labels, from 0"
-
-    def of(self, labels: Sequence[str]) -> list[int]:
-        """Return the id of each label.
-
-        Raises:
-            ConfigError: The labels do not match this numbering.
-        """
-        if self is not CategoryIds.COCO_91:
-            return list(range(len(labels))) if self is CategoryIds.FROM_ZERO else list(range(1, len(labels) + 1))
-        if tuple(labels) != COCO:
-            raise ConfigError(
-                "detector.category_ids: expected FROM_ONE or FROM_ZERO unless label_space is coco, got COCO_91"
-            )
-        return [k for k, name in enumerate(COCO_BY_ID) if name != NO_CLASS]
+from framework.vocabulary.category_ids import CategoryIds, recognize
+from framework.vocabulary.label_spaces import COCO
 
 
 def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[StoredDetection]:
     """Read the detections in a results file.
 
-    `segmentation` contains run lengths or polygons. `image_id` is a frame index, or a file name such as
+    `segmentation` contains run lengths or polygons. `image_id` is a whole number, or a file name such as
     "color/000012.png".
 
     Args:
@@ -74,25 +51,37 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
     if not isinstance(entries, list):
         raise DataError(f"{path}: expected a list of results in COCO's format, got {entries!r:.100}")
     index = {name: k for k, name in enumerate(labels)}
-    names: dict[int, str] | None = None
+    names = _names_by_id(path, entries, labels, ids)
     found: list[StoredDetection] = []
-    folders: dict[int, PurePosixPath] = {}
+    folders: dict[str, PureWindowsPath] = {}
     for k, entry in enumerate(entries):
         where = f"{path}, entry {k}"
         if not isinstance(entry, Mapping):
             raise DataError(f"{where}: expected a JSON object, got {entry!r:.200}")
-        if names is None and entry.get("category_name") is None:
-            names = dict(zip(ids.of(labels), labels, strict=True))
         with errors_of(where):
-            found.append(_read_entry(where, entry, index, names or {}))
-            if isinstance(entry["image_id"], str):
-                image, frame = PurePosixPath(entry["image_id"]), found[-1].frame
-                if (other := folders.setdefault(frame, image.parent)) != image.parent:
+            found.append(_read_entry(where, entry, index, names))
+            if isinstance(image := found[-1].image, ImageName):
+                path_of_image = PureWindowsPath(entry["image_id"])
+                if (other := folders.setdefault(image.stem, path_of_image.parent)) != path_of_image.parent:
                     raise DataError(
-                        f"{image}: expected one image of frame {frame}, got another image in {other}/; "
-                        "split the file by sequence"
+                        f"{path_of_image.as_posix()}: expected one image {image.stem}, got another image in "
+                        f"{other.as_posix()}/; split the file by sequence"
                     )
     return found
+
+
+def _names_by_id(path: Path, entries: Sequence[Any], labels: Sequence[str], ids: CategoryIds) -> dict[int, str]:
+    """Return the label of each `category_id`, or an empty dictionary if all entries have a `category_name`."""
+    objects = [entry for entry in entries if isinstance(entry, Mapping)]
+    unnamed = [entry.get("category_id") for entry in objects if entry.get("category_name") is None]
+    numbers = [k for k in unnamed if type(k) is int]
+    if not numbers:
+        return {}
+    if ids is CategoryIds.AUTO:
+        pairs = [(entry.get("category_id"), entry.get("category_name")) for entry in objects]
+        known = [(k, name) for k, name in pairs if type(k) is int and isinstance(name, str)]
+        ids = recognize(str(path), numbers, labels, known)
+    return ids.names(labels)
 
 
 def _read_entry(
@@ -109,7 +98,7 @@ def _read_entry(
         )
     return StoredDetection(
         where=where,
-        frame=_read_image_id(entry.get("image_id")),
+        image=read_image_id(entry.get("image_id")),
         label=label,
         score=read_score(entry.get("score")),
         segmentation=_read_segmentation(entry.get("segmentation")),
@@ -117,16 +106,6 @@ def _read_entry(
         box=_read_box(entry.get("bbox")),
         exact=entry.get("exact") is True,
     )
-
-
-def _read_image_id(found: Any) -> int:
-    if type(found) is int and found >= 0:
-        return found
-    name = PurePosixPath(found if isinstance(found, str) else "")
-    stem = "" if name.suffix[1:].isdigit() else name.stem  # 12.5 is not a file name
-    if not (stem.isascii() and stem.isdigit() and len(stem) <= MAX_DIGITS):
-        raise DataError(f"image_id: expected a frame number, or a file name such as 000012.png, got {found!r}")
-    return int(stem)
 
 
 def _read_box(found: Any) -> Float32 | None:

@@ -1,6 +1,6 @@
 """Folders with instance masks.
 
-Each frame has an image NNNNNN.png of instance ids and a file NNNNNN.json of classes and scores.
+Each frame has an image of instance ids, such as 000012.png, and a file 000012.json of classes and scores.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Bool
+from framework.detection.stored.image_names import ImageName
 from framework.detection.stored.stored_detection import (
     Segmentation,
     StoredDetection,
@@ -49,8 +50,9 @@ class InstanceOfImage(Segmentation):
 def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetection]:
     """Read the detections in a mask folder.
 
-    NNNNNN is the frame index. The PNG has one channel of 16 bits. The JSON is a list of objects with the keys "id",
-    "class", "score" and optionally "class_probabilities". Ids that are not listed are ignored.
+    The files of a frame have the name of its color image. The PNG has one channel of 16 bits. The JSON is a list of
+    objects with the keys "id", "class", "score" and optionally "class_probabilities". Ids that are not listed are
+    ignored.
 
     Args:
         folder: The mask folder.
@@ -61,14 +63,12 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
     """
     index = {name: k for k, name in enumerate(labels)}
     found: list[StoredDetection] = []
-    images: dict[int, Path] = {}
+    images: dict[tuple[str, int], Path] = {}
     for path in sorted(folder.glob("*.png")):
-        if not (path.stem.isascii() and path.stem.isdigit()):
-            raise DataError(f"{folder}: expected frame numbers as file names, such as 000012.png, got {path.name}")
-        frame = int(path.stem)
-        if images.setdefault(frame, path) != path:
+        name = ImageName.of(path.name)
+        if name.number is not None and (other := images.setdefault((name.prefix, name.number), path)) != path:
             raise DataError(
-                f"{path}: expected one image of frame {frame}, got {images[frame].name} as well; keep one of them"
+                f"{path}: expected one image of frame {name.number}, got {other.name} as well; keep one of them"
             )
         description = path.with_suffix(".json")
         ids: set[int] = set()
@@ -86,9 +86,7 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
                 ids.add(instance)
                 label, score = read_label(entry.get("class"), index), read_score(entry.get("score"))
                 probabilities = read_probabilities(entry.get("class_probabilities"), index)
-                found.append(
-                    StoredDetection(where, frame, label, score, InstanceOfImage(path, instance), probabilities)
-                )
+                found.append(StoredDetection(where, name, label, score, InstanceOfImage(path, instance), probabilities))
     alone = [path for path in sorted(folder.glob("*.json")) if not path.with_suffix(".png").exists()]
     if alone:
         raise DataError(f"{alone[0]}: expected an image {alone[0].stem}.png next to it, got none")

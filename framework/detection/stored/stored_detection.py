@@ -12,6 +12,7 @@ from pycocotools import mask as coco
 
 from framework.data import PROBABILITY_TOLERANCE, Bool, Float32
 from framework.detection.masks.run_length import decode
+from framework.detection.stored.image_names import ImageId
 from framework.errors import DataError
 
 ROUNDED_SUM = 0.05  # largest |sum - 1| of probabilities with rounded digits
@@ -73,7 +74,7 @@ class StoredDetection:
     """One detection in a file."""
 
     where: str  # file and entry, for errors
-    frame: int  # Frame.index
+    image: ImageId  # whole number or file name of the image
     label: str  # name in the file's label space
     score: float  # in [0, 1]
     segmentation: Segmentation

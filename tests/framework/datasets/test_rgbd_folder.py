@@ -61,6 +61,16 @@ def change_camera(folder, **changes):
     (folder / "camera.json").write_text(json.dumps(CAMERA | changes))
 
 
+def test_rgbd_folder_frames_know_their_file_names(folder):
+    for name in ("color", "depth", "instance"):
+        for k in reversed(range(FRAMES)):
+            (folder / name / f"{k:06d}.png").rename(folder / name / f"frame_{3 * k + 1:06d}.png")
+    sequence = RgbdFolder(folder, start=1, stride=2)
+    names = {0: "frame_000001.png", 1: "frame_000004.png", 2: "frame_000007.png", 3: "frame_000010.png"}
+    assert sequence.image_names() == names
+    assert [(frame.index, frame.image_name) for frame in sequence] == [(1, names[1]), (3, names[3])]
+
+
 def test_rgbd_folder_frame_matches_files(folder):
     sequence = RgbdFolder(folder)
     assert (len(sequence), sequence.name) == (FRAMES, "kitchen")

@@ -130,7 +130,7 @@ def test_decode_ssd_without_detections_is_empty():
         (
             OutputLayout.ssd_unit,
             {"boxes": np.zeros((2, 4)), "labels": np.array([4, 1]), "scores": np.ones(2)},
-            r"detector\.label_space: expected labels 1 to 3, got",
+            r"detector\.category_ids: expected labels 1 to 3 of 3 classes, got 4",
         ),
     ],
 )

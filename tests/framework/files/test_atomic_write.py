@@ -18,7 +18,7 @@ from framework.datasets.scenenn.scene_files import read_intrinsics, read_timesta
 from framework.datasets.scenenn.scenenn_annotation import read_annotation
 from framework.detection.mask_rcnn.checkpoint import read_network
 from framework.detection.mask_rcnn.detectron2_checkpoint import read_pickle
-from framework.detection.stored.coco_results import CategoryIds, read_results
+from framework.detection.stored.coco_results import read_results
 from framework.errors import ConfigError, DataError, FrameError
 from framework.files.atomic_write import atomic_write, read_bytes, read_text
 from framework.files.hashing import path_hash
@@ -29,6 +29,7 @@ from framework.files.ply import read_ply
 from framework.files.tum_trajectory import read_tum
 from framework.runs.stored_runs import read_yaml
 from framework.runs.timings_file import read_timings
+from framework.vocabulary.category_ids import CategoryIds
 from framework.vocabulary.label_spaces import COCO, read_labels
 
 

@@ -50,6 +50,8 @@ def outputs_of(layout):
         table = np.zeros((1, 7 * 10 + 3 * 5 + 1 * 2, 8))
         table[0, 14] = [*(rows[0, :2] / 8 - (4, 1)), *np.log(rows[0, 2:] / 8), 0.8, 0.25, 0.75, 0.0]  # cell (4, 1)
         return {"output": table}
+    if layout is OutputLayout.end_to_end:
+        return {"output0": np.c_[boxes, [0.6, 0.9, 0.02], [1, 2, 1]][None]}
     unit = boxes / [80, 60, 80, 60]
     if layout is OutputLayout.ssd_unit:
         return {"boxes": unit[None], "scores": np.c_[[0.2, 0, 0.9], scores][None]}
@@ -69,6 +71,7 @@ EXPECTED = {  # score, and probabilities of chair and cup
     OutputLayout.ssd_unit: (0.6, [0.25, 0.75]),
     OutputLayout.ssd_tensorflow: (0.6, [0.25, 0.75]),  # 0.2 0.6 0.2 without the wall
     OutputLayout.ssd_torchvision: (0.6, [0.25, 0.75]),
+    OutputLayout.end_to_end: (0.6, [0.25, 0.75]),
 }
 
 
@@ -79,7 +82,7 @@ def tiny(folder, layout, **parameters):
     return OnnxBoxes(weights=weights, sha256="", label_space=str(labels), layout=layout, device="cpu", **parameters)
 
 
-@pytest.mark.parametrize("layout", OutputLayout)
+@pytest.mark.parametrize("layout", EXPECTED)
 def test_onnx_boxes_known_network_detects_cup_in_each_layout(tmp_path, layout):
     detector = tiny(tmp_path, layout)
     assert detector.classes == ("cup", "chair")  # order of COCO

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,11 @@ from pycocotools import mask as coco
 
 from framework.commands.running.detect import write_detections, write_labels
 from framework.data import Camera, Detections, Frame
-from framework.detection.stored.coco_results import CategoryIds
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.detection.map_classes import DetectorOfMap
+from framework.detection.stored.cache import CachedDetector
 from framework.errors import ConfigError, DataError, FrameError
+from framework.vocabulary.category_ids import CategoryIds
 from framework.vocabulary.label_spaces import COCO
 from plugins.detectors.ground_truth import GroundTruthDetector
 from plugins.detectors.precomputed import Precomputed
@@ -254,12 +259,11 @@ def test_precomputed_mask_image_with_wrong_size_or_type_raises(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"image_id": "left.png"}, "image_id: expected a frame number, or a file name such as 000012.png, got"),
+        ({"image_id": ""}, "image_id: expected a frame number, or a file name such as 000012.png, got"),
         ({"image_id": -1}, "image_id"),
         ({"image_id": True}, "image_id"),
-        ({"image_id": "0.5"}, "image_id: expected a frame number, or a file name such as 000012.png, got"),
+        ({"image_id": 0.5}, "image_id: expected a frame number, or a file name such as 000012.png, got"),
         ({"category_name": "chiar"}, "label: expected one of the 80 names in detector.label_space, got"),
-        ({"category_name": None, "category_id": 12}, "category_id: expected the id of a label, got 12"),
         ({"category_name": None}, "category_id: expected the id of a label, got None"),
         ({"score": 1.5}, "score: expected a number in [0, 1], got 1.5"),
         ({"score": None}, "score"),
@@ -310,7 +314,7 @@ def test_precomputed_result_file_with_two_sequences_raises(tmp_path: Path) -> No
     path = write(tmp_path, entry(image_id="kitchen/000002.png"), entry(image_id="hall/000002.png"))
     with pytest.raises(
         DataError,
-        match=r"entry 1: hall/000002\.png: expected one image of frame 2, got another image in kitchen/",
+        match=r"entry 1: hall/000002\.png: expected one image 000002, got another image in kitchen/",
     ):
         Precomputed(path)
 
@@ -349,8 +353,9 @@ def test_precomputed_possible_sequence_mismatch_warns_once(tmp_path: Path, caplo
 
 
 def test_precomputed_coco_91_ids_with_other_label_space_raise(tmp_path: Path) -> None:
+    path = write(tmp_path, entry(category_name=None, category_id=1))
     with pytest.raises(ConfigError, match="FROM_ONE or FROM_ZERO"):
-        Precomputed(write(tmp_path, entry(category_name=None, category_id=1)), label_space="nyu40")
+        Precomputed(path, label_space="nyu40", category_ids=CategoryIds.COCO_91)
 
 
 def test_precomputed_invalid_parameter_raises(tmp_path: Path) -> None:
@@ -365,3 +370,126 @@ def test_precomputed_unusable_or_duplicate_label_raises(tmp_path: Path) -> None:
     (tmp_path / "labels.txt").write_text("chair\nchair\n")
     with pytest.raises(ConfigError, match=r"detector\.label_space: expected unique names, got 'chair' twice"):
         Precomputed(write(tmp_path, entry()), label_space=str(tmp_path / "labels.txt"))
+
+
+# File names
+
+
+@pytest.mark.parametrize(
+    ("image_name", "image_id"),
+    [
+        ("000004.jpg", "color/000004.jpg"),
+        ("frame_000012.jpg", "frame_000012.png"),
+        ("000012.png", "color\\000012.png"),
+        ("1305031102.175304.png", "rgb/1305031102.175304.png"),
+        ("frame-000007.color.png", "seq-01/frame-000007.color.png"),
+    ],
+)
+def test_precomputed_file_name_belongs_to_frame_with_this_file(tmp_path: Path, image_name: str, image_id: str) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id=image_id)))
+    assert len(detector.detect(replace(frame(2), image_name=image_name))) == 1
+    assert len(detector.detect(replace(frame(4), image_name="000099.png"))) == 0
+
+
+def test_precomputed_mask_named_like_color_image_is_read(tmp_path: Path) -> None:
+    detector = Precomputed(write_folder(tmp_path, name="frame_000003"))
+    assert len(detector.detect(replace(frame(1), image_name="frame_000003.jpg"))) == 2
+
+
+@pytest.mark.parametrize("numbers", [range(0, 8, 2), range(1, 5), range(4), range(7, 11), (3, 4, 9, 12)])
+@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize("masks", [False, True])
+def test_precomputed_numbered_folder_finds_its_masks(
+    tmp_path: Path, numbers: Sequence[int], stride: int, masks: bool
+) -> None:
+    """Frame k has k + 1 detections, named by the file of its color image."""
+    root, stored = tmp_path / "room", tmp_path / "stored"
+    for folder in (root / "color", root / "depth", stored):
+        folder.mkdir(parents=True)
+    camera = {"width": 8, "height": 6, "fx": 10.0, "fy": 10.0, "cx": 3.5, "cy": 2.5, "depth_scale": 1000.0}
+    (root / "camera.json").write_text(json.dumps(camera))
+    entries = []
+    for k, number in enumerate(numbers):
+        cv2.imwrite(str(root / "color" / f"{number:06d}.png"), np.zeros((6, 8, 3), np.uint8))
+        cv2.imwrite(str(root / "depth" / f"{number:06d}.png"), np.full((6, 8), 1000, np.uint16))
+        entries += [entry(image_id=f"color/{number:06d}.jpg")] * (k + 1)
+        listed = [{"id": one + 1, "class": "chair", "score": 0.5} for one in range(k + 1)]
+        write_folder(stored, np.arange(1, 49, dtype=np.uint16).reshape(6, 8), listed, f"{number:06d}")
+    sequence = RgbdFolder(root, stride=stride)
+    detector = Precomputed(stored if masks else write(tmp_path, *entries))
+    detector.check_sequence(sequence)
+    assert [len(detector.detect(one)) for one in sequence] == [one.index + 1 for one in sequence]
+
+
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        lambda detector, folder: CachedDetector(detector, folder),
+        lambda detector, folder: DetectorOfMap(detector, (*COCO, "forklift")),
+    ],
+    ids=["cached", "of_map"],
+)
+def test_precomputed_in_other_detector_checks_sequence(tmp_path: Path, wrapped: Any) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id="color/000007.jpg")))
+    with pytest.raises(DataError, match="expected detections of this sequence"):
+        wrapped(detector, tmp_path / "cache").check_sequence(NamedRoom())
+
+
+class NamedRoom(CornerRoom):
+    """A room whose frames have numbered files with gaps."""
+
+    def image_names(self) -> dict[int, str]:
+        return {k: f"{2 * k:06d}.jpg" for k in range(len(self))}
+
+
+def test_precomputed_detections_of_other_files_raise(tmp_path: Path) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id="color/000007.jpg")))
+    with pytest.raises(DataError, match=r"expected detections of this sequence .*000000\.jpg.*first: '000007'"):
+        detector.check_sequence(NamedRoom())
+    detector = Precomputed(write(tmp_path, entry(image_id=len(NamedRoom()))))
+    with pytest.raises(DataError, match=r"set detector\.image_ids=FROM_ONE"):
+        detector.check_sequence(NamedRoom())
+
+
+def test_precomputed_file_names_without_numbers_need_named_frames(tmp_path: Path) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id="left.png")))
+    with pytest.raises(DataError, match=r"expected frame numbers .*first: 'left'.*frame 0 has no file"):
+        detector.detect(frame())
+
+
+# Own classes
+
+
+@pytest.mark.parametrize(
+    ("labels", "found", "parameters", "name"),
+    [
+        (("forklift", "pallet"), {"category_id": 1}, {"category_ids": CategoryIds.FROM_ONE}, "forklift"),
+        (("forklift", "pallet"), {"category_id": 2}, {}, "pallet"),
+        (("forklift", "pallet"), {"category_id": 0}, {}, "forklift"),
+        (("forklift", "pallet", "chair"), {"category_name": "pallet"}, {}, "pallet"),
+        (("forklift", "pallet", "chair"), {"category_id": 3}, {}, "chair"),
+    ],
+)
+def test_precomputed_own_classes_keep_their_names(
+    tmp_path: Path, labels: tuple[str, ...], found: dict[str, Any], parameters: dict[str, Any], name: str
+) -> None:
+    (tmp_path / "labels.txt").write_text("\n".join(labels))
+    one = entry(**{"category_name": None, **found})
+    detected_one = detected(tmp_path, one, label_space=str(tmp_path / "labels.txt"), **parameters)
+    assert detected_one.classes[int(detected_one.class_probabilities[0].argmax())] == name
+
+
+def test_precomputed_ambiguous_own_ids_raise(tmp_path: Path) -> None:
+    (tmp_path / "labels.txt").write_text("forklift\npallet")
+    with pytest.raises(ConfigError, match=r"1 is 'forklift' by FROM_ONE or 'pallet' by FROM_ZERO; set detector\.cat"):
+        detected(tmp_path, entry(category_name=None, category_id=1), label_space=str(tmp_path / "labels.txt"))
+
+
+def test_precomputed_mask_folder_keeps_own_classes(tmp_path: Path) -> None:
+    (tmp_path / "labels.txt").write_text("forklift\npallet")
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    write_folder(folder, listed=[{"id": 7, "class": "forklift", "score": 0.9}])
+    found = Precomputed(folder, label_space=str(tmp_path / "labels.txt")).detect(frame(3))
+    assert found.classes == ("forklift", "pallet")
+    assert found.class_probabilities[0].argmax() == 0

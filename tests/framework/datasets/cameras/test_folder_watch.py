@@ -94,7 +94,7 @@ def test_folder_watch_frames_match_recorded_folder(folder: Path) -> None:
         write(folder, k)
         found += [reader() for reader in watched.readers()]
     for live, recorded in zip(found, RgbdFolder(folder), strict=True):
-        assert (live.index, live.camera) == (recorded.index, recorded.camera)
+        assert (live.index, live.image_name, live.camera) == (recorded.index, recorded.image_name, recorded.camera)
         np.testing.assert_array_equal(live.color, recorded.color)
         np.testing.assert_array_equal(live.depth, recorded.depth)
     times = [before, *(frame.timestamp for frame in found), time.time()]

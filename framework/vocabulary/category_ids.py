@@ -1,0 +1,168 @@
+"""Numberings of classes in the outputs of networks and in files of detections."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from enum import Enum
+
+from framework.errors import ConfigError, DataError
+from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
+
+KEY = "detector.category_ids"
+
+log = logging.getLogger(__name__)
+
+
+class CategoryIds(Enum):
+    """Numbering of classes."""
+
+    AUTO = "recognized from the ids"
+    COCO_91 = "ids of COCO's annotation files: 1 to 90, with gaps"
+    FROM_ONE = "indices of the labels, from 1"
+    FROM_ZERO = "indices of the labels, from 0"
+
+    def of(self, labels: Sequence[str]) -> list[int]:
+        """Return the id of each label. AUTO has no ids.
+
+        Raises:
+            ConfigError: The labels do not match this numbering.
+        """
+        if self is CategoryIds.FROM_ZERO:
+            return list(range(len(labels)))
+        if self is CategoryIds.FROM_ONE:
+            return list(range(1, len(labels) + 1))
+        if self is CategoryIds.AUTO or tuple(labels) != COCO:
+            raise ConfigError(
+                f"{KEY}: expected FROM_ONE or FROM_ZERO unless label_space is coco, got {self.name}; "
+                f"set {KEY}=FROM_ONE or {KEY}=FROM_ZERO"
+            )
+        return [k for k, name in enumerate(COCO_BY_ID) if name != NO_CLASS]
+
+    def names(self, labels: Sequence[str]) -> dict[int, str]:
+        """Return the label of each id.
+
+        Raises:
+            ConfigError: The labels do not match this numbering.
+        """
+        return dict(zip(self.of(labels), labels, strict=True))
+
+
+def possible_numberings(labels: Sequence[str]) -> list[CategoryIds]:
+    """Return the numberings that these labels may have, COCO's own first."""
+    contiguous = [CategoryIds.FROM_ONE, CategoryIds.FROM_ZERO]
+    return [CategoryIds.COCO_91, *contiguous] if tuple(labels) == COCO else contiguous
+
+
+def recognize(
+    where: str, ids: Sequence[int], labels: Sequence[str], named: Iterable[tuple[int, str]] = ()
+) -> CategoryIds:
+    """Return the numbering of class ids, and log an example.
+
+    Ids that all numberings have are read as COCO's if the labels are COCO's, and a warning is logged.
+
+    Args:
+        where: The file, for messages.
+        ids: The ids.
+        labels: The class names.
+        named: Ids with known names.
+
+    Raises:
+        DataError: No numbering has all of the ids.
+        ConfigError: Several numberings have all of the ids.
+    """
+    candidates = [(one, one.names(labels)) for one in possible_numberings(labels)]
+    pairs = set(named)
+    matching = [(one, names) for one, names in candidates if all(names.get(k) == name for k, name in pairs)]
+    fitting = [(one, names) for one, names in matching if all(k in names for k in ids)]
+    if not fitting:
+        raise DataError(
+            f"{where}: category_id: expected the ids of {len(labels)} labels, got {min(ids)} to {max(ids)}; set "
+            f"detector.label_space to the label space of the file, and {KEY} to its numbering"
+        )
+    example = next((k for k in ids if len({names[k] for _, names in fitting}) > 1), ids[0])
+    (numbering, names), *others = fitting
+    alternatives = " or ".join(f"{other[example]!r} by {one.name}" for one, other in others)
+    fixes = " or ".join(f"{KEY}={one.name}" for one, _ in others)
+    if others and numbering is not CategoryIds.COCO_91:
+        raise ConfigError(
+            f"{KEY}: expected a numbering, got {where} with ids {min(ids)} to {max(ids)}, where {example} is "
+            f"{names[example]!r} by {numbering.name} or {alternatives}; set {KEY}={numbering.name} or {fixes}"
+        )
+    if others:
+        log.warning(
+            "%s: class ids read as %s, so %d is %r, but it could be %s; set %s if the ids are not those of COCO's "
+            "annotation files, or %s=%s to confirm",
+            where, numbering.name, example, names[example], alternatives, fixes, KEY, numbering.name,
+        )  # fmt: skip
+    else:
+        log.info("%s: class ids read as %s, so %d is %r", where, numbering.name, example, names[example])
+    return numbering
+
+
+def label_ids(ids: CategoryIds, labels: Sequence[str], published: CategoryIds | None) -> list[int]:
+    """Return the number of each class in the label output of a network, and log an example.
+
+    Args:
+        ids: The numbering.
+        labels: The class names.
+        published: The numbering of published networks of this layout; None = unknown. AUTO uses it. For labels other
+            than COCO's, COCO_91 is replaced by FROM_ONE.
+
+    Raises:
+        ConfigError: The numbering is AUTO and unknown, or does not match the labels.
+    """
+    is_coco = tuple(labels) == COCO
+    numbering = ids
+    if ids is CategoryIds.AUTO:
+        if published is None:
+            choices = [one.name for one in possible_numberings(labels)]
+            raise ConfigError(
+                f"{KEY}: expected the numbering of the network's labels ({', '.join(choices)}), got AUTO for a layout "
+                f"without a known numbering; set {' or '.join(f'{KEY}={choice}' for choice in choices)}"
+            )
+        numbering = CategoryIds.FROM_ONE if published is CategoryIds.COCO_91 and not is_coco else published
+    numbers = numbering.of(labels)
+    example = labels.index("chair") if is_coco else 0
+    others = " or ".join(f"{KEY}={one.name}" for one in possible_numberings(labels) if one is not numbering)
+    log.info(
+        "%s: labels of the network read as %s, so %d is %r; set %s if the network counts otherwise",
+        KEY, numbering.name, numbers[example], labels[example], others,
+    )  # fmt: skip
+    return numbers
+
+
+def column_ids(ids: CategoryIds, labels: Sequence[str], columns: int) -> list[int]:
+    """Return the column of each class in a table with C class columns, and log an example.
+
+    Args:
+        ids: The numbering of the columns.
+        labels: The class names.
+        columns: The number of class columns C.
+
+    Raises:
+        DataError: The table has another number of columns.
+        ConfigError: The numbering is AUTO, and the table has one more column than classes.
+    """
+    count, is_coco = len(labels), tuple(labels) == COCO
+    numbering, shift = ids, 0
+    if ids is CategoryIds.AUTO:
+        if is_coco and columns in (len(COCO_BY_ID) - 1, len(COCO_BY_ID)):
+            numbering, shift = CategoryIds.COCO_91, len(COCO_BY_ID) - columns
+        elif columns == count:
+            numbering = CategoryIds.FROM_ZERO
+        elif columns == count + 1:
+            raise ConfigError(
+                f"{KEY}: expected the numbering of {columns} class columns for {count} labels, got AUTO; set "
+                f"{KEY}=FROM_ONE (first column unused) or {KEY}=FROM_ZERO (last column unused)"
+            )
+    wanted = [k - shift for k in numbering.of(labels)] if numbering is not CategoryIds.AUTO else []
+    if not wanted or max(wanted) >= columns:
+        coco = f", or {len(COCO_BY_ID)}" if is_coco else ""
+        raise DataError(
+            f"detector.label_space: expected {count} or {count + 1}{coco} class columns, got {columns}; set another "
+            f"label_space, or {KEY}=FROM_ONE (first column unused) or {KEY}=FROM_ZERO"
+        )
+    example = labels.index("chair") if is_coco else 0
+    log.info("%s: class columns read as %s, so column %d is %r", KEY, numbering.name, wanted[example], labels[example])
+    return wanted
