@@ -27,6 +27,7 @@ MIN_LOG_UNCERTAINTY = 0.07
 MAX_ERROR_INCREASE = 1.3
 WRONG_SCALE = 2.5  # minimum factor of a clearly wrong scale; during rotation, the scale is uncertain by up to 1.6
 USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
+UNPOSED = "tracker=voxel_hashing_icp"  # setting for recordings with unusable poses
 PLAUSIBLE = (0.2, 12.0)  # m, plausible median depth of a room
 
 
@@ -141,7 +142,7 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
         return PoseJudgment((Finding(Verdict.FINE, "poses", f"valid: {measured}"),), as_given, as_given, others)
     if chosen.error > MAX_RELATIVE_ERROR * motion:
         text = f"inconsistent with the images in all supported conventions: {measured}"
-        finding = Finding(Verdict.ERROR, "poses", text, "tracker=voxel_hashing_icp")
+        finding = Finding(Verdict.ERROR, "poses", text, UNPOSED)
         return PoseJudgment((finding,), as_given, best, others)
     findings = []
     if reading != given:
