@@ -37,6 +37,7 @@ from framework.detection.stored.cache import with_cache
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.files.atomic_write import atomic_write
 from framework.files.directory_lock import locked
+from framework.geometry import camera_of
 from framework.interfaces import (
     ClusterRefiner,
     Detector,
@@ -133,6 +134,7 @@ def begin(config: DictConfig) -> Pipeline:
     tracker = build(PoseTracker, config.get("tracker"))
     viewer = build(Viewer, config.get("viewer"))
     classes: tuple[str, ...] = ()
+    resumed = False
     chosen = {key: config.get(key) for key in ("resume_from", "localize_in") if config.get(key) is not None}
     if len(chosen) > 1:
         raise ConfigError("resume_from and localize_in: expected at most one of these keys, got both; remove one")
@@ -141,12 +143,14 @@ def begin(config: DictConfig) -> Pipeline:
         scene = scene_of(key, run)
         if key == "resume_from":
             fuser.resume(scene)
-            classes = scene.classes
+            classes, resumed = scene.classes, True
         tracker.load_keyframes(read_keyframes(run / KEYFRAMES), scene)
     detector = build(Detector, config.get("detector"))  # last, because loading a network is slow
     detector = with_cache(with_classes_of_map(detector, classes), config)
     compile_for_run()
-    return Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval)
+    pipeline = Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval)
+    pipeline.resumed = resumed
+    return pipeline
 
 
 def scene_of(key: str, run: Path) -> SceneMap:
@@ -213,13 +217,14 @@ class Mapper(Map):
         self._sensor = SensorKind.KINECT_V1  # kind of depth sensor of the last frame
         self._T_world_color: Float64 | None = None  # (4, 4) pose of the color image of the last mapped frame
         self._frames = 0  # number of calls of `add`
+        self._posed_frames = 0  # number of calls of `add` with a pose
 
     def add(
         self,
         color: UInt8 | Frame,
         depth: Float32 | None = None,
         pose: Float64 | None = None,
-        camera: Camera | None = None,
+        camera: Camera | Float64 | None = None,
         timestamp: float | None = None,
         up: Float64 | None = None,
         depth_timestamp: float | None = None,
@@ -231,8 +236,9 @@ class Mapper(Map):
         Args:
             color: RGB image (H, W, 3), uint8, or a Frame, which replaces all other arguments.
             depth: Depth image (H, W), float32, m along z; 0 = no reading.
-            pose: Camera pose T_world_camera (4, 4); None = unknown.
-            camera: The camera; None = the camera of the last frame.
+            pose: Camera pose T_world_camera (4, 4); None = unknown. Most trackers use only the pose of the first frame,
+                which defines the world frame. `tracker="ground_truth"` uses all poses.
+            camera: The camera, or the intrinsic matrix (3, 3) of this image, px; None = the camera of the last frame.
             timestamp: Time of the color image, s; None = the frame number (from 0) / 30.
             up: Up direction (3,) in the camera frame, a unit vector; None = unknown.
             depth_timestamp: Time of the depth image, s; None = the time of the color image.
@@ -251,21 +257,23 @@ class Mapper(Map):
             if isinstance(color, Frame):
                 frame = color
             else:
-                camera = camera or self._camera
                 if depth is None:
                     raise DataError(
                         f"Mapper.add: expected a Frame, or color and depth, got only {type(color).__name__}"
                     )
-                if camera is None:
+                used = self._camera if camera is None else camera_of(camera, color)
+                if used is None:
                     raise DataError(
                         "Mapper.add: expected a camera in the first call, got none; pass camera=Camera(width, height, "
-                        "fx, fy, cx, cy)"
+                        "fx, fy, cx, cy) or camera=K"
                     )
                 time = self._frames / FRAME_RATE if timestamp is None else timestamp
                 frame = Frame(
-                    self._frames, time, color, depth, camera, pose, up=up, depth_timestamp=depth_timestamp,
+                    self._frames, time, color, depth, used, pose, up=up, depth_timestamp=depth_timestamp,
                     sensor=sensor or self._sensor, T_odom_camera=odometry,
                 )  # fmt: skip
+                if pose is not None:
+                    self._warn_of_ignored_pose()
             self._camera, self._sensor = frame.camera, frame.sensor
             self._frames += 1
             self._journal.timings.clear()  # unused here; the list would grow without limit for a live camera
@@ -277,6 +285,17 @@ class Mapper(Map):
             self._T_world_color = self.pipeline.T_world_color
             now = self.scene.instance_ids()
         return FrameResult(found.T_world_camera, new=tuple(sorted(now - before)), removed=tuple(sorted(before - now)))
+
+    def _warn_of_ignored_pose(self) -> None:
+        """Log a warning at the second pose that the tracker ignores."""
+        tracker = self.pipeline.tracker
+        self._posed_frames += 1
+        if self._posed_frames == 2 and tracker.pose_source != "ground_truth":
+            log.warning(
+                "Mapper.add: pose: expected a tracker that uses given poses, got %s, which uses only the first; "
+                'set tracker="ground_truth", or omit pose after the first frame',
+                type(tracker).__name__,
+            )
 
     def _map(self, frame: Frame) -> Pose:
         pipeline, journal = self.pipeline, self._journal

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from framework.data import Camera, Float32, Float64, Int32, PointClusters
+from framework.data import Camera, Float32, Float64, Int32, PointClusters, UInt8
 from framework.errors import DataError
 
 RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| due to rounding in files; larger for lost poses, stored as R = 0
@@ -91,6 +91,27 @@ def exp_se3(xi: Float64) -> Float64:
 
 def _sinc(x: float) -> float:
     return math.sin(x) / x if x else 1.0
+
+
+def camera_of(camera: Camera | Float64, image: UInt8) -> Camera:
+    """Return a camera given as such, or as the intrinsic matrix of an image (H, W, ...).
+
+    Raises:
+        DataError: The matrix is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px.
+    """
+    if isinstance(camera, Camera):
+        return camera
+    form = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px"
+    try:
+        K = np.asarray(camera, np.float64)
+    except (TypeError, ValueError):
+        raise DataError(f"camera: expected a Camera or {form}, got {type(camera).__name__}") from None
+    if K.shape != (3, 3):
+        raise DataError(f"camera: expected a Camera or {form}, got an array of shape {K.shape}")
+    if not np.allclose(K, [[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]], rtol=0, atol=1e-6):
+        raise DataError(f"camera: expected {form}, got {K.tolist()}; undistort and unskew the images first")
+    height, width = np.shape(image)[:2] if np.ndim(image) >= 2 else (0, 0)
+    return Camera(width, height, *(float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
 
 
 def rotation_angle(R: Float64) -> float:

@@ -67,6 +67,8 @@ class RGBDVideo(ABC):
     name: str  # name of the scene, for tables
     annotation: str = ""  # release of the ground truth, for tables; "" = only one release exists
     domain: str = ""  # image domain, such as "rendered rooms", for `Detector.domain`; "" = photographs or unknown
+    # origin of the world frame of the poses in the world frame of the recording, m; nonzero for distant coordinates
+    world_origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def has_poses(self) -> bool:
         """Return True if frames may have ground-truth poses. Called before any frame is read."""
@@ -159,6 +161,7 @@ class PoseTracker(ABC):
     """Tracker of the camera pose."""
 
     pose_source: str = "tracked"  # source of the poses, for tables; `ground_truth` = the poses of the sequence
+    poses_given: bool = False  # True = the poses are read, not estimated; the pipeline compares them with the map
 
     @abstractmethod
     def track(self, frame: Frame, scene: SceneMap) -> Pose:

@@ -34,6 +34,7 @@ from framework.runtime.frame_stream import FrameStream, Turns, prefetched_map, s
 from framework.runtime.run_log import Journal, RunResult, StageTime
 from framework.runtime.signals import Interruption, signals_deferred
 from framework.tracking.color_to_depth import ColorToDepth
+from framework.tracking.map_agreement import check_resumed, map_agreement
 
 log = logging.getLogger(__name__)
 
@@ -68,6 +69,7 @@ class Pipeline:
             raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}; set it to 0")
         self.viewer = GuardedViewer(self.viewer)
         self.color_to_depth = ColorToDepth(delay=None)
+        self.resumed = False  # True until a frame is compared with the map of `resume_from`
         self.T_world_color: Float64 | None = None  # (4, 4) pose of the color camera in the last tracked frame
 
     def run(self, video: RGBDVideo) -> RunResult:
@@ -286,6 +288,8 @@ class Pipeline:
             if self.color_to_depth.displaced_before:
                 self.tracker.renew_colors()
                 self.fuser.renew_colors()
+            if self.tracker.poses_given and not pose.lost and self.fuser.scene.statistics.voxels:
+                self.compare_with_map(frame, pose, journal)
         journal.frame_tracked(frame, pose)
         if pose.lost:
             return pose
@@ -299,6 +303,18 @@ class Pipeline:
         journal.frame_fused(frame)
         journal.digest(frame.index, detection=detections, lifting=lifted, refinement=clusters, fusion=self.fuser.scene)
         return pose
+
+    def compare_with_map(self, frame: Frame, pose: Pose, journal: Journal) -> None:
+        """Compare the depth of a frame with the map at its given pose, and record the result.
+
+        Raises:
+            DataError: The first frame contradicts the map of `resume_from`.
+        """
+        agreement = map_agreement(frame, pose.T_world_camera, self.fuser.scene)
+        if self.resumed and (warning := check_resumed(frame, agreement)):
+            log.warning("%s", warning)
+        self.resumed = False
+        journal.frame_compared(frame, agreement.disagrees, agreement.disagreeing)
 
 
 @contextmanager

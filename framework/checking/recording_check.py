@@ -17,6 +17,7 @@ from framework.checking.image_geometry import check_orientation, check_principal
 from framework.checking.matched_pairs import MatchedPair, Matcher
 from framework.checking.pose_delay import delayed, find_delay
 from framework.checking.pose_fit import PLAUSIBLE, UNPOSED, USUAL_SCALES, PoseJudgment
+from framework.checking.pose_jumps import find_jumps
 from framework.checking.registration import EdgeAlignment, EdgeComparison, color_gradient
 from framework.data import Camera, Float64, Frame
 from framework.datasets.frames.conventions import MIRRORED_POSE, OF_MATRICES, Mirror, PoseReading
@@ -26,6 +27,7 @@ from framework.interfaces import RGBDSequence, RGBDVideo
 
 CHECKED_FRAMES = 12  # number of checked frames, evenly spaced over the sequence
 QUICK_STARTS, QUICK_STEPS = (0.1, 0.35, 0.6, 0.85), (1, 4, 16)  # fractions of the sequence; steps in frames
+QUICK_JUMPS = 6  # number of pairs of neighboring frames that a run compares, with the largest motions
 MAX_MISSING = 0.7  # maximum fraction of pixels without a depth reading, for a good map
 MAX_BEYOND = 0.3  # maximum fraction of depth readings beyond the mapped range, for a good map
 # maximum width of sharp color edges, as a fraction of the image width; real recordings have 4 to 9 px of 640
@@ -103,6 +105,8 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
         judgment, pose_delay = _judge_poses(sequence, posed, given, median_depth)
         if depth_finding.setting and _is_inconsistent(judgment):
             judgment = _judged_at_scale(sequence, starts, given, depth_finding.setting) or judgment
+        if not (late or pose_delay or depth_finding.verdict is Verdict.ERROR):
+            judgment = _with_jumps(judgment, matcher, posed, given, median_depth)
     else:
         no_poses = Finding(Verdict.FINE, "poses", "none in the recording; the camera is tracked")
         judgment, pose_delay = PoseJudgment((no_poses,), None, None), 0
@@ -192,6 +196,29 @@ def _judge_poses(
     return replace(then, findings=findings, given=judgment.given), late.frames
 
 
+def _with_jumps(
+    judgment: PoseJudgment, matcher: Matcher, pairs: Sequence[MatchedPair], given: PoseReading, median_depth: float
+) -> PoseJudgment:
+    """Return the judgment with the jumps of the poses, unless another error explains them."""
+    jumps = find_jumps(matcher, _chosen_poses(matcher.sequence), given)
+    finding = jumps.finding()
+    if finding is None:
+        return judgment
+    if any(one.verdict is Verdict.ERROR for one in judgment.findings):  # may be an effect of the jumps
+        judged = pose_fit.judge(jumps.without(pairs), given, _scale_of(matcher.sequence), median_depth)
+        if any(one.verdict is not Verdict.FINE for one in judged.findings):
+            return judgment
+        judgment = judged
+    return replace(judgment, findings=(finding,))
+
+
+def _chosen_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
+    """Return the pose of each selected frame of a recording."""
+    if not isinstance(sequence, Recording):
+        return []
+    return [sequence.contents.frames[index].T_world_camera for index in sequence.chosen]
+
+
 def _stored_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
     """Return the poses of all frames in a recording, including frames that are not selected."""
     return [recorded.T_world_camera for recorded in sequence.contents.frames] if isinstance(sequence, Recording) else []
@@ -222,13 +249,18 @@ def warn_of_poses(sequence: RGBDVideo) -> None:
     if not isinstance(sequence, RGBDSequence) or not sequence.has_poses():
         return
     starts = [int(fraction * len(sequence)) for fraction in QUICK_STARTS]
-    pairs = [pair for pair in Matcher(sequence).pairs(starts, QUICK_STEPS) if _is_posed(pair)]
+    matcher = Matcher(sequence)
+    pairs = [pair for pair in matcher.pairs(starts, QUICK_STEPS) if _is_posed(pair)]
     if not pairs:
         return
     median_depth = float(np.median(np.concatenate([pair.points_first[:, 2] for pair in pairs])))
-    for finding in pose_fit.judge(pairs, PoseReading(), _scale_of(sequence), median_depth).findings:
-        if finding.verdict is Verdict.ERROR:
-            log.warning("%s: %s; run `instancemap check` for details", finding.subject, finding.text)
+    findings = pose_fit.judge(pairs, PoseReading(), _scale_of(sequence), median_depth).findings
+    errors = [finding for finding in findings if finding.verdict is Verdict.ERROR]
+    if not errors:
+        jump = find_jumps(matcher, _chosen_poses(sequence), PoseReading(), QUICK_JUMPS, revisits=0).finding()
+        errors = [] if jump is None else [jump]
+    for finding in errors:
+        log.warning("%s: %s; run `instancemap check` for details", finding.subject, finding.text)
 
 
 @dataclass

@@ -1,7 +1,8 @@
 """Stored runs in an upright coordinate frame.
 
-The room frame has z up and the floor at z = 0. It is the world frame, rotated upright by the smallest angle and
-translated along z. If z is already up in the world frame, x and y do not change.
+The room frame has z up and the floor at z = 0. It is the world frame, rotated upright by the smallest angle about the
+center of the map on the floor, and translated along z. So x and y of the center do not change, and if z is already up
+in the world frame, all x and y do not change.
 """
 
 from __future__ import annotations
@@ -152,7 +153,7 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
         mesh = read_mesh(run / MESH)
     direction = _direction(f"{run}: map.up", figures) if up is None else _unit("up", up)
     height = _height(f"{run}: map.floor_m", figures.get("map.floor_m") if floor is None and up is None else floor)
-    T_room_world = upright(UP if direction is None else direction, height or 0.0)
+    T_room_world = upright(UP if direction is None else direction, height, middle(mesh.vertices))
     _, poses = read_tum(run / TRAJECTORY) if path_exists(run / TRAJECTORY) else (None, np.zeros((0, 4, 4)))
     placed = replace(mesh, vertices=transform(T_room_world, mesh.vertices.astype(np.float64)).astype(np.float32))
     return UprightRoom(
@@ -221,18 +222,29 @@ def facing(box: Box) -> Box:
     return Box(box.center, np.array(extent), rotation)
 
 
-def upright(up: Float64, floor: float) -> Float64:
+def middle(vertices: Float32) -> Float64:
+    """Return the center (3,) of the bounding box of vertices (V, 3); the origin without vertices."""
+    if not len(vertices):
+        return np.zeros(3)
+    return np.asarray((vertices.min(axis=0).astype(np.float64) + vertices.max(axis=0)) / 2)
+
+
+def upright(up: Float64, floor: float | None, center: Float64) -> Float64:
     """Return the transform T_room_world (4, 4).
 
     Args:
         up: Up direction (3,) in the world frame, a unit vector.
-        floor: Floor height along `up`, m.
+        floor: Floor height along `up`, m; None = unknown. It is then 0, and the rotation is about `center` itself.
+        center: Center (3,) of the map in the world frame, whose point on the floor keeps x and y.
     """
+    if floor is not None:
+        center = center + (floor - up @ center) * up
     T = np.eye(4)
     # smallest rotation from `up` to z
     across, cosine = skew(np.cross(up, UP)), float(up @ UP)
     T[:3, :3] += across + across @ across / (1 + cosine) if cosine > -1 + 1e-9 else np.diag([0.0, -2.0, -2.0])
-    T[2, 3] = -floor
+    T[:2, 3] = (center - T[:3, :3] @ center)[:2]
+    T[2, 3] = -(floor or 0.0)
     return T
 
 

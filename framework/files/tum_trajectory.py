@@ -107,13 +107,19 @@ def read_tum_lines(path: Path) -> list[TumLine]:
     return [_line(path, number, found, columns) for number, found in enumerate(words, start=1) if found]
 
 
-def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence[Float64] | Float64) -> None:
+def write_tum(
+    path: Path,
+    timestamps: Sequence[float] | Float64,
+    poses: Sequence[Float64] | Float64,
+    comments: Sequence[str] = (),
+) -> None:
     """Write a trajectory in the TUM format atomically.
 
     Args:
         path: The output file.
         timestamps: The timestamps (F,), s.
         poses: The poses T_world_camera (F, 4, 4).
+        comments: Lines before the first pose.
 
     Raises:
         DataError: The lengths differ, a pose is not rigid, or the file cannot be written.
@@ -126,6 +132,7 @@ def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence
     quat_xyzw = Rotation.from_matrix(T_all[:, :3, :3]).as_quat(canonical=True) if len(T_all) else np.zeros((0, 4))
     rows = np.column_stack([T_all[:, :3, 3], quat_xyzw])
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.writelines(f"# {comment}\n" for comment in comments)
         for timestamp, row in zip(timestamps, rows, strict=True):
             file.write(f"{timestamp:.9f} " + " ".join(f"{value:.12g}" for value in row) + "\n")
 

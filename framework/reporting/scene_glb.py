@@ -35,7 +35,7 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
     """
     labels = np.where(np.isin(mesh.instance_ids, list(names)), mesh.instance_ids, 0).astype(np.int32)
     of_triangle = triangle_labels(mesh.triangles, labels)
-    T_gltf_world = T_GLTF_ROOM @ upright(up, 0.0)
+    T_gltf_world = T_GLTF_ROOM @ upright(up, 0.0, np.zeros(3))
     nodes = []
     for key in (0, *sorted(names)):
         chosen = of_triangle == key

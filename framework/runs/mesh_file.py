@@ -20,12 +20,12 @@ SAFE = "".join(chr(code) for code in range(32, 127) if chr(code) not in ",%")  #
 CLASSES = "classes "  # prefix of the comment with the class names
 
 
-def write_mesh(path: Path, mesh: InstanceMesh) -> None:
+def write_mesh(path: Path, mesh: InstanceMesh, comments: Sequence[str] = ()) -> None:
     """Write a mesh to a binary PLY file.
 
     Each vertex has a position in m, a color, an instance id and a class. The class is an index into the class names in
     the header, where commas and characters outside of ASCII are escaped as in URLs. Vertices without an instance have
-    the id 0, and vertices without a class have the index -1.
+    the id 0, and vertices without a class have the index -1. `comments` are added to the header.
     """
     properties: dict[str, Array] = {
         **{channel: mesh.colors[:, k] for k, channel in enumerate(CHANNELS)},
@@ -33,6 +33,7 @@ def write_mesh(path: Path, mesh: InstanceMesh) -> None:
         "class": mesh.class_ids,
     }
     comments = (
+        *comments,
         "InstanceMap; meters; instance 0 = none; class -1 = none, else an index into:",
         f"{CLASSES}{','.join(quote(name, SAFE) for name in mesh.classes)}",
     )

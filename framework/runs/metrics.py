@@ -16,6 +16,7 @@ from framework.evaluation.compared_classes import Compared, ComparedClasses, ind
 from framework.evaluation.instances import PredictedInstances, Transfer
 from framework.evaluation.scannet_benchmark import BenchmarkScene, benchmark_metrics, semantic_metrics
 from framework.evaluation.truth_alignment import in_map_world
+from framework.evaluation.truth_coverage import TruthCoverage
 from framework.files.hashing import add_values
 from framework.interfaces import RGBDVideo, SceneMap
 from framework.mapping.gravity import floor_height
@@ -33,6 +34,7 @@ MAIN_FIGURES = (
     "ap50_agnostic",
     "mean_iou",
 )  # keys below `instances.` that are stored for both directions of the label transfer
+COVERAGE = "coverage."  # prefix of the fractions of the ground truth and of the map near each other
 CLASSES = "evaluated_classes."  # prefix of the keys about the label space of the evaluation
 LABEL_SPACE, CLASS_NAMES = CLASSES + "label_space", CLASSES + "names"
 OF_FILE = CLASSES + "of_file"  # classes of a label space in a file, as JSON, because the file may change
@@ -55,6 +57,8 @@ def run_metrics(result: RunResult) -> Metrics:
         "pose_source": result.pose_source,
         **{f"map.{name}": value for name, value in asdict(result.scene.statistics).items()},
     }
+    if result.disagreeing is not None:
+        metrics["frames_disagreeing"] = len(result.disagreeing)
     for stage in dict.fromkeys([*STAGES, *(time.stage for time in result.timings)]):
         milliseconds = [time.milliseconds for time in result.timings if time.stage == stage]
         metrics[f"stage_ms.{stage}.median"] = float(np.median(milliseconds)) if milliseconds else None
@@ -133,7 +137,9 @@ def evaluation_metrics(
     annotation: str,
     compared_classes: ComparedClasses,
 ) -> Metrics:
-    """Return the instance metrics, the label space, the release of the ground truth and its hash.
+    """Return the instance metrics, the coverage, the label space, the release of the ground truth and its hash.
+
+    A small coverage is logged, because the ground truth may have another world frame.
 
     By default, labels are transferred from the map to the ground truth. The keys `instances.to_map.*` contain the main
     metrics with labels transferred from the ground truth to the map.
@@ -145,6 +151,12 @@ def evaluation_metrics(
         annotation: The release of the ground truth, or "" for a dataset with a single release.
         compared_classes: The label space of the evaluation.
     """
+    coverage = TruthCoverage.of(predictions.points_world, aligned.points_world)
+    if not coverage.plausible:
+        log.warning(
+            "ground truth: expected the world frame of the map, got only %s; check the ground truth, or transform it",
+            coverage,
+        )
     compared = compared_classes.compare(predictions, aligned)
     for side, ignored in (("map", compared.ignored_predictions), ("ground truth", compared.ignored_truths)):
         if ignored:
@@ -157,6 +169,7 @@ def evaluation_metrics(
         **figures,
         **of_map,
         **_scannet_metrics(compared, compared_classes),
+        **{f"{COVERAGE}{name}": value for name, value in asdict(coverage).items()},
         LABEL_SPACE: compared_classes.label_space,
         CLASS_NAMES: compared_classes.names_text,
         OF_FILE: compared_classes.file_text,
@@ -200,7 +213,7 @@ def annotated_sha256(annotated: AnnotatedObjects) -> str:
 
 def is_evaluation(key: str) -> bool:
     """Return True for the key of a metric from `evaluation_metrics`."""
-    prefixes = ("instances.", "semantic.", CLASSES)
+    prefixes = ("instances.", "semantic.", COVERAGE, CLASSES)
     return key in ("annotation_release", TRUTH, ANNOTATED) or (key.startswith(prefixes) and key != "instances.count")
 
 

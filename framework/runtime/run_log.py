@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import takewhile
@@ -75,6 +75,7 @@ class RunResult:
     keyframes: Mapping[str, Array] = field(default_factory=dict)  # of the tracker
     color_delay: DelayEstimate | None = None  # None = given, not estimated
     digests: tuple[StageDigest, ...] = ()  # of each stage and frame
+    disagreeing: tuple[int, ...] | None = None  # Frame.index of the frames that contradict the map; None = not compared
 
     @property
     def frames_lost(self) -> int:
@@ -113,6 +114,8 @@ class Journal:
     frames_dropped: int = 0
     latencies: list[float] = field(default_factory=list)  # s
     sensor: SensorKind | None = None  # of the last frame
+    compared: int = 0  # number of frames whose depth is compared with the map at a given pose
+    disagreeing: list[int] = field(default_factory=list)  # Frame.index of those that contradict the map
 
     def __enter__(self) -> Journal:
         self._screen = ExitStack()
@@ -130,6 +133,12 @@ class Journal:
             log.warning("%d of %d frames skipped because they have no pose; the first: %s", *counts)
         if self._errors > SKIPS_LOGGED:
             log.warning("%d frames skipped in total", self.frames_skipped)
+        if self.disagreeing:
+            log.warning(
+                "%d of %d frames disagree with the map at their given poses: frames %s; run `instancemap check`, or "
+                "estimate the poses with tracker=voxel_hashing_icp",
+                len(self.disagreeing), self.frames, frame_ranges(self.disagreeing),
+            )  # fmt: skip
         if self.frames_dropped:
             log.warning("%d frames dropped because mapping fell behind", self.frames_dropped)
 
@@ -217,6 +226,22 @@ class Journal:
             log.warning("frame %d: tracked again after %d lost frames", frame.index, self.lost_for)
             self.lost_for = 0
 
+    def frame_compared(self, frame: Frame, disagrees: bool, fraction: float) -> None:
+        """Record the comparison of a frame with the map. Log the first frame that disagrees.
+
+        Args:
+            frame: The frame.
+            disagrees: True if the given pose contradicts the map.
+            fraction: Fraction of the pixels whose depth differs from the map.
+        """
+        self.compared += 1
+        if not disagrees:
+            return
+        if not self.disagreeing:
+            text = "frame %d: depth differs from the map at %.0f%% of the pixels; its given pose may be wrong"
+            log.warning(text, frame.index, 100 * fraction)
+        self.disagreeing.append(frame.index)
+
     def frame_fused(self, frame: Frame) -> None:
         """Record the latency of a frame if the video is live."""
         if self.frames_expected is None:
@@ -235,5 +260,17 @@ class Journal:
             stopped_by=self.stopped_by,
             intervals=tuple(np.diff(self.frames_began).tolist()),
             pose_source=self.pose_source,
+            disagreeing=tuple(self.disagreeing) if self.compared else None,
             live=LiveFigures(self.frames_dropped, tuple(self.latencies)) if self.frames_expected is None else None,
         )
+
+
+def frame_ranges(indices: Sequence[int]) -> str:
+    """Return increasing frame numbers as text, such as "3, 7 to 9"."""
+    parts: list[list[int]] = []
+    for index in indices:
+        if parts and index == parts[-1][1] + 1:
+            parts[-1][1] = index
+        else:
+            parts.append([index, index])
+    return ", ".join(f"{first}" if first == last else f"{first} to {last}" for first, last in parts)

@@ -58,9 +58,9 @@ SCENENN_NAMES = {coco: name for name, coco in SCENENN_TO_COCO.items()}
 
 DIRECTIONS = {
     **dict.fromkeys(("instances.count", "instances.true_count", "instances.ignored_count"), Direction.NONE),
-    **dict.fromkeys(("instances", "semantic", "fps", "fps_median"), Direction.HIGHER),
+    **dict.fromkeys(("instances", "semantic", "coverage", "fps", "fps_median"), Direction.HIGHER),
     **dict.fromkeys(("trajectory", "stage_ms", "latency_ms", "map.bytes", "peak_rss_bytes"), Direction.LOWER),
-    **dict.fromkeys(("frames_lost", "frames_skipped", "frames_dropped"), Direction.LOWER),
+    **dict.fromkeys(("frames_lost", "frames_skipped", "frames_dropped", "frames_disagreeing"), Direction.LOWER),
 }
 """Directions by prefix of the key. The longest prefix applies. Other metrics have no direction."""
 

@@ -18,6 +18,7 @@ class GroundTruth(PoseTracker):
     """
 
     pose_source = "ground_truth"
+    poses_given = True
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         """Return the ground-truth pose of the frame.

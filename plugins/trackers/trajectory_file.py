@@ -36,6 +36,8 @@ class TrajectoryFile(PoseTracker):
     DataError if a pose is not finite or not rigid, or if timestamps do not increase.
     """
 
+    poses_given = True
+
     path: Path  # trajectory in TUM, EuRoC or KITTI format
     # maximum time difference between a frame and its pose, s, >= 0; frames without a pose are skipped
     max_time_difference: float = 0.02

@@ -167,6 +167,48 @@ def test_mapper_pickle_round_trip_continues_mapping(room: CornerRoom, fuser: str
     np.testing.assert_array_equal(copied.scene.mesh().vertices, mapper.scene.mesh().vertices)
 
 
+def test_mapper_camera_matrix_equals_camera(room: CornerRoom) -> None:
+    frame, found = room[0], []
+    for camera in (frame.camera, frame.camera.K, frame.camera.K.tolist(), frame.camera.K.astype(np.float32)):
+        mapper = Mapper("detector=none", *STAGES[1:])
+        mapper.add(frame.color, frame.depth, pose=frame.T_world_camera, camera=camera)
+        mapper.add(frame.color, frame.depth, pose=frame.T_world_camera)
+        assert mapper._camera is not None
+        assert mapper._camera.shape == frame.depth.shape
+        found.append(mapper.mesh().vertices)
+    for vertices in found[1:]:
+        np.testing.assert_allclose(vertices, found[0], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        (np.eye(4), r"camera: expected a Camera or \[\[fx, 0, cx\], .* got an array of shape \(4, 4\)"),
+        ([500, 500, 319.5, 239.5], r"got an array of shape \(4,\)"),
+        ([[500, 2, 319.5], [0, 500, 239.5], [0, 0, 1]], "undistort and unskew the images first"),
+        (np.diag([500.0, 500.0, 2.0]), r"camera: expected \[\[fx, 0, cx\], .* got "),
+        (np.eye(3), "fx, fy, cx, cy in px"),
+        ("camera.json", "got str"),
+    ],
+)
+def test_mapper_invalid_camera_raises(room: CornerRoom, camera: Any, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        Mapper("detector=none", *STAGES[1:]).add(room[0].color, room[0].depth, camera=camera)
+
+
+@pytest.mark.parametrize(
+    ("tracker", "warned"), [("ground_truth", False), ("voxel_hashing_icp", True), ("open3d_odometry", True)]
+)
+def test_mapper_ignored_poses_are_logged_once(
+    room: CornerRoom, caplog: pytest.LogCaptureFixture, tracker: str, warned: bool
+) -> None:
+    mapper = Mapper("detector=none", f"tracker={tracker}", *STAGES[2:])
+    for k in range(3):
+        assert "Mapper.add: pose" not in caplog.text or k > 1
+        mapper.add(room[k].color, room[k].depth, pose=room[k].T_world_camera, camera=room[k].camera)
+    assert caplog.text.count('set tracker="ground_truth", or omit pose after the first frame') == int(warned)
+
+
 def test_mapper_add_none_raises() -> None:
     with pytest.raises(DataError, match=r"Mapper\.add: expected a Frame, or color and depth, got only NoneType"):
         Mapper(*STAGES).add(None)  # type: ignore[arg-type]

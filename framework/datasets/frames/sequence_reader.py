@@ -37,6 +37,7 @@ from framework.datasets.frames.conventions import (
 )
 from framework.datasets.frames.odometry import KEY as ODOMETRY_KEY
 from framework.datasets.frames.odometry import Odometry, OdometryFile
+from framework.datasets.frames.world_offset import FARTHEST, as_setting, world_offset_of
 from framework.datasets.ground_truth.labeled_mesh import unseen
 from framework.datasets.ground_truth.named_truth import KEY, NamedTruth, read_named_truth
 from framework.errors import ConfigError, DataError, FrameError
@@ -46,7 +47,6 @@ from framework.files.search_paths import folder_of
 from framework.interfaces import RGBDSequence
 from framework.sensors.noise_models import SensorChoice, SensorKind
 
-FARTHEST = 1e4  # m, maximum distance of a pose from the origin; at this distance, float32 resolves 1 mm
 FRAME_RATE = 30.0  # Hz, for recordings without valid timestamps
 
 TO_THE_END = -1  # value of `stop` for the end of the sequence
@@ -150,6 +150,9 @@ class Recording(RGBDSequence):
     # delay of color relative to depth at equal timestamps, s, in [-0.2, 0.2]; positive = color captured later; AUTO =
     # estimated during the run, 0 until then
     color_delay: str = AUTO
+    # origin of the mapped world frame, "x y z" in the world frame of the poses, m; subtracted from all poses; AUTO = 0,
+    # or a multiple of 1000 m near the cameras if they are farther than 10 km
+    world_offset: str = AUTO
     odometry_file: OdometryFile = field(default_factory=OdometryFile)
 
     def __post_init__(self) -> None:
@@ -167,7 +170,7 @@ class Recording(RGBDSequence):
         stored = self.open()
         timed = [_in_seconds(frame, self.time_unit) for frame in stored.frames]
         depth_scale = self.depth_reading.depth_scale or stored.depth_scale
-        posed = [_posed(frame, self.pose_reading) for frame in delay_poses(timed, self.pose_reading.pose_delay)]
+        posed = self._posed_frames(delay_poses(timed, self.pose_reading.pose_delay))
         ordered = _in_order_of_time(self.name, _with_plausible_image_times(self.name, posed))
         frames = delay_depth(ordered, self.depth_reading.depth_delay)
         self.contents = replace(stored, frames=frames, depth_scale=depth_scale)
@@ -184,6 +187,17 @@ class Recording(RGBDSequence):
         if self.named_truth is not None:
             self.annotation = self.named_truth.name
             self._check_truth_poses(self.named_truth)
+
+    def _posed_frames(self, frames: Sequence[RecordedFrame]) -> list[RecordedFrame]:
+        """Return the frames with poses in the default convention, relative to the world offset."""
+        converted = [_converted(frame, self.pose_reading) for frame in frames]
+        poses = [one.T_world_camera for one in converted if one.T_world_camera is not None]
+        positions = np.array([T[:3, 3] for T in poses]).reshape(-1, 3)
+        offset = world_offset_of(self.world_offset, positions)
+        self.world_origin = tuple(offset.tolist())
+        if offset.any():
+            log.info("%s: all coordinates are relative to %s", self.name, as_setting(offset))
+        return [_relative(frame, offset) for frame in converted]
 
     @abstractmethod
     def open(self) -> Contents:
@@ -378,21 +392,31 @@ def _in_seconds(frame: RecordedFrame, unit: float) -> RecordedFrame:
     return replace(frame, timestamp=unit * frame.timestamp, color_timestamp=color, depth_timestamp=depth)
 
 
-def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
-    """Convert the pose of a frame to the default convention.
-
-    A frame has an error instead if the pose is more than FARTHEST m from the origin.
-    """
+def _converted(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
+    """Convert the pose of a frame to the default convention. A frame has an error instead if this is impossible."""
     if recorded.T_world_camera is None:
         return recorded
     try:
-        T_world_camera = reading.pose(recorded.T_world_camera)
+        return replace(recorded, T_world_camera=reading.pose(recorded.T_world_camera))
     except DataError as reason:
         return RecordedFrame(recorded.images, recorded.timestamp, error=f"{recorded.images.color_name}: {reason}")
+
+
+def _relative(recorded: RecordedFrame, offset: Float64) -> RecordedFrame:
+    """Subtract a world offset (3,) from the position of a frame.
+
+    A frame has an error instead if the pose is more than FARTHEST m from the offset.
+    """
+    T_world_camera = recorded.T_world_camera
+    if T_world_camera is None:
+        return recorded
+    if offset.any():
+        T_world_camera = T_world_camera.copy()
+        T_world_camera[:3, 3] -= offset
     distance = math.hypot(*T_world_camera[:3, 3])
     if distance <= FARTHEST:
         return replace(recorded, T_world_camera=T_world_camera)
-    expected = f"expected a pose within {FARTHEST:g} m of the origin"
+    expected = f"expected a pose within {FARTHEST:g} m of dataset.world_offset"
     error = f"{recorded.images.color_name}: {expected}, got {distance:.6g} m"
     return RecordedFrame(recorded.images, recorded.timestamp, error=error)
 

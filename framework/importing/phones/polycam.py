@@ -8,12 +8,14 @@
     keyframes/confidence/1442008525605.png      uint8: 0 low, 255 high, other values medium (127 as documented, 54 in
                                                 exports)
 
-Corrected files are preferred. The up direction is taken from the recorded poses, because the y axis of optimized poses
-is undocumented.
+Corrected files are preferred. Optimized poses have another world frame than recorded poses, so they are used only if
+all frames have one. The up direction is taken from the recorded poses, because the y axis of optimized poses is
+undocumented.
 """
 
 from __future__ import annotations
 
+import logging
 import re
 from functools import partial
 from pathlib import Path
@@ -27,6 +29,8 @@ from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
 from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, meters
 from framework.sensors.noise_models import SensorKind
+
+log = logging.getLogger(__name__)
 
 MICROSECONDS = 1e6  # per second
 LEVELS = (1, 255)  # minimum values of medium and high confidence
@@ -58,15 +62,23 @@ def open_source(path: Path) -> Source:
         raise DataError(
             f"{path}: {expected}, {found}; record with a LiDAR device, and export with Polycam's developer mode on"
         )
-    frames = [partial(_read, folder, stem) for stem in stems]
+    optimized = [stem for stem in stems if (folder / f"corrected_cameras/{stem}.json").exists()]
+    if 0 < len(optimized) < len(stems):
+        log.warning(
+            "%s: corrected_cameras/ has poses for only %d of %d frames; using the poses of cameras/ for all frames, "
+            "because the two have different world frames",
+            path, len(optimized), len(stems),
+        )  # fmt: skip
+    pose_folder = "corrected_cameras" if len(optimized) == len(stems) else "cameras"
+    frames = [partial(_read, folder, stem, pose_folder) for stem in stems]
     return Source("Polycam", frames, len(frames), posed=True, sensor=SensorKind.PHONE_LIDAR)
 
 
-def _read(folder: Path, stem: str) -> DeviceFrame:
+def _read(folder: Path, stem: str, pose_folder: str) -> DeviceFrame:
     undistorted = (folder / f"corrected_images/{stem}.jpg").exists()
     color = read_color(folder / f"{'corrected_images' if undistorted else 'images'}/{stem}.jpg")
     corrected, as_recorded = folder / f"corrected_cameras/{stem}.json", folder / f"cameras/{stem}.json"
-    posed = corrected if corrected.exists() else as_recorded
+    posed = folder / f"{pose_folder}/{stem}.json"
     camera = corrected if undistorted and corrected.exists() else as_recorded
     corrected_depth = folder / f"corrected_depth/{stem}.png"
     depth = corrected_depth if undistorted and corrected_depth.exists() else folder / f"depth/{stem}.png"

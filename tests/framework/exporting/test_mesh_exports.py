@@ -13,6 +13,7 @@ import open3d as o3d
 import pytest
 import trimesh
 from PIL import ImageColor
+from scipy.spatial.transform import Rotation
 
 from framework.data import Box
 from framework.errors import DataError
@@ -71,6 +72,29 @@ def test_read_room_with_z_up_keeps_world_xy(tmp_path: Path) -> None:
     expected = np.eye(4)
     expected[2, 3] = -0.5
     np.testing.assert_allclose(room.T_room_world, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("shift", "tilt"),
+    [
+        ((6000, 6000, 0), (0.3, -0.2, 0)),
+        ((-8000, 200, 40), (1, 0, 0)),
+        ((500, -900, -3), (0, 2, 0)),
+        ((3000, 0, 0), (-0.5, 1.5, 30)),
+        ((0, 9000, 100), (5, 5, 90)),
+    ],
+    ids=str,
+)
+def test_read_room_far_from_origin_keeps_world_xy(
+    tmp_path: Path, shift: tuple[float, float, float], tilt: tuple[float, float, float]
+) -> None:
+    """A rotation about the origin of the world frame would move the room by up to a kilometer."""
+    scene = ExportedRoom(shift=shift, R_world_room=Rotation.from_euler("xyz", tilt, degrees=True).as_matrix())
+    room, world = read_room(scene.write(tmp_path / "run")), scene.mesh().vertices
+    middles = [(vertices.min(axis=0) + vertices.max(axis=0))[:2] / 2 for vertices in (world, room.mesh.vertices)]
+    np.testing.assert_allclose(middles[1], middles[0], atol=0.2)
+    assert room.mesh.vertices[:, 2].min() == pytest.approx(0, abs=2e-3)
+    np.testing.assert_allclose(room.T_room_world[:3, :3] @ scene.R_world_room[:, 2], (0, 0, 1), atol=1e-9)
 
 
 @pytest.mark.parametrize(

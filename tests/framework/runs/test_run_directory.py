@@ -155,6 +155,8 @@ def test_instance_metrics_have_both_transfers_and_truth_release(
         assert metrics.pop(f"instances.to_map.{name}") == to_map[f"instances.{name}"]
     for name in ("label_space", "names", "of_file", "ignored_in_map", "ignored_in_ground_truth"):
         assert metrics.pop(f"evaluated_classes.{name}") is None
+    assert metrics.pop("coverage.ground_truth") == 1.0
+    assert metrics.pop("coverage.map") > 0.99
     assert metrics == to_truth
 
 

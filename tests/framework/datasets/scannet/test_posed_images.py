@@ -88,5 +88,5 @@ def test_posed_images_without_images_raise(tmp_path: Path, suffix: str, kind: st
     write_posed_images(tmp_path, SHOTS, CAMERA)
     for path in tmp_path.glob(f"*.{suffix}"):
         path.unlink()
-    with pytest.raises(DataError, match=rf"expected images \({kind}\), got none"):
+    with pytest.raises(DataError, match=rf"expected files \({kind}\), got "):
         ScanNet(tmp_path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,24 @@ def test_polycam_optimized_poses_and_images_are_used(tmp_path: Path) -> None:
     check_imported(tmp_path / "out", FRAMES, tells_up=False)
     for frame, seen in zip(drifted, RgbdFolder(tmp_path / "out"), strict=True):  # up in the world frame of ARKit
         np.testing.assert_allclose(frame.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("missing", [(0,), (1,), (-1,), (0, 1), range(1, len(FRAMES))], ids=str)
+def test_polycam_partial_optimized_poses_are_ignored(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, missing: Sequence[int]
+) -> None:
+    """Optimized and recorded poses have different world frames, so that a mixture maps surfaces twice."""
+    drifted = [replace(frame, T_world_camera=DRIFT @ frame.T_world_camera) for frame in FRAMES]
+    write_polycam(tmp_path / "export", drifted)
+    write_polycam(tmp_path / "export", FRAMES, "corrected_")
+    cameras = sorted((tmp_path / "export/keyframes/corrected_cameras").iterdir(), key=lambda path: int(path.stem))
+    for k in missing:
+        cameras[k].unlink()
+    assert not write(tmp_path / "export", tmp_path)
+    for frame, seen in zip(drifted, RgbdFolder(tmp_path / "out"), strict=True):
+        np.testing.assert_allclose(frame.T_world_camera, seen.T_world_camera, atol=1e-5)
+    found = f"poses for only {len(FRAMES) - len(missing)} of {len(FRAMES)} frames; using the poses of cameras/"
+    assert found in caplog.text
 
 
 def test_polycam_optimized_poses_without_images_are_used(tmp_path: Path) -> None:

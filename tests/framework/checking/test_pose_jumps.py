@@ -1,0 +1,96 @@
+"""Tests for jumps of stored poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from framework.checking.matched_pairs import Matcher
+from framework.checking.pose_jumps import find_jumps
+from framework.checking.recording_check import check, warn_of_poses
+from framework.data import Float64
+from framework.datasets.frames.conventions import PoseReading
+from framework.datasets.frames.sequence_reader import Recording
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.datasets.tum_rgbd import TumRgbd
+from tests.support.recordings.damaged import write_damaged
+
+pytestmark = pytest.mark.integration
+
+DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
+
+
+def motion(shift: tuple[float, ...], turn: tuple[float, ...] = (0, 0, 0)) -> Float64:
+    T = np.eye(4)
+    T[:3, 3], T[:3, :3] = shift, Rotation.from_rotvec(np.radians(turn)).as_matrix()
+    return T
+
+
+def jumping(T: Float64, after: Callable[[int], bool]) -> Callable[[Float64], Float64]:
+    """Return a function that moves the poses of some frames, to be called in the order of the frames."""
+    numbers = count()
+    return lambda pose: T @ pose if after(next(numbers)) else pose
+
+
+def jumps_of(recording: Recording) -> list[tuple[int, int]]:
+    poses = [recording.contents.frames[index].T_world_camera for index in recording.chosen]
+    found = find_jumps(Matcher(recording), poses, PoseReading(), revisits=0)
+    return [(one.first, one.second) for one in found.neighbors]
+
+
+@pytest.mark.parametrize(
+    ("T", "after", "expected"),
+    [
+        (motion((0.3, 0, 0)), lambda k: k >= 9, [(8, 9)]),
+        (motion((0, 0, -0.3)), lambda k: k >= 5, [(4, 5)]),
+        (motion((0, 0, 0), (0, 0, 10)), lambda k: k >= 12, [(11, 12)]),
+        (motion((0, 0, 0), (10, 0, 0)), lambda k: k == 7, [(6, 7), (7, 8)]),
+        (motion((2, 1, 0.5), (0, 0, 60)), lambda k: k % 6 >= 3, [(2, 3), (5, 6), (8, 9), (11, 12), (14, 15)]),
+    ],
+    ids=["sideways", "down", "turn", "single", "two_worlds"],
+)
+def test_find_jumps_names_frames(
+    tmp_path: Path, T: Float64, after: Callable[[int], bool], expected: list[tuple[int, int]]
+) -> None:
+    recording = RgbdFolder(write_damaged(tmp_path / "jump", DESK, pose=jumping(T, after), frames=18))
+    assert jumps_of(recording) == expected
+
+
+def test_find_jumps_in_valid_recordings_finds_none(shared_data: Path) -> None:
+    assert not jumps_of(DESK)
+    for name in ("mit76", "redwood5"):
+        assert not jumps_of(RgbdFolder(shared_data / name))
+
+
+def test_find_jumps_between_revisits_finds_drift(tmp_path: Path) -> None:
+    """Each step is too small for a jump, but the camera sees the same place again at another pose."""
+    numbers = count()
+
+    def drifting(T: Float64) -> Float64:
+        return motion((0.012 * next(numbers), 0, 0)) @ T
+
+    recording = RgbdFolder(write_damaged(tmp_path / "drift", DESK, pose=drifting))
+    poses = [recording.contents.frames[index].T_world_camera for index in recording.chosen]
+    found = find_jumps(Matcher(recording), poses, PoseReading(), neighbors=30)
+    assert not found.neighbors
+    assert found.revisits
+    finding = found.finding()
+    assert finding is not None
+    assert "frames of the same place" in finding.text
+
+
+@pytest.mark.acceptance
+def test_check_of_two_world_frames_reports_jumps_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The poses alternate between two world frames, which looks like a wrong scale to the median pair."""
+    mixed = jumping(motion((1, 2, 0.5), (0, 0, 40)), lambda k: k % 20 >= 10)
+    recording = RgbdFolder(write_damaged(tmp_path / "mixed", DESK, pose=mixed))
+    [error] = check(recording, 5.0).errors
+    assert error.text.startswith("jump between the neighboring frames 9 and 10 (by ")
+    assert error.setting == "tracker=voxel_hashing_icp"
+    warn_of_poses(recording)
+    assert "jump between the neighboring frames 9 and 10" in caplog.text

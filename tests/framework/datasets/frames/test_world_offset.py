@@ -1,0 +1,102 @@
+"""Tests for recordings with coordinates far from the origin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.data import Float64
+from framework.datasets.frames.conventions import PoseKind, PoseReading
+from framework.datasets.frames.world_offset import as_setting, world_offset_of
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.datasets.tum_rgbd import TumRgbd
+from framework.errors import ConfigError, DataError, FrameError
+from framework.files.tum_trajectory import read_tum
+from framework.geometry import inverse
+from framework.runs.stored_runs import read_metrics
+from instancemap import load_map, run
+from tests.support.recordings.damaged import write_damaged
+
+DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
+FAR = [(450000, 5400000, 300), (-84000, 0, 0), (12000, 12000, 0), (3980000, -12000, 4960000), (0, 0, 50000)]
+
+
+def shifted(shift: tuple[float, ...], T: Float64) -> Float64:
+    T = T.copy()
+    T[:3, 3] += shift
+    return T
+
+
+def recording(tmp_path: Path, shift: tuple[float, ...]) -> Path:
+    return write_damaged(tmp_path / "far", DESK, pose=lambda T: shifted(shift, T), frames=6)
+
+
+@pytest.mark.parametrize("shift", FAR, ids=str)
+def test_recording_far_from_origin_is_recentered(
+    tmp_path: Path, shift: tuple[float, ...], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    found = RgbdFolder(recording(tmp_path, shift))
+    origin = np.array(found.world_origin)
+    np.testing.assert_array_equal(origin % 1000, 0)
+    for far, near in zip(found, DESK, strict=False):
+        assert far.T_world_camera is not None
+        assert np.linalg.norm(far.T_world_camera[:3, 3]) < 1000
+        np.testing.assert_allclose(shifted(tuple(origin - shift), far.T_world_camera), near.T_world_camera, atol=2e-5)
+    assert f"all coordinates are relative to {as_setting(origin)}" in caplog.text
+
+
+def test_recording_near_origin_is_unchanged(tmp_path: Path) -> None:
+    found = RgbdFolder(recording(tmp_path, (6000, 6000, 0)))
+    assert found.world_origin == (0, 0, 0)
+    assert DESK.world_origin == (0, 0, 0)
+
+
+def test_recording_of_inverse_poses_is_recentered(tmp_path: Path) -> None:
+    place = write_damaged(tmp_path / "far", DESK, pose=lambda T: inverse(shifted(FAR[1], T)), frames=3)
+    found = RgbdFolder(place, pose_reading=PoseReading(PoseKind.T_CAMERA_WORLD))
+    assert found.world_origin == (-83000, 0, 0) or found.world_origin == (-84000, 0, 0)
+    assert np.abs(found[0].T_world_camera[:3, 3]).max() < 1500
+
+
+def test_world_offset_of_outlier_is_zero() -> None:
+    positions = np.zeros((9, 3))
+    positions[0] = 1e12
+    assert not world_offset_of("AUTO", positions).any()
+    assert not world_offset_of("AUTO", np.zeros((0, 3))).any()
+    np.testing.assert_array_equal(world_offset_of("1 -2.5 3e5", positions), (1, -2.5, 3e5))
+
+
+@pytest.mark.parametrize("parameter", ["auto", "", "1 2", "1 2 3 4", "1 2 nan", "1 2 1e9", "1,2,3"])
+def test_invalid_world_offset_raises(parameter: str) -> None:
+    with pytest.raises(ConfigError, match=r'dataset\.world_offset: expected AUTO or three numbers "x y z"'):
+        world_offset_of(parameter, np.zeros((1, 3)))
+
+
+def test_pose_far_from_world_offset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FrameError, match=r"expected a pose within 10000 m of dataset\.world_offset, got 5"):
+        RgbdFolder(recording(tmp_path, FAR[0]), world_offset="0 0 0")[0]
+
+
+@pytest.mark.integration
+def test_run_far_from_origin_equals_run_near_origin(tmp_path: Path) -> None:
+    """The outputs are those of the run at the origin, and name the origin of the map."""
+    stages = ("tracker=ground_truth", "detector=none", "fuser.voxel_size=0.02", "dataset=rgbd_folder")
+    places = {"near": (0.0, 0.0, 0.0), "far": (450000.0, 5400000.0, 1000.0)}
+    for name, shift in places.items():
+        place = write_damaged(tmp_path / name, DESK, pose=lambda T, shift=shift: shifted(shift, T), frames=4)
+        run(tmp_path / f"run_{name}", *stages, f"dataset.root={place}")
+    near, far = (load_map(tmp_path / f"run_{name}" / "map.npz").mesh().vertices for name in places)
+    origin = [read_metrics(tmp_path / "run_far")[f"map.origin.{axis}"] for axis in "xyz"]
+    np.testing.assert_allclose(near - (np.array(origin) - places["far"]), far, atol=1e-3)
+    _, poses = read_tum(tmp_path / "run_far/trajectory.txt")
+    assert np.abs(poses[:, :3, 3]).max() < 1000
+    named = f"origin of the map in the world frame of the recording, m: {' '.join(f'{value:.12g}' for value in origin)}"
+    assert (tmp_path / "run_far/trajectory.txt").read_text().startswith(f"# {named}\n")
+    assert f"comment {named}\n".encode() in (tmp_path / "run_far/mesh.ply").read_bytes()
+    resumed = (*stages, f"dataset.root={tmp_path / 'far'}")
+    run(tmp_path / "again", *resumed, resume_from=str(tmp_path / "run_far"))
+    with pytest.raises(DataError, match=r'resume_from: expected poses .*; set "dataset\.world_offset=0 0 0"'):
+        run(tmp_path / "refused", *resumed, resume_from=str(tmp_path / "run_near"))
