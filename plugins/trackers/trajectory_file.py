@@ -17,6 +17,8 @@ from framework.files.pose_lines import read_trajectory
 from framework.geometry import inverse
 from framework.interfaces import PoseTracker, SceneMap
 
+LONGEST_STEP = 10.0  # s, longest plausible time between poses, and between the poses and a frame of the same clock
+
 
 class World(Enum):
     """World frame of the poses."""
@@ -88,11 +90,13 @@ class TrajectoryFile(PoseTracker):
     def _time_fix(self, times: Float64, timestamp: float) -> str:
         """Return the setting that brings poses at `times` to the clock of a frame at `timestamp`, s, or ""."""
         stored = (times - self.time_offset) / self.time_unit
+        step = float(np.median(np.diff(stored))) if len(stored) > 1 else abs(float(stored[0]))
         for unit, name in TIME_UNITS.items():
-            if unit != self.time_unit and np.abs(stored * unit - timestamp).min() <= self.max_time_difference:
+            is_near = np.abs(stored * unit - timestamp).min() <= self.max_time_difference
+            if step * self.time_unit > LONGEST_STEP and is_near:
                 return f"; set tracker.time_unit={unit:g} (the timestamps are in {name})"
         first, last = times[[0, -1]]
-        if first <= timestamp <= last:
+        if first - LONGEST_STEP <= timestamp <= last + LONGEST_STEP:
             return ""
         offset = timestamp - first + self.time_offset
         return (

@@ -192,7 +192,7 @@ def test_rgbd_folder_distant_pose_raises_for_its_frame(folder):
     set_pose_line(folder, 1, "0.1 0 1e4 0 0 0 0 1")
     RgbdFolder(folder)[1]
     set_pose_line(folder, 1, "0.1 0 1e5 0 0 0 0 1")
-    assert "000001.png: expected a pose within 10000 m of the origin, got 100000 m" in read_all_but(folder, 1)
+    assert "000001.png: expected a pose within 10000 m of dataset.world_offset, got 100000 m" in read_all_but(folder, 1)
 
 
 def test_rgbd_folder_scene_truth_skips_frame_with_distant_pose(folder, caplog):
