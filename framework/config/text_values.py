@@ -24,6 +24,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from framework.config.composition import added_config_dirs, config_loader
+from framework.config.hydra_api import version_base
 from framework.config.validation import checked_rows, without_interpolation
 
 SELECTING = ("dataset", "detector", "tracker", "refiner", "fuser", "viewer", "experiment", "preset")
@@ -120,8 +121,9 @@ def value_in(config: DictConfig, override: str, kind_of: KindOf) -> tuple[str, A
         return KEYS.get(key) or kind_of(config, key) or TextKind.NONE
 
     word = _quoted(override, kind, False, lambda _: True)
-    parsed = OverridesParser.create().parse_override(word)
-    return parsed.key_or_group, parsed.value()
+    with version_base("1.3"):
+        parsed = OverridesParser.create().parse_override(word)
+        return parsed.key_or_group, parsed.value()
 
 
 def typed(key: str, value: object) -> str:
@@ -259,7 +261,8 @@ def _is_plain(override: str) -> bool:
 def _parsed(override: str) -> Override | None:
     """Return a parsed override, or None if Hydra cannot parse it."""
     try:
-        return OverridesParser.create().parse_override(override)
+        with version_base("1.3"):
+            return OverridesParser.create().parse_override(override)
     except HydraException:
         return None
 

@@ -19,12 +19,13 @@ from omegaconf import OmegaConf
 
 from framework.api import Map, load_map
 from framework.config import composition
+from framework.config.text_values import literal
 from framework.data import Camera, Frame
 from framework.files.search_paths import CONF
 from framework.interfaces import Detector
 from framework.pipeline import Pipeline
 from framework.refinement.lifting import lift
-from framework.registry import STAGES, build
+from framework.registry import STAGES, build, text_kind
 from framework.runs.mesh_file import read_mesh
 from framework.testing.corner_room import exact_clusters, frame_at
 from tests.support import stored_experiments
@@ -157,7 +158,9 @@ def test_documented_command_composes(command: str) -> None:
         for k in range(max(map(len, choices), default=1)):
             compose(
                 COMMANDS[command],
-                overrides=[re.sub(r"=.*", f"={_kth(override, k)}", override) for override in overrides],
+                overrides=literal(
+                    [re.sub(r"=.*", f"={_kth(override, k)}", override) for override in overrides], text_kind
+                ),
             )
 
 

@@ -140,7 +140,7 @@ def test_write_tables_overrides_change_stored_settings(sweep: Path) -> None:
     assert "\\caption{Our \\textbf{results}.}\n\\label{tab:ours}" in latex
     stored = OmegaConf.load(sweep / "multirun.yaml").table
     assert stored == {"average_over": ["seed"], "columns": [AP50]}
-    with pytest.raises(ConfigError, match=r"table\.base=\[a: expected KEY=VALUE, got an error"):
-        write_tables(sweep, ["table.base=[a"])
-    with pytest.raises(ConfigError, match=r"table\.base=a,b: expected one value, got a sweep"):
-        write_tables(sweep, ["table.base=a,b"])
+    with pytest.raises(ConfigError, match=r"table\.columns=\[a: expected KEY=VALUE, got an error"):
+        write_tables(sweep, ["table.columns=[a"])
+    with pytest.raises(ConfigError, match=r"table\.columns=a,b: expected one value, got a sweep"):
+        write_tables(sweep, ["table.columns=a,b"])

@@ -137,8 +137,8 @@ def test_resume_with_incompatible_config_raises(
 def test_resume_from_missing_map_raises(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"resume_from: expected a run directory with map.npz, got .* without"):
         Mapper(*GIVEN, f"resume_from={tmp_path}")
-    with pytest.raises(ConfigError, match="resume_from: expected a path"):
-        Mapper(*GIVEN, "resume_from=7")
+    with pytest.raises(DataError, match=r"resume_from: expected a run directory with map.npz, got .*7 without it"):
+        Mapper(*GIVEN, "resume_from=7")  # a path, not a number
 
 
 @pytest.fixture(scope="module")
