@@ -204,8 +204,8 @@ def to_class_names(labels: Sequence[str], class_names: ClassNames, key: str = "d
 def label_space_of(classes: Sequence[str]) -> str:
     """Return the name of the label space of a map.
 
-    It is the first label space with all of the classes, OWN_CLASSES if there is none, AGNOSTIC for the single class
-    OBJECT, and "none" for a map without classes.
+    It is the first label space that contains all classes, or OWN_CLASSES for classes of no label space. It is AGNOSTIC
+    for the single class OBJECT, and "none" for a map without classes.
     """
     if not classes:
         return "none"

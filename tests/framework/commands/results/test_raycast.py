@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from framework.figures import raycast_figure
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.reporting.run_source import RunSource
 from framework.reporting.visibility import NOT_CAMERA
+from tests.support.command_call import call_command
 from tests.support.reported_run import write_run
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
@@ -46,14 +46,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     """Return a function that runs the command in this process and returns the status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["raycast", *map(str, arguments)])
-        status = 0
-        try:
-            raycast.main()
-        except SystemExit as ended:
-            status = int(ended.code or 0)
-        written = capsys.readouterr()
-        return status, written.out, written.err
+        return call_command(raycast, arguments, monkeypatch, capsys)
 
     return start
 

@@ -6,7 +6,6 @@ import json
 import re
 import shlex
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from framework.config import composition
 from framework.errors import DataError
 from framework.reporting import run_page
 from framework.reporting.run_page import RunReport
+from tests.support.command_call import call_command
 from tests.support.reported_run import rename_class, write_run
 from tests.support.scenes.corner_room import CornerRoom
 
@@ -38,14 +38,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     """Return a function that runs the command in this process and returns the status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["report", *map(str, arguments)])
-        status = 0
-        try:
-            report.main()
-        except SystemExit as ended:
-            status = int(ended.code or 0)
-        written = capsys.readouterr()
-        return status, written.out, written.err
+        return call_command(report, arguments, monkeypatch, capsys)
 
     return start
 
