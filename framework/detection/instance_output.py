@@ -34,7 +34,7 @@ from framework.detection.candidates import (
 from framework.detection.masks.binary_masks import masks_from_grids, paste_masks
 from framework.detection.masks.letterbox import ImageFormat, ImageFormatChoice, Letterbox, Level, Placement
 from framework.detection.runtimes.onnx_network import Outputs
-from framework.detection.segmentation_output import BoxKind
+from framework.detection.segmentation_output import BoxKind, MaskOutput
 from framework.errors import DataError
 from framework.vocabulary.category_ids import CategoryIds, column_ids, label_ids
 
@@ -77,7 +77,7 @@ class OutputNames:
 
 
 @dataclass(frozen=True)
-class InstanceOutput:
+class InstanceOutput(MaskOutput):
     """K candidates, with one mask each."""
 
     candidates: Candidates
@@ -87,15 +87,6 @@ class InstanceOutput:
     def masks(
         self, chosen: Int32, borders: Float32, letterbox: Letterbox, shape: tuple[int, int], threshold: float
     ) -> Bool:
-        """Return the masks (N, H, W) of the chosen candidates.
-
-        Args:
-            chosen: The indices (N,) of the candidates.
-            borders: The boxes (N, 4) x1 y1 x2 y2 of the chosen candidates in the image, px.
-            letterbox: The placement of the image in the input of the network.
-            shape: The image size (height, width), px.
-            threshold: The minimum probability of a pixel in the mask.
-        """
         grids = self.grids[chosen]
         if _are_logits(self.grids):
             grids = _sigmoid(grids)

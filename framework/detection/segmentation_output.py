@@ -6,6 +6,7 @@ for each cell. If the network contains non-maximum suppression, the table has on
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -34,14 +35,12 @@ class BoxKind(Enum):
     CORNER = "x1 y1 x2 y2"
 
 
-@dataclass(frozen=True)
-class SegmentationOutput:
-    """K candidates with mask coefficients, and the mask prototypes."""
+class MaskOutput(ABC):
+    """K candidates of a segmentation network, with masks that are computed on demand."""
 
     candidates: Candidates
-    coefficients: Float32  # (K, M)
-    prototypes: Float32  # (M, h, w)
 
+    @abstractmethod
     def masks(
         self, chosen: Int32, borders: Float32, letterbox: Letterbox, shape: tuple[int, int], threshold: float
     ) -> Bool:
@@ -54,6 +53,19 @@ class SegmentationOutput:
             shape: The image size (height, width), px.
             threshold: The minimum probability of a pixel in the mask.
         """
+
+
+@dataclass(frozen=True)
+class SegmentationOutput(MaskOutput):
+    """K candidates with mask coefficients, and the mask prototypes."""
+
+    candidates: Candidates
+    coefficients: Float32  # (K, M)
+    prototypes: Float32  # (M, h, w)
+
+    def masks(
+        self, chosen: Int32, borders: Float32, letterbox: Letterbox, shape: tuple[int, int], threshold: float
+    ) -> Bool:
         return masks_from_prototypes(self.coefficients[chosen], self.prototypes, borders, letterbox, shape, threshold)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from framework.data import Camera
 from tests.support.recordings.phone_exports import PhoneFrame, write_jpeg, write_png
 
 NERFCAPTURE_DEPTH_SCALE = 10.0  # m, parameter --depth_scale of the script
@@ -19,15 +20,9 @@ NERFCAPTURE_DEPTH_SCALE = 10.0  # m, parameter --depth_scale of the script
 
 def write_nerfstudio(folder: Path, frames: Sequence[PhoneFrame]) -> None:
     """Write one set of intrinsics, JPEG images and depth in millimeters, without timestamps."""
-    camera = frames[0].camera
     content: dict[str, object] = {
         "camera_model": "OPENCV",
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx + 0.5,
-        "cy": camera.cy + 0.5,
-        "w": camera.width,
-        "h": camera.height,
+        **_intrinsics(frames[0].camera),
         "k1": 0.0,
         "k2": 0.0,
         "p1": 0.0,
@@ -50,14 +45,8 @@ def write_nerfstudio(folder: Path, frames: Sequence[PhoneFrame]) -> None:
 
 def write_nerfcapture(folder: Path, frames: Sequence[PhoneFrame]) -> None:
     """Write intrinsics of each frame and depth in units of a 65535th of the depth scale, resized to color."""
-    first = frames[0].camera
     content: dict[str, object] = {
-        "fl_x": first.fx,
-        "fl_y": first.fy,
-        "cx": first.cx + 0.5,
-        "cy": first.cy + 0.5,
-        "w": first.width,
-        "h": first.height,
+        **_intrinsics(frames[0].camera),
         "integer_depth_scale": NERFCAPTURE_DEPTH_SCALE / 65535.0,
     }
     entries = []
@@ -66,22 +55,28 @@ def write_nerfcapture(folder: Path, frames: Sequence[PhoneFrame]) -> None:
         write_png(folder / f"images/{k}.png", np.concatenate([frame.color[..., ::-1], alpha], axis=2))
         units = frame.depth_mm / 1000 * 65535 / NERFCAPTURE_DEPTH_SCALE
         write_png(folder / f"images/{k}.depth.png", units.astype(np.uint16))
-        camera = frame.camera
         entries.append(
             {
                 "transform_matrix": _opengl(frame),
                 "file_path": f"images/{k}",
-                "fl_x": camera.fx,
-                "fl_y": camera.fy,
-                "cx": camera.cx + 0.5,
-                "cy": camera.cy + 0.5,
-                "w": camera.width,
-                "h": camera.height,
+                **_intrinsics(frame.camera),
                 "depth_path": f"images/{k}.depth.png",
             }
         )
     content["frames"] = entries
     (folder / "transforms.json").write_text(json.dumps(content, indent=4))
+
+
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    """Return the intrinsics with pixel centers at half integers."""
+    return {
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx + 0.5,
+        "cy": camera.cy + 0.5,
+        "w": camera.width,
+        "h": camera.height,
+    }
 
 
 def _opengl(frame: PhoneFrame) -> list[list[float]]:
