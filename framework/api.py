@@ -35,7 +35,6 @@ from framework.detection.domain import warn_outside_domain
 from framework.detection.map_classes import with_classes_of_map
 from framework.detection.stored.cache import with_cache
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
-from framework.files.atomic_write import atomic_write
 from framework.files.directory_lock import locked
 from framework.geometry import camera_of
 from framework.interfaces import (
@@ -114,8 +113,8 @@ __all__ = [
     "untimed",
 ]
 
-SWEEPS = ("experiment", "hydra", "launcher")
-"""Config groups of the command line that run several jobs, and of its working directory."""
+OF_COMMAND_LINE = ("experiment", "hydra", "launcher")
+"""Config groups that only the command line supports."""
 
 log = logging.getLogger(__name__)
 
@@ -198,7 +197,7 @@ class Mapper(Map):
     def __init__(self, *overrides: str, **named: object) -> None:
         words = _overrides("Mapper", overrides, named)
         for override in words:
-            if override.lstrip("+~").startswith(("dataset", "sequences", *SWEEPS)):
+            if override.lstrip("+~").startswith(("dataset", "sequences", *OF_COMMAND_LINE)):
                 raise ConfigError(
                     f"Mapper: expected an override of a stage or setting, got {override}; use dataset, experiment, "
                     "sequences, launcher and hydra overrides only on the command line"
@@ -396,10 +395,10 @@ def run(directory: Path | str, *overrides: str, **named: object) -> Path:
 
     words = _overrides("run", overrides, named)
     for override in words:
-        if override.lstrip("+~").startswith(SWEEPS):
+        if override.lstrip("+~").startswith(OF_COMMAND_LINE):
             raise ConfigError(
-                f"run: expected an override of a single run, got {override}; use {', '.join(SWEEPS)} overrides only on "
-                "the command line"
+                f"run: expected an override of a single run, got {override}; use {', '.join(OF_COMMAND_LINE)} "
+                "overrides only on the command line"
             )
     check_new(Path(directory))
     config, choices = composed_with_choices(*words)
@@ -423,13 +422,13 @@ def report(run: Path | str, out: Path | str | None = None) -> Path:
     Raises:
         DataError: The run cannot be read, or the file cannot be written.
     """
+    from framework.reporting.markup import write_page
     from framework.reporting.run_contents import RunContents
     from framework.reporting.run_page import RunReport
 
     path = Path(run) / REPORT if out is None else Path(out)
     page = RunReport.of(RunContents.read(Path(run))).html()
-    with atomic_write(path) as temporary:
-        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names may be invalid Unicode
+    write_page(path, page)
     return path
 
 

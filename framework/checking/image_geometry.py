@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -16,7 +15,7 @@ from framework.checking.registration import color_gradient, depth_edges
 from framework.data import Camera, Frame
 from framework.datasets.frames.sequence_reader import Recording
 from framework.errors import FrameError
-from framework.files.image_files import UPRIGHT, exif_orientation
+from framework.files.image_files import UPRIGHT, exif_orientation, rotation_command
 from framework.interfaces import RGBDSequence
 from framework.tracking.color_delay import MAX_GRADIENT
 
@@ -77,12 +76,11 @@ def check_orientation(sequence: RGBDSequence, chosen: Sequence[int]) -> Finding 
     if turned <= MIN_EDGE_RATIO * as_stored:
         return Finding(Verdict.NOTE, "color", f"{text}; the stored pixels match the depth images")
     first = next(name for name in names if isinstance(name, Path))
-    files = f"{shlex.quote(str(first.parent))}/*{first.suffix}"
     return Finding(
         Verdict.ERROR,
         "color",
         f"{text}; depth matches the images only after it: rotate the stored pixels, for example with "
-        f"mogrify -auto-orient {files}",
+        f"{rotation_command(first)}",
     )
 
 

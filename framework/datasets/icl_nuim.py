@@ -20,9 +20,8 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from framework.data import Camera, Float64
+from framework.datasets.frames.conventions import Mirror
 from framework.datasets.frames.numbered_images import numbered_images, paired_images
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording
 from framework.errors import DataError
@@ -32,7 +31,6 @@ from framework.sensors.noise_models import SensorKind
 CAMERA = Camera(640, 480, 481.20, 480.00, 319.50, 239.50)  # as published, with positive fy
 DEPTH_SCALE = 5000.0  # units per meter
 POSES = ".gt.freiburg"
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])  # about the plane y = 0
 
 _NOISY = re.compile(r"traj[0-9]n(_|$)")
 
@@ -61,4 +59,4 @@ class IclNuim(Recording):
 
 def _mirrored(line: TumLine) -> Callable[[], Float64]:
     """Return the function that reads the pose (4, 4) in the mirrored world."""
-    return lambda: MIRROR @ line.pose() @ MIRROR
+    return lambda: Mirror.Y.undone(line.pose())

@@ -7,6 +7,7 @@ raises an error for damaged data. OpenCV fills the damaged regions without an er
 from __future__ import annotations
 
 import io
+import shlex
 from pathlib import Path
 
 import cv2
@@ -35,6 +36,11 @@ def exif_orientation(path: Path) -> int:
             return int(image.getexif().get(ExifTags.Base.Orientation, UPRIGHT))
     except Exception:  # Pillow has no common base exception; reading the pixels reports damage
         return UPRIGHT
+
+
+def rotation_command(path: Path) -> str:
+    """Return the shell command that applies the EXIF orientation to the pixels of all images next to an image."""
+    return f"mogrify -auto-orient {shlex.quote(str(path.parent))}/*{path.suffix}"
 
 
 def read_color(path: Path) -> UInt8:

@@ -9,11 +9,13 @@ import base64
 import hashlib
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from framework.errors import DataError
+from framework.files.atomic_write import atomic_write
 
 ASSETS = files("framework.reporting") / "assets"
 STYLE = "report.css"
@@ -54,3 +56,9 @@ def page(template: str, title: str, context: Mapping[str, Any], data: Mapping[st
 
 def _hash(text: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+def write_page(path: Path, page: str) -> None:
+    """Write an HTML page. Invalid Unicode in names is escaped."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")

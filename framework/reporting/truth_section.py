@@ -26,7 +26,7 @@ from framework.reporting.run_contents import RunContents
 from framework.reporting.run_source import Footage
 from framework.reporting.visibility import sightings
 from framework.runs.instances_file import StoredInstance
-from framework.runs.metrics import IGNORED_IN_MAP, IGNORED_IN_TRUTH, LABEL_SPACE
+from framework.runs.metrics import LABEL_SPACE, ignored_names
 from framework.runs.reevaluation import classes_of
 from framework.runs.stored_runs import is_number
 
@@ -41,7 +41,6 @@ METRICS = {
     "instances.recall50": "Recall",
     "instances.pq50": "PQ",
 }
-IGNORED = {"map": IGNORED_IN_MAP, "ground truth": IGNORED_IN_TRUTH}
 GROUPS = {
     Outcome.WRONG_CLASS: ("Wrong class", "IoU of at least 0.5 with a ground-truth object of another class"),
     Outcome.FALSE: ("False positives", "IoU below 0.5 with every ground-truth object, or duplicate of another object"),
@@ -154,7 +153,7 @@ def truth_section(
         "metrics": main,
         "classes": classes,
         "label_space": metrics.get(LABEL_SPACE),
-        "ignored": [(side, names) for side, key in IGNORED.items() if (names := metrics.get(key))],
+        "ignored": ignored_names(metrics),
         "unchecked": "" if check else why_unchecked or "the run has no mesh",
         "galleries": check.galleries(contents, pictures) if check else [],
     }

@@ -6,6 +6,7 @@ import hashlib
 import logging
 from collections.abc import Mapping
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
@@ -38,7 +39,7 @@ COVERAGE = "coverage."  # prefix of the fractions of the ground truth and of the
 CLASSES = "evaluated_classes."  # prefix of the keys about the label space of the evaluation
 LABEL_SPACE, CLASS_NAMES = CLASSES + "label_space", CLASSES + "names"
 OF_FILE = CLASSES + "of_file"  # classes of a label space in a file, as JSON, because the file may change
-IGNORED_IN_MAP, IGNORED_IN_TRUTH = CLASSES + "ignored_in_map", CLASSES + "ignored_in_ground_truth"
+IGNORED = {"map": CLASSES + "ignored_in_map", "ground truth": CLASSES + "ignored_in_ground_truth"}  # keys by side
 TRUTH = "truth_sha256"  # key of the ground-truth hash in metrics.json
 ANNOTATED = "annotated_sha256"  # key of the hash of the names outside of COCO, for datasets that have them
 
@@ -173,8 +174,8 @@ def evaluation_metrics(
         LABEL_SPACE: compared_classes.label_space,
         CLASS_NAMES: compared_classes.names_text,
         OF_FILE: compared_classes.file_text,
-        IGNORED_IN_MAP: listed(compared.ignored_predictions) or None,
-        IGNORED_IN_TRUTH: listed(compared.ignored_truths) or None,
+        IGNORED["map"]: listed(compared.ignored_predictions) or None,
+        IGNORED["ground truth"]: listed(compared.ignored_truths) or None,
         "annotation_release": annotation or None,
         TRUTH: truth_sha256(truth),
         **({} if truth.annotated is None else {ANNOTATED: annotated_sha256(truth.annotated)}),
@@ -209,6 +210,11 @@ def annotated_sha256(annotated: AnnotatedObjects) -> str:
     digest = hashlib.sha256(repr((sorted(annotated.own_names.items()), names)).encode())
     add_values(digest, annotated.instance_ids)
     return digest.hexdigest()
+
+
+def ignored_names(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the sides with objects that the evaluation ignored because of their names, and these names as text."""
+    return [(side, str(names)) for side, key in IGNORED.items() if (names := metrics.get(key))]
 
 
 def is_evaluation(key: str) -> bool:

@@ -210,6 +210,10 @@ def write_run(
 ) -> Interruption:
     """Map the sequence or live video of a config, and write the run directory.
 
+    A signal, an error of a stage or a disk error ends a run early. If at least one frame was mapped, the available
+    outputs are written and marked as partial. The first signal takes effect after the current frame or output, the
+    second signal immediately.
+
     Args:
         pipeline: The stages of the config.
         config: The config of the run.

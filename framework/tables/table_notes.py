@@ -9,7 +9,7 @@ from typing import Any
 
 from framework.evaluation.instances import MAX_DISTANCE
 from framework.registry import STAGES
-from framework.runs.metrics import IGNORED_IN_MAP, IGNORED_IN_TRUTH, LABEL_SPACE, is_evaluation
+from framework.runs.metrics import LABEL_SPACE, ignored_names, is_evaluation
 from framework.runs.plugin_code import CODE
 from framework.runs.run_rows import DATA, Run, RunRow, dependent_keys
 from framework.runs.stored_runs import Record, is_number
@@ -197,8 +197,7 @@ def _protocol(comparison: ComparisonTable) -> Iterator[str]:
 
 def _ignored(record: Record) -> str:
     """Return the names of the objects that an evaluation ignored because of their classes."""
-    sides = {"map": IGNORED_IN_MAP, "ground truth": IGNORED_IN_TRUTH}
-    return "; ".join(f"{side}: {names}" for side, key in sides.items() if (names := record.metrics.get(key)))
+    return "; ".join(f"{side}: {names}" for side, names in ignored_names(record.metrics))
 
 
 def _published(comparison: ComparisonTable) -> Iterator[str]:

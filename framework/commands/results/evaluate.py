@@ -17,7 +17,7 @@ from framework.evaluation.compared_classes import ComparedClasses
 from framework.evaluation.instances import Transfer
 from framework.evaluation.scannet_benchmark import BenchmarkScene, benchmark_metrics
 from framework.registry import STAGES
-from framework.runs.metrics import CLASS_NAMES, IGNORED_IN_MAP, IGNORED_IN_TRUTH, LABEL_SPACE, MAIN_FIGURES
+from framework.runs.metrics import CLASS_NAMES, LABEL_SPACE, MAIN_FIGURES, ignored_names
 from framework.runs.reevaluation import Reevaluation, Truth, benchmark_scene, dataset_of
 from framework.runs.stored_runs import Record, find_records
 from framework.tables.metric_columns import head
@@ -136,8 +136,8 @@ def evaluate_runs(
                     if write:
                         found.write()
                     tqdm.write(f"{record.directory}: {summary(found, transfer)}")
-                    for line in ignored(found):
-                        tqdm.write(f"  {line}")
+                    for side, names in ignored_names(found.metrics):
+                        tqdm.write(f"  ignored in the {side}: {names}")
                     if len(records) > 1 and (scene := benchmark_scene(found, truth)):
                         pooled.append((found, scene))
                 except KNOWN_ERRORS as error:
@@ -161,12 +161,6 @@ def differing(found: Sequence[Reevaluation]) -> str:
     stages = {stage for stage in STAGES if stage != "dataset"}
     methods = {(one.record.row, *(one.record.choices.get(stage) for stage in sorted(stages))) for one in found}
     return "the stages of the runs differ" if len(methods) > 1 else ""
-
-
-def ignored(found: Reevaluation) -> list[str]:
-    """Return a line with the ignored objects of the map, and one of the ground truth, if there are any."""
-    sides = {"map": IGNORED_IN_MAP, "ground truth": IGNORED_IN_TRUTH}
-    return [f"ignored in the {side}: {names}" for side, key in sides.items() if (names := found.metrics.get(key))]
 
 
 def over_scenes(scenes: Sequence[BenchmarkScene]) -> str:

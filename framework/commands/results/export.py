@@ -44,8 +44,8 @@ def main() -> None:
     add("--robot-height", metavar="M", type=float, default=1.0, help=height)
     add = parser.add_argument_group("predictions for benchmarks").add_argument
     space = (
-        "label space: nyu40, scannet20, scannet200, or a JSON file with the name of each class id; default: label "
-        "space of the evaluation if it is one of these, otherwise scannet20"
+        "label space: nyu40, scannet20, scannet200, agnostic, or a JSON file with the name of each class id; default: "
+        "label space of the evaluation if it is one of these names, otherwise scannet20"
     )
     add("--label-space", metavar="SPACE", help=space)
     points = "PLY or NPY file with the labeled points, in the world frame of the dataset; default: ground-truth points"

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.errors import DataError
-from framework.files.atomic_write import atomic_write, check_regular
+from framework.files.atomic_write import check_regular
 from framework.runs.stored_runs import REPORT
 
 COMPARISON = "comparison.html"
@@ -49,6 +49,7 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
         DataError: A run cannot be read.
     """
     from framework.reporting.comparison_page import Comparison
+    from framework.reporting.markup import write_page
     from framework.reporting.run_contents import RunContents
     from framework.reporting.run_page import RunReport
 
@@ -63,17 +64,12 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
     runs = [RunContents.read(directory) for directory in directories]
     if len(runs) == 1:
         path = out or directories[0] / REPORT
-        _write(path, RunReport.of(runs[0]).html())
+        write_page(path, RunReport.of(runs[0]).html())
         return [path]
     pages = [directory / REPORT for directory in directories]
     for page, run in zip(tqdm(pages, unit=" pages", disable=None, dynamic_ncols=True), runs, strict=True):
-        _write(page, RunReport.of(run).html())
+        write_page(page, RunReport.of(run).html())
     path = out or Path(os.path.commonpath([place.parent for place in places])) / COMPARISON
     links = [quote(os.path.relpath(page.resolve(), path.resolve().parent)) for page in pages]
-    _write(path, Comparison.of(runs, links).html())
+    write_page(path, Comparison.of(runs, links).html())
     return [*pages, path]
-
-
-def _write(path: Path, page: str) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names may be invalid Unicode

@@ -57,25 +57,7 @@ def run_job(config: DictConfig, hydra_config: HydraConf) -> float | list[float] 
 
 
 def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) -> Interruption:
-    """Map the sequence or live video of the config, and write the outputs.
-
-    A signal, an error of a stage or a disk error ends a run early. If at least one frame was mapped, the available
-    outputs are written and marked as partial. The first signal takes effect after the current frame or output, the
-    second signal immediately.
-
-    Args:
-        config: Config of the run.
-        directory: Output directory.
-        choices: Chosen option of each config group.
-
-    Returns:
-        A record of the signal that arrived during writing or ended a live video, if any.
-
-    Raises:
-        Interrupted: A signal ended the run early.
-        PartialRunError: An error ended the run early. The error is its cause. If no frame was mapped, the error itself
-            is raised.
-    """
+    """Build the pipeline of a config with the settings of the process, and call `write_run`."""
     from framework.api import begin  # local: after Hydra has checked the names
     from framework.runs.run_directory import write_run
     from framework.runtime.process_settings import Settings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from framework.config.validation import require
 from framework.data import Camera, Float32, UInt8, UInt16
 from framework.datasets.calibration.undistortion import Distortion, Undistortion
 from framework.errors import FrameError
-from framework.files.image_files import UPRIGHT, exif_orientation
+from framework.files.image_files import UPRIGHT, exif_orientation, rotation_command
 
 NO_READING = 65535  # uint16, written by some sensors instead of 0
 
@@ -94,5 +93,6 @@ def _orientation_hint(name: Path | str) -> str:
     orientation = exif_orientation(name) if isinstance(name, Path) else UPRIGHT
     if orientation == UPRIGHT or not isinstance(name, Path):
         return ""
-    rotate = f"mogrify -auto-orient {shlex.quote(str(name.parent / f'*{name.suffix}'))}"
-    return f" with the EXIF orientation {orientation}, which is not applied; rotate the pixels: {rotate}"
+    return (
+        f" with the EXIF orientation {orientation}, which is not applied; rotate the pixels: {rotation_command(name)}"
+    )
