@@ -138,6 +138,17 @@ def evaluation_metrics(
     annotation: str,
     compared_classes: ComparedClasses,
 ) -> Metrics:
+    """Return the metrics of `evaluated`, without the overlaps."""
+    return evaluated(predictions, truth, aligned, annotation, compared_classes)[0]
+
+
+def evaluated(
+    predictions: PredictedInstances,
+    truth: SceneTruth,
+    aligned: SceneTruth,
+    annotation: str,
+    compared_classes: ComparedClasses,
+) -> tuple[Metrics, BenchmarkScene | None]:
     """Return the instance metrics, the coverage, the label space, the release of the ground truth and its hash.
 
     A small coverage is logged, because the ground truth may have another world frame.
@@ -151,6 +162,9 @@ def evaluation_metrics(
         aligned: The ground truth in the world frame of the map.
         annotation: The release of the ground truth, or "" for a dataset with a single release.
         compared_classes: The label space of the evaluation.
+
+    Returns:
+        The metrics, and the overlaps for ScanNet's metrics over several scenes; None = no label space.
     """
     coverage = TruthCoverage.of(predictions.points_world, aligned.points_world)
     if not coverage.plausible:
@@ -166,10 +180,11 @@ def evaluation_metrics(
     figures = instances.evaluate(compared.predictions, compared.truth).metrics()
     to_map = instances.evaluate(compared.predictions, compared.truth, transfer=Transfer.TO_MAP).metrics()
     of_map = {f"instances.to_map.{name}": to_map[f"instances.{name}"] for name in MAIN_FIGURES if to_map}
-    return {
+    scene, of_scannet = _scannet_metrics(compared, compared_classes)
+    metrics: Metrics = {
         **figures,
         **of_map,
-        **_scannet_metrics(compared, compared_classes),
+        **of_scannet,
         **{f"{COVERAGE}{name}": value for name, value in asdict(coverage).items()},
         LABEL_SPACE: compared_classes.label_space,
         CLASS_NAMES: compared_classes.names_text,
@@ -180,20 +195,22 @@ def evaluation_metrics(
         TRUTH: truth_sha256(truth),
         **({} if truth.annotated is None else {ANNOTATED: annotated_sha256(truth.annotated)}),
     }
+    return metrics, scene
 
 
-def _scannet_metrics(compared: Compared, compared_classes: ComparedClasses) -> Metrics:
-    """Return the metrics of ScanNet's benchmarks, or an empty dictionary without a label space."""
+def _scannet_metrics(compared: Compared, compared_classes: ComparedClasses) -> tuple[BenchmarkScene | None, Metrics]:
+    """Return the overlaps and the metrics of ScanNet's benchmarks, or None and {} without a label space."""
     if compared_classes.label_space is None:
-        return {}
+        return None, {}
     predictions, truth, classes = compared.predictions, compared.truth, compared_classes.classes
     objects = compared_classes.object_classes
     ids = compared.predicted_ids()
-    found: Metrics = {**benchmark_metrics([BenchmarkScene.of(ids, predictions, truth, objects)], objects)}
+    scene = BenchmarkScene.of(ids, predictions, truth, objects)
+    found: Metrics = {**benchmark_metrics([scene], objects)}
     if compared_classes.label_space == AGNOSTIC:
-        return found
+        return scene, found
     names = dict(zip(predictions.ids.tolist(), predictions.class_names, strict=True))
-    return found | semantic_metrics(indices(ids, names, classes), compared.true_classes, classes)
+    return scene, found | semantic_metrics(indices(ids, names, classes), compared.true_classes, classes)
 
 
 def truth_sha256(truth: SceneTruth) -> str:

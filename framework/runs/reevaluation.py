@@ -6,7 +6,7 @@ import json
 import logging
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from framework.runs.metrics import (
     LABEL_SPACE,
     OF_FILE,
     TRUTH,
-    evaluation_metrics,
+    evaluated,
     is_evaluation,
 )
 from framework.runs.provenance import code_version, leaves
@@ -88,6 +88,7 @@ class Reevaluation:
 
     record: Record
     metrics: Mapping[str, Any]  # new contents of metrics.json
+    scene: BenchmarkScene | None = None  # overlaps for ScanNet's metrics over several scenes; None = no label space
 
     @classmethod
     def of(
@@ -116,7 +117,7 @@ class Reevaluation:
         aligned = truth.in_world_of(record)
         assert aligned is not None
         chosen = classes_of(record) if classes is None else classes
-        found = evaluation_metrics(read_predictions(record), truth.scene, aligned, truth.annotation, chosen)
+        found, scene = evaluated(read_predictions(record), truth.scene, aligned, truth.annotation, chosen)
         for key in (TRUTH, ANNOTATED):
             if not allow_changed and record.metrics.get(key) not in (None, found.get(key)):
                 raise DataError(
@@ -132,7 +133,7 @@ class Reevaluation:
                 metrics |= found | {EVALUATION + name: value for name, value in code_version().items()}
         if truth.named != record.config["dataset"].get("ground_truth"):
             metrics[GROUND_TRUTH] = truth.named
-        return cls(record, metrics)
+        return cls(record, metrics, scene)
 
     @property
     def changed(self) -> dict[str, tuple[Any, Any]]:
@@ -174,22 +175,6 @@ class Reevaluation:
         if (self.record.directory / MANIFEST).exists():
             stored = Manifest.read(self.record.directory)
             stored.with_files(self.record.directory, stored.files).write(self.record.directory)
-
-
-def benchmark_scene(found: Reevaluation, truth: Truth) -> BenchmarkScene | None:
-    """Return the overlaps of a re-evaluated run for ScanNet's metrics over several scenes.
-
-    The result is None without ground truth or without a label space.
-
-    Raises:
-        DataError: The files of the run are inconsistent.
-    """
-    record = replace(found.record, metrics=found.metrics)
-    aligned, classes = truth.in_world_of(record), classes_of(record)
-    if aligned is None or classes.label_space is None:
-        return None
-    compared = classes.compare(read_predictions(record), aligned)
-    return BenchmarkScene.of(compared.predicted_ids(), compared.predictions, compared.truth, classes.object_classes)
 
 
 def read_predictions(record: Record) -> PredictedInstances:

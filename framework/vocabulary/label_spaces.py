@@ -245,7 +245,7 @@ def check_class_name(where: str, name: str) -> None:
 
 
 def with_similar(name: str, others: Sequence[str] = ()) -> str:
-    """Return a quoted name, with the most similar name among others and all known names if there is one."""
+    """Return a quoted name, followed by a similar name among others and all known names, if any is similar."""
     close = get_close_matches(label_key(name), [*others, *MEANINGS], n=1, cutoff=0.75)
     return f"{name!r} (similar to {close[0]!r})" if close and close[0] != name else repr(name)
 

@@ -18,7 +18,7 @@ from framework.evaluation.instances import Transfer
 from framework.evaluation.scannet_benchmark import BenchmarkScene, benchmark_metrics
 from framework.registry import STAGES
 from framework.runs.metrics import CLASS_NAMES, LABEL_SPACE, MAIN_FIGURES, ignored_names
-from framework.runs.reevaluation import Reevaluation, Truth, benchmark_scene, dataset_of
+from framework.runs.reevaluation import Reevaluation, Truth, dataset_of
 from framework.runs.stored_runs import Record, find_records
 from framework.tables.metric_columns import head
 
@@ -138,8 +138,8 @@ def evaluate_runs(
                     tqdm.write(f"{record.directory}: {summary(found, transfer)}")
                     for side, names in ignored_names(found.metrics):
                         tqdm.write(f"  ignored in the {side}: {names}")
-                    if len(records) > 1 and (scene := benchmark_scene(found, truth)):
-                        pooled.append((found, scene))
+                    if found.scene is not None:
+                        pooled.append((found, found.scene))
                 except KNOWN_ERRORS as error:
                     print_error(error, f"{REFUSED}{record.directory}: " if truth is None else REFUSED)
                     failed += 1

@@ -27,14 +27,13 @@ from framework.files.json_file import read_json
 from framework.files.ply import PlyMesh, found_property, read_ply
 from framework.files.search_paths import candidates
 from framework.files.tum_trajectory import read_tum
-from framework.vocabulary.label_spaces import COCO, MEANINGS, with_similar
+from framework.vocabulary.label_spaces import COCO, LONGEST_CLASS_NAME, MEANINGS, with_similar
 
 KEY = "dataset.ground_truth"
 MESH, INSTANCES, TRAJECTORY, METRICS = "mesh.ply", "instances.json", "trajectory.txt", "metrics.json"  # run outputs
 LABELS = "instance"  # name of the vertex property
 LARGEST_ID = np.iinfo(np.int32).max
 MAX_DIGITS = 10  # maximum number of digits of an id, including leading zeros
-LONGEST_NAME = 100  # maximum number of characters of a class name
 
 log = logging.getLogger(__name__)
 
@@ -136,8 +135,8 @@ def _class_of(where: str, entry: Any) -> str | None:
     name = entry["class"]
     if name is None:
         return None
-    if not isinstance(name, str) or name != name.strip() or not 0 < len(name) <= LONGEST_NAME:
-        expected = f"a name of at most {LONGEST_NAME} characters without outer spaces, or null if unknown"
+    if not isinstance(name, str) or name != name.strip() or not 0 < len(name) <= LONGEST_CLASS_NAME:
+        expected = f"a name of at most {LONGEST_CLASS_NAME} characters without outer spaces, or null if unknown"
         raise DataError(f"{where}: class: expected {expected}, got {name!r:.60}")
     coco = MEANINGS.get(name.lower())
     if coco not in (None, name):
