@@ -20,9 +20,8 @@ from framework.interfaces import RGBDSequence
 MIN_FRAMES = 3  # minimum number of readable depth images
 MIN_FRACTION = 0.9  # minimum fraction of frames with the same largest value
 TYPE_LIMITS = (255, 255 * 256, 255 * 257, 65535)  # largest values of normalized images of 8 or 16 bits
-MAX_AT_LIMIT = (
-    0.03  # maximum fraction of readings at the largest value; clipped images have more, at least in some frames
-)
+# maximum fraction of readings at the largest value; clipped images have more, at least in some frames
+MAX_AT_LIMIT = 0.03
 MAX_STEP = 0.1  # maximum relative step to the next value; 65535 = no reading has a large step
 MAX_NEAREST = 0.01  # maximum ratio of the smallest to the largest value, if zero is the nearest reading
 

@@ -21,9 +21,8 @@ MIN_MOTION = 0.01  # fraction of the image width; pairs with less motion fit any
 MAX_RELATIVE_ERROR = 0.2  # fraction of the motion, maximum error of valid poses; real recordings have 0.01 to 0.06
 ALIKE, ALIKE_PX = 1.15, 0.2  # ratio, and offset in px, up to which two errors count as equal
 MAX_OTHER_RATIO = 0.5  # maximum ratio of the error of another convention to the error of the configured convention
-MAX_MIRRORED_RATIO = (
-    0.7  # maximum ratio of the error of a mirrored convention to the error of the best other convention
-)
+# maximum ratio of the error of a mirrored convention to the error of the best other convention
+MAX_MIRRORED_RATIO = 0.7
 # minimum uncertainty of the logarithm of the depth factor, due to inaccurate poses and depth in real recordings
 MIN_LOG_UNCERTAINTY = 0.07
 # maximum ratio of the errors with the estimated and the stored scale, for a clearly wrong scale

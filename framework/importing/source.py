@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,6 +20,8 @@ from framework.sensors.noise_models import SensorKind
 
 SMALLEST_SIDE = 2  # px, minimum side of a depth image for resampling
 UNSURE, FAIRLY_SURE, SURE = 0, 1, 2  # ARKit's low, medium and high confidence
+
+log = logging.getLogger(__name__)
 
 _ARKIT = PoseReading(camera_axes=CameraAxes.OPENGL)
 
@@ -94,6 +97,11 @@ class Format:
     recognized: Callable[[Path], bool]  # True for a recording in this format
     open: Callable[..., Source]  # parameters: path, and topics and options if has_topics; raises DataError
     has_topics: bool = False  # True if `open` has the parameters topics and options
+
+
+def warn_of_zeros(where: Path | str) -> None:
+    """Log that all poses of a recording contain only zeros, which means that they are unknown."""
+    log.warning("%s: expected camera poses, got only zeros; imported without poses", where)
 
 
 def without_poses(source: Source) -> Source:

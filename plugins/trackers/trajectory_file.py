@@ -53,7 +53,7 @@ class TrajectoryFile(PoseTracker):
         trajectory = read_trajectory(self.path)
         self._T_file_camera = trajectory.poses
         if len(self._T_file_camera) == 0:
-            raise DataError(f"{self.path}: expected poses in TUM format, got none")
+            raise DataError(f"{self.path}: expected poses, got none")
         stored = trajectory.timestamps
         self._timestamps = None if stored is None else stored * self.time_unit + self.time_offset
         self._T_world_file: Float64 | None = np.eye(4) if self.world_frame is World.FILE else None

@@ -15,6 +15,7 @@ from framework.files.tum_trajectory import TumLine
 from framework.importing.bags.ros_messages import ODOMETRY, TRANSFORMS, RosBag
 from framework.importing.bags.ros_topics import NO_POSES, BagOptions, Topics
 from framework.importing.bags.transform_tree import FIXED_FRAMES, TransformTree
+from framework.importing.source import warn_of_zeros
 
 MAX_POSE_INTERVAL = 0.1  # s, maximum time between a color image and the nearest pose
 # T_base_camera of a camera at the origin of a frame in ROS axes that looks along x
@@ -47,7 +48,7 @@ def find_camera_poses(bag: RosBag, topics: Topics, tree: TransformTree, options:
     lines, base = pose_lines(bag, topics.poses)
     trajectory = Trajectory.of(bag.path, lines, MAX_POSE_INTERVAL)
     if not len(trajectory.lines):
-        log.warning("%s: %s: expected camera poses, got only zeros; imported without poses", bag.path, topics.poses)
+        warn_of_zeros(f"{bag.path}: {topics.poses}")
         return None
     at_base = _mounting(bag, topics, tree, options, camera, base)
 

@@ -161,8 +161,8 @@ def _pairs(bag: RosBag, topics: Topics, max_difference: float) -> list[Pair]:
         )
     largest = max(abs(pair.timestamp - pair.depth_timestamp) for pair in pairs)
     if largest > MAX_PAIR_INTERVAL:
-        expected = "color and depth images are up to %.3g s apart; --max-difference S sets another limit"
-        log.warning(f"%s: {expected}", bag.path, largest)
+        text = "%s: color and depth images are up to %.3g s apart; --max-difference S sets another limit"
+        log.warning(text, bag.path, largest)
     if len(pairs) < max(colors, depths):
         log.warning(
             "%s: skipped %d of %d color images and %d of %d depth images without a partner within %.3g s; "

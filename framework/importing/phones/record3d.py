@@ -16,7 +16,6 @@ the first pose is the identity, and the up direction is unknown. Newer versions 
 from __future__ import annotations
 
 import io
-import logging
 import math
 import zipfile
 from collections.abc import Mapping
@@ -36,7 +35,7 @@ from framework.files.image_files import LARGEST_FILE, decode_color, read_color
 from framework.files.json_file import parse_json
 from framework.files.number_lines import SHOWN
 from framework.files.tum_trajectory import QUATERNION_TOLERANCE
-from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, readings
+from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, readings, warn_of_zeros
 from framework.sensors.noise_models import SensorKind
 
 CHANNEL = "R"  # of the EXR files
@@ -45,8 +44,6 @@ BYTES_A_BLOCK = 20_000  # minimum block size; blocks of data without repetitions
 # maximum sine of half the rotation angle of an unrotated pose; a hand-held phone is never aligned this exactly
 UNTURNED = 1e-3
 MAX_BLOCKS = 8  # number of additional blocks; limited, because a block may decompress to 27 MB
-
-log = logging.getLogger(__name__)
 
 _load_openexr = partial(import_optional, "OpenEXR", "reads Record3D's depth", "phone")
 _load_lzfse = partial(import_optional, "lzfse", "unpacks Record3D's .r3d files", "phone")
@@ -188,7 +185,7 @@ def _source(where: Path | str, content: Mapping[str, Any], files: ExrFolder | R3
 
     posed = not all(_is_unknown(pose) for pose in poses)
     if not posed:
-        log.warning("%s: poses: expected camera poses, got only zeros; imported without poses", where)
+        warn_of_zeros(f"{where}: poses")
     frames = [partial(read, k) for k in range(len(poses))]
     return Source("Record3D", frames, len(poses), posed=posed, sensor=SensorKind.PHONE_LIDAR)
 

@@ -13,7 +13,6 @@ confirm this.
 
 from __future__ import annotations
 
-import logging
 import os
 from dataclasses import dataclass
 from functools import partial
@@ -29,7 +28,7 @@ from framework.files.atomic_write import check_regular
 from framework.files.image_files import read_uint8, read_uint16
 from framework.files.number_lines import SHOWN, numbers, read_lines
 from framework.files.tum_trajectory import TumLine
-from framework.importing.source import DeviceFrame, Format, Source, arkit_up, meters
+from framework.importing.source import DeviceFrame, Format, Source, arkit_up, meters, warn_of_zeros
 from framework.sensors.noise_models import SensorKind
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # first columns of odometry.csv
@@ -38,8 +37,6 @@ INTRINSICS = ("fx", "fy", "cx", "cy")  # next columns, in newer versions
 KIND_AT, KIND = 4, b"ftyp"
 QUIET = "-8"  # FFmpeg's AV_LOG_QUIET; damage is reported by DataError instead
 LAST_FRAME = 10**6 - 1  # largest frame number of six digits
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ def open_source(path: Path) -> Source:
     frames = [partial(_read, path, row, video, confident) for row in rows]
     posed = not rows or not all(isinstance(row, OdometryRow) and row.line.is_zero for row in rows)
     if not posed:
-        log.warning("%s: expected camera poses, got only zeros; imported without poses", path / "odometry.csv")
+        warn_of_zeros(path / "odometry.csv")
     return Source("Stray Scanner", frames, len(frames), posed=posed, sensor=SensorKind.PHONE_LIDAR)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from framework.data import Float32, Float64, Instance, InstanceMesh, Int32, UInt8, check_rigid
 from framework.errors import DataError
+from framework.evaluation.compared_classes import listed
 from framework.files.number_lines import read_matrix
 from framework.files.ply import PlyMesh
 from framework.geometry import transform
@@ -168,9 +169,8 @@ class MapClasses:
         counts = Counter(one.label or UNLABELED for one in instances if not self.keeps(one))
         if not counts:
             return ""
-        listed = ", ".join(f"{name} ({count})" for name, count in counts.most_common(12))
-        rest = f" and {len(counts) - 12} more classes" if len(counts) > 12 else ""
-        return f"left out: {counts.total()} of {len(instances)} instances without {self.described}: {listed}{rest}"
+        left_out = f"{counts.total()} of {len(instances)} instances without {self.described}"
+        return f"left out: {left_out}: {listed(counts)}"
 
     def distribution(self, instance: ExternalInstance) -> Float32:
         """Return the class distribution (C,) of an instance."""

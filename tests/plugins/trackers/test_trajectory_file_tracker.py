@@ -93,7 +93,7 @@ def test_trajectory_file_time_offset_aligns_clocks(tmp_path: Path) -> None:
         ("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "line 2: expected a timestamp > 1 s, got 0 s"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "line 2: expected a timestamp > 1 s, got 1 s"),
         ("1 0 0 0\n", "line 1: expected 8 numbers"),
-        ("# nothing\n", "expected poses in TUM format, got none"),
+        ("# nothing\n", "expected poses, got none"),
     ],
 )
 def test_trajectory_file_invalid_raises_one_line_error(tmp_path: Path, text: str, message: str) -> None:
