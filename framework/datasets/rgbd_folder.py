@@ -49,6 +49,7 @@ from framework.files.depth_files import DEPTH_SUFFIXES, FARTHEST, read_depth
 from framework.files.image_files import UPRIGHT, decode_uint16, exif_orientation, read_image_file
 from framework.files.number_lines import read_gravity, read_image_times
 from framework.files.pose_lines import PoseLine, read_pose_lines
+from framework.files.tum_trajectory import TumLine
 
 TIMES = ("timestamps.txt", "times.txt")  # names of the file with timestamps, in order of preference
 LARGEST_ID = 2**16 - 1  # maximum instance id; instance-ID images are uint16
@@ -206,7 +207,9 @@ class RgbdFolder(Recording):
 
 
 def _pose_of(line: PoseLine) -> Callable[[], Float64 | None]:
-    return (lambda: None) if line.is_zero else line.pose
+    if line.is_zero:
+        return lambda: None
+    return line.pose if isinstance(line, TumLine) else line.stored_pose
 
 
 def _log_orientation(path: Path) -> None:

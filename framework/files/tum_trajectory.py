@@ -1,11 +1,13 @@
 """Trajectories in the TUM format.
 
-A line contains one pose T_world_camera: `timestamp tx ty tz qx qy qz qw`, in s and m. If all lines have the same number
-of further columns, such as the ids of RTAB-Map, these are ignored. evo is not used because of its GPL license.
+A line contains one pose T_world_camera: `timestamp tx ty tz qx qy qz qw`, in s and m. A header that names the columns
+in another order is applied. If all lines have the same number of further columns, such as the ids of RTAB-Map, these
+are ignored. evo is not used because of its GPL license.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,9 +20,12 @@ from scipy.spatial.transform import Rotation
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
 from framework.files.atomic_write import atomic_write
-from framework.files.number_lines import COMMENT, SHOWN, numbers, read_lines
+from framework.files.number_lines import SHOWN, numbers, read_lines
+from framework.files.trajectory_columns import NANOSECOND, TUM, Columns, without_header
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
+log = logging.getLogger(__name__)
+
 QUATERNION_TOLERANCE = 1e-2  # maximum | |q| - 1 | due to rounding
 
 
@@ -101,10 +106,20 @@ def read_tum_lines(path: Path) -> list[TumLine]:
     Raises:
         DataError: A line does not contain eight numbers, or it has more or fewer columns than the first line.
     """
-    lines = read_lines(path, missing="expected a trajectory in TUM format, got no such file")
-    words = [COMMENT.sub("", line).split() for line in lines]
-    columns = max(len(COLUMNS.split()), len(next(filter(None, words), [])))
-    return [_line(path, number, found, columns) for number, found in enumerate(words, start=1) if found]
+    columns, rows = without_header(read_lines(path, missing="expected a trajectory in TUM format, got no such file"))
+    if columns is not None and (columns.order, columns.time_unit or 1.0) != (TUM.order, TUM.time_unit):
+        log.info("%s: read as named by the header: %s", path, columns)
+    return posed_lines(path, columns or TUM, [(number, text.split()) for number, text in rows])
+
+
+def posed_lines(path: Path, columns: Columns, rows: Sequence[tuple[int, Sequence[str]]]) -> list[TumLine]:
+    """Return the poses in numbered lines of words.
+
+    Raises:
+        DataError: A line does not have the columns, or it has more or fewer columns than the first line.
+    """
+    width = max(columns.count, len(rows[0][1]) if rows else 0)
+    return [_line(path, number, words, columns, width) for number, words in rows]
 
 
 def write_tum(
@@ -137,12 +152,14 @@ def write_tum(
             file.write(f"{timestamp:.9f} " + " ".join(f"{value:.12g}" for value in row) + "\n")
 
 
-def _line(path: Path, number: int, words: list[str], columns: int) -> TumLine:
-    pose = len(COLUMNS.split())
-    if pose < columns != len(words):
-        expected = f"expected {columns} columns, as in the first line"
-        raise DataError(f"{path}, line {number}: {expected}, got {len(words)}")
-    values = numbers(f"{path}, line {number}", words[:pose] if pose < columns else words, pose, COLUMNS)
-    if not math.isfinite(values[0]):
-        raise DataError(f"{path}, line {number}: expected a finite timestamp, got {words[0][:SHOWN]!r}")
-    return TumLine(path, number, values[0], tuple(values[1:4]), tuple(values[4:]))
+def _line(path: Path, number: int, words: Sequence[str], columns: Columns, width: int) -> TumLine:
+    where = f"{path}, line {number}"
+    if len(COLUMNS.split()) < width != len(words):
+        raise DataError(f"{where}: expected {width} columns, as in the first line, got {len(words)}")
+    pose = columns.chosen(words) if len(words) == width else words
+    timestamp, *values = numbers(where, pose, len(COLUMNS.split()), COLUMNS)
+    if not math.isfinite(timestamp):
+        raise DataError(f"{where}: expected a finite timestamp, got {pose[0][:SHOWN]!r}")
+    if columns.time_unit == NANOSECOND and not timestamp.is_integer():
+        raise DataError(f"{where}: expected a timestamp in ns without decimals, got {pose[0][:SHOWN]!r}")
+    return TumLine(path, number, timestamp * (columns.time_unit or 1.0), tuple(values[:3]), tuple(values[3:]))

@@ -52,7 +52,7 @@ class TrajectoryFile(PoseTracker):
         self.path = Path(self.path).expanduser()
         trajectory = read_trajectory(self.path)
         self._T_file_camera = trajectory.poses
-        if len(self._T_file_camera) == 0:
+        if all(T is None for T in self._T_file_camera):
             raise DataError(f"{self.path}: expected poses, got none")
         stored = trajectory.timestamps
         self._timestamps = None if stored is None else stored * self.time_unit + self.time_offset
@@ -65,6 +65,8 @@ class TrajectoryFile(PoseTracker):
             NoPoseError: If the file has no pose for the frame.
         """
         T_file_camera = self._T_file_camera[self._pose_index(frame)]
+        if T_file_camera is None:
+            raise NoPoseError(f"frame {frame.index}: {self.path.name}: expected a pose, got only zeros")
         if self._T_world_file is None:
             T_world_first = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
             self._T_world_file = T_world_first @ inverse(T_file_camera)

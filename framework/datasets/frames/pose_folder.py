@@ -51,7 +51,7 @@ def _pose_of(matrix: PrintedMatrix | DataError | None) -> Callable[[], Float64 |
     def pose() -> Float64 | None:
         if isinstance(matrix, DataError):
             raise matrix
-        return None if matrix is None else matrix.pose()
+        return None if matrix is None else matrix.stored_pose()
 
     return pose
 

@@ -148,7 +148,7 @@ def _exported_frame(folder: Path, k: int, images: StoredImages) -> RecordedFrame
 
 def _posed_frame(folder: Path, k: int, images: StoredImages) -> RecordedFrame:
     pose = folder / f"{Path(images.depth_name).stem}.txt"
-    return RecordedFrame.posed(images, k / FRAME_RATE, lambda: read_matrix(pose).pose())
+    return RecordedFrame.posed(images, k / FRAME_RATE, lambda: read_matrix(pose).stored_pose())
 
 
 def _posed_contents(folder: Path) -> Contents:

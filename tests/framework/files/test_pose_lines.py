@@ -13,7 +13,7 @@ from framework.errors import DataError
 from framework.files.pose_lines import TrajectoryFormat, read_pose_lines, read_trajectory
 from framework.files.tum_trajectory import write_tum
 from tests.support.recordings.recorded_frames import desk_frames
-from tests.support.recordings.trajectory_files import write_euroc, write_kitti, write_tum_with_ids
+from tests.support.recordings.trajectory_files import write_euroc, write_kitti, write_table, write_tum_with_ids
 
 WRITERS = {
     TrajectoryFormat.TUM: write_tum_with_ids,
@@ -90,15 +90,11 @@ INVALID = [
     (f"0 {POSE} 5\n1 {POSE} 6 2 {POSE} 7\n", "line 2: expected 9 columns, as in the first line, got 18"),
     (f"0 {POSE}\n1 {POSE} 2 {POSE}\n", "line 2: expected 8 numbers .*, got 16"),
     ("0 1 2 3 0 0 0 2 5\n", "line 1: expected a quaternion qx qy qz qw of length 1, got 2"),
-    ("0,1,2,3,0,0,0,1\n", "expected a header #timestamp .ns., ... or Unix times in ns, as in EuRoC, got '0,1,2"),
-    ("1305031100.5,1,2,3,0,0,0,1\n", "expected a header #timestamp .ns., ... or Unix times in ns"),
-    ("#timestamp,tx,ty,tz,qw,qx,qy,qz\n0,1,2,3,1,0,0,0\n", "expected a header #timestamp .ns. and the columns"),
-    (
-        "#timestamp [ns],x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n",
-        "expected a header #timestamp .ns. and the columns .* qw qx",
-    ),
-    ("#timestamp [ns],x,y,z\n0,1,2,3\n", "expected a header #timestamp .ns. and the columns"),
-    (EUROC + "1403636580848555520,4.6\r\n", "line 4: expected 9 columns .*, got 2"),
+    ("0,1,2,3,0,0,0,1\n", "expected a header that names the columns, .* or Unix times in ns, as in EuRoC, got '0,1,2"),
+    ("1305031100.5;1;2;3;0;0;0;1\n", "expected a header that names the columns, such as timestamp,tx,ty,tz,qx,"),
+    ("#timestamp [ns],x,y,z\n0,1,2,3\n", "expected a header that names the columns, .*; add the header"),
+    (f"0 {KITTI}1 {KITTI}", "expected 12 numbers .*, got 13; remove the first column"),
+    (EUROC + "1403636580848555520,4.6\r\n", "line 4: expected 9 columns, as in the first line, got 2"),
     (
         EUROC + "1403636580848.5,4,-1,0,1,0,0,0,0\n",
         "line 4: expected a timestamp in ns without decimals, got '140363658",
@@ -118,6 +114,50 @@ def test_trajectory_invalid_line_raises(tmp_path: Path, text: str, message: str)
     with pytest.raises(DataError, match=f"t.txt.*{message}") as refused:
         read_trajectory(tmp_path / "t.txt")
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("header", "line"),
+    [
+        ("# timestamp tx ty tz qw qx qy qz", "{t:.6f} {x} {y} {z} {qw} {qx} {qy} {qz}"),
+        ("timestamp tx ty tz qx qy qz qw", "{t:.6f} {x} {y} {z} {qx} {qy} {qz} {qw}"),
+        ("% time\tq_w\tq_x\tq_y\tq_z\tp_x\tp_y\tp_z", "{t:.6f}\t{qw}\t{qx}\t{qy}\t{qz}\t{x}\t{y}\t{z}"),
+        ("# timestamp(s) tx ty tz qx qy qz qw Pr11 Pr12", "{t:.6f} {x} {y} {z} {qx} {qy} {qz} {qw} 0.1 0"),
+        ("timestamp,tx,ty,tz,qx,qy,qz,qw", "{t:.6f},{x},{y},{z},{qx},{qy},{qz},{qw}"),
+        (",time,x,y,z,qw,qx,qy,qz", "{k},{t:.6f},{x},{y},{z},{qw},{qx},{qy},{qz}"),
+        ("timestamp [ns], vertex index, position x [m], position y [m], position z [m], quaternion x, quaternion y, "
+         "quaternion z, quaternion w", "{ns}, {k}, {x}, {y}, {z}, {qx}, {qy}, {qz}, {qw}"),
+        ("#timestamp [s];p_RS_R_x [m];p_RS_R_y [m];p_RS_R_z [m];q_RS_w [];q_RS_x [];q_RS_y [];q_RS_z []",
+         "{t:.6f};{x};{y};{z};{qw};{qx};{qy};{qz}"),
+        ("%time,field.header.seq,field.header.stamp,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
+         "field.pose.orientation.x,field.pose.orientation.y,field.pose.orientation.z,field.pose.orientation.w",
+         "{ns},{k},{ns},{x},{y},{z},{qx},{qy},{qz},{qw}"),
+        ("", "{ns},{x},{y},{z},{qw},{qx},{qy},{qz},0.1,0.2,0.3,"),
+        ("", "{ns}.0,{x},{y},{z},{qw},{qx},{qy},{qz}"),
+    ],
+    ids=["wxyz", "no_hash", "tabs", "openvins", "csv", "pandas", "maplab", "semicolons", "rostopic", "vins", "float"],
+)  # fmt: skip
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_trajectory_header_names_columns(tmp_path: Path, header: str, line: str, end: str) -> None:
+    write_table(tmp_path / "t.txt", TIMES, POSES, header, line, end)
+    trajectory = read_trajectory(tmp_path / "t.txt")
+    np.testing.assert_allclose(trajectory.timestamps, TIMES, atol=1e-6)
+    np.testing.assert_allclose(trajectory.poses, POSES, atol=1e-6)
+
+
+def test_trajectory_other_comment_names_no_columns(tmp_path: Path) -> None:
+    write_table(tmp_path / "t.txt", TIMES, POSES, "# poses qw x, y", "{t:.6f} {x} {y} {z} {qx} {qy} {qz} {qw}")
+    np.testing.assert_allclose(read_trajectory(tmp_path / "t.txt").poses, POSES, atol=1e-6)
+
+
+@pytest.mark.parametrize("separator", [" ", "\t", ",", ", "])
+@pytest.mark.parametrize("rows", [3, 4])
+def test_trajectory_matrix_lines_of_any_separator(tmp_path: Path, rows: int, separator: str) -> None:
+    lines = [separator.join(f"{value:.9e}" for value in T[:rows].ravel()) for T in (np.zeros((4, 4)), *POSES)]
+    (tmp_path / "t.txt").write_text("\r\n".join(lines))
+    trajectory = read_trajectory(tmp_path / "t.txt")
+    assert (trajectory.format, trajectory.poses[0]) == (TrajectoryFormat.KITTI, None)
+    np.testing.assert_allclose(trajectory.poses[1:], POSES, atol=1e-6)
 
 
 def test_trajectory_euroc_without_header_needs_unix_times(tmp_path: Path) -> None:

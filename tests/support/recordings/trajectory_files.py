@@ -40,5 +40,20 @@ def write_kitti(path: Path, timestamps: Sequence[float], poses: Sequence[np.ndar
     path.write_text("".join(f"{' '.join(f'{value:.6e}' for value in T[:3].ravel())}\n" for T in poses))
 
 
+def write_table(
+    path: Path, timestamps: Sequence[float], poses: Sequence[np.ndarray], header: str, line: str, end: str = "\n"
+) -> None:
+    """Write a header and a line per pose in a format of its columns, such as "{t:.6f},{x},{y},{z},{qx},{qy},{qz},{qw}".
+
+    The names ns and k are the time in nanoseconds and the line number from 0.
+    """
+    lines = [header] * bool(header)
+    for k, (time, T) in enumerate(zip(timestamps, poses, strict=True)):
+        values = [f"{value:.9f}" for value in (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())]
+        named = dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), values, strict=True))
+        lines.append(line.format(t=time, ns=round(time * 1e9), k=k, **named))
+    path.write_bytes((end.join(lines) + end).encode())
+
+
 def _words(values: Sequence[float]) -> str:
     return " ".join(f"{value:.9f}" for value in values)
