@@ -23,6 +23,9 @@ ALIKE, ALIKE_PX = 1.15, 0.2  # ratio, and offset in px, up to which two errors c
 MAX_OTHER_RATIO = 0.5  # maximum ratio of the error of another convention to the error of the configured convention
 # maximum ratio of the error of a mirrored convention to the error of the best other convention
 MAX_MIRRORED_RATIO = 0.7
+# minimum cosine between the translations in the poses and in the images, median of the pairs, for a scale estimate; real
+# recordings have 0.7 to 1.0, random errors of the poses 0
+MIN_COSINE = 0.3
 # minimum uncertainty of the logarithm of the depth factor, due to inaccurate poses and depth in real recordings
 MIN_LOG_UNCERTAINTY = 0.07
 # maximum ratio of the errors with the estimated and the stored scale, for a clearly wrong scale
@@ -92,12 +95,14 @@ def _depth_factor(pairs: Sequence[MatchedPair], motions: Sequence[Float64]) -> t
 
     The uncertainty is also a ratio. Both values are 1 if unknown.
     """
-    ratios = []
+    ratios, cosines = [], []
     for pair, T_second_first in zip(pairs, motions, strict=True):
-        seen, moved = np.linalg.norm(pair.T_second_first[:3, 3]), np.linalg.norm(T_second_first[:3, 3])
+        t_seen, t_moved = pair.T_second_first[:3, 3], T_second_first[:3, 3]
+        seen, moved = np.linalg.norm(t_seen), np.linalg.norm(t_moved)
         if seen > MIN_BASELINE * np.median(pair.points_first[:, 2]) and moved > 0:
             ratios.append(float(np.log(moved / seen)))
-    if len(ratios) < MIN_PAIRS:
+            cosines.append(float(t_seen @ t_moved / (seen * moved)))
+    if len(ratios) < MIN_PAIRS or np.median(cosines) < MIN_COSINE:
         return 1.0, 1.0
     middle = float(np.median(ratios))
     spread = 1.5 * float(np.median(np.abs(np.array(ratios) - middle)))

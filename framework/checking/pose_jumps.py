@@ -26,6 +26,7 @@ MIN_ERROR = 0.012  # fraction of the image width, minimum reprojection error of 
 REVISIT_FACTOR = 2.5  # factor of both limits for distant frames, because given poses drift; real sequences have 1.1
 MAX_NEIGHBORS = 100  # maximum number of compared pairs of neighboring frames; pairs with large motions come first
 REVISITS = 16  # number of evenly spaced frames that are compared with each other
+STEPS = (1, 2, 3, 4)  # frames; a neighbor that is blurred is replaced by the next frame
 SHOWN = 5  # maximum number of jumps in a message
 
 
@@ -37,6 +38,10 @@ class PoseJump:
     second: int  # Frame.index
     translation: float  # m, difference of the two motions
     rotation: float  # degrees, difference of the two motions
+
+    def contains(self, other: PoseJump) -> bool:
+        """Return True if the frames of another jump are between the frames of this jump."""
+        return self.first <= other.first and other.second <= self.second
 
     def __str__(self) -> str:
         return f"{self.first} and {self.second} (by {self.translation:.2f} m and {self.rotation:.1f} degrees)"
@@ -90,13 +95,23 @@ def find_jumps(
     chosen = sorted(sorted(posed, key=lambda k: -_motion(poses[k], poses[k + 1], reading))[:neighbors])
     places = [int(k) for k in np.unique(np.linspace(0, count - 1, revisits).round())] if revisits else []
     distant = [(i, j - i) for i, j in combinations(places, 2) if j > i + 1]
-    of_neighbors = list(_compared(matcher, [(k, 1) for k in chosen], reading))
+    nearest = [(k, _nearest(matcher, k)) for k in chosen]
+    matched, blurred = ([pair for pair in nearest if (pair[1] == 1) is is_next] for is_next in (True, False))
+    of_neighbors = list(_compared(matcher, matched, reading))
+    of_blurred = list(_compared(matcher, blurred, reading, REVISIT_FACTOR))
     of_revisits = list(_compared(matcher, distant, reading, REVISIT_FACTOR))
+    jumps = [jump for jump in of_neighbors if jump is not None]
+    others = [jump for jump in of_blurred if jump is not None and not any(jump.contains(one) for one in jumps)]
     return PoseJumps(
-        tuple(jump for jump in of_neighbors if jump is not None),
+        tuple(sorted([*jumps, *others], key=lambda jump: jump.first)),
         tuple(jump for jump in of_revisits if jump is not None),
-        len(of_neighbors) + len(of_revisits),
+        len(of_neighbors) + len(of_blurred) + len(of_revisits),
     )
+
+
+def _nearest(matcher: Matcher, k: int) -> int:
+    """Return the step from frame k to the nearest later frame with enough matched points, or 1 without one."""
+    return next((step for step in STEPS if matcher.pair(k, step) is not None), 1)
 
 
 def _compared(
