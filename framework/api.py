@@ -13,6 +13,7 @@ from weakref import finalize
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig
 
+from framework.checking.image_geometry import warn_of_camera
 from framework.compilation.catalog import compile_for_run
 from framework.config.composition import composed, composed_with_choices, config_errors, resolved
 from framework.config.text_values import literal
@@ -36,7 +37,7 @@ from framework.detection.map_classes import with_classes_of_map
 from framework.detection.stored.cache import with_cache
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.files.directory_lock import locked
-from framework.geometry import camera_of
+from framework.geometry import camera_of, pose_of
 from framework.interfaces import (
     ClusterRefiner,
     Detector,
@@ -235,9 +236,10 @@ class Mapper(Map):
         Args:
             color: RGB image (H, W, 3), uint8, or a Frame, which replaces all other arguments.
             depth: Depth image (H, W), float32, m along z; 0 = no reading.
-            pose: Camera pose T_world_camera (4, 4); None = unknown. Most trackers use only the pose of the first frame,
-                which defines the world frame. `tracker="ground_truth"` uses all poses.
-            camera: The camera, or the intrinsic matrix (3, 3) of this image, px; None = the camera of the last frame.
+            pose: Camera pose T_world_camera (4, 4) or (3, 4), m; None = unknown. Most trackers use only the pose of
+                the first frame, which defines the world frame. `tracker="ground_truth"` uses all poses.
+            camera: The camera, or the intrinsic matrix (3, 3) of this image, px, also padded to (3, 4) or (4, 4);
+                None = the camera of the last frame.
             timestamp: Time of the color image, s; None = the frame number (from 0) / 30.
             up: Up direction (3,) in the camera frame, a unit vector; None = unknown.
             depth_timestamp: Time of the depth image, s; None = the time of the color image.
@@ -266,10 +268,15 @@ class Mapper(Map):
                         "Mapper.add: expected a camera in the first call, got none; pass camera=Camera(width, height, "
                         "fx, fy, cx, cy) or camera=K"
                     )
+                if used != self._camera:
+                    warn_of_camera(used)
+                T_world_camera, T_odom_camera = (
+                    None if T is None else pose_of(f"frame {self._frames}", T) for T in (pose, odometry)
+                )
                 time = self._frames / FRAME_RATE if timestamp is None else timestamp
                 frame = Frame(
-                    self._frames, time, color, depth, used, pose, up=up, depth_timestamp=depth_timestamp,
-                    sensor=sensor or self._sensor, T_odom_camera=odometry,
+                    self._frames, time, color, depth, used, T_world_camera, up=up, depth_timestamp=depth_timestamp,
+                    sensor=sensor or self._sensor, T_odom_camera=T_odom_camera,
                 )  # fmt: skip
                 if pose is not None:
                     self._warn_of_ignored_pose()

@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from framework.data import Camera, Float32, Float64, Int32, PointClusters, UInt8
-from framework.errors import DataError
+from framework.errors import DataError, errors_of
 
 RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| due to rounding in files; larger for lost poses, stored as R = 0
+MAX_SKEW = 1e-3  # px, maximum skew of a camera matrix, and maximum error of its other constant entries
 EXACT_WITHIN = 1e-12  # maximum entry of |R R^T - I| of a float64 rotation, which is not changed
 
 
@@ -96,22 +97,52 @@ def _sinc(x: float) -> float:
 def camera_of(camera: Camera | Float64, image: UInt8) -> Camera:
     """Return a camera given as such, or as the intrinsic matrix of an image (H, W, ...).
 
+    The matrix may be padded to (3, 4) with a column of zeros, or to (4, 4) with a row and a column of the identity.
+
     Raises:
         DataError: The matrix is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px.
     """
     if isinstance(camera, Camera):
         return camera
     form = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px"
-    try:
-        K = np.asarray(camera, np.float64)
-    except (TypeError, ValueError):
-        raise DataError(f"camera: expected a Camera or {form}, got {type(camera).__name__}") from None
+    K = as_array("camera", camera, f"a Camera or {form}")
+    if K.shape in ((3, 4), (4, 4)) and not (K[:3, 3:].any() or (K[3:] != (0, 0, 0, 1)).any()):
+        K = K[:3, :3]
     if K.shape != (3, 3):
         raise DataError(f"camera: expected a Camera or {form}, got an array of shape {K.shape}")
-    if not np.allclose(K, [[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]], rtol=0, atol=1e-6):
-        raise DataError(f"camera: expected {form}, got {K.tolist()}; undistort and unskew the images first")
+    if not np.allclose(K, [[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]], rtol=0, atol=MAX_SKEW):
+        fix = "; undistort and unskew the images first" if abs(K[0, 1]) > MAX_SKEW else ""
+        raise DataError(f"camera: expected {form}, got {K.tolist()}{fix}")
     height, width = np.shape(image)[:2] if np.ndim(image) >= 2 else (0, 0)
     return Camera(width, height, *(float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+
+
+def pose_of(where: str, pose: object) -> Float64:
+    """Return a transform (4, 4) given as an array, tensor or list of numbers of any type, (4, 4) or (3, 4).
+
+    Raises:
+        DataError: The matrix is not rigid. The message begins with `where`.
+    """
+    form = "a rigid transform (4, 4)"
+    T = as_array(f"{where}: pose", pose, form)
+    if T.shape == (3, 4):
+        T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
+    if T.shape != (4, 4):
+        raise DataError(f"{where}: pose: expected {form}, got an array of shape {T.shape}; pass R and t in one matrix")
+    with errors_of(where):
+        return nearest_rigid(T)
+
+
+def as_array(name: str, value: object, form: str) -> Float64:
+    """Return an array, tensor or list of numbers as float64.
+
+    Raises:
+        DataError: The value is not an array of numbers in the given form.
+    """
+    try:
+        return np.asarray(value, np.float64)
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor on another device, or with a gradient
+        raise DataError(f"{name}: expected {form}, got {type(value).__name__}") from None
 
 
 def rotation_angle(R: Float64) -> float:

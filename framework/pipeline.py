@@ -34,7 +34,7 @@ from framework.runtime.frame_stream import FrameStream, Turns, prefetched_map, s
 from framework.runtime.run_log import Journal, RunResult, StageTime
 from framework.runtime.signals import Interruption, signals_deferred
 from framework.tracking.color_to_depth import ColorToDepth
-from framework.tracking.map_agreement import check_resumed, map_agreement
+from framework.tracking.map_agreement import check_distance, check_resumed, map_agreement
 
 log = logging.getLogger(__name__)
 
@@ -284,6 +284,7 @@ class Pipeline:
                     f"frame {frame.index}: expected a Pose from the tracker, got {type(pose).__name__}; return a Pose "
                     "from track()"
                 )
+            check_distance(frame, pose)
             frame, self.T_world_color, color_pixels = self.color_to_depth.tracked(frame, pose)
             if self.color_to_depth.displaced_before:
                 self.tracker.renew_colors()
@@ -314,7 +315,7 @@ class Pipeline:
         if self.resumed and (warning := check_resumed(frame, agreement)):
             log.warning("%s", warning)
         self.resumed = False
-        journal.frame_compared(frame, agreement.disagrees, agreement.disagreeing)
+        journal.frame_compared(frame, agreement)
 
 
 @contextmanager

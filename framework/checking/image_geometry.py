@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -20,10 +21,12 @@ from framework.interfaces import RGBDSequence
 from framework.tracking.color_delay import MAX_GRADIENT
 
 MAX_OFFSET = 0.2  # fraction of the image size, maximum distance of the principal point from the image center
+MAX_SWAPPED_OFFSET = 0.04  # fraction of the image size, the same for exchanged cx and cy
 FACTORS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 1.0, 3 / 2, 2.0, 2.25, 2.5, 3.0, 4.0, 5.0, 6.0)
 """Usual ratios of two resolutions of a camera."""
 MAX_FACTOR_ERROR = 0.1  # maximum relative difference from a usual ratio; cameras have principal points within 8 %
 SUBJECT = "camera"
+log = logging.getLogger(__name__)
 TURNS = {2: "a mirror image", 3: "a rotation by 180 degrees", 4: "a vertical mirror image", 5: "a transposition"}
 TURNS |= {6: "a rotation by 90 degrees", 7: "a transposition", 8: "a rotation by 270 degrees"}
 MIN_EDGE_RATIO = 1.2  # minimum ratio of the edge agreement after and before the rotation
@@ -32,10 +35,14 @@ MIN_EDGE_RATIO = 1.2  # minimum ratio of the edge agreement after and before the
 def check_principal_point(camera: Camera) -> Finding | None:
     """Return an error if the principal point is far from the image center, or None."""
     x, y = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height  # 0.5 = center
-    if max(abs(x - 0.5), abs(y - 0.5)) <= MAX_OFFSET:
-        return None
     where = f"cx {camera.cx:.4g} px and cy {camera.cy:.4g} px"
     expected = f"expected a principal point near the center of {camera.width}x{camera.height} px, got {where}"
+    swapped = (camera.cy + 0.5) / camera.width, (camera.cx + 0.5) / camera.height
+    if _is_near_center(*swapped, MAX_SWAPPED_OFFSET) and not _is_near_center(x, y, 2 * MAX_SWAPPED_OFFSET):
+        fix = "exchange cx and cy; also exchange fx and fy if these intrinsics are of images rotated by 90 degrees"
+        return Finding(Verdict.ERROR, SUBJECT, f"{expected}; cx and cy are exchanged: {fix}")
+    if _is_near_center(x, y, MAX_OFFSET):
+        return None
     both = _nearest_factor(x, y)
     factors = (both, both) if both else (_nearest_factor(x) or round(2 * x, 2), _nearest_factor(y) or round(2 * y, 2))
     size = f"{factors[0] * camera.width:.0f}x{factors[1] * camera.height:.0f} px"
@@ -43,8 +50,19 @@ def check_principal_point(camera: Camera) -> Finding | None:
         fix = f"multiply fx, fy, cx, cy by {1 / factors[0]:.4g}"
     else:
         fix = f"multiply fx, cx by {1 / factors[0]:.4g} and fy, cy by {1 / factors[1]:.4g}"
-    text = f"{expected}; these intrinsics are of images of {size}: {fix} in the camera's file"
-    return Finding(Verdict.ERROR, SUBJECT, text)
+    return Finding(Verdict.ERROR, SUBJECT, f"{expected}; these intrinsics are of images of {size}: {fix}")
+
+
+def warn_of_camera(camera: Camera) -> None:
+    """Log a warning if the principal point of a camera is far from the image center."""
+    finding = check_principal_point(camera)
+    if finding is not None:
+        log.warning("%s: %s", finding.subject, finding.text)
+
+
+def _is_near_center(x: float, y: float, distance: float) -> bool:
+    """Return True if a relative position is within a distance of the image center along both axes."""
+    return max(abs(x - 0.5), abs(y - 0.5)) <= distance
 
 
 def _nearest_factor(*centers: float) -> float | None:

@@ -23,8 +23,8 @@ ALIKE, ALIKE_PX = 1.15, 0.2  # ratio, and offset in px, up to which two errors c
 MAX_OTHER_RATIO = 0.5  # maximum ratio of the error of another convention to the error of the configured convention
 # maximum ratio of the error of a mirrored convention to the error of the best other convention
 MAX_MIRRORED_RATIO = 0.7
-# minimum cosine between the translations in the poses and in the images, median of the pairs, for a scale estimate; real
-# recordings have 0.7 to 1.0, random errors of the poses 0
+# minimum cosine of the angle between translations in the poses and in the images, median of the pairs, for a scale
+# estimate; real recordings have 0.7 to 1.0, random errors of the poses 0
 MIN_COSINE = 0.3
 # minimum uncertainty of the logarithm of the depth factor, due to inaccurate poses and depth in real recordings
 MIN_LOG_UNCERTAINTY = 0.07
@@ -32,6 +32,8 @@ MIN_LOG_UNCERTAINTY = 0.07
 MAX_ERROR_INCREASE = 1.3
 WRONG_SCALE = 2.5  # minimum factor of a clearly wrong scale; during rotation, the scale is uncertain by up to 1.6
 USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
+INCH, FOOT = 0.0254, 0.3048  # m
+USUAL_UNITS = (1e-3, 1e-2, INCH, 0.1)  # m, units of translations that differ clearly from meters
 UNPOSED = "tracker=voxel_hashing_icp"  # setting for recordings with unusable poses
 PLAUSIBLE = (0.2, 12.0)  # m, plausible median depth of a room
 
@@ -157,8 +159,10 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     # a mirrored rotation is a rotation with other axes, so translations decide
     if mirrored.error < min(MAX_MIRRORED_RATIO * chosen.error, MAX_RELATIVE_ERROR * motion):
         text = f"mirrored (a left-handed world): {measured}, and {mirrored.error:.1f} px without the mirroring"
-        finding = Finding(Verdict.ERROR, "poses", text, " ".join(_settings(mirrored.reading, given)))
-        return PoseJudgment((finding,), as_given, mirrored, others)
+        findings = [Finding(Verdict.ERROR, "poses", text, " ".join(_settings(mirrored.reading, given)))]
+        if mirrored.depth_factor != 1.0:
+            findings.append(_scale_finding(mirrored, depth_scale, median_depth))
+        return PoseJudgment(tuple(findings), as_given, mirrored, others)
     if chosen.error > MAX_RELATIVE_ERROR * motion:
         text = f"inconsistent with the images in all supported conventions: {measured}"
         finding = Finding(Verdict.ERROR, "poses", text, UNPOSED)
@@ -180,8 +184,10 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
 
 def _mirrored_fit(pairs: Sequence[MatchedPair], given: PoseReading) -> PoseFit:
     """Return the best fit of a mirrored convention."""
-    fits = [fit(pairs, reading, 1.0) for reading in mirrored_readings(given.pose_unit)]
-    return min(_equal_to_best(fits), key=lambda one: (len(_settings(one.reading, given)), one.error))
+    options = list(mirrored_readings(given.pose_unit))
+    alike = _equal_to_best([fit(pairs, one, factor) for one in options for factor in (1.0, None)])
+    best = min(alike, key=lambda one: (len(_settings(one.reading, given)), one.error))
+    return _with_plain_factor(pairs, best.reading)
 
 
 def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> PoseFit:
@@ -200,10 +206,15 @@ def _scale_finding(chosen: PoseFit, depth_scale: float, median_depth: float) -> 
     factor = chosen.depth_factor
     if low <= median_depth <= high and not low <= median_depth * factor <= high:
         text = f"translations are {factor:.3g} times as long as in the images at a median depth of {median_depth:.2f} m"
-        unit = chosen.reading.pose_unit * 10.0 ** round(np.log10(1 / factor))
-        return Finding(Verdict.ERROR, "poses", text, f"dataset.pose_unit={unit:g}")
+        nearest = min(USUAL_UNITS, key=lambda usual: abs(np.log(usual * factor)))
+        is_usual = abs(np.log(nearest * factor)) < np.log(chosen.factor_within)
+        unit = nearest if is_usual else 10.0 ** round(np.log10(1 / factor))
+        return Finding(Verdict.ERROR, "poses", text, f"dataset.pose_unit={chosen.reading.pose_unit * unit:g}")
     scale = depth_scale / factor
     fitting = [usual for usual in USUAL_SCALES if abs(np.log(usual / scale)) < np.log(chosen.factor_within)]
+    if not fitting and abs(np.log(FOOT * factor)) < np.log(chosen.factor_within):
+        text = f"translations are {factor:.3g} times as long as in the images: in feet"
+        return Finding(Verdict.ERROR, "poses", text, f"dataset.pose_unit={chosen.reading.pose_unit * FOOT:g}")
     setting = fitting[0] if fitting else float(f"{scale:.3g}")
     text = f"expected {scale:.3g} units per m according to the poses, got {depth_scale:g}"
     return Finding(Verdict.ERROR, "depth", text, f"dataset.depth_scale={setting:g}")

@@ -20,9 +20,11 @@ from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
 from framework.runtime.digests import StageDigest, digest_of
 from framework.runtime.progress import Progress
 from framework.sensors.noise_models import SensorKind
+from framework.tracking.map_agreement import MapAgreement
 
 log = logging.getLogger(__name__)
 
+MAX_APART = 3  # frames in a row without overlap with the map, for a warning
 SKIPS_LOGGED = 10  # maximum number of logged unusable frames, so that a broken disk does not flood the log
 FUSION_STAGES: tuple[str, ...] = get_args(FusionStage)
 STAGES = ("reading", "detection", "tracking", "lifting", "refinement", *FUSION_STAGES)
@@ -115,6 +117,7 @@ class Journal:
     latencies: list[float] = field(default_factory=list)  # s
     sensor: SensorKind | None = None  # of the last frame
     compared: int = 0  # number of frames whose depth is compared with the map at a given pose
+    apart: int = 0  # number of compared frames in a row that see nothing of the map
     disagreeing: list[int] = field(default_factory=list)  # Frame.index of those that contradict the map
 
     def __enter__(self) -> Journal:
@@ -226,20 +229,25 @@ class Journal:
             log.warning("frame %d: tracked again after %d lost frames", frame.index, self.lost_for)
             self.lost_for = 0
 
-    def frame_compared(self, frame: Frame, disagrees: bool, fraction: float) -> None:
-        """Record the comparison of a frame with the map. Log the first frame that disagrees.
+    def frame_compared(self, frame: Frame, agreement: MapAgreement) -> None:
+        """Record the comparison of a frame with the map. Log the first frames that disagree or see nothing of the map.
 
-        Args:
-            frame: The frame.
-            disagrees: True if the given pose contradicts the map.
-            fraction: Fraction of the pixels whose depth differs from the map.
+        Frames of a video overlap with the frames before. Several frames without overlap have poses in another unit or
+        convention.
         """
         self.compared += 1
-        if not disagrees:
+        self.apart = self.apart + 1 if agreement.is_apart else 0
+        if self.apart == MAX_APART and not self.disagreeing:
+            text = (
+                "frames up to %d: depth is nowhere on the map of the frames before at %d given poses; expected "
+                "T_world_camera in m, with x right, y down, z forward"
+            )
+            log.warning(text, frame.index, MAX_APART)
+        if not agreement.disagrees:
             return
         if not self.disagreeing:
             text = "frame %d: depth differs from the map at %.0f%% of the pixels; its given pose may be wrong"
-            log.warning(text, frame.index, 100 * fraction)
+            log.warning(text, frame.index, 100 * agreement.disagreeing)
         self.disagreeing.append(frame.index)
 
     def frame_fused(self, frame: Frame) -> None:

@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from framework.data import Camera, Float64, Frame
-from framework.errors import DataError
+from framework.data import Camera, Float64, Frame, Pose
+from framework.datasets.frames.world_offset import FARTHEST
+from framework.errors import DataError, FrameError
 from framework.interfaces import SceneMap
 
 SIDE = 80  # maximum number of samples along the longer image side
@@ -26,6 +27,7 @@ MAX_DISAGREEING_RESUMED = 0.4  # maximum fraction for the first frame on a resum
 class MapAgreement(NamedTuple):
     """Agreement of the depth of a frame with the map."""
 
+    valid: int  # number of samples with depth
     samples: int  # number of samples on the map
     visible: float  # fraction of the samples with depth that are on the map
     disagreeing: float  # fraction of the samples on the map at another depth
@@ -34,6 +36,11 @@ class MapAgreement(NamedTuple):
     def known(self) -> bool:
         """True if enough of the map is in view."""
         return self.samples >= MIN_SAMPLES and self.visible >= MIN_VISIBLE
+
+    @property
+    def is_apart(self) -> bool:
+        """True if the frame has depth, but hardly any of it is on the map."""
+        return self.valid >= MIN_SAMPLES and self.visible < MIN_VISIBLE
 
     @property
     def disagrees(self) -> bool:
@@ -67,10 +74,21 @@ def map_agreement(frame: Frame, T_world_camera: Float64, scene: SceneMap) -> Map
             agreeing |= np.abs(around[row : row + height, column : column + width] - depth) < close
     samples = int(visible.sum())
     return MapAgreement(
+        valid=int(valid.sum()),
         samples=samples,
         visible=samples / max(int(valid.sum()), 1),
         disagreeing=float((visible & ~agreeing).sum()) / max(samples, 1),
     )
+
+
+def check_distance(frame: Frame, pose: Pose) -> None:
+    """Raise FrameError if a pose is too far from the origin for the float32 coordinates of maps."""
+    distance = float(np.linalg.norm(pose.T_world_camera[:3, 3]))
+    if distance > FARTHEST:
+        raise FrameError(
+            f"frame {frame.index}: expected a pose within {FARTHEST:g} m of the origin, got {distance:.6g} m; subtract "
+            "one offset from all poses, in float64"
+        )
 
 
 def check_resumed(frame: Frame, agreement: MapAgreement) -> str:

@@ -18,7 +18,7 @@ from hydra import compose, initialize_config_dir
 import instancemap
 from framework.api import Mapper, load_map
 from framework.config.composition import composed
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError, DataError, InstanceMapError
 from framework.files.search_paths import CONF
 from framework.geometry import exp_se3
 from framework.interfaces import MapFuser
@@ -183,7 +183,9 @@ def test_mapper_camera_matrix_equals_camera(room: CornerRoom) -> None:
 @pytest.mark.parametrize(
     ("camera", "message"),
     [
-        (np.eye(4), r"camera: expected a Camera or \[\[fx, 0, cx\], .* got an array of shape \(4, 4\)"),
+        (np.ones((4, 4)), r"camera: expected a Camera or \[\[fx, 0, cx\], .* got an array of shape \(4, 4\)"),
+        (np.c_[np.eye(3), [-40, 0, 0]], r"got an array of shape \(3, 4\)"),  # of a stereo camera
+        (np.full((3, 3), np.nan), r"camera: expected .* got \[\[nan, nan, nan\], .*\]\]$"),
         ([500, 500, 319.5, 239.5], r"got an array of shape \(4,\)"),
         ([[500, 2, 319.5], [0, 500, 239.5], [0, 0, 1]], "undistort and unskew the images first"),
         (np.diag([500.0, 500.0, 2.0]), r"camera: expected \[\[fx, 0, cx\], .* got "),
@@ -194,6 +196,91 @@ def test_mapper_camera_matrix_equals_camera(room: CornerRoom) -> None:
 def test_mapper_invalid_camera_raises(room: CornerRoom, camera: Any, message: str) -> None:
     with pytest.raises(DataError, match=message):
         Mapper("detector=none", *STAGES[1:]).add(room[0].color, room[0].depth, camera=camera)
+
+
+@pytest.mark.parametrize(
+    "converted",
+    [
+        lambda K: K.tolist(),
+        lambda K: K.astype(np.float32),
+        lambda K: np.c_[K, np.zeros(3)],
+        lambda K: np.vstack([np.c_[K, np.zeros(3)], [0, 0, 0, 1]]).tolist(),
+        lambda K: K + np.array([[0, 1e-5, 0], [0, 0, 0], [0, 0, 0]]),
+    ],
+    ids=["list", "float32", "3x4", "4x4", "noise"],
+)
+def test_mapper_camera_matrix_of_any_form_is_camera(room: CornerRoom, converted: Any) -> None:
+    c = room[0].camera
+    K = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
+    mapper = Mapper("detector=none", *STAGES[1:])
+    mapper.add(room[0].color, room[0].depth, pose=room[0].T_world_camera, camera=converted(K))
+    assert mapper._camera == c
+
+
+@pytest.mark.parametrize(
+    ("scale", "swap", "text"),
+    [
+        (2.0, False, "multiply fx, fy, cx, cy by 0.5"),
+        (0.5, False, "multiply fx, fy, cx, cy by 2"),
+        (1.0, True, "exchange cx and cy"),
+        (1.0, False, ""),
+    ],
+)
+def test_mapper_camera_of_other_image_is_logged_once(
+    room: CornerRoom, caplog: pytest.LogCaptureFixture, scale: float, swap: bool, text: str
+) -> None:
+    c = room[0].camera
+    cx, cy = (c.cy, c.cx) if swap else (c.cx, c.cy)
+    mapper = Mapper("detector=none", "tracker=ground_truth", *STAGES[2:])
+    for k in range(2):
+        K = np.diag([scale, scale, 1]) @ [[c.fx, 0, cx], [0, c.fy, cy], [0, 0, 1]]
+        mapper.add(room[k].color, room[k].depth, pose=room[k].T_world_camera, camera=K)
+    assert caplog.text.count("camera: expected a principal point near the center") == bool(text)
+    assert text in caplog.text
+
+
+@pytest.mark.parametrize(
+    "converted",
+    [
+        lambda T: T.tolist(),
+        lambda T: T.astype(np.float32),
+        lambda T: T[:3],
+        lambda T: T[:3].tolist(),
+        lambda T: T * (1 + 1e-5 * (np.arange(4) < 3)),
+    ],
+    ids=["list", "float32", "3x4", "3x4_list", "rounded"],
+)
+def test_mapper_pose_of_any_form_is_pose(room: CornerRoom, converted: Any) -> None:
+    mapper = Mapper("detector=none", "tracker=ground_truth", *STAGES[2:])
+    pose = converted(room[1].T_world_camera)
+    found = mapper.add(room[1].color, room[1].depth, pose=pose, camera=room[1].camera, odometry=pose)
+    np.testing.assert_allclose(found.T_world_camera, room[1].T_world_camera, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (np.full((4, 4), np.nan), "frame 0: pose: expected finite values"),
+        (np.diag([1.0, -1, 1, 1]), "frame 0: pose: expected a rigid transform, .* det R = -1"),
+        (np.diag([2.0, 2, 2, 1]), "frame 0: pose: expected a rigid transform"),
+        ([0, 0, 0, 0, 0, 0, 1], r"frame 0: pose: expected a rigid transform \(4, 4\), got an array of shape \(7,\)"),
+        ((np.eye(3), np.zeros(3)), r"frame 0: pose: expected a rigid transform \(4, 4\), got tuple"),
+        (np.eye(4) + np.outer([1, 1, 0, 0], [0, 0, 0, 5e5]), "within 10000 m"),
+    ],
+)
+def test_mapper_invalid_pose_raises(room: CornerRoom, pose: Any, message: str) -> None:
+    mapper = Mapper("detector=none", "tracker=ground_truth", *STAGES[2:])
+    with pytest.raises(InstanceMapError, match=message):
+        mapper.add(room[0].color, room[0].depth, pose=pose, camera=room[0].camera)
+
+
+def test_mapper_poses_in_other_unit_are_logged(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+    mapper = Mapper("detector=none", "tracker=ground_truth", *STAGES[2:])
+    for k in range(6):
+        pose = room[k].T_world_camera.copy()
+        pose[:3, 3] *= 1000
+        mapper.add(room[k].color, room[k].depth, pose=pose, camera=room[k].camera)
+    assert caplog.text.count("depth is nowhere on the map of the frames before at 3 given poses") == 1
 
 
 @pytest.mark.parametrize(
