@@ -14,6 +14,7 @@ import trimesh
 
 from framework.config.validation import require
 from framework.data import InstanceMesh
+from framework.datasets.frames.world_offset import origin_comments
 from framework.errors import ConfigError, DataError
 from framework.exporting.benchmark_predictions import BenchmarkPredictions
 from framework.exporting.decimation import joined
@@ -150,6 +151,8 @@ def export(
     _check_known(run, room, formats)
     room = room.chosen(chosen.objects, chosen.min_confidence)
     directory.mkdir(parents=True, exist_ok=True)
+    for comment in origin_comments(room.origin):
+        log.info("%s", comment)
     if surfaces := [one for one in formats if one in MESHES]:
         written += _write_surfaces(room, surfaces, directory, chosen)
     others = [one for one in formats if one not in MESHES]
@@ -157,7 +160,11 @@ def export(
     if ExportFormat.FLOORPLAN in others and found is not None:
         write_floor_plan(directory / "floor_plan.png", room, found, chosen.robot_height)
         write_geojson(directory / "floor_plan.geojson", room)
-        written += [directory / "floor_plan.png", directory / "floor_plan.geojson", *write_ros_map(directory, found)]
+        written += [
+            directory / "floor_plan.png",
+            directory / "floor_plan.geojson",
+            *write_ros_map(directory, found, room),
+        ]
     if ExportFormat.GRAPH in others:
         write_scene_graph(directory / "scene_graph.json", room, found)
         written.append(directory / "scene_graph.json")
@@ -197,22 +204,25 @@ def _write_surfaces(room: UprightRoom, formats: Sequence[ExportFormat], director
         for name, shown in files.items():
             path = directory / f"{name}{MESHES[kind]}"
             path.parent.mkdir(exist_ok=True)
-            _write_parts(path, kind, shown, chosen)
+            _write_parts(path, kind, shown, chosen, origin_comments(room.origin))
             written.append(path)
     return written
 
 
-def _write_parts(path: Path, kind: ExportFormat, shown: Sequence[Part], chosen: Chosen) -> None:
+def _write_parts(
+    path: Path, kind: ExportFormat, shown: Sequence[Part], chosen: Chosen, comments: Sequence[str]
+) -> None:
     if kind is ExportFormat.USD:
-        write_usd(path, shown, chosen.coloring, chosen.collision)
+        write_usd(path, shown, chosen.coloring, chosen.collision, comments)
     elif kind is ExportFormat.GLB:
         with atomic_write(path) as temporary:
-            temporary.write_bytes(glb(shown, chosen.coloring))
+            temporary.write_bytes(glb(shown, chosen.coloring, comments))
     elif kind is ExportFormat.OBJ:
         with atomic_write(path) as temporary:
-            temporary.write_text(_obj(_placed(shown, chosen.coloring)))
+            header = "".join(f"# {comment}\n" for comment in comments)
+            temporary.write_text(header + _obj(_placed(shown, chosen.coloring)))
     else:
-        write_mesh(path, joined(list(_placed(shown, chosen.coloring).values())))
+        write_mesh(path, joined(list(_placed(shown, chosen.coloring).values())), comments)
 
 
 def _placed(shown: Sequence[Part], coloring: Coloring) -> dict[str, InstanceMesh]:

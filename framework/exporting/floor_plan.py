@@ -183,6 +183,7 @@ def write_geojson(path: Path, room: UprightRoom) -> None:
             "type": "FeatureCollection",
             "coordinates_are": COORDINATES,
             "T_room_world": room.T_room_world.tolist(),
+            **({"map_origin": list(room.origin)} if room.origin else {}),
             "features": [_feature(room, one) for one in room.objects],
         },
     )

@@ -38,17 +38,21 @@ class Node:
     attributes: Mapping[str, Float32] = field(default_factory=dict)  # vertex attributes (V,); names start with _
 
 
-def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> bytes:
-    """Return the content of a GLB file with the given parts. The result is deterministic."""
+def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE, comments: Sequence[str] = ()) -> bytes:
+    """Return the content of a GLB file with the given parts. The result is deterministic.
+
+    Comments are stored as metadata of the scene.
+    """
     return glb_of(
         [_node(part, colors) for part, colors in zip(shown, part_colors(shown, coloring), strict=True)],
         lit=coloring is not Coloring.APPEARANCE,
+        comments=comments,
     )
 
 
-def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
+def glb_of(nodes: Sequence[Node], lit: bool, comments: Sequence[str] = ()) -> bytes:
     """Return the content of a GLB file with the given nodes. The result is deterministic."""
-    scene: Any = trimesh.Scene(base_frame="world")
+    scene: Any = trimesh.Scene(base_frame="world", metadata={"comments": list(comments)} if comments else None)
     for node in nodes:
         extras = dict(node.extras)
         if not len(node.triangles):

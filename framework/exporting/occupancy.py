@@ -20,6 +20,7 @@ import numpy as np
 from PIL import Image
 
 from framework.data import Bool, Float64, Int32, Int64, UInt8
+from framework.datasets.frames.world_offset import origin_comments
 from framework.errors import DataError
 from framework.exporting.upright_room import SurfacePoints, UprightRoom, surface_points
 from framework.files.atomic_write import atomic_write
@@ -164,13 +165,14 @@ OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # gray levels of map_saver
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # limits of (255 - level) / 255; UNKNOWN is just above FREE_THRESHOLD
 
 
-def write_ros_map(directory: Path, found: Plan) -> list[Path]:
+def write_ros_map(directory: Path, found: Plan, room: UprightRoom) -> list[Path]:
     """Write map.pgm and map.yaml, in the room frame, for the map servers of ROS and ROS 2."""
     image, yaml = directory / "map.pgm", directory / "map.yaml"
     with atomic_write(image) as temporary:
         Image.fromarray(levels(found)).save(temporary)
     x, y = found.origin.tolist()
     lines = [
+        *(f"# {comment}" for comment in origin_comments(room.origin)),
         f"image: {image.name}",
         "mode: trinary",
         f"resolution: {found.resolution:g}",

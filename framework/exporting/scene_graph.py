@@ -37,7 +37,9 @@ def scene_graph(room: UprightRoom, plan: Plan | None) -> dict[str, Any]:
         nodes += [{"id": "floor", "kind": "floor"}, {"id": "walls", "kind": "walls"}, *_room_nodes(divided)]
         edges += _room_edges(room, divided)
     label_space = label_space_of(room.mesh.classes)
-    return {"T_room_world": room.T_room_world.tolist(), "label_space": label_space, "nodes": nodes, "edges": edges}
+    origin = {"map_origin": list(room.origin)} if room.origin else {}
+    T_room_world = room.T_room_world.tolist()
+    return {"T_room_world": T_room_world, **origin, "label_space": label_space, "nodes": nodes, "edges": edges}
 
 
 def _object_node(one: RoomObject) -> dict[str, Any]:

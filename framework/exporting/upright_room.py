@@ -20,6 +20,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from framework.data import Bool, Box, Float32, Float64, InstanceMesh, Int32, Int64, UInt8
+from framework.datasets.frames.world_offset import stored_origin
 from framework.errors import DataError
 from framework.files.atomic_write import path_exists
 from framework.files.tum_trajectory import read_tum
@@ -90,6 +91,7 @@ class UprightRoom:
     T_room_world: Float64  # (4, 4)
     up_known: bool  # False = unknown; the z axis of the world frame is used
     floor_known: bool  # False = unknown; z = 0 is the origin of the world frame
+    origin: tuple[float, ...] = ()  # (3,) m, of the world frame of the map in that of the recording; () = 0
 
     @cached_property
     def surface(self) -> Surface:
@@ -163,6 +165,7 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
         T_room_world=T_room_world,
         up_known=direction is not None,
         floor_known=direction is not None and height is not None,
+        origin=stored_origin(figures),
     )
 
 

@@ -54,8 +54,9 @@ def check_usd() -> None:
 
 
 def write_usd(
-    path: Path, parts: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE, collision: Collision = Collision.HULL
-) -> None:
+    path: Path, parts: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE,
+    collision: Collision = Collision.HULL, comments: Sequence[str] = (),
+) -> None:  # fmt: skip
     """Write parts as a USD stage in the room frame. The file is deterministic.
 
     Raises:
@@ -79,6 +80,7 @@ def write_usd(
             _add_rest(stage, part, colors)
         else:
             _add_object(stage, part, colors, collision)
+    stage.GetRootLayer().comment = "\n".join(comments)
     with atomic_write(path) as temporary:
         try:
             written = stage.GetRootLayer().Export(str(temporary))

@@ -46,10 +46,14 @@ def found_property(mesh: PlyMesh, values: Array | None) -> str:
     return f"only the properties {', '.join((*AXES, *sorted(mesh.properties)))}"
 
 
-def read_ply(path: Path) -> PlyMesh:
+def read_ply(path: Path, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> PlyMesh:
     """Read a mesh.
 
     Polygons are converted to triangles. Other elements and list properties of vertices are ignored.
+
+    Args:
+        path: The file.
+        origin: Position (3,), m, that is subtracted from the vertices in float64.
 
     Raises:
         DataError: The file is damaged, a vertex is not finite, or a vertex index is invalid.
@@ -57,7 +61,7 @@ def read_ply(path: Path) -> PlyMesh:
     header, elements = read_elements(path, read_bytes(path, LARGEST_FILE))
     if "vertex" not in elements:
         raise DataError(f"{path}, line {header.lines}: expected an element 'vertex' in the header, got none")
-    vertices = _vertices(path, elements["vertex"])
+    vertices = _vertices(path, elements["vertex"], origin)
     triangles, of_triangles = np.empty((0, 3), np.int32), {}
     if "face" in elements:
         triangles, lengths = _triangles(path, elements["face"], len(vertices))
@@ -111,12 +115,13 @@ def write_ply(
         faces.tofile(file)
 
 
-def _vertices(path: Path, rows: Element) -> Float32:
+def _vertices(path: Path, rows: Element, origin: Sequence[float]) -> Float32:
     missing = [axis for axis in AXES if axis not in rows.scalars]
     if missing:
         raise DataError(f"{path}: element 'vertex': expected a scalar property {missing[0]!r}, got none")
     with np.errstate(over="ignore"):  # values too large for float32 become infinite and are rejected
-        vertices = np.stack([rows.scalars[axis].astype(np.float32) for axis in AXES], axis=1)
+        columns = [rows.scalars[axis].astype(np.float64) - start for axis, start in zip(AXES, origin, strict=True)]
+        vertices = np.stack([column.astype(np.float32) for column in columns], axis=1)
     if not np.isfinite(vertices).all():
         k = int(np.argmin(np.isfinite(vertices).all(axis=1)))
         found = " ".join(f"{rows.scalars[axis][k]:g}" for axis in AXES)

@@ -25,7 +25,7 @@ from framework.config.composition import one_line, resolved
 from framework.config.validation import checked_path
 from framework.data import Instance
 from framework.datasets.frames.sequence_reader import Recording
-from framework.datasets.frames.world_offset import as_setting, as_text
+from framework.datasets.frames.world_offset import ORIGIN, as_setting, as_text, origin_comments, stored_origin
 from framework.detection.stored.cache import cache_metrics
 from framework.errors import DataError, InstanceMapError, PartialRunError
 from framework.evaluation.compared_classes import ComparedClasses
@@ -126,7 +126,7 @@ class RunRecord:
         trusted = [frame for frame in result.tracked if not frame.pose.lost]
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
         timestamps = np.array([frame.timestamp for frame in trusted])
-        attempt(write_tum, self.directory / TRAJECTORY, timestamps, poses, origin_comments(video))
+        attempt(write_tum, self.directory / TRAJECTORY, timestamps, poses, origin_comments(video.world_origin))
         attempt(write_timings, self.directory / "timings.csv", result)
         attempt(write_digests, self.directory / DIGESTS, result)
         attempt(lambda: _write_text(self.directory / ENVIRONMENT, frozen_environment()))
@@ -138,7 +138,7 @@ class RunRecord:
             figures |= {"label_space": label_space_of(scene.classes), "instances.count": len(found[1])}
         attempt(self._write_partial, video, figures, attempt.error)  # in case the process is killed
         if found is not None:  # the map is written before the evaluation, in case the ground truth is unusable
-            attempt(write_mesh, self.directory / MESH, found[0], origin_comments(video))
+            attempt(write_mesh, self.directory / MESH, found[0], origin_comments(video.world_origin))
         attempt(scene.save, self.directory / MAP)
         if result.keyframes:
             attempt(write_keyframes, self.directory / KEYFRAMES, result.keyframes)
@@ -260,21 +260,15 @@ def origin_metrics(video: RGBDVideo) -> Metrics:
     """Return the origin of the map in the world frame of the recording, m; {} if it is that of the recording."""
     if not any(video.world_origin):
         return {}
-    return {f"map.origin.{axis}": value for axis, value in zip("xyz", video.world_origin, strict=True)}
-
-
-def origin_comments(video: RGBDVideo) -> list[str]:
-    """Return the origin of the map as a comment for the headers of files."""
-    origin = video.world_origin if any(video.world_origin) else ()
-    return [f"origin of the map in the world frame of the recording, m: {as_text(origin)}"] if origin else []
+    return {f"{ORIGIN}{axis}": value for axis, value in zip("xyz", video.world_origin, strict=True)}
 
 
 def check_origin(video: RGBDVideo, resumed: Path) -> None:
     """Raise DataError if the map of a stored run has another origin than the poses of the video."""
     if not video.has_poses() or not any((resumed / name).exists() for name in (METRICS, PARTIAL_METRICS)):
         return
-    stored = read_metrics(resumed)
-    origin, found = np.array([stored.get(f"map.origin.{axis}", 0.0) for axis in "xyz"]), np.array(video.world_origin)
+    origin = np.array(stored_origin(read_metrics(resumed)) or (0.0, 0.0, 0.0))
+    found = np.array(video.world_origin)
     if not np.array_equal(origin, found):
         expected = f"expected poses relative to the origin of the map, {as_text(origin)} m"
         raise DataError(f"resume_from: {expected}, got {as_text(found)} m; set {as_setting(origin)}")

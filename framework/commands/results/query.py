@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
+from framework.datasets.frames.world_offset import origin_comments, stored_origin
+from framework.errors import DataError
 from framework.queries.text_search import BY, WITH_EMBEDDINGS, Match, QueryResult
+from framework.runs.stored_runs import read_metrics
 
 
 def main() -> None:
@@ -40,6 +44,9 @@ def main() -> None:
         print(heading(answer, parsed.by))
         if shown:
             print(table(shown, "similarity" if answer.by == "embeddings" else "match"))
+            with suppress(DataError):  # a run directory may lack metrics
+                for line in origin_comments(stored_origin(read_metrics(parsed.run))):
+                    print(line)
         else:
             print(f"no object matches {parsed.text!r}")
 

@@ -184,6 +184,8 @@ class Recording(RGBDSequence):
         self.odometry = self.odometry_file.read()
         if self.odometry is not None:
             self._check_odometry(self.odometry)
+        if self.ground_truth is not None and any(self.world_origin):
+            self.named_truth = read_named_truth(Path(self.ground_truth), self.world_origin)
         if self.named_truth is not None:
             self.annotation = self.named_truth.name
             self._check_truth_poses(self.named_truth)

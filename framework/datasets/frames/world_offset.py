@@ -5,7 +5,7 @@ Maps have float32 coordinates, which resolve 0.5 m at 5000 km. The offset is sub
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from framework.config.validation import require
 from framework.data import Float64
 
 KEY = "dataset.world_offset"
+ORIGIN = "map.origin."  # prefix of the figures x, y, z of a run
 AUTO = "AUTO"
 FARTHEST = 1e4  # m, maximum distance of a pose from the origin; at this distance, float32 resolves 1 mm
 GRID = 1000.0  # m, AUTO offsets are multiples of it
@@ -45,6 +46,18 @@ def world_offset_of(parameter: str, positions: Float64) -> Float64:
 def as_text(offset: Iterable[float]) -> str:
     """Return an offset (3,) as text, as in the parameter."""
     return " ".join(f"{value:.12g}" for value in offset)
+
+
+def stored_origin(figures: Mapping[str, object]) -> tuple[float, ...]:
+    """Return the origin of the map (3,) in the world frame of the recording, m, from the figures of a run; () = 0."""
+    origin = tuple(float(str(figures.get(f"{ORIGIN}{axis}", 0.0))) for axis in "xyz")
+    return origin if any(origin) else ()
+
+
+def origin_comments(origin: Iterable[float]) -> list[str]:
+    """Return an origin (3,) as a comment for the headers of files; [] = the origin is 0."""
+    text = as_text(origin)
+    return [f"origin of the map in the world frame of the recording, m: {text}"] if text.strip("0 ") else []
 
 
 def as_setting(offset: Iterable[float]) -> str:

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from framework.data import Float64, Int32, ReferenceTrajectory
+from framework.datasets.frames.world_offset import FARTHEST
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import path_exists
@@ -59,8 +60,13 @@ class NamedTruth:
         return self.trajectory.T_world_camera[k] if k >= 0 else None
 
 
-def read_named_truth(path: Path) -> NamedTruth:
+def read_named_truth(path: Path, origin: Sequence[float] = ()) -> NamedTruth:
     """Read the ground truth in a run directory or a labeled mesh.
+
+    Args:
+        path: The run directory or the mesh.
+        origin: Origin of the mapped world frame in the world frame of the recording (3,), m; () = 0. It is subtracted
+            from a mesh that is far from the origin.
 
     Raises:
         ConfigError: The path does not exist.
@@ -75,6 +81,8 @@ def read_named_truth(path: Path) -> NamedTruth:
         class_names = _classes_of_run(names, content)
         ids = np.where(np.isin(ids, list(class_names)), ids, 0).astype(np.int32)  # tentative instances have no entry
         return NamedTruth(_labeled(mesh, ply, ids, class_names), label, _trajectory_of_run(mesh.parent))
+    if origin and np.linalg.norm(np.median(ply.vertices, axis=0)) > FARTHEST:
+        ply = read_ply(mesh, origin)
     class_names = read_class_names(names, LARGEST_ID)
     unlisted = set(np.unique(ids).tolist()) - class_names.keys() - {0}
     if unlisted:
