@@ -55,7 +55,7 @@ class MapPlacement:
         if np.abs(points).max(initial=0) > MAX_COORDINATE:
             raise DataError(
                 f"map: expected coordinates of at most {MAX_COORDINATE:g} m, got {np.abs(points).max():g} m; set "
-                "scale to the number of meters per unit"
+                "scale to the number of meters per unit, or subtract an offset from coordinates such as UTM"
             )
         return points.astype(np.float32)
 

@@ -14,6 +14,7 @@ from framework.files.ply import PlyMesh, read_ply
 from framework.runs.external_maps.array_files import read_array
 
 UNLABELED = "unlabeled"  # name of an instance without a class, in a map with classes
+FIX = "subtract an offset from coordinates such as UTM"
 MAX_COORDINATE = 1e6  # maximum absolute coordinate of a point; float32 has a resolution of 6 cm there
 
 
@@ -48,7 +49,7 @@ def read_surface(path: Path) -> PlyMesh:
         if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
             raise DataError(f"{path}: expected floating-point points (V, 3), got {points.dtype} {points.shape}")
         if not (np.abs(points) <= MAX_COORDINATE).all():  # rejects NaN
-            raise DataError(f"{path}: expected coordinates of at most {MAX_COORDINATE:g}, got larger values or NaN")
+            raise DataError(f"{path}: expected coordinates of at most {MAX_COORDINATE:g}, got larger values or NaN; {FIX}")
         surface = PlyMesh(points.astype(np.float32), np.empty((0, 3), np.int32), {}, ())
     else:
         surface = read_ply(path)

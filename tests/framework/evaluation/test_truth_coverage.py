@@ -41,10 +41,30 @@ OTHER_WORLDS = [
     moved(shift=(5, 0, 0), turn=(0, 0, 90)),
     moved(shift=(0.2, 0.3, 0.1), turn=(0, 0, 20)),
     moved() * np.float32(1000),
+    moved() * np.float32([1, -1, 1]),
+    moved() * np.float32(3.28),
+    moved() @ np.float32([[0, 1, 0], [0, 0, 1], [1, 0, 0]]),
+    moved(turn=(0, 0, 180)),
+    moved(shift=(0.15, 0.15, 0.15)),
 ]
 
 
-@pytest.mark.parametrize("points", OTHER_WORLDS, ids=["shifted", "y_up", "turned", "slightly_turned", "millimeters"])
+@pytest.mark.parametrize(
+    "points",
+    OTHER_WORLDS,
+    ids=[
+        "shifted",
+        "y_up",
+        "turned",
+        "slightly_turned",
+        "millimeters",
+        "mirrored",
+        "feet",
+        "axes",
+        "backwards",
+        "near",
+    ],
+)
 def test_truth_coverage_in_other_world_frame_is_implausible(points: Float32) -> None:
     assert not TruthCoverage.of(points, moved()).plausible
 

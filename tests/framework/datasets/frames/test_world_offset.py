@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from framework.datasets.frames.world_offset import as_setting, world_offset_of
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.datasets.tum_rgbd import TumRgbd
 from framework.errors import ConfigError, DataError, FrameError
+from framework.exporting.exports import ExportFormat, export
 from framework.files.tum_trajectory import read_tum
 from framework.geometry import inverse
 from framework.runs.stored_runs import read_metrics
@@ -21,6 +23,12 @@ from tests.support.recordings.damaged import write_damaged
 
 DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
 FAR = [(450000, 5400000, 300), (-84000, 0, 0), (12000, 12000, 0), (3980000, -12000, 4960000), (0, 0, 50000)]
+
+
+TRIANGLE = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty double x\nproperty double y\nproperty double z\n"
+    "property int instance\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+)
 
 
 def shifted(shift: tuple[float, ...], T: Float64) -> Float64:
@@ -80,9 +88,25 @@ def test_pose_far_from_world_offset_is_refused(tmp_path: Path) -> None:
         RgbdFolder(recording(tmp_path, FAR[0]), world_offset="0 0 0")[0]
 
 
+@pytest.mark.parametrize("shift", FAR, ids=str)
+def test_truth_mesh_of_recording_far_from_origin_is_moved(tmp_path: Path, shift: tuple[float, ...]) -> None:
+    """A mesh in the world frame of the recording or in that of the map is the same ground truth."""
+    place = recording(tmp_path, shift)
+    origin = np.array(RgbdFolder(place).world_origin)
+    corners = np.array([[0, 0, 1], [1.25, 0, 1], [0, 1.5, 1.125]]) + shift
+    (tmp_path / "instances.json").write_text('{"1": {"name": "desk", "class": "dining table"}}')
+    for name, vertices in {"world": corners, "map": corners - origin}.items():
+        rows = "".join(f"{x:.4f} {y:.4f} {z:.4f} 1\n" for x, y, z in vertices)
+        (tmp_path / f"{name}.ply").write_text(f"{TRIANGLE}{rows}3 0 1 2\n")
+        truth = RgbdFolder(place, ground_truth=tmp_path / f"{name}.ply").scene_truth()
+        assert truth is not None
+        np.testing.assert_allclose(truth.points_world, corners - origin, atol=1e-3)
+
+
 @pytest.mark.integration
 def test_run_far_from_origin_equals_run_near_origin(tmp_path: Path) -> None:
     """The outputs are those of the run at the origin, and name the origin of the map."""
+    formats = [ExportFormat(name) for name in ("ply", "obj", "glb", "floorplan", "graph")]
     stages = ("tracker=ground_truth", "detector=none", "fuser.voxel_size=0.02", "dataset=rgbd_folder")
     places = {"near": (0.0, 0.0, 0.0), "far": (450000.0, 5400000.0, 1000.0)}
     for name, shift in places.items():
@@ -96,6 +120,14 @@ def test_run_far_from_origin_equals_run_near_origin(tmp_path: Path) -> None:
     named = f"origin of the map in the world frame of the recording, m: {' '.join(f'{value:.12g}' for value in origin)}"
     assert (tmp_path / "run_far/trajectory.txt").read_text().startswith(f"# {named}\n")
     assert f"comment {named}\n".encode() in (tmp_path / "run_far/mesh.ply").read_bytes()
+    export(tmp_path / "run_far", formats, up=(0, 0, 1), floor=1000.0)
+    export(tmp_path / "run_near", formats, up=(0, 0, 1), floor=0.0)
+    for name in ("scene.ply", "scene.obj", "scene.glb", "map.yaml"):
+        assert named.encode() in (tmp_path / "run_far/export" / name).read_bytes()
+        assert b"origin of the map" not in (tmp_path / "run_near/export" / name).read_bytes()
+    for name in ("floor_plan.geojson", "scene_graph.json"):
+        assert json.loads((tmp_path / "run_far/export" / name).read_text())["map_origin"] == origin
+        assert "map_origin" not in json.loads((tmp_path / "run_near/export" / name).read_text())
     resumed = (*stages, f"dataset.root={tmp_path / 'far'}")
     run(tmp_path / "again", *resumed, resume_from=str(tmp_path / "run_far"))
     with pytest.raises(DataError, match=r'resume_from: expected poses .*; set "dataset\.world_offset=0 0 0"'):
