@@ -49,7 +49,9 @@ def read_surface(path: Path) -> PlyMesh:
         if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
             raise DataError(f"{path}: expected floating-point points (V, 3), got {points.dtype} {points.shape}")
         if not (np.abs(points) <= MAX_COORDINATE).all():  # rejects NaN
-            raise DataError(f"{path}: expected coordinates of at most {MAX_COORDINATE:g}, got larger values or NaN; {FIX}")
+            raise DataError(
+                f"{path}: expected coordinates of at most {MAX_COORDINATE:g}, got larger values or NaN; {FIX}"
+            )
         surface = PlyMesh(points.astype(np.float32), np.empty((0, 3), np.int32), {}, ())
     else:
         surface = read_ply(path)

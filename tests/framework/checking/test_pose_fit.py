@@ -17,6 +17,7 @@ from framework.datasets.frames.conventions import CameraAxes, PoseKind, PoseRead
 from framework.geometry import inverse, project, transform
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
+X_FORWARD = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # camera axes of ROS
 BLANK = np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32)
 
 
@@ -125,3 +126,46 @@ def test_pose_fit_keeps_configured_unit_in_axes_search() -> None:
     assert fault.setting == "dataset.pose_kind=T_CAMERA_WORLD"
     wrong_unit = judge(pairs_of(walk(6)), PoseReading(pose_unit=0.001), 1000.0, 2.0)
     assert wrong_unit.findings[-1].setting == "dataset.pose_unit=1"
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-2, 0.0254, 0.3048])
+@pytest.mark.parametrize(
+    ("convert", "settings"),
+    [
+        (lambda T: T, []),
+        (lambda T: T @ np.diag([1, -1, -1, 1.0]), ["dataset.camera_axes=OPENGL"]),
+        (lambda T: np.diag([1, -1, 1, 1.0]) @ T @ np.diag([1, -1, 1, 1.0]), ["dataset.mirrored=Y"]),
+        (lambda T: np.diag([1, -1, 1, 1.0]) @ T @ X_FORWARD @ np.diag([1, -1, 1, 1.0]), ["dataset.mirrored=Z", "ROS"]),
+        (inverse, ["dataset.pose_kind=T_CAMERA_WORLD"]),
+    ],
+    ids=["opencv", "opengl", "unity", "unreal", "inverse"],
+)
+def test_judge_in_other_unit_names_unit_and_convention(
+    convert: Callable[[Float64], Float64], settings: list[str], unit: float
+) -> None:
+    def stored(T_world_camera: Float64) -> Float64:
+        T = convert(T_world_camera).copy()
+        T[:3, 3] /= unit
+        return T
+
+    found = judge(pairs_of(walk(4), stored), PoseReading(), 1000.0, 2.2)
+    named = " ".join(finding.setting for finding in found.findings)
+    assert named.split()[-1] == f"dataset.pose_unit={unit:g}"
+    assert ("mirrored" in named) == ("mirrored" in " ".join(settings))
+    assert found.best is not None
+    assert found.best.error < 0.1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_judge_of_random_errors_suggests_no_scale(seed: int) -> None:
+    """Random translations are longer than those in the images, but no scale corrects them."""
+    chosen = np.random.default_rng(seed)
+
+    def noisy(T_world_camera: Float64) -> Float64:
+        T = T_world_camera.copy()
+        T[:3, 3] += chosen.normal(scale=0.6, size=3)
+        return T
+
+    [finding] = judge(pairs_of(walk(seed), noisy), PoseReading(), 1000.0, 2.2).findings
+    assert finding.verdict is Verdict.ERROR
+    assert finding.setting == "tracker=voxel_hashing_icp"

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -50,15 +51,31 @@ def jumps_of(recording: Recording) -> list[tuple[int, int]]:
         (motion((0, 0, -0.3)), lambda k: k >= 5, [(4, 5)]),
         (motion((0, 0, 0), (0, 0, 10)), lambda k: k >= 12, [(11, 12)]),
         (motion((0, 0, 0), (10, 0, 0)), lambda k: k == 7, [(6, 7), (7, 8)]),
+        (motion((0.2, 0.1, 0)), lambda k: k == 0, [(0, 1)]),
+        (motion((0, 0.3, 0)), lambda k: k < 3, [(2, 3)]),
+        (motion((0.15, 0, 0)), lambda k: k >= 17, [(16, 17)]),
+        (motion((0, 0, 0), (0, 6, 0)), lambda k: k in (5, 6), [(4, 5), (6, 7)]),
         (motion((2, 1, 0.5), (0, 0, 60)), lambda k: k % 6 >= 3, [(2, 3), (5, 6), (8, 9), (11, 12), (14, 15)]),
     ],
-    ids=["sideways", "down", "turn", "single", "two_worlds"],
+    ids=["sideways", "down", "turn", "single", "first", "start", "last", "pair", "two_worlds"],
 )
 def test_find_jumps_names_frames(
     tmp_path: Path, T: Float64, after: Callable[[int], bool], expected: list[tuple[int, int]]
 ) -> None:
     recording = RgbdFolder(write_damaged(tmp_path / "jump", DESK, pose=jumping(T, after), frames=18))
     assert jumps_of(recording) == expected
+
+
+def test_find_jumps_next_to_blurred_frame_compares_next_frame(tmp_path: Path) -> None:
+    """The frames 8 and 9 have no matches, so the jump between them is found between their neighbors."""
+    place = write_damaged(tmp_path / "jump", DESK, pose=jumping(motion((0.3, 0, 0)), lambda k: k >= 9), frames=18)
+    for k in (8, 9):
+        [path] = place.glob(f"color/{k:06d}.*")
+        color = cv2.imread(str(path))
+        path.unlink()
+        cv2.imwrite(str(path), cv2.GaussianBlur(color, (0, 0), 25))
+    recording = RgbdFolder(place)
+    assert jumps_of(recording) == [(7, 10)]
 
 
 def test_find_jumps_in_valid_recordings_finds_none(shared_data: Path) -> None:
