@@ -175,6 +175,13 @@ class PoseTracker(ABC):
             NoPoseError: The tracker requires the poses of the sequence, but this frame has none. The frame is skipped.
         """
 
+    def given_pose(self, frame: Frame) -> Float64 | None:
+        """Return the pose (4, 4) of a frame in any fixed frame, as read; None = unknown. Called in any order.
+
+        Trackers with `poses_given` implement it, so that the poses can be compared with the images before the run.
+        """
+        return None
+
     def renew_colors(self) -> None:  # noqa: B027  # optional
         """Discard the color images of earlier frames, which were displaced relative to depth. By default, keep them.
 

@@ -244,8 +244,11 @@ def _image_findings(sequence: RGBDSequence, chosen: Sequence[int]) -> list[Findi
     return [finding for finding in found if finding is not None]
 
 
-def warn_of_poses(sequence: RGBDVideo) -> None:
-    """Log a warning if the given poses do not fit the images of a few frames."""
+CHECK = "run `instancemap check` for details"
+
+
+def warn_of_poses(sequence: RGBDVideo, fix: str = CHECK) -> None:
+    """Log a warning with a fix if the given poses do not fit the images of a few frames."""
     if not isinstance(sequence, RGBDSequence) or not sequence.has_poses():
         return
     starts = [int(fraction * len(sequence)) for fraction in QUICK_STARTS]
@@ -260,7 +263,7 @@ def warn_of_poses(sequence: RGBDVideo) -> None:
         jump = find_jumps(matcher, _chosen_poses(sequence), PoseReading(), QUICK_JUMPS, revisits=0).finding()
         errors = [] if jump is None else [jump]
     for finding in errors:
-        log.warning("%s: %s; run `instancemap check` for details", finding.subject, finding.text)
+        log.warning("%s: %s; %s", finding.subject, finding.text, fix)
 
 
 @dataclass

@@ -238,10 +238,16 @@ def write_run(
     if config.get("resume_from") is not None:
         check_origin(video, checked_path("resume_from", config.resume_from))
     if isinstance(video, Recording):  # third-party datasets may have another class
-        from framework.checking.recording_check import warn_of_images, warn_of_poses
+        from framework.checking.posed_sequence import PosedSequence
+        from framework.checking.recording_check import CHECK, warn_of_images, warn_of_poses
 
         warn_of_images(video)
-        warn_of_poses(video)
+        tracker = pipeline.tracker
+        if tracker.poses_given and tracker.pose_source != "ground_truth":
+            fix = f"check the times and the convention of the tracker's poses, or write them to poses.txt and {CHECK}"
+            warn_of_poses(PosedSequence(video, tracker), fix)
+        else:
+            warn_of_poses(video)
     with signals_deferred(*ENDING) as interruption, watched_run(pipeline.viewer, directory, record.config) as outcome:
         with frozen_garbage_collector():
             result = pipeline.run_to_any_end(video, directory)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from framework.data import Array, Frame, Pose
+from framework.data import Array, Float64, Frame, Pose
 from framework.errors import NoPoseError
 from framework.interfaces import PoseTracker, SceneMap
 
@@ -29,6 +29,10 @@ class GroundTruth(PoseTracker):
         if frame.T_world_camera is None:
             raise NoPoseError(f"frame {frame.index}: expected a ground-truth pose at {frame.timestamp:.3f} s, got none")
         return Pose(frame.T_world_camera)
+
+    def given_pose(self, frame: Frame) -> Float64 | None:
+        """Return the ground-truth pose of the frame, None = unknown."""
+        return frame.T_world_camera
 
     def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
         """Do nothing, because the ground-truth poses are in the world frame of the map."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -71,6 +72,12 @@ class TrajectoryFile(PoseTracker):
             T_world_first = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
             self._T_world_file = T_world_first @ inverse(T_file_camera)
         return Pose(self._T_world_file @ T_file_camera)
+
+    def given_pose(self, frame: Frame) -> Float64 | None:
+        """Return the pose T_file_camera (4, 4) of a frame, None = unknown."""
+        with suppress(NoPoseError):
+            return self._T_file_camera[self._pose_index(frame)]
+        return None
 
     def _pose_index(self, frame: Frame) -> int:
         """Return the index of the pose of a frame."""

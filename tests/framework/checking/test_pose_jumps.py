@@ -13,12 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from framework.checking.matched_pairs import Matcher
 from framework.checking.pose_jumps import find_jumps
+from framework.checking.posed_sequence import PosedSequence
 from framework.checking.recording_check import check, warn_of_poses
 from framework.data import Float64
 from framework.datasets.frames.conventions import PoseReading
 from framework.datasets.frames.sequence_reader import Recording
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.datasets.tum_rgbd import TumRgbd
+from framework.files.tum_trajectory import read_tum, write_tum
+from framework.geometry import inverse
+from plugins.trackers.trajectory_file import TrajectoryFile
 from tests.support.recordings.damaged import write_damaged
 
 pytestmark = pytest.mark.integration
@@ -99,6 +103,27 @@ def test_find_jumps_between_revisits_finds_drift(tmp_path: Path) -> None:
     finding = found.finding()
     assert finding is not None
     assert "frames of the same place" in finding.text
+
+
+@pytest.mark.parametrize(
+    ("stored", "late", "text"),
+    [
+        (lambda T: T, 0.0, ""),
+        (inverse, 0.0, "stored as T_camera_world"),
+        (lambda T: T @ np.diag([1, -1, -1, 1.0]), 0.0, "x right, y up, z backward"),
+        (lambda T: motion(tuple(999 * T[:3, 3])) @ T, 0.0, "translations are"),
+        (lambda T: T, 0.13, "inconsistent with the images"),
+    ],
+    ids=["valid", "inverse", "opengl", "millimeters", "late"],
+)
+def test_warn_of_poses_of_trajectory_file_names_error(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, stored: Callable[[Float64], Float64], late: float, text: str
+) -> None:
+    times, poses = read_tum(DESK.folder / "groundtruth.txt")
+    write_tum(tmp_path / "poses.txt", times + late, [stored(T) for T in poses])
+    warn_of_poses(PosedSequence(DESK, TrajectoryFile(tmp_path / "poses.txt")), "check the poses")
+    assert ("check the poses" in caplog.text) == bool(text)
+    assert text in caplog.text
 
 
 @pytest.mark.acceptance
