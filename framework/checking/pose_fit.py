@@ -24,8 +24,8 @@ MAX_OTHER_RATIO = 0.5  # maximum ratio of the error of another convention to the
 # maximum ratio of the error of a mirrored convention to the error of the best other convention
 MAX_MIRRORED_RATIO = 0.7
 # minimum cosine of the angle between translations in the poses and in the images, median of the pairs, for a scale
-# estimate; real recordings have 0.7 to 1.0, random errors of the poses 0
-MIN_COSINE = 0.3
+# estimate; real recordings have 0.1 to 1.0
+MIN_COSINE = 0.0
 # minimum uncertainty of the logarithm of the depth factor, due to inaccurate poses and depth in real recordings
 MIN_LOG_UNCERTAINTY = 0.07
 # maximum ratio of the errors with the estimated and the stored scale, for a clearly wrong scale
@@ -33,7 +33,8 @@ MAX_ERROR_INCREASE = 1.3
 WRONG_SCALE = 2.5  # minimum factor of a clearly wrong scale; during rotation, the scale is uncertain by up to 1.6
 USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
 INCH, FOOT = 0.0254, 0.3048  # m
-USUAL_UNITS = (1e-3, 1e-2, INCH, 0.1)  # m, units of translations that differ clearly from meters
+OTHER_UNIT = 20.0  # minimum factor of translations in another unit than meters, such as centimeters
+CERTAIN_FACTOR = 1.1  # maximum ratio of an estimated scale to that of inches or feet
 UNPOSED = "tracker=voxel_hashing_icp"  # setting for recordings with unusable poses
 PLAUSIBLE = (0.2, 12.0)  # m, plausible median depth of a room
 
@@ -184,10 +185,12 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
 
 def _mirrored_fit(pairs: Sequence[MatchedPair], given: PoseReading) -> PoseFit:
     """Return the best fit of a mirrored convention."""
-    options = list(mirrored_readings(given.pose_unit))
-    alike = _equal_to_best([fit(pairs, one, factor) for one in options for factor in (1.0, None)])
-    best = min(alike, key=lambda one: (len(_settings(one.reading, given)), one.error))
-    return _with_plain_factor(pairs, best.reading)
+    fits = []
+    for reading in mirrored_readings(given.pose_unit):
+        as_stored, scaled = fit(pairs, reading, 1.0), fit(pairs, reading)
+        is_other_unit = not 1 / OTHER_UNIT < scaled.depth_factor < OTHER_UNIT
+        fits.append(scaled if is_other_unit and scaled.error < as_stored.error else as_stored)
+    return min(_equal_to_best(fits), key=lambda one: (len(_settings(one.reading, given)), one.error))
 
 
 def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> PoseFit:
@@ -206,13 +209,12 @@ def _scale_finding(chosen: PoseFit, depth_scale: float, median_depth: float) -> 
     factor = chosen.depth_factor
     if low <= median_depth <= high and not low <= median_depth * factor <= high:
         text = f"translations are {factor:.3g} times as long as in the images at a median depth of {median_depth:.2f} m"
-        nearest = min(USUAL_UNITS, key=lambda usual: abs(np.log(usual * factor)))
-        is_usual = abs(np.log(nearest * factor)) < np.log(chosen.factor_within)
-        unit = nearest if is_usual else 10.0 ** round(np.log10(1 / factor))
+        is_inch = abs(np.log(INCH * factor)) < np.log(min(chosen.factor_within, CERTAIN_FACTOR))
+        unit = INCH if is_inch else 10.0 ** round(np.log10(1 / factor))
         return Finding(Verdict.ERROR, "poses", text, f"dataset.pose_unit={chosen.reading.pose_unit * unit:g}")
     scale = depth_scale / factor
     fitting = [usual for usual in USUAL_SCALES if abs(np.log(usual / scale)) < np.log(chosen.factor_within)]
-    if not fitting and abs(np.log(FOOT * factor)) < np.log(chosen.factor_within):
+    if not fitting and abs(np.log(FOOT * factor)) < np.log(min(chosen.factor_within, CERTAIN_FACTOR)):
         text = f"translations are {factor:.3g} times as long as in the images: in feet"
         return Finding(Verdict.ERROR, "poses", text, f"dataset.pose_unit={chosen.reading.pose_unit * FOOT:g}")
     setting = fitting[0] if fitting else float(f"{scale:.3g}")

@@ -60,7 +60,8 @@ def words_of(line: str) -> list[str]:
 
 def without_header(lines: Sequence[str]) -> tuple[Columns | None, list[tuple[int, str]]]:
     """Return the columns named by a header, or None, and the other lines with their numbers, without comments."""
-    columns, rows = None, []
+    columns: Columns | None = None
+    rows: list[tuple[int, str]] = []
     for number, line in enumerate(lines, start=1):
         named = None if rows else named_columns(line)
         columns = named or columns

@@ -128,7 +128,7 @@ def test_pose_fit_keeps_configured_unit_in_axes_search() -> None:
     assert wrong_unit.findings[-1].setting == "dataset.pose_unit=1"
 
 
-@pytest.mark.parametrize("unit", [1e-3, 1e-2, 0.0254, 0.3048])
+@pytest.mark.parametrize("unit", [1e-3, 1e-2, 0.0254])
 @pytest.mark.parametrize(
     ("convert", "settings"),
     [
