@@ -32,7 +32,7 @@ from framework.evaluation.compared_classes import ComparedClasses
 from framework.files.atomic_write import atomic_write, remove_left_over
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum, write_tum
-from framework.interfaces import RGBDSequence, RGBDVideo
+from framework.interfaces import PoseTracker, RGBDSequence, RGBDVideo
 from framework.live_view.guarded_viewer import watched_run
 from framework.pipeline import Pipeline
 from framework.registry import STAGES, build
@@ -238,16 +238,7 @@ def write_run(
     if config.get("resume_from") is not None:
         check_origin(video, checked_path("resume_from", config.resume_from))
     if isinstance(video, Recording):  # third-party datasets may have another class
-        from framework.checking.posed_sequence import PosedSequence
-        from framework.checking.recording_check import CHECK, warn_of_images, warn_of_poses
-
-        warn_of_images(video)
-        tracker = pipeline.tracker
-        if tracker.poses_given and tracker.pose_source != "ground_truth":
-            fix = f"check the times and the convention of the tracker's poses, or write them to poses.txt and {CHECK}"
-            warn_of_poses(PosedSequence(video, tracker), fix)
-        else:
-            warn_of_poses(video)
+        warn_of_recording(video, pipeline.tracker)
     with signals_deferred(*ENDING) as interruption, watched_run(pipeline.viewer, directory, record.config) as outcome:
         with frozen_garbage_collector():
             result = pipeline.run_to_any_end(video, directory)
@@ -260,6 +251,20 @@ def write_run(
         if error is not None:
             raise error
     return interruption
+
+
+def warn_of_recording(video: Recording, tracker: PoseTracker) -> None:
+    """Log a warning if the images or the given poses of a recording are wrong in a few frames."""
+    from framework.checking.posed_sequence import PosedSequence
+    from framework.checking.recording_check import CHECK, warn_of_images, warn_of_poses
+
+    if warn_of_images(video):
+        return  # errors of the poses are consequences
+    if tracker.poses_given and tracker.pose_source != "ground_truth":
+        fix = f"check the times and the convention of the tracker's poses, or write them to poses.txt and {CHECK}"
+        warn_of_poses(PosedSequence(video, tracker), fix)
+    else:
+        warn_of_poses(video)
 
 
 def origin_metrics(video: RGBDVideo) -> Metrics:
