@@ -15,6 +15,7 @@ from framework.data import Camera, Float32, Float64, Int32, PointClusters, UInt8
 from framework.errors import DataError, errors_of
 
 RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| due to rounding in files; larger for lost poses, stored as R = 0
+FARTHEST = 1e4  # m, maximum distance of a pose from the origin; at this distance, float32 resolves 1 mm
 MAX_SKEW = 1e-3  # px, maximum skew of a camera matrix, and maximum error of its other constant entries
 EXACT_WITHIN = 1e-12  # maximum entry of |R R^T - I| of a float64 rotation, which is not changed
 

@@ -315,7 +315,7 @@ class Pipeline:
         if self.resumed and (warning := check_resumed(frame, agreement)):
             log.warning("%s", warning)
         self.resumed = False
-        journal.frame_compared(frame, agreement)
+        journal.frame_compared(frame, agreement.is_apart, agreement.disagrees, agreement.disagreeing)
 
 
 @contextmanager

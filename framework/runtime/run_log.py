@@ -20,7 +20,6 @@ from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
 from framework.runtime.digests import StageDigest, digest_of
 from framework.runtime.progress import Progress
 from framework.sensors.noise_models import SensorKind
-from framework.tracking.map_agreement import MapAgreement
 
 log = logging.getLogger(__name__)
 
@@ -229,25 +228,31 @@ class Journal:
             log.warning("frame %d: tracked again after %d lost frames", frame.index, self.lost_for)
             self.lost_for = 0
 
-    def frame_compared(self, frame: Frame, agreement: MapAgreement) -> None:
+    def frame_compared(self, frame: Frame, is_apart: bool, disagrees: bool, fraction: float) -> None:
         """Record the comparison of a frame with the map. Log the first frames that disagree or see nothing of the map.
 
         Frames of a video overlap with the frames before. Several frames without overlap have poses in another unit or
         convention.
+
+        Args:
+            frame: The frame.
+            is_apart: True if hardly any depth of the frame is on the map.
+            disagrees: True if the given pose contradicts the map.
+            fraction: Fraction of the pixels whose depth differs from the map.
         """
         self.compared += 1
-        self.apart = self.apart + 1 if agreement.is_apart else 0
+        self.apart = self.apart + 1 if is_apart else 0
         if self.apart == MAX_APART and not self.disagreeing:
             text = (
                 "frames up to %d: depth is nowhere on the map of the frames before at %d given poses; expected "
                 "T_world_camera in m, with x right, y down, z forward"
             )
             log.warning(text, frame.index, MAX_APART)
-        if not agreement.disagrees:
+        if not disagrees:
             return
         if not self.disagreeing:
             text = "frame %d: depth differs from the map at %.0f%% of the pixels; its given pose may be wrong"
-            log.warning(text, frame.index, 100 * agreement.disagreeing)
+            log.warning(text, frame.index, 100 * fraction)
         self.disagreeing.append(frame.index)
 
     def frame_fused(self, frame: Frame) -> None:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.data import Camera, Float64, Frame, Pose
-from framework.datasets.frames.world_offset import FARTHEST
 from framework.errors import DataError, FrameError
+from framework.geometry import FARTHEST
 from framework.interfaces import SceneMap
 
 SIDE = 80  # maximum number of samples along the longer image side

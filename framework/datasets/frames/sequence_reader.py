@@ -37,13 +37,14 @@ from framework.datasets.frames.conventions import (
 )
 from framework.datasets.frames.odometry import KEY as ODOMETRY_KEY
 from framework.datasets.frames.odometry import Odometry, OdometryFile
-from framework.datasets.frames.world_offset import FARTHEST, as_setting, world_offset_of
+from framework.datasets.frames.world_offset import as_setting, world_offset_of
 from framework.datasets.ground_truth.labeled_mesh import unseen
 from framework.datasets.ground_truth.named_truth import KEY, NamedTruth, read_named_truth
 from framework.errors import ConfigError, DataError, FrameError
 from framework.files.depth_files import read_depth
 from framework.files.image_files import read_color
 from framework.files.search_paths import folder_of
+from framework.geometry import FARTHEST
 from framework.interfaces import RGBDSequence
 from framework.sensors.noise_models import SensorChoice, SensorKind
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from framework.config.validation import require
 from framework.data import Float64
+from framework.geometry import FARTHEST
 
 KEY = "dataset.world_offset"
 ORIGIN = "map.origin."  # prefix of the figures x, y, z of a run
 AUTO = "AUTO"
-FARTHEST = 1e4  # m, maximum distance of a pose from the origin; at this distance, float32 resolves 1 mm
 GRID = 1000.0  # m, AUTO offsets are multiples of it
 LARGEST = 1e8  # m, maximum offset
 

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from framework.data import Float64, Int32, ReferenceTrajectory
-from framework.datasets.frames.world_offset import FARTHEST
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import path_exists
@@ -28,6 +27,7 @@ from framework.files.json_file import read_json
 from framework.files.ply import PlyMesh, found_property, read_ply
 from framework.files.search_paths import candidates
 from framework.files.tum_trajectory import read_tum
+from framework.geometry import FARTHEST
 from framework.vocabulary.label_spaces import COCO, LONGEST_CLASS_NAME, MEANINGS, with_similar
 
 KEY = "dataset.ground_truth"
