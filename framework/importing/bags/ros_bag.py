@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -71,10 +71,11 @@ def open_source(path: Path, given: Topics, options: BagOptions) -> Source:
     if info is None:
         raise DataError(f"{path}: {topics.camera_info}: expected at least one message, got none")
     camera, lens = ros_camera(f"{path}: {topics.camera_info}", info, is_rectified(topics.color))
-    stored = None if lens is None else lens.distortion
-    depth_camera = find_depth_camera(bag, topics, tree, options, camera, None if stored else lens)
-    if depth_camera.registration is not None:
-        stored = None  # registered depth is of the pinhole camera
+    depth_camera = find_depth_camera(bag, topics, tree, options, camera, lens)
+    # camera.json has one lens for both images; resampled depth is of the pinhole camera
+    stored = None if lens is None or depth_camera.registration is not None else lens.distortion
+    if stored:
+        depth_camera = replace(depth_camera, lens=None)
     pairs = _pairs(bag, topics, options.max_difference)
     accelerometer = find_accelerometer(bag, tree, topics.color, [pair.timestamp for pair in pairs])
     poses = find_camera_poses(bag, topics, tree, options)
