@@ -3,8 +3,10 @@
     sensor_msgs/Image, CompressedImage      color (8 bits) and depth (16UC1 and similar: mm; 32FC1: m)
     sensor_msgs/CameraInfo                  intrinsics of color, and of depth if it is not registered: K and D of raw
                                             images, P of rectified images
-    geometry_msgs/PoseStamped               camera poses in optical axes, optional
-    nav_msgs/Odometry                       poses of the camera or of a frame that /tf_static connects with it, optional
+    geometry_msgs/PoseStamped, PoseWithCovarianceStamped, nav_msgs/Path
+                                            camera poses in optical axes, optional; a path is used on request only
+    nav_msgs/Odometry, geometry_msgs/TransformStamped
+                                            poses of the camera or of a frame that /tf_static connects with it, optional
     tf2_msgs/TFMessage                      transforms between the frames of color, depth, poses and accelerometer; the
                                             poses on /tf are used if the bag has no other poses
     sensor_msgs/Imu                         up direction, optional, from the accelerometer
@@ -78,7 +80,7 @@ def open_source(path: Path, given: Topics, options: BagOptions) -> Source:
         depth_camera = replace(depth_camera, lens=None)
     pairs = _pairs(bag, topics, options.max_difference)
     accelerometer = find_accelerometer(bag, tree, topics.color, [pair.timestamp for pair in pairs])
-    poses = find_camera_poses(bag, topics, tree, options)
+    poses = find_camera_poses(bag, topics, tree, options, [pair.timestamp for pair in pairs])
     device = Device(bag, topics, camera, None if stored else lens, depth_camera, accelerometer, poses)
     source = poses.source if poses else "none"
     return Source(

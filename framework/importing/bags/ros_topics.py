@@ -13,12 +13,16 @@ from framework.data import Float64
 from framework.errors import ConfigError, DataError
 from framework.files.number_lines import numbers
 from framework.files.tum_trajectory import rigid_pose
+from framework.importing.bags.ros_images import shows_depth
 from framework.importing.bags.ros_messages import (
     CAMERA_INFO,
     COMPRESSED,
     IMAGE,
     ODOMETRY,
+    PATH,
     POSE,
+    POSE_WITH_COVARIANCE,
+    TRANSFORM,
     TRANSFORMS,
     RosBag,
 )
@@ -38,12 +42,14 @@ OPTIONS = {
 TRANSPORT = ("/compressed", "/compressedDepth")  # ends of the topics of supported transports, preferred last
 NO_POSES = "none"  # value of --poses: import without poses
 IMAGES, POSES = (IMAGE, COMPRESSED), (ODOMETRY, POSE)
+OTHER_POSES = (POSE_WITH_COVARIANCE, TRANSFORM)  # often sparse or of other objects; selected without POSES only
+COMMANDED = re.compile("goal|initial_?pose|setpoint|waypoint|target|cmd|command|desired", re.IGNORECASE)
 KINDS = {
     "color": IMAGES,
     "depth": IMAGES,
     "camera_info": (CAMERA_INFO,),
-    "poses": (*POSES, *TRANSFORMS),
-    "odometry": POSES,
+    "poses": (*POSES, *OTHER_POSES, PATH, *TRANSFORMS),
+    "odometry": (*POSES, *OTHER_POSES, PATH),
 }
 
 
@@ -107,8 +113,12 @@ def found_topics(bag: RosBag, given: Topics, tree: TransformTree) -> Topics:
         DataError: The bag has no matching camera info.
     """
     images = [topic for topic in bag.topics(*IMAGES) if not NEITHER.search(topic)]
-    depth = given.depth or _one(bag, "depth", [topic for topic in images if DEPTH.search(topic)], REGISTERED)
-    color = given.color or _one(bag, "color", [topic for topic in images if not DEPTH.search(topic)], COLOR)
+    depths = [topic for topic in images if DEPTH.search(topic) and _shows_depth(bag, topic) is not False]
+    depths = depths or [topic for topic in images if _shows_depth(bag, topic)]
+    depth = given.depth or _one(bag, "depth", depths, REGISTERED)
+    colors = [topic for topic in images if topic not in (*depths, depth)]
+    colors = [topic for topic in colors if not DEPTH.search(topic)] or colors
+    color = given.color or _one(bag, "color", colors, COLOR)
     info = given.camera_info or camera_info_of(bag, color)
     if not given.camera_info and info and _is_of_depth(bag, tree, info, color, depth):
         expected = f"expected a {CAMERA_INFO} topic of {color}"
@@ -117,7 +127,7 @@ def found_topics(bag: RosBag, given: Topics, tree: TransformTree) -> Topics:
     if not info:
         expected = f"expected a {CAMERA_INFO} topic next to {color}"
         raise DataError(f"{bag.path}: {expected}, got none{_choice(bag, 'camera_info')}")
-    posed = [topic for topic in bag.topics(*POSES) if topic != given.odometry]
+    posed = _posed(bag, given, POSES) or _posed(bag, given, OTHER_POSES)
     if len(posed) > 1 and not given.poses:
         raise ConfigError(
             f"{bag.path}: expected one topic with poses, got {', '.join(posed)}; set --poses to one of them or to none"
@@ -139,6 +149,19 @@ def camera_info_of(bag: RosBag, image: str) -> str:
         return next(iter(shared))
     best = max(shared.values(), default=1)  # 1 = only the root is shared
     return min((topic for topic, count in shared.items() if count == best), key=len) if best > 1 else ""
+
+
+def _posed(bag: RosBag, given: Topics, kinds: Sequence[str]) -> list[str]:
+    return [topic for topic in bag.topics(*kinds) if topic != given.odometry and not COMMANDED.search(topic)]
+
+
+def _shows_depth(bag: RosBag, topic: str) -> bool | None:
+    """Return `shows_depth` of the first message of a topic; None also for a damaged message."""
+    try:
+        message = bag.first(topic)
+        return None if message is None else shows_depth(message)
+    except DataError:
+        return None
 
 
 def _shared_parts(topic: str, other: str) -> int:
