@@ -77,7 +77,7 @@ def node_class(monkeypatch: pytest.MonkeyPatch) -> type[Any]:
     fake("message_filters", Subscriber=subscriber, ApproximateTimeSynchronizer=Synchronizer)
     for package, names in {
         "geometry_msgs": ("Point", "Vector3"),
-        "sensor_msgs": ("CameraInfo", "Image"),
+        "sensor_msgs": ("CameraInfo", "CompressedImage", "Image"),
         "visualization_msgs": ("Marker", "MarkerArray"),
     }.items():
         fake(package)
@@ -107,7 +107,7 @@ def messages(k: int, encoding: str, in_meters: bool) -> tuple[Message, Message, 
     return (
         image,
         Message(height=480, width=640, step=640 * depth.itemsize, encoding=kind, is_bigendian=0, data=depth.tobytes()),
-        Message(height=480, width=640, k=K, d=[0.0] * 5, p=P, distortion_model="plumb_bob"),
+        SimpleNamespace(height=480, width=640, k=K, d=[0.0] * 5, p=P, distortion_model="plumb_bob"),
     )
 
 

@@ -1,8 +1,8 @@
 """Cameras of sensor_msgs/CameraInfo.
 
 Raw images belong to the intrinsics K and the lens distortion D. Rectified images, whose topics are named `image_rect`
-or similar, belong to the projection matrix P and have no distortion. R rotates from the raw to the rectified camera. The
-matrices are of the full resolution. Images may be binned, or a region of interest.
+or similar, belong to the projection matrix P and have no distortion. R rotates from the raw to the rectified camera.
+The matrices are of the full resolution. Images may be binned, or a region of interest.
 """
 
 from __future__ import annotations

@@ -42,13 +42,14 @@ from framework.files.image_files import LARGEST_FILE, check_image, decode_color,
 from framework.files.rvl_images import decode_rvl
 from framework.geometry import nearest_rigid
 from framework.importing.bags.ros_images import inverse_depth
-from framework.importing.source import DeviceFrame, Format, Source, meters, readings
+from framework.importing.source import DeviceFrame, Format, Source, meters, readings, warn_of_zeros
 
 SQLITE_START = b"SQLite format 3\0"
 HEADER = struct.Struct("<11i")
-ONE_CAMERA = 0  # type of a calibration
+ONE_CAMERA, LAST_TYPE = 0, 1  # types of a calibration; 1 = stereo
 NUMBERS = {"K": (9,), "R": (0, 9), "P": (0, 12), "T_base_camera": (12,)}  # possible counts of values
 TRANSFORM = 12  # numbers of a transform
+UNKNOWN = bytes(4 * TRANSFORM)  # transform of a node without a pose
 OLD_CALIBRATIONS = {64: 4, 72: 6}  # numbers before the transform, by the size in bytes
 FLOAT_CHANNELS = 4  # 8-bit channels of float32 depth
 RVL_DEPTH, INVERSE_DEPTH = b"DEPTHRVL", b"DEPTHINV"  # first bytes of depth that is not a PNG
@@ -92,7 +93,10 @@ def open_source(path: Path) -> Source:
     if optimized is None:
         log.warning("%s: expected optimized poses, got only odometry, which drifts; %s", path, OPTIMIZE)
     frames = [partial(_read, path, node, stamp, odometry, optimized) for node, stamp, odometry in nodes]
-    return Source("RTAB-Map", frames, len(frames), posed=True)
+    posed = optimized is not None or any(odometry not in (None, UNKNOWN) for _, _, odometry in nodes)
+    if not posed:
+        warn_of_zeros(path)
+    return Source("RTAB-Map", frames, len(frames), posed)
 
 
 @contextmanager
@@ -110,8 +114,6 @@ def _read(path: Path, node: int, stamp: object, odometry: object, optimized: dic
     if not isinstance(stamp, float | int):
         raise FrameError(f"{where}: stamp: expected a time in s, got {stamp!r:.40}")
     T_world_base = _transform(where, odometry) if optimized is None else optimized.get(node)
-    if T_world_base is None:
-        raise FrameError(f"{where}: expected an optimized pose, got none")
     with _database(path) as database:
         query = "SELECT image, depth, calibration FROM Data WHERE id = ?"
         image, depth, calibration = (
@@ -121,7 +123,7 @@ def _read(path: Path, node: int, stamp: object, odometry: object, optimized: dic
     color = decode_color(f"{where}: image", image)
     camera, T_base_camera = _calibration(where, calibration, color.shape[:2])
     with errors_of(where):
-        T_world_camera = nearest_rigid(T_world_base) @ T_base_camera
+        T_world_camera = None if T_world_base is None else nearest_rigid(T_world_base) @ T_base_camera
     return DeviceFrame(
         name=where,
         timestamp=float(stamp),
@@ -138,8 +140,10 @@ def _blob(where: str, name: str, value: object) -> bytes:
     return value
 
 
-def _transform(where: str, value: object) -> Float64:
-    """Return a stored transform (4, 4), which may be invalid."""
+def _transform(where: str, value: object) -> Float64 | None:
+    """Return a stored transform (4, 4), which may be invalid; None = unknown."""
+    if value is None or value == UNKNOWN:
+        return None
     if not isinstance(value, bytes) or len(value) != 4 * TRANSFORM:
         raise FrameError(f"{where}: pose: expected {TRANSFORM} float32, got {value!r:.40}")
     return _matrix(np.frombuffer(value, "<f4"))
@@ -163,7 +167,8 @@ def _calibration(where: str, data: bytes, shape: tuple[int, int]) -> tuple[Camer
         raise FrameError(f"{where}: {expected}, got {len(data)} bytes")
     *_, kind, width, height, n_K, n_D, n_R, n_P, n_T = HEADER.unpack_from(data)
     if kind != ONE_CAMERA:
-        raise FrameError(f"{where}: {expected}, got type {kind}; only RGB-D cameras are supported")
+        found = f"type {kind}" if 0 < kind <= LAST_TYPE else f"{len(data)} bytes"
+        raise FrameError(f"{where}: {expected}, got {found}; only single RGB-D cameras are supported")
     counts = {"K": n_K, "R": n_R, "P": n_P, "T_base_camera": n_T}
     wrong = [name for name, count in counts.items() if count not in NUMBERS[name]]
     if wrong or not 0 <= n_D <= 14:
