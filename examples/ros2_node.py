@@ -5,9 +5,9 @@ r"""ROS 2 node that maps the images of a depth camera and publishes the objects 
 
 Depth must be registered to color. Images of topics named `image_rect` or similar are rectified. All other images are
 undistorted with the lens model of the camera info. Set `--compressed` before `--ros-args` for topics of
-sensor_msgs/CompressedImage, such as `image_raw/compressed`. Publishers may be reliable or best effort. Each marker on the
-topic `objects` is the axis-aligned bounding box of one object in the world frame, `map`. The text of a marker is the class
-name.
+sensor_msgs/CompressedImage, such as `image_raw/compressed`. Publishers may be reliable or best effort. Each marker on
+the topic `objects` is the axis-aligned bounding box of one object in the world frame, `map`. The text of a marker is
+the class name.
 """
 
 from __future__ import annotations
