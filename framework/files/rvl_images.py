@@ -39,13 +39,16 @@ def decode_rvl(name: Path | str, data: bytes) -> UInt16:
     steps = np.zeros(width * height, np.int64)
     has_reading = np.zeros(width * height, bool)
     pixel = number = 0
+    corrupt = FrameError(f"{name}: expected an RVL image of {width}x{height} px, got corrupt data")
     while pixel < width * height:
         empty, count = numbers[number : number + 2].tolist() if number + 2 <= len(numbers) else (0, 0)
         first, start = number + 2, pixel + empty
         number, pixel = first + count, start + count
         if empty + count == 0 or number > len(numbers) or pixel > width * height:
-            raise FrameError(f"{name}: expected an RVL image of {width}x{height} px, got corrupt data")
+            raise corrupt
         steps[start:pixel], has_reading[start:pixel] = differences[first:number], True
+    if numbers[number:].any():  # the last word is padded with zeros
+        raise corrupt
     return np.where(has_reading, np.cumsum(steps), 0).astype(np.uint16).reshape(height, width)
 
 
