@@ -233,11 +233,11 @@ def png(image: np.ndarray) -> bytes:
     return bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
-def compressed_depth(depth: np.ndarray) -> tuple[bytes, str]:
+def compressed_depth(depth: np.ndarray, encode: Callable[[np.ndarray], bytes] = png) -> tuple[bytes, str]:
     """Return depth (m) in the inverse depth format of compressed_depth_image_transport, and the format name."""
     a, b = 100.0 * 101.0, 1.0 - 100.0 * 101.0 / 10.0  # for a quantization of 100 and a range of 10 m
     stored = np.where(depth > 0, np.rint(a / np.where(depth > 0, depth, 1) + b), 0).astype(np.uint16)
-    return struct.pack("<iff", 0, a, b) + png(stored), "32FC1; compressedDepth png"
+    return struct.pack("<iff", 0, a, b) + encode(stored), f"32FC1; compressedDepth {encode.__name__}"
 
 
 def millimeters(depth: np.ndarray) -> np.ndarray:
