@@ -15,8 +15,9 @@ import struct
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from framework.data import MAX_PIXELS, Array, UInt16
+from framework.data import MAX_PIXELS, UInt16
 from framework.errors import FrameError
 
 HEADER = struct.Struct("<II")  # width and height, px
@@ -52,7 +53,7 @@ def decode_rvl(name: Path | str, data: bytes) -> UInt16:
     return np.where(has_reading, np.cumsum(steps), 0).astype(np.uint16).reshape(height, width)
 
 
-def _numbers(code: bytes) -> Array:
+def _numbers(code: bytes) -> NDArray[np.int64]:
     """Return the numbers (N,), int64."""
     words = np.frombuffer(code[: len(code) // 4 * 4], "<u4")
     groups = (words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32) & 15).ravel().astype(np.int64)

@@ -163,7 +163,7 @@ def pose_lines(bag: RosBag, topic: str) -> tuple[list[TumLine], str | None]:
 
 
 def _time(message: Any) -> float:
-    return message.header.stamp.sec + NANOSECONDS * message.header.stamp.nanosec
+    return float(message.header.stamp.sec + NANOSECONDS * message.header.stamp.nanosec)
 
 
 def _line(bag: RosBag, number: int, timestamp: float, content: Any) -> TumLine:
