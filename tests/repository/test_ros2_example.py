@@ -303,11 +303,6 @@ def test_ros2_node_binned_images_use_reduced_camera(node_class: type[Any], binni
     full = DESK[0].camera.scaled(max(binning, 1))
     info.width, info.height, info.k = full.width, full.height, full.K.ravel()
     info.binning_x = info.binning_y = binning
-        full.width,
-        full.height,
-        full.K.ravel(),
-        *[binning] * 2,
-    )
     node.map(color, depth, info)
     assert node.warned == []
     assert vars(node.mapper.camera) == pytest.approx(vars(DESK[0].camera))

@@ -13,8 +13,16 @@ from framework.data import Float64
 from framework.datasets.tum_rgbd import Trajectory
 from framework.errors import DataError, FrameError
 from framework.files.tum_trajectory import TumLine
-from framework.importing.bags.ros_messages import NANOSECONDS, ODOMETRY, PATH, TRANSFORM, TRANSFORMS, RosBag
-from framework.importing.bags.ros_topics import NO_POSES, BagOptions, Topics
+from framework.importing.bags.ros_messages import (
+    NANOSECONDS,
+    ODOMETRY,
+    PATH,
+    POSE_WITH_COVARIANCE,
+    TRANSFORM,
+    TRANSFORMS,
+    RosBag,
+)
+from framework.importing.bags.ros_topics import NO_POSES, BagOptions, Topics, pose_topics
 from framework.importing.bags.transform_tree import TransformTree, is_fixed_frame
 from framework.importing.source import warn_of_zeros
 
@@ -54,9 +62,10 @@ def find_camera_poses(
     camera = tree.frame_of(topics.color)
     if not topics.poses:
         found = _poses_on_tf(bag, tree, camera, "")
-        paths = bag.topics(PATH)
-        if found is None and paths:
-            log.warning("%s: paths are not used; set --poses %s if it is the path of the camera", bag.path, paths[0])
+        unused = pose_topics(bag, POSE_WITH_COVARIANCE, PATH)
+        if found is None and unused:
+            message = "%s: imported without poses; set --poses %s if this topic has the poses of the camera"
+            log.warning(message, bag.path, unused[0])
         return found
     if bag.kinds[topics.poses] in TRANSFORMS:
         return _poses_on_tf(bag, tree, camera, topics.poses)

@@ -17,7 +17,7 @@ from framework.geometry import inverse
 from framework.importing.bags.ros_camera import RosLens, is_rectified, rectification, ros_camera
 from framework.importing.bags.ros_images import MILLIMETER, decode_ros_depth
 from framework.importing.bags.ros_messages import Message, RosBag
-from framework.importing.bags.ros_topics import BagOptions, Topics, camera_info_of
+from framework.importing.bags.ros_topics import BagOptions, Topics, camera_info_of, is_of_camera
 from framework.importing.bags.transform_tree import REALSENSE, TransformTree
 from framework.importing.depth_resampling import DepthRegistration
 
@@ -86,7 +86,9 @@ def find_depth_camera(
     integer, single = (options.depth_unit,) * 2 if options.depth_unit else (_integer_unit(bag, topics), 1.0)
     topic = topics.depth
     own = camera_info_of(bag, topic)
-    info = None if own in ("", topics.camera_info) else bag.first(own)
+    if own in ("", topics.camera_info) or not is_of_camera(bag, tree, own, topic):
+        own = ""
+    info = bag.first(own) if own else None
     frames = [tree.frame_of(name) for name in (topics.color, topic)]
     has_same_frame = frames[0] == frames[1] != ""
     has_equal_rectification = _has_equal_rectification(topics)

@@ -26,6 +26,7 @@ INVERSE = ("Inverse Brown Conrady",)  # RealSense: the polynomial maps the recor
 FISHEYE = ("equidistant", "fisheye", "Kannala Brandt4")  # lens models of cv2.fisheye
 COEFFICIENTS = (4, 5, 8, 12, 14)  # numbers of coefficients that OpenCV supports
 _RECTIFIED = re.compile("(?<!un)rect", re.IGNORECASE)
+_RECTIFIED_FOLDER = re.compile("(^|_)rect(ified)?(_|$)", re.IGNORECASE)
 TRANSPORTS = ("compressed", "compressedDepth", "theora", "ffmpeg", "zstd")  # ends of topics of image_transport
 
 
@@ -34,7 +35,7 @@ def is_rectified(topic: str) -> bool:
     *folders, name = [part for part in topic.split("/") if part not in TRANSPORTS]
     if _RECTIFIED.search(name):
         return True
-    return "raw" not in name and any(part in ("rect", "rectified") for part in folders)
+    return "raw" not in name and any(map(_RECTIFIED_FOLDER.search, folders))
 
 
 @dataclass(frozen=True)

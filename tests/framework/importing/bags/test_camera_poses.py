@@ -141,7 +141,8 @@ def test_ros_bag_kinds_of_poses_are_imported(tmp_path: Path, topic: str, ros1: b
     """Goals and the pose estimate of a user are not poses of the camera."""
     bag = BagWriter(ros1)
     add_camera_of_ros(bag)
-    bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
+    if "localization" not in topic:
+        bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
     for name in ("/goal_pose", "/move_base_simple/goal", "/mavros/setpoint_position/local"):
         bag.add_pose(time_of(1), name, np.eye(4))
     bag.add_pose_with_covariance(time_of(1), "/initialpose", np.eye(4))
@@ -164,9 +165,29 @@ def test_ros_bag_path_is_imported_on_request(tmp_path: Path, caplog: pytest.LogC
     add_camera_path(bag, "/orb_slam3/path")
     path = bag.write(tmp_path / "bag")
     assert not open_source(path).posed
-    assert "paths are not used; set --poses /orb_slam3/path if it is the path of the camera" in caplog.text
+    assert "without poses; set --poses /orb_slam3/path if this topic has the poses of the camera" in caplog.text
     assert not imported(path, tmp_path / "out", poses="/orb_slam3/path")
     check_room(tmp_path / "out")
+
+
+@pytest.mark.parametrize("on_tf", [True, False])
+def test_ros_bag_localization_of_robot_is_not_camera_pose(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, on_tf: bool
+) -> None:
+    """AMCL publishes poses of a base frame without its name."""
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
+    for k in range(COUNT):
+        T_world_base = pose_at(k) @ inverse(T_BASE_CAMERA)
+        bag.add_pose_with_covariance(time_of(k), "/amcl_pose", T_world_base)
+        if on_tf:
+            bag.add_tf(time_of(k), ("map", "base_link", T_world_base))
+    path = bag.write(tmp_path / "bag")
+    assert not imported(path, tmp_path / "out")
+    check_room(tmp_path / "out", posed=on_tf)
+    assert (tmp_path / "out/poses.txt").exists() is on_tf
+    assert ("imported without poses; set --poses /amcl_pose if" in caplog.text) is not on_tf
 
 
 @pytest.mark.parametrize("child", ["", "odom", "/odom"])
