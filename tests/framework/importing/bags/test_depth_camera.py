@@ -334,3 +334,31 @@ def test_ros_bag_depth_topic_is_selected_by_encoding(
     bag.add_camera(time_of(0), f"{color.rpartition('/')[0]}/camera_info", ROOM)
     assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
     check_room(tmp_path / "out", posed=False)
+
+
+@pytest.mark.parametrize(
+    ("topic", "frame", "is_accepted"),
+    [
+        ("/camera/color/camera_info", "camera_link", True),  # the namespace of the images
+        ("/camera_info", OPTICAL, True),
+        ("/sensors/front/camera_info", f"/{OPTICAL}", True),
+        ("/sensors/front/camera_info", "", True),
+        ("/wrist/camera_info", "wrist_optical", False),
+        ("/camera/infra1/camera_info", "camera_infra1_optical_frame", False),
+        ("/camera/depth/camera_info", DEPTH_FRAME, False),
+    ],
+)
+def test_ros_bag_camera_info_of_other_camera_raises(tmp_path: Path, topic: str, frame: str, is_accepted: bool) -> None:
+    bag = BagWriter()
+    for k in range(COUNT):
+        bag.add_image(time_of(k), "/camera/color/image_raw", seen(k)[0], "rgb8")
+        bag.add_image(time_of(k), ALIGNED, millimeters(seen(k)[1]), "16UC1")
+    bag.add_camera(time_of(0), topic, ROOM, frame_id=frame)
+    path = bag.write(tmp_path / "bag")
+    if is_accepted:
+        assert not imported(path, tmp_path / "out")
+        check_room(tmp_path / "out", posed=False)
+        return
+    with pytest.raises(DataError, match=f"got only {topic}, which belongs to {frame}; set --camera-info {topic} if"):
+        open_source(path)
+    assert not imported(path, tmp_path / "out", camera_info=topic)
