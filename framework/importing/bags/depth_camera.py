@@ -1,7 +1,8 @@
 """The depth camera in a ROS bag: its unit, and its registration to the color camera.
 
-Depth counts as registered if its topic is named so, if it has the frame and the intrinsics of color, or on request. All
-other depth images are registered with their CameraInfo and the transform tree of the bag.
+Depth counts as registered if its topic is named so, if it has the frame of color, or on request. All other depth images
+are registered with their CameraInfo and the transform tree of the bag. Without transforms, depth with the intrinsics of
+color counts as registered.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from framework.importing.bags.ros_topics import BagOptions, Topics, camera_info_
 from framework.importing.bags.transform_tree import REALSENSE, TransformTree
 from framework.importing.depth_resampling import DepthRegistration
 
-SAME_CAMERA = 0.01  # fraction of the image width, maximum difference between intrinsics of the same camera
+# fraction of the image width, maximum difference between the intrinsics of cameras with the same pose, and between
+# those of depth and color if the bag does not show the poses
+SIMILAR, COPIED = 0.01, 0.001
 SAME_PROPORTIONS = 0.01  # maximum relative difference between the aspect ratios of registered images
 FARTHEST = 65.535  # m, maximum depth of the written images
 DEPTH_STREAM = "/Depth_"  # in RealSense's topic names
@@ -110,7 +113,7 @@ def find_depth_camera(
     T_color_depth = _rotation(topics, color_info) if is_registered else tree.fixed(to=frames[0], of=frames[1])
     if T_color_depth is None and options.depth_registered:
         T_color_depth = np.eye(4)
-    if T_color_depth is None and _is_same(depth, color):
+    if T_color_depth is None and _is_same(depth, color, COPIED):  # other cameras may be similar
         return plain
     if T_color_depth is None:
         raise DataError(
@@ -119,7 +122,7 @@ def find_depth_camera(
             "cameras have the same pose"
         )
     has_equal_lens = (lens and lens.coefficients) == (color_lens and color_lens.coefficients)
-    if _is_same(depth, color) and has_equal_lens and np.allclose(T_color_depth, np.eye(4), atol=1e-6):
+    if _is_same(depth, color, SIMILAR) and has_equal_lens and np.allclose(T_color_depth, np.eye(4), atol=1e-6):
         return plain
     return BagDepth(bag, integer, single, lens, DepthRegistration(depth, color, T_color_depth))
 
@@ -138,12 +141,12 @@ def _rotation(topics: Topics, color_info: Any) -> Float64:
     return T_rectified_raw if is_rectified(topics.color) else inverse(T_rectified_raw)
 
 
-def _is_same(depth: Camera, color: Camera) -> bool:
+def _is_same(depth: Camera, color: Camera, tolerance: float) -> bool:
     scale = color.width / depth.width
     of_depth = np.array([depth.fx, depth.fy, depth.cx + 0.5, depth.cy + 0.5]) * scale
     of_color = np.array([color.fx, color.fy, color.cx + 0.5, color.cy + 0.5])
     has_proportions = abs(depth.height * scale / color.height - 1) <= SAME_PROPORTIONS
-    return has_proportions and bool((np.abs(of_depth - of_color) <= SAME_CAMERA * color.width).all())
+    return has_proportions and bool((np.abs(of_depth - of_color) <= tolerance * color.width).all())
 
 
 def _check_proportions(bag: RosBag, topic: str, color: Camera) -> None:

@@ -241,7 +241,8 @@ def _odometry(bag: RosBag, topics: Topics, tree: TransformTree) -> StoredOdometr
     camera = tree.frame_of(topics.color)
     T_base_camera = np.eye(4) if base is None or base == camera else tree.fixed(to=base, of=camera)
     if T_base_camera is None:
-        expected = f"expected the transform from {base} to {camera} in /tf_static, got none"
+        name = base or "the unnamed moving frame"
+        expected = f"expected the transform from {name} to {camera} in /tf_static, got none"
         log.warning("%s: %s; set dataset.odometry_camera to the pose of the camera", topics.odometry, expected)
     poses = [line.pose() if T_base_camera is None else line.pose() @ T_base_camera for line in trajectory.lines]
     return StoredOdometry(trajectory.timestamps, poses, of_camera=T_base_camera is not None)

@@ -154,15 +154,15 @@ def _matrix(values: Array) -> Float64:
 
 
 def _calibration(where: str, data: bytes, shape: tuple[int, int]) -> tuple[Camera, Float64]:
-    """Return the camera of the color image, which has a given shape, and T_base_camera (4, 4)."""
+    """Return the camera of the color image and T_base_camera (4, 4). `shape` is used without a stored size."""
     where = f"{where}: calibration"
     expected = "expected the calibration of one rectified camera"
     if len(data) in OLD_CALIBRATIONS:
         fx, fy, cx, cy, *size = np.frombuffer(data, "<f4", OLD_CALIBRATIONS[len(data)]).tolist()
-        width, height = map(int, size or shape[::-1])
+        width, height = map(int, size or (0, 0))
         with errors_of(where):
             T_base_camera = nearest_rigid(_matrix(np.frombuffer(data, "<f4")[-TRANSFORM:]))
-        return pinhole(where, width, height, fx, fy, cx, cy), T_base_camera
+        return pinhole(where, width or shape[1], height or shape[0], fx, fy, cx, cy), T_base_camera
     if len(data) < HEADER.size:
         raise FrameError(f"{where}: {expected}, got {len(data)} bytes")
     *_, kind, width, height, n_K, n_D, n_R, n_P, n_T = HEADER.unpack_from(data)
@@ -183,7 +183,7 @@ def _calibration(where: str, data: bytes, shape: tuple[int, int]) -> tuple[Camer
     (fx, _, cx), (_, fy, cy) = projection[:2, :3].tolist()
     with errors_of(where):
         T_base_camera = nearest_rigid(_matrix(np.frombuffer(data, "<f4", n_T, size - 4 * n_T)))
-    return pinhole(where, width, height, fx, fy, cx, cy), T_base_camera
+    return pinhole(where, width or shape[1], height or shape[0], fx, fy, cx, cy), T_base_camera
 
 
 def _depth(name: str, data: bytes) -> Float32:

@@ -362,3 +362,36 @@ def test_ros_bag_camera_info_of_other_camera_raises(tmp_path: Path, topic: str, 
     with pytest.raises(DataError, match=f"got only {topic}, which belongs to {frame}; set --camera-info {topic} if"):
         open_source(path)
     assert not imported(path, tmp_path / "out", camera_info=topic)
+
+
+SIMILAR = replace(ROOM, fx=1.01 * ROOM.fx, fy=1.01 * ROOM.fy, cx=ROOM.cx + 1)  # such as depth and color of a D455
+
+
+@pytest.mark.parametrize(
+    ("camera", "frame", "is_accepted"),
+    [
+        (ROOM, DEPTH_FRAME, True),  # the driver copies the CameraInfo of color
+        (ROOM.scaled(0.5), DEPTH_FRAME, True),
+        (ROOM.scaled(2), "", True),
+        (SIMILAR, DEPTH_FRAME, False),
+        (SIMILAR.scaled(0.5), DEPTH_FRAME, False),
+        (SIMILAR, "", False),
+    ],
+)
+def test_ros_bag_depth_of_similar_camera_is_not_registered(
+    tmp_path: Path, camera: Camera, frame: str, is_accepted: bool
+) -> None:
+    bag = BagWriter()
+    for k in range(COUNT):
+        bag.add_image(time_of(k), "/camera/color/image_raw", seen(k)[0], "rgb8")
+        depth = millimeters(look(camera, pose_at(k))[0])
+        bag.add_image(time_of(k), "/camera/depth/image_rect_raw", depth, "16UC1", frame_id=frame)
+    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM)
+    bag.add_camera(time_of(0), "/camera/depth/camera_info", camera, frame_id=frame)
+    path = bag.write(tmp_path / "bag")
+    if not is_accepted:
+        with pytest.raises(DataError, match="expected depth in the camera of .* or extrinsics in the bag"):
+            open_source(path)
+        return
+    assert not imported(path, tmp_path / "out")
+    check_room(tmp_path / "out", posed=False, within=5e-3)

@@ -154,6 +154,7 @@ def rvl_depth(image: np.ndarray) -> bytes:
 VERSIONS: dict[str, tuple[str, Callable[[PhoneFrame], bytes]]] = {
     "0.11.0": ("calibration", lambda frame: old_calibration(frame, has_size=False)),
     "0.11.8": ("calibration", lambda frame: old_calibration(frame, has_size=True)),
+    "without size": ("calibration", lambda frame: calibration(frame)[:16] + bytes(8) + calibration(frame)[24:]),
     "rvl": ("depth", lambda frame: rvl_depth(frame.depth_mm)),
     "inverse png": ("depth", lambda frame: inverse_depth(frame.depth_mm, png)),
     "inverse rvl": ("depth", lambda frame: inverse_depth(frame.depth_mm, rvl_depth)),
