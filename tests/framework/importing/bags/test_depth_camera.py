@@ -390,7 +390,7 @@ def test_ros_bag_depth_of_similar_camera_is_not_registered(
     bag.add_camera(time_of(0), "/camera/depth/camera_info", camera, frame_id=frame)
     path = bag.write(tmp_path / "bag")
     if not is_accepted:
-        with pytest.raises(DataError, match="expected depth in the camera of .* or extrinsics in the bag"):
+        with pytest.raises(DataError, match=r"expected depth in the camera of .* or extrinsics in the bag"):
             open_source(path)
         return
     assert not imported(path, tmp_path / "out")
