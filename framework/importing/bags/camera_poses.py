@@ -62,7 +62,7 @@ def find_camera_poses(
     camera = tree.frame_of(topics.color)
     if not topics.poses:
         found = _poses_on_tf(bag, tree, camera, "")
-        unused = pose_topics(bag, POSE_WITH_COVARIANCE, PATH)
+        unused = pose_topics(bag, topics, POSE_WITH_COVARIANCE, PATH)
         if found is None and unused:
             message = "%s: imported without poses; set --poses %s if this topic has the poses of the camera"
             log.warning(message, bag.path, unused[0])

@@ -130,8 +130,7 @@ def found_topics(bag: RosBag, given: Topics, tree: TransformTree) -> Topics:
         expected = f"expected a {CAMERA_INFO} topic next to {color}"
         raise DataError(f"{bag.path}: {expected}, got none{_choice(bag, 'camera_info')}")
     of_camera = () if bag.topics(*TRANSFORMS) else (POSE_WITH_COVARIANCE,)  # poses of robots are of a base frame
-    posed = pose_topics(bag, *POSES) or pose_topics(bag, TRANSFORM, *of_camera)
-    posed = [topic for topic in posed if topic != given.odometry]
+    posed = pose_topics(bag, given, *POSES) or pose_topics(bag, given, TRANSFORM, *of_camera)
     if len(posed) > 1 and not given.poses:
         raise ConfigError(
             f"{bag.path}: expected one topic with poses, got {', '.join(posed)}; set --poses to one of them or to none"
@@ -155,9 +154,9 @@ def camera_info_of(bag: RosBag, image: str) -> str:
     return min((topic for topic, count in shared.items() if count == best), key=len) if best > 1 else ""
 
 
-def pose_topics(bag: RosBag, *kinds: str) -> list[str]:
-    """Return the topics of given types that may have poses of the camera, which excludes goals."""
-    return [topic for topic in bag.topics(*kinds) if not COMMANDED.search(topic)]
+def pose_topics(bag: RosBag, topics: Topics, *kinds: str) -> list[str]:
+    """Return the topics of some types that may have poses of the camera, which excludes goals and the odometry."""
+    return [topic for topic in bag.topics(*kinds) if topic != topics.odometry and not COMMANDED.search(topic)]
 
 
 def _shows_depth(bag: RosBag, topic: str) -> bool | None:
