@@ -6,14 +6,24 @@ for each cell. If the network contains non-maximum suppression, the table has on
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
 from framework.data import Bool, Float32, Int32
-from framework.detection.candidates import CONFIDENT, LARGEST_UNIT, Candidates, check_scores, corners, described
+from framework.detection.candidates import (
+    CONFIDENT,
+    LARGEST_UNIT,
+    Candidates,
+    cell_counts,
+    check_scores,
+    corners,
+    described,
+)
 from framework.detection.masks.binary_masks import masks_from_prototypes
 from framework.detection.masks.letterbox import Letterbox
 from framework.detection.runtimes.onnx_network import ExportMetadata, Outputs
@@ -22,9 +32,11 @@ from framework.errors import DataError
 MIN_ORDERED_CORNERS = 0.9  # minimum fraction of boxes with x2 >= x1 and y2 >= y1, if boxes are corners
 MAX_ORDERED_CENTERS = 0.5  # maximum fraction of such boxes, if boxes are centers and sizes; typically a few percent
 MIN_ROWS = 20  # minimum number of detections to evaluate these fractions
-STRIDES = (8, 16, 32, 64)  # px per cell in the YOLO family, the last only in large networks
 BOXES_PER_CELL = (1, 3)  # 3 up to YOLOv7
+SHOWN_NAMES = 5  # maximum number of class names in messages
 SCORE, LABEL, COEFFICIENTS = 4, 5, 6  # columns of a table with suppression, after x1 y1 x2 y2
+
+log = logging.getLogger(__name__)
 
 
 class BoxKind(Enum):
@@ -174,12 +186,15 @@ def detect_layout(
     channels_last = _is_channels_last(prototypes, shape, input_channels_last, metadata)
     count = prototypes.shape[-1 if channels_last else 1]
     columns = (5 if objectness else 4) + classes + count
+    if not objectness and table.shape[2] == columns + 1 and table.shape[1] in [3 * k for k in cell_counts(shape)]:
+        objectness, columns = True, columns + 1  # YOLOv5 and YOLOv7 have three boxes per cell
+        log.info("detector.objectness: class scores follow an objectness score, as in YOLOv5")
     is_rows, is_columns = table.shape[2] == columns, table.shape[1] == columns
     suppressed = table.shape[2] == COEFFICIENTS + count and (
         not (is_rows or is_columns) or _looks_suppressed(table[0], classes, shape)
     )
     if not suppressed and is_rows == is_columns:
-        raise DataError(_no_such_table(table.shape, columns, count, objectness, is_rows))
+        raise DataError(_no_such_table(table.shape, columns, count, objectness, is_rows, metadata.names))
     given = None if boxes is BoxKind.AUTO else boxes
     layout = SegmentationLayout(classes, objectness, shape, suppressed, suppressed or is_rows, channels_last, given)
     layout = layout.determined_by(outputs)
@@ -190,12 +205,22 @@ def detect_layout(
 def _table_and_prototypes(outputs: Outputs) -> tuple[Float32, Float32]:
     tables = [output for output in outputs.values() if output.ndim == 3 and output.shape[0] == 1]
     maps = [output for output in outputs.values() if output.ndim == 4 and output.shape[0] == 1]
+    if len(outputs) == 1 and max(len(tables), *(one.ndim == 2 for one in outputs.values())):
+        raise DataError(
+            f"detector.weights: expected masks, got boxes only ({described(outputs)}); set detector=onnx_boxes"
+        )
     if len(outputs) != 2 or len(tables) != 1 or len(maps) != 1:
         raise DataError(
             "detector.weights: expected two outputs, a table (1, 4 + classes + M, K), or (1, K, 6 + M) with "
             f"suppression, and prototypes (1, M, h, w), or boxes, classes and masks of RF-DETR, torchvision or "
             f"Detectron2, got {described(outputs)}; use detector=rf_detr_seg or detector=transformers_segmentation for "
             "models on huggingface.co"
+        )
+    queries = maps[0].shape[1]
+    if tables[0].shape[1] == queries != tables[0].shape[2] - COEFFICIENTS:  # one mask for each query, but no box
+        raise DataError(
+            f"detector.weights: expected boxes, classes and masks, got {described(outputs)}, as of Mask2Former, "
+            "MaskFormer or OneFormer; set detector=transformers_segmentation detector.model=FOLDER to the folder of the network"
         )
     return tables[0], maps[0]
 
@@ -227,16 +252,24 @@ def _are_labels(column: Float32, classes: int) -> bool:
 def _looks_suppressed(rows: Float32, classes: int, shape: tuple[int, int]) -> bool:
     """Return True if the rows of a table are detections, False if they are cells."""
     # labels alone are not sufficient in 8-bit networks, where most scores are 0 and resemble labels
-    cells = [-(-shape[0] // stride) * -(-shape[1] // stride) for stride in STRIDES]
-    counts = {boxes * sum(cells[:levels]) for boxes in BOXES_PER_CELL for levels in (3, 4)}
+    counts = {boxes * cells for boxes in BOXES_PER_CELL for cells in cell_counts(shape)}
     return _are_labels(rows[:, LABEL], classes) and len(rows) not in counts
 
 
-def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness: bool, both: bool) -> str:
+def _no_such_table(
+    shape: tuple[int, ...], columns: int, count: int, objectness: bool, both: bool, names: Sequence[str]
+) -> str:
     if both:
         return (
             f"detector.weights: expected different numbers of candidates and columns, got {columns} for both; "
             "export for another input size"
+        )
+    fewer = min(shape[1:]) - 4 - count
+    if names and fewer in (len(names), len(names) + 1):
+        return (
+            f"detector.label_space: expected the {len(names)} classes of the network, got another number of names; set "
+            f"detector.label_space to a text file with the names {', '.join(names[:SHOWN_NAMES])}"
+            f"{', ...' if len(names) > SHOWN_NAMES else ''}, one per line"
         )
     other = columns - 1 if objectness else columns + 1
     fix = f"set detector.objectness={str(not objectness).lower()} or" if other in shape[1:] else "choose"

@@ -118,12 +118,14 @@ def read_labels(name_or_path: str, key: str = "detector.label_space", also: Sequ
     """
     if name_or_path in SPACES:
         return SPACES[name_or_path]
+    if name_or_path == AGNOSTIC:
+        return (OBJECT,)
     path = expanded(Path(name_or_path))
     try:
         lines = read_text(path, LARGEST_FILE).rstrip().splitlines()
     except DataError as error:
         raise ConfigError(
-            f"{key}: expected one of {', '.join([*SPACES, *also])}, or a text file with one name per line, got "
+            f"{key}: expected one of {', '.join([*SPACES, AGNOSTIC])}, or a text file with one name per line, got "
             f"{name_or_path}"
         ) from error
     names = tuple(line.strip() for line in lines)

@@ -24,11 +24,13 @@ if TYPE_CHECKING:
 Outputs = dict[str, Float32]
 Shape = tuple[int, ...]  # 0 = dynamic
 INPUT_DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(uint8)": "uint8"}  # -> numpy dtype
+SIZE_DTYPES = {"tensor(float)": "float32", "tensor(int64)": "int64", "tensor(int32)": "int32"}
+SIZE_INPUTS = ("orig_target_sizes", "im_shape", "scale_factor")  # of RT-DETR, and of PaddleDetection
 CUDA = "CUDAExecutionProvider"
 
 
 class OnnxNetwork:
-    """An ONNX network with one image as input.
+    """An ONNX network with one image as input, and optionally the image size.
 
     The number of threads is that of OpenCV (`threads` in the config). Idle threads sleep, because mapping runs at the
     same time.
@@ -57,7 +59,8 @@ class OnnxNetwork:
         self.sha256 = checked_hash(self.path, sha256)
         self._session = _loaded(self.path, device)
         self.metadata = ExportMetadata.parse(self._session.get_modelmeta().custom_metadata_map)
-        image, shape = _image_input(self.path, self._session.get_inputs())
+        sizes = [one for one in self._session.get_inputs() if one.name in SIZE_INPUTS and one.type in SIZE_DTYPES]
+        image, shape = _image_input(self.path, [one for one in self._session.get_inputs() if one not in sizes])
         if image.type not in INPUT_DTYPES:
             wanted = ", ".join(INPUT_DTYPES.values())
             raise DataError(f"{self.path}: expected one of {wanted} as input, got {_described(image)}")
@@ -66,6 +69,7 @@ class OnnxNetwork:
         self._batched = len(shape) == 4  # networks of Detectron2 and torchvision have the input (3, H, W)
         self.channels_last = shape[-1] == 3 and shape[-3] != 3  # (1, H, W, 3), as in TensorFlow networks
         self.shape = _input_shape(self.path, image, self.channels_last, input_size, self.metadata)
+        self._sizes = {one.name: _size_values(one, self.shape) for one in sizes}
         self.integers = frozenset(one.name for one in self._session.get_outputs() if "int" in one.type)
 
     def __call__(self, image: Array) -> Outputs:
@@ -78,7 +82,7 @@ class OnnxNetwork:
         blob = blob[None] if self._batched else blob
         names = [output.name for output in self._session.get_outputs()]
         try:
-            arrays = self._session.run(names, {self._name: np.ascontiguousarray(blob)})
+            arrays = self._session.run(names, {self._name: np.ascontiguousarray(blob), **self._sizes})
         except Exception as error:  # errors of onnxruntime have no common base class
             raise DataError(
                 f"{self.path}: expected a successful run in onnxruntime, got an error ({in_one_line(error)})"
@@ -133,9 +137,9 @@ class ImageNetwork:
         onnx = "an ONNX file (converted with tf2onnx, see docs/guides/detectors.md)"
         require(path.suffix.lower() != ".tflite", "detector.weights", path, onnx)
         self._network = OnnxNetwork(path, detector.sha256, device, detector.input_size)
-        levels = f"{black} and {white}"
-        fits = self._network.dtype != "uint8" or (black, white) == (0, 255)
-        require(fits, "detector.black_level and white_level", levels, "0 and 255 for a network with integer input")
+        fits = self._network.dtype != "uint8" or (black, white) in ((0, 255), (0, 1))  # defaults of detectors
+        levels, whole = f"{black} and {white}", "0 and 255 for a network with integer input"
+        require(fits, "detector.black_level and detector.white_level", levels, whole)
         self.shape = self._network.shape  # (height, width) px
         self.channels_last = self._network.channels_last  # the input is (1, H, W, 3)
         self.metadata = self._network.metadata
@@ -214,6 +218,13 @@ def _input_shape(
             "detector.input_size=640, or the size of the training images"
         )
     return height or open_height, width or open_width
+
+
+def _size_values(tensor: NodeArg, shape: tuple[int, int]) -> Array:
+    """Return the value (1, 2) of an input of the image size, for boxes in px of the network's input."""
+    height, width = shape
+    values = {"orig_target_sizes": (width, height), "im_shape": (height, width), "scale_factor": (1, 1)}
+    return np.array([values[tensor.name]], SIZE_DTYPES[tensor.type])
 
 
 def _described(tensor: NodeArg) -> str:
