@@ -220,7 +220,7 @@ def _table_and_prototypes(outputs: Outputs) -> tuple[Float32, Float32]:
     if tables[0].shape[1] == queries != tables[0].shape[2] - COEFFICIENTS:  # one mask for each query, but no box
         raise DataError(
             f"detector.weights: expected boxes, classes and masks, got {described(outputs)}, as of Mask2Former, "
-            "MaskFormer or OneFormer; set detector=transformers_segmentation detector.model=FOLDER to the folder of the network"
+            "MaskFormer or OneFormer; set detector=transformers_segmentation and detector.model to the network's folder"
         )
     return tables[0], maps[0]
 

@@ -1,7 +1,9 @@
 """COCO results files: a JSON list with an entry for each detection (cocodataset.org/#format-results).
 
-In addition to COCO's keys, an entry may contain `category_name` and the distribution `class_probabilities`. pycocotools
-is not used for reading, because it requires an annotation file and does not validate entries.
+In addition to COCO's keys, an entry may contain `category_name`, `file_name` and the distribution
+`class_probabilities`. Annotation files with images, annotations and categories (cocodataset.org/#format-data) are also
+read. pycocotools is not used for reading, because it requires an annotation file for results and does not validate
+entries.
 """
 
 from __future__ import annotations
@@ -36,8 +38,8 @@ from framework.vocabulary.label_spaces import COCO
 def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[StoredDetection]:
     """Read the detections in a results file.
 
-    `segmentation` contains run lengths or polygons. `image_id` is a whole number, or a file name such as
-    "color/000012.png".
+    `segmentation` contains run lengths or polygons. The image is `file_name`, such as "color/000012.png", or
+    `image_id`, a whole number or file name.
 
     Args:
         path: The results file.
@@ -48,6 +50,8 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
         DataError: An entry is invalid.
     """
     entries = read_json(path)
+    if isinstance(entries, dict):
+        entries = _annotated(path, entries)
     if not isinstance(entries, list):
         raise DataError(f"{path}: expected a list of results in COCO's format, got {entries!r:.100}")
     index = {name: k for k, name in enumerate(labels)}
@@ -61,13 +65,49 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
         with errors_of(where):
             found.append(_read_entry(where, entry, index, names))
             if isinstance(image := found[-1].image, ImageName):
-                path_of_image = PureWindowsPath(entry["image_id"])
+                path_of_image = PureWindowsPath(_image_of(entry))
                 if (other := folders.setdefault(image.stem, path_of_image.parent)) != path_of_image.parent:
                     raise DataError(
                         f"{path_of_image.as_posix()}: expected one image {image.stem}, got another image in "
                         f"{other.as_posix()}/; split the file by sequence"
                     )
     return found
+
+
+def _annotated(path: Path, dataset: Mapping[str, Any]) -> list[Any]:
+    """Return the annotations of a COCO dataset as results, with the names of images and categories.
+
+    Annotations without a score have the score 1.
+    """
+    parts = [dataset.get(key) for key in ("images", "annotations", "categories")]
+    if not all(isinstance(part, list) and all(isinstance(one, dict) for one in part) for part in parts):
+        raise DataError(
+            f"{path}: expected a list of results in COCO's format, or an object with lists of images, annotations and "
+            f"categories, got the keys {', '.join(map(repr, dataset))}"
+        )
+    images, annotations, categories = parts
+    files = {image.get("id"): _file_of(image) for image in images}
+    names = {category.get("id"): category.get("name") for category in categories}
+    found = []
+    for k, one in enumerate(annotations):
+        if one.get("image_id") not in files or one.get("category_id") not in names:
+            raise DataError(
+                f"{path}, annotation {k}: expected ids of images and categories, got image_id="
+                f"{one.get('image_id')!r}, category_id={one.get('category_id')!r}"
+            )
+        image, name = files[one["image_id"]], names[one["category_id"]]
+        found.append({"score": 1.0, **one, "file_name": image, "category_name": name})
+    return found
+
+
+def _file_of(image: Mapping[str, Any]) -> Any:
+    """Return the file name of an image. Roboflow keeps the name before its export in `extra`."""
+    extra = image.get("extra")
+    return extra["name"] if isinstance(extra, dict) and "name" in extra else image.get("file_name")
+
+
+def _image_of(entry: Mapping[str, Any]) -> Any:
+    return entry.get("image_id") if entry.get("file_name") is None else entry["file_name"]
 
 
 def _names_by_id(path: Path, entries: Sequence[Any], labels: Sequence[str], ids: CategoryIds) -> dict[int, str]:
@@ -98,7 +138,7 @@ def _read_entry(
         )
     return StoredDetection(
         where=where,
-        image=read_image_id(entry.get("image_id")),
+        image=read_image_id(_image_of(entry)),
         label=label,
         score=read_score(entry.get("score")),
         segmentation=_read_segmentation(entry.get("segmentation")),
