@@ -55,6 +55,11 @@ def recognize_table(
             f"detector.layout: expected one output, or outputs of a known network, got {described(outputs)}; set "
             f"detector.layout={layout.value} if boxes are x1 y1 x2 y2"
         )
+    if any(array.ndim > 3 for array in outputs.values()):
+        raise DataError(
+            f"detector.layout: expected a table of boxes, got {described(outputs)}; set detector=onnx_segmentation for a "
+            "network with masks, or export with decoded boxes"
+        )
     output = single_table(outputs)
     table = output[0] if output.ndim == 3 and output.shape[0] == 1 else output
     if table.ndim != 2:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from onnx import TensorProto
 
 from framework.data import Camera, Frame
 from framework.detection.candidates import OutputLayout
@@ -16,7 +17,22 @@ from framework.errors import ConfigError, DataError
 from framework.vocabulary.category_ids import CategoryIds
 from plugins.detectors.onnx_boxes import OnnxBoxes
 from plugins.detectors.onnx_segmentation import OnnxSegmentation
-from tests.support.networks.exported_networks import BOX, detectron2, export, mask_rcnn, rf_detr, yolo26
+from tests.support.networks.exported_networks import (
+    BOX,
+    cells,
+    detections,
+    detectron2,
+    detr,
+    end2end,
+    export,
+    mask_rcnn,
+    mmdeploy,
+    prototypes,
+    rf_detr,
+    rows,
+    tensorflow,
+    yolo26,
+)
 from tests.support.networks.tiny_networks import constant_network
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
@@ -216,7 +232,128 @@ def test_onnx_boxes_ssd_unit_labels_need_numbering(tmp_path: Path) -> None:
     assert the_object(numbered)[0] == "chair"
 
 
-def test_onnx_boxes_tensorflow_outputs_error_names_layout(tmp_path: Path) -> None:
-    weights = constant_network(tmp_path / "n.onnx", (1, 3, 240, 320), ssd(62))
-    with pytest.raises(DataError, match=r"set detector\.layout=ssd_tensorflow detector\.placement=stretch"):
-        OnnxBoxes(weights=weights, device="cpu")
+SIDES = (480, 640)
+YOLO = (1, 3, *SIDES)
+
+
+def swapped(table: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    return table.transpose(0, 2, 1)
+
+
+def pair(table: np.ndarray[Any, Any], rows_first: bool = False) -> dict[str, np.ndarray[Any, Any]]:
+    with_coefficients, maps = prototypes(table, *SIDES)
+    return {"516": maps, "output0": with_coefficients if rows_first else swapped(with_coefficients)}
+
+
+def rt_detr() -> np.ndarray[Any, Any]:
+    boxes, scores, labels = detections(56, 1, 1)
+    centers = np.concatenate([(boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]], axis=1)
+    return np.concatenate([centers, np.eye(80)[labels] * scores[:, None]], axis=1)[None]
+
+
+BOX_EXPORTS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
+    "tensorflow": ((1, 240, 320, 3), tensorflow(62), {"element": TensorProto.UINT8}),
+    "efficientdet": ((1, 480, 640, 3), rows(62, *SIDES, "efficientdet"), {"element": TensorProto.UINT8}),
+    "yolov5": (YOLO, {"output0": cells(56, *SIDES, "objectness classes", 3)}, {}),
+    "yolov6": (YOLO, {"outputs": cells(56, *SIDES, "ones classes")}, {}),
+    "yolov7_end2end": (YOLO, rows(56, *SIDES, "yolov7"), {"dynamic": True, "empty": True}),
+    "yolov8": (YOLO, {"output0": swapped(cells(56, *SIDES, "classes"))}, {}),
+    "yolov9_end2end": (YOLO, end2end(56, *SIDES), {}),
+    "yolox_decoded": (YOLO, {"output": cells(56, *SIDES, "objectness classes")}, {}),
+    "rt_detr": (YOLO, {"output0": rt_detr()}, {}),
+    "detr": (YOLO, detr(62), {}),
+    "mmdeploy": (YOLO, mmdeploy(56, *SIDES, ""), {}),
+    "paddle": (YOLO, rows(56, *SIDES, "paddle"), {"sizes": {"scale_factor": TensorProto.FLOAT}}),
+    "paddle_empty": (YOLO, rows(56, *SIDES, "paddle"), {"dynamic": True, "empty": True}),
+}
+MASK_EXPORTS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
+    "tensorflow": ((1, 240, 320, 3), tensorflow(62, masks=True), {"element": TensorProto.UINT8}),
+    "yolov5": (YOLO, pair(cells(56, *SIDES, "objectness classes", 3), rows_first=True), {}),
+    "yolov8": (YOLO, pair(cells(56, *SIDES, "classes")), {}),
+    "detr": (YOLO, detr(62, masks=True), {}),
+    "mmdeploy": (YOLO, mmdeploy(56, *SIDES, "in boxes"), {}),
+    "mmdeploy_bytes": (YOLO, mmdeploy(56, *SIDES, "bytes"), {}),
+    "mmdeploy_logits": (YOLO, mmdeploy(56, *SIDES, "logits"), {}),
+    "torchvision_int32": (WIDE, mask_rcnn(62, WIDE[1:]) | {"labels": np.full(5, 62, np.int32)}, {"dynamic": True}),
+    "detectron2_bytes": (WIDE, detectron2(56, WIDE[1:]), {"element": TensorProto.UINT8}),
+}
+
+
+@pytest.mark.parametrize(("shape", "outputs", "how"), BOX_EXPORTS.values(), ids=BOX_EXPORTS)
+def test_onnx_boxes_common_export_finds_chair(tmp_path: Path, shape: Any, outputs: Any, how: Any) -> None:
+    name, mask, _ = the_object(OnnxBoxes(weights=export(tmp_path / "n.onnx", shape, outputs, **how), device="cpu"))
+    assert (name, iou(mask) > 0.9) == ("chair", True)
+
+
+@pytest.mark.parametrize(("shape", "outputs", "how"), MASK_EXPORTS.values(), ids=MASK_EXPORTS)
+def test_onnx_segmentation_common_export_finds_chair(tmp_path: Path, shape: Any, outputs: Any, how: Any) -> None:
+    weights = export(tmp_path / "n.onnx", shape, outputs, **how)
+    name, mask, _ = the_object(OnnxSegmentation(weights=weights, device="cpu"))
+    assert (name, iou(mask) > 0.9) == ("chair", True)
+
+
+@pytest.mark.parametrize(
+    ("export_name", "placement", "bgr", "white"),
+    [
+        ("tensorflow", Placement.stretch, False, 255.0),
+        ("yolov5", Placement.center, False, 1.0),
+        ("yolov8", Placement.center, False, 1.0),
+        ("yolox_decoded", Placement.top_left, True, 255.0),
+        ("rt_detr", Placement.stretch, False, 1.0),
+    ],
+)
+def test_onnx_boxes_common_export_gets_its_image_format(
+    tmp_path: Path, export_name: str, placement: Placement, bgr: bool, white: float
+) -> None:
+    shape, outputs, how = BOX_EXPORTS[export_name]
+    detector = OnnxBoxes(weights=export(tmp_path / "n.onnx", shape, outputs, **how), device="cpu")
+    found = detector._network.format
+    assert (found.placement, found.bgr, found.white) == (placement, bgr, white)
+
+
+def queries() -> dict[str, np.ndarray[Any, Any]]:
+    found = rf_detr(56, columns=81, queries=100)
+    return {"class_queries_logits": found["labels"], "masks_queries_logits": found["masks"]}
+
+
+def batched() -> dict[str, np.ndarray[Any, Any]]:
+    """Return outputs of an RT-DETR or D-FINE, whose labels count from 0 under torchvision's names."""
+    return {name: array[None] for name, array in mask_rcnn(56, SIDES).items() if name != "masks"}
+
+
+@pytest.mark.parametrize(
+    ("outputs", "message"),
+    [
+        (batched(), r"set detector\.category_ids=COCO_91 or detector\.category_ids=FROM_ONE or .*=FROM_ZERO"),
+        ({"boxes": batched()["boxes"], "scores": np.zeros((1, 5, 80))}, r"set detector\.layout=ssd_torchvision if"),
+        (queries(), r"set detector=onnx_segmentation for a network with masks"),
+        ({"y": np.zeros((0, 6))}, r"set detector\.layout=end_to_end or detector\.layout=label_first"),
+    ],
+    ids=["rt_detr_postprocessed", "yolo_nas", "mask2former", "unknown_rows"],
+)
+def test_onnx_boxes_uncertain_export_error_names_setting(tmp_path: Path, outputs: Any, message: str) -> None:
+    with pytest.raises((ConfigError, DataError), match=message):
+        OnnxBoxes(weights=export(tmp_path / "n.onnx", YOLO, outputs), device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("outputs", "message"),
+    [
+        (queries(), r"as of Mask2Former, .*set detector=transformers_segmentation"),
+        (
+            {"output0": swapped(cells(56, *SIDES, "classes"))},
+            r"expected masks, got boxes only .*set detector=onnx_boxes",
+        ),
+        (pair(cells(0, *SIDES, "classes")[..., :5]), r"label_space: expected 116 columns"),
+    ],
+    ids=["mask2former", "boxes", "fastsam"],
+)
+def test_onnx_segmentation_other_export_error_names_setting(tmp_path: Path, outputs: Any, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        OnnxSegmentation(weights=export(tmp_path / "n.onnx", YOLO, outputs), device="cpu")
+
+
+def test_onnx_segmentation_class_agnostic_network_finds_object(tmp_path: Path) -> None:
+    weights = export(tmp_path / "n.onnx", YOLO, pair(cells(0, *SIDES, "classes")[..., :5]))  # as FastSAM
+    name, mask, _ = the_object(OnnxSegmentation(weights=weights, device="cpu", label_space="agnostic"))
+    assert (name, iou(mask) > 0.9) == ("object", True)
