@@ -57,8 +57,8 @@ def recognize_table(
         )
     if any(array.ndim > 3 for array in outputs.values()):
         raise DataError(
-            f"detector.layout: expected a table of boxes, got {described(outputs)}; set detector=onnx_segmentation for a "
-            "network with masks, or export with decoded boxes"
+            f"detector.layout: expected a table of boxes, got {described(outputs)}; set detector=onnx_segmentation for "
+            "a network with masks, or export with decoded boxes"
         )
     output = single_table(outputs)
     table = output[0] if output.ndim == 3 and output.shape[0] == 1 else output

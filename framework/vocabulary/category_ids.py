@@ -99,6 +99,7 @@ def recognize(
         )
     example = next((k for k in ids if len({names[k] for _, names in fitting}) > 1), ids[0])
     (numbering, names), *others = fitting
+    others = [(one, other) for one, other in others if any(other[k] != names[k] for k in ids)]
     alternatives = " or ".join(f"{other[example]!r} by {one.name}" for one, other in others)
     fixes = " or ".join(f"{KEY}={one.name}" for one, _ in others)
     if others and numbering is not CategoryIds.COCO_91:

@@ -130,7 +130,7 @@ def test_commas_separate_values_in_experiment() -> None:
 
 def test_parameter_of_second_swept_option_is_literal() -> None:
     words = ["detector=none,precomputed", "detector.path=Küche,b"]
-    assert literal(words, text_kind, multirun=True)[1] == "detector.path='Küche',b"
+    assert literal(words, text_kind, multirun=True)[1] == "++detector.path='Küche',b"
 
 
 @pytest.mark.parametrize(

@@ -297,7 +297,9 @@ def test_precomputed_invalid_entry_raises_one_line_error(tmp_path: Path, changes
     ("content", "message"),
     [
         ("[{]", "expected valid JSON"),
-        ('{"annotations": []}', "expected a list of"),
+        ('{"annotations": []}', "expected a list of results in COCO's format, or an object with lists of images, ann"),
+        ('{"images": [], "annotations": [], "categories": []}', "expected at least one detection"),
+        ('{"images": [], "annotations": [{"image_id": 3}], "categories": []}', "annotation 0: expected ids of images"),
         ("[]", "expected at least one detection"),
         ("[3]", "entry 0"),
     ],
@@ -457,7 +459,65 @@ def test_precomputed_file_names_without_numbers_need_named_frames(tmp_path: Path
         detector.detect(frame())
 
 
+def test_precomputed_file_name_precedes_image_id(tmp_path: Path) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id=0, file_name="000006.jpg")))  # as Ultralytics writes
+    detector.check_sequence(NamedRoom())
+    assert len(detector.detect(replace(frame(3), image_name="000006.jpg"))) == 1
+    assert len(detector.detect(replace(frame(0), image_name="000000.jpg"))) == 0
+
+
+def dataset(image: dict[str, Any], category: str, **changes: Any) -> dict[str, Any]:
+    """Return a COCO dataset with one annotation of the image 17 and the category 3."""
+    segmentation = [[2, 1, 7, 1, 7, 4, 2, 4]]
+    annotation = {"id": 1, "image_id": 17, "category_id": 3, "segmentation": segmentation, "iscrowd": 0, "area": 15}
+    return {
+        "images": [{"id": 9, "file_name": "000000.jpg"}, {"id": 17, **image}],
+        "annotations": [annotation | changes],
+        "categories": [{"id": 0, "name": "things"}, {"id": 3, "name": category, "supercategory": "things"}],
+    }
+
+
+@pytest.mark.parametrize(
+    ("image", "category", "changes", "score"),
+    [
+        ({"file_name": "000006.jpg"}, "chair", {}, 1.0),
+        ({"file_name": "C:\\scans\\color\\000006.png"}, "chair", {"score": 0.5}, 0.5),
+        ({"file_name": "000006_jpg.rf.a1b2c3.jpg"}, "Chair", {}, 1.0),  # Roboflow
+        ({"file_name": "x.jpg", "extra": {"name": "000006.jpg"}}, "chair", {}, 1.0),
+        ({"file_name": "6.png"}, "chair", {"segmentation": {"size": [6, 8], "counts": RUN_LENGTHS}}, 1.0),
+    ],
+    ids=["file", "windows", "roboflow", "roboflow_extra", "crowd"],
+)
+def test_precomputed_coco_dataset_is_read(
+    tmp_path: Path, image: dict[str, Any], category: str, changes: dict[str, Any], score: float
+) -> None:
+    (tmp_path / "dataset.json").write_text(json.dumps(dataset(image, category, **changes)))
+    detector = Precomputed(tmp_path / "dataset.json")
+    detector.check_sequence(NamedRoom())
+    found = detector.detect(replace(frame(3), image_name="000006.jpg"))
+    assert (len(found), float(found.scores[0])) == (1, score)
+    np.testing.assert_array_equal(found.masks[0], MASK)
+    assert COCO[found.class_probabilities[0].argmax()] == "chair"
+
+
+@pytest.mark.parametrize(
+    ("written", "name"),
+    [("sofa", "couch"), ("tvmonitor", "tv"), ("Dining Table", "dining table"), ("potted_plant", "potted plant")],
+)
+def test_precomputed_other_name_of_class_is_read(tmp_path: Path, written: str, name: str) -> None:
+    found = detected(tmp_path, entry(category_name=written))
+    assert found.classes[int(found.class_probabilities[0].argmax())] == name
+
+
 # Own classes
+
+
+def test_precomputed_label_file_with_unused_ids_is_read(tmp_path: Path) -> None:
+    (tmp_path / "labels.txt").write_text("\n".join(["__background__", "forklift", "N/A", "pallet"]))
+    entries = [entry(category_name=None, category_id=3), entry(category_name="forklift", score=0.5)]
+    found = detected(tmp_path, *entries, label_space=str(tmp_path / "labels.txt"))
+    assert found.classes == ("forklift", "pallet")
+    assert [found.classes[k] for k in found.class_probabilities.argmax(axis=1)] == ["pallet", "forklift"]
 
 
 @pytest.mark.parametrize(
