@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -33,7 +32,6 @@ MIN_ORDERED_CORNERS = 0.9  # minimum fraction of boxes with x2 >= x1 and y2 >= y
 MAX_ORDERED_CENTERS = 0.5  # maximum fraction of such boxes, if boxes are centers and sizes; typically a few percent
 MIN_ROWS = 20  # minimum number of detections to evaluate these fractions
 BOXES_PER_CELL = (1, 3)  # 3 up to YOLOv7
-SHOWN_NAMES = 5  # maximum number of class names in messages
 SCORE, LABEL, COEFFICIENTS = 4, 5, 6  # columns of a table with suppression, after x1 y1 x2 y2
 
 log = logging.getLogger(__name__)
@@ -194,7 +192,7 @@ def detect_layout(
         not (is_rows or is_columns) or _looks_suppressed(table[0], classes, shape)
     )
     if not suppressed and is_rows == is_columns:
-        raise DataError(_no_such_table(table.shape, columns, count, objectness, is_rows, metadata.names))
+        raise DataError(_no_such_table(table.shape, columns, count, objectness, is_rows))
     given = None if boxes is BoxKind.AUTO else boxes
     layout = SegmentationLayout(classes, objectness, shape, suppressed, suppressed or is_rows, channels_last, given)
     layout = layout.determined_by(outputs)
@@ -256,20 +254,11 @@ def _looks_suppressed(rows: Float32, classes: int, shape: tuple[int, int]) -> bo
     return _are_labels(rows[:, LABEL], classes) and len(rows) not in counts
 
 
-def _no_such_table(
-    shape: tuple[int, ...], columns: int, count: int, objectness: bool, both: bool, names: Sequence[str]
-) -> str:
+def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness: bool, both: bool) -> str:
     if both:
         return (
             f"detector.weights: expected different numbers of candidates and columns, got {columns} for both; "
             "export for another input size"
-        )
-    fewer = min(shape[1:]) - 4 - count
-    if names and fewer in (len(names), len(names) + 1):
-        return (
-            f"detector.label_space: expected the {len(names)} classes of the network, got another number of names; set "
-            f"detector.label_space to a text file with the names {', '.join(names[:SHOWN_NAMES])}"
-            f"{', ...' if len(names) > SHOWN_NAMES else ''}, one per line"
         )
     other = columns - 1 if objectness else columns + 1
     fix = f"set detector.objectness={str(not objectness).lower()} or" if other in shape[1:] else "choose"

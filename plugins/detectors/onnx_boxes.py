@@ -122,6 +122,7 @@ class OnnxBoxes(Detector):
                 return instances.candidates_of_boxes
             layout, known = recognize_table(outputs, network.shape, len(self._labels))
             network.format = choose_format(layout.value, known, self.preprocessing, network.format)
+        network.check_names(self._labels, self.label_space)
         ids = label_numbers(layout, outputs, self._labels, self.category_ids)
         decoder = partial(decode, layout, shape=network.shape, classes=len(self._labels), ids=ids)
         decoder(outputs)

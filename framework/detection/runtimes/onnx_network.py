@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,8 @@ from framework.errors import ConfigError, DataError, import_optional, in_one_lin
 from framework.files.hashing import path_hash
 from framework.files.search_paths import candidates
 
+log = logging.getLogger(__name__)
+
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession, NodeArg
 
@@ -26,6 +29,7 @@ Shape = tuple[int, ...]  # 0 = dynamic
 INPUT_DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(uint8)": "uint8"}  # -> numpy dtype
 SIZE_DTYPES = {"tensor(float)": "float32", "tensor(int64)": "int64", "tensor(int32)": "int32"}
 SIZE_INPUTS = ("orig_target_sizes", "im_shape", "scale_factor")  # of RT-DETR, and of PaddleDetection
+SHOWN_NAMES = 5  # maximum number of class names in messages
 CUDA = "CUDAExecutionProvider"
 
 
@@ -154,10 +158,35 @@ class ImageNetwork:
         image = network_input(canvas, self._network.dtype, wanted.bgr, wanted.black, wanted.white)
         return self._network(image), letterbox
 
+    def check_names(self, labels: Sequence[str], label_space: str) -> None:
+        """Compare the class names in the file with the labels, and log a warning if names differ.
+
+        Raises:
+            ConfigError: The file has another number of classes.
+        """
+        names = self.metadata.names
+        if names and len(names) != len(labels):
+            raise ConfigError(
+                f"detector.label_space: expected the class names of {self._network.path.name} ({_listed(names)}), got "
+                f"{len(labels)} names of {label_space}; set detector.label_space to a text file with these names, one "
+                "per line"
+            )
+        different = [(k, a, b) for k, (a, b) in enumerate(zip(names, labels, strict=False)) if a != b]
+        if different:
+            log.warning(
+                "%s: %d of its %d classes differ from detector.label_space=%s: class %d is %r, expected %r",
+                self._network.path.name, len(different), len(names), label_space, *different[0],
+            )  # fmt: skip
+
     def outputs_for_black(self) -> Outputs:
         """Return the outputs for a black image, for example to check their shapes."""
         outputs, _ = self(np.zeros((*self.shape, 3), np.uint8))
         return outputs
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - SHOWN_NAMES} more" if len(names) > SHOWN_NAMES else ""
+    return f"{', '.join(names[:SHOWN_NAMES])}{more}"
 
 
 def _loaded(path: Path, device: str) -> InferenceSession:

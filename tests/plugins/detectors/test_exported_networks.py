@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 from onnx import TensorProto
 
@@ -251,6 +252,11 @@ def rt_detr() -> np.ndarray[Any, Any]:
     return np.concatenate([centers, np.eye(80)[labels] * scores[:, None]], axis=1)[None]
 
 
+def batched() -> dict[str, np.ndarray[Any, Any]]:
+    """Return outputs of an RT-DETR or D-FINE, whose labels count from 0 under torchvision's names."""
+    return {name: array[None] for name, array in mask_rcnn(56, SIDES).items() if name != "masks"}
+
+
 BOX_EXPORTS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
     "tensorflow": ((1, 240, 320, 3), tensorflow(62), {"element": TensorProto.UINT8}),
     "efficientdet": ((1, 480, 640, 3), rows(62, *SIDES, "efficientdet"), {"element": TensorProto.UINT8}),
@@ -316,11 +322,6 @@ def queries() -> dict[str, np.ndarray[Any, Any]]:
     return {"class_queries_logits": found["labels"], "masks_queries_logits": found["masks"]}
 
 
-def batched() -> dict[str, np.ndarray[Any, Any]]:
-    """Return outputs of an RT-DETR or D-FINE, whose labels count from 0 under torchvision's names."""
-    return {name: array[None] for name, array in mask_rcnn(56, SIDES).items() if name != "masks"}
-
-
 @pytest.mark.parametrize(
     ("outputs", "message"),
     [
@@ -357,3 +358,31 @@ def test_onnx_segmentation_class_agnostic_network_finds_object(tmp_path: Path) -
     weights = export(tmp_path / "n.onnx", YOLO, pair(cells(0, *SIDES, "classes")[..., :5]))  # as FastSAM
     name, mask, _ = the_object(OnnxSegmentation(weights=weights, device="cpu", label_space="agnostic"))
     assert (name, iou(mask) > 0.9) == ("object", True)
+
+
+def test_onnx_boxes_input_of_image_size_is_given(tmp_path: Path) -> None:
+    sizes = {"orig_target_sizes": TensorProto.INT64}  # as in RT-DETR and D-FINE
+    weights = export(tmp_path / "n.onnx", YOLO, batched(), sizes=sizes)
+    detector = OnnxBoxes(weights=weights, device="cpu", category_ids=CategoryIds.FROM_ZERO)
+    assert the_object(detector)[0] == "chair"
+    assert detector._network._network._sizes["orig_target_sizes"].tolist() == [[640, 480]]
+
+
+@pytest.mark.parametrize(
+    ("detector", "outputs"),
+    [
+        (OnnxBoxes, {"output0": yolo26(0)["output0"][..., :6]}),
+        (OnnxBoxes, {"output0": swapped(cells(0, *SIDES, "classes")[..., :6])}),
+        (OnnxSegmentation, yolo26(0)),
+        (OnnxSegmentation, pair(cells(0, *SIDES, "classes")[..., :6])),
+    ],
+    ids=["boxes_end_to_end", "boxes", "end_to_end", "segmentation"],
+)
+def test_own_classes_of_network_error_lists_names(tmp_path: Path, detector: Any, outputs: Any) -> None:
+    side = 640 if outputs["output0"].shape[1] == 300 else SIDES[0]
+    weights = export(tmp_path / "n.onnx", (1, 3, side, 640), outputs)
+    model = onnx.load(weights)
+    onnx.helper.set_model_props(model, {"names": "{0: 'forklift', 1: 'pallet'}", "author": "Ultralytics"})
+    onnx.save(model, weights)
+    with pytest.raises((ConfigError, DataError), match=r"label_space: expected .*\(forklift, pallet\), got 80 names"):
+        detector(weights=weights, device="cpu")
