@@ -36,8 +36,8 @@ class Precomputed(Detector):
     """Detections from a COCO results file or a mask folder, by file name or frame index.
 
     COCO results files are written by `instancemap detect` and by other programs. A mask folder contains two files for
-    each frame, such as 000012.png and 000012.json. The first is an image of 16-bit instance ids, and the second is a
-    list of {"id", "class", "score"}.
+    each frame, such as 000012.png and 000012.json. The first is an image of 8-bit or 16-bit instance ids, and the
+    second is a list of {"id", "class", "score"}.
 
     Annotation files of COCO datasets are also read.
 

@@ -32,7 +32,7 @@ from framework.errors import DataError, errors_of
 from framework.files.atomic_write import atomic_write
 from framework.files.json_file import read_json
 from framework.vocabulary.category_ids import CategoryIds, recognize
-from framework.vocabulary.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO, whole_number
 
 
 def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[StoredDetection]:
@@ -79,7 +79,7 @@ def _annotated(path: Path, dataset: Mapping[str, Any]) -> list[Any]:
 
     Annotations without a score have the score 1.
     """
-    parts = [dataset.get(key) for key in ("images", "annotations", "categories")]
+    parts: list[Any] = [dataset.get(key) for key in ("images", "annotations", "categories")]
     if not all(isinstance(part, list) and all(isinstance(one, dict) for one in part) for part in parts):
         raise DataError(
             f"{path}: expected a list of results in COCO's format, or an object with lists of images, annotations and "
@@ -110,16 +110,22 @@ def _image_of(entry: Mapping[str, Any]) -> Any:
     return entry.get("image_id") if entry.get("file_name") is None else entry["file_name"]
 
 
+def _category_of(entry: Mapping[str, Any]) -> int | None:
+    """Return the `category_id` of an entry, which may also be text or 62.0; None = no whole number."""
+    found = entry.get("category_id")
+    return int(found) if isinstance(found, float) and found.is_integer() else whole_number(found)
+
+
 def _names_by_id(path: Path, entries: Sequence[Any], labels: Sequence[str], ids: CategoryIds) -> dict[int, str]:
     """Return the label of each `category_id`, or an empty dictionary if all entries have a `category_name`."""
     objects = [entry for entry in entries if isinstance(entry, Mapping)]
-    unnamed = [entry.get("category_id") for entry in objects if entry.get("category_name") is None]
-    numbers = [k for k in unnamed if type(k) is int]
+    unnamed = [_category_of(entry) for entry in objects if entry.get("category_name") is None]
+    numbers = [k for k in unnamed if k is not None]
     if not numbers:
         return {}
     if ids is CategoryIds.AUTO:
-        pairs = [(entry.get("category_id"), entry.get("category_name")) for entry in objects]
-        known = [(k, name) for k, name in pairs if type(k) is int and isinstance(name, str)]
+        pairs = [(_category_of(entry), entry.get("category_name")) for entry in objects]
+        known = [(k, name) for k, name in pairs if k is not None and isinstance(name, str)]
         ids = recognize(str(path), numbers, labels, known)
     return ids.names(labels)
 
@@ -127,10 +133,13 @@ def _names_by_id(path: Path, entries: Sequence[Any], labels: Sequence[str], ids:
 def _read_entry(
     where: str, entry: Mapping[str, Any], index: Mapping[str, int], names: Mapping[int, str]
 ) -> StoredDetection:
+    category = _category_of(entry)
     if entry.get("category_name") is not None:
         label = read_label(entry["category_name"], index)
-    elif type(entry.get("category_id")) is int and entry["category_id"] in names:
-        label = names[entry["category_id"]]
+    elif entry.get("category_id") is None:
+        raise DataError("category_id: expected category_id or category_name, got neither; add one of them")
+    elif category is not None and category in names:
+        label = names[category]
     else:
         raise DataError(
             f"category_id: expected the id of a label, got {entry.get('category_id')!r}; set "
@@ -167,7 +176,8 @@ def _read_segmentation(found: Any) -> Segmentation:
     size = found.get("size") if isinstance(found, Mapping) else None
     if not isinstance(size, list) or len(size) != 2 or not all(type(side) is int and side > 0 for side in size):
         raise DataError(
-            f"segmentation: expected run lengths with size [height, width], or a list of polygons, got {found!r:.200}"
+            f"segmentation: expected run lengths with size [height, width], or a list of polygons, got {found!r:.200}; "
+            "write masks as well as boxes"
         )
     shape = (size[0], size[1])
     if shape[0] * shape[1] > MAX_PIXELS:

@@ -101,14 +101,16 @@ def read_label(found: Any, index: Mapping[str, int]) -> str:
     Raises:
         DataError: The value is not a name in `index`.
     """
-    if isinstance(found, str) and found not in index:
+    if not isinstance(found, str):
+        raise DataError(f"label: expected a class name, got {found!r}; write the name of the class")
+    if found not in index:
         found = coco_name(found) or coco_name(found.replace("_", " ")) or found
-    if not isinstance(found, str) or found not in index:
+    if found not in index:
         raise DataError(
             f"label: expected one of the {len(index)} names in detector.label_space, got {found!r}; set "
             "detector.label_space to the label space of the file"
         )
-    return found
+    return str(found)
 
 
 def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:

@@ -123,6 +123,7 @@ def test_precomputed_partial_distribution_is_normalized(tmp_path: Path) -> None:
         (CategoryIds.FROM_ONE, "coco", 57, "chair"),
         (CategoryIds.FROM_ZERO, "coco", 56, "chair"),
         (CategoryIds.FROM_ONE, "nyu40", 5, "chair"),
+        (CategoryIds.SCANNET, "scannet20", 33, "toilet"),
     ],
 )
 def test_precomputed_category_id_maps_to_label(
@@ -227,6 +228,20 @@ def test_precomputed_invalid_mask_folder_entry_raises(tmp_path: Path, listed: An
     assert "000003.json" in str(raised.value)
 
 
+def test_precomputed_mask_folder_of_8_bits_is_read(tmp_path: Path) -> None:
+    found = Precomputed(write_folder(tmp_path, np.where(MASK, np.uint8(7), np.uint8(0)))).detect(frame(3))
+    np.testing.assert_array_equal(found.masks[0], MASK)
+
+
+@pytest.mark.parametrize(
+    ("category_id", "name"),
+    [("62", "chair"), (62.0, "chair"), ("1", "person")],  # as text or by pandas
+)
+def test_precomputed_category_id_of_other_type_is_read(tmp_path: Path, category_id: Any, name: str) -> None:
+    found = detected(tmp_path, entry(category_name=None, category_id=category_id))
+    assert found.classes[int(found.class_probabilities[0].argmax())] == name
+
+
 def test_precomputed_mask_folder_with_unpaired_file_raises(tmp_path: Path) -> None:
     (write_folder(tmp_path) / "000003.json").rename(tmp_path / "000004.json")
     with pytest.raises(DataError, match=r"000003\.json: expected a readable file"):
@@ -244,7 +259,7 @@ def test_precomputed_mask_folder_with_duplicate_frame_raises(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("ids", "error"), [(np.zeros((6, 9), np.uint16), DataError), (np.zeros((6, 8), np.uint8), FrameError)]
+    ("ids", "error"), [(np.zeros((6, 9), np.uint16), DataError), (np.zeros((6, 8, 3), np.uint8), FrameError)]
 )
 def test_precomputed_mask_image_with_wrong_size_or_type_raises(
     tmp_path: Path, ids: np.ndarray, error: type[DataError]
@@ -264,7 +279,7 @@ def test_precomputed_mask_image_with_wrong_size_or_type_raises(
         ({"image_id": True}, "image_id"),
         ({"image_id": 0.5}, "image_id: expected a frame number, or a file name such as 000012.png, got"),
         ({"category_name": "chiar"}, "label: expected one of the 80 names in detector.label_space, got"),
-        ({"category_name": None}, "category_id: expected the id of a label, got None"),
+        ({"category_name": None}, "category_id: expected category_id or category_name, got neither; add one of them"),
         ({"score": 1.5}, "score: expected a number in [0, 1], got 1.5"),
         ({"score": None}, "score"),
         (
