@@ -17,11 +17,12 @@ from framework.detection.runtimes.onnx_network import Outputs
 TENSORFLOW_NAMES = frozenset({"detection_boxes", "detection_classes", "detection_scores"})
 YOLO_NAMES = frozenset({"det_boxes", "det_classes", "det_scores"})
 TENSORFLOW_MASKS = "detection_masks"
+HIDDEN = "hidden_state"  # part of the names of additional outputs of transformers
 SCORES = "dets_scores"  # name of the scores that are split from the boxes of MMDeploy
 
 
 def standard_outputs(outputs: Outputs) -> Outputs:
-    """Return the outputs without numbers of detections, with boxes x1 y1 x2 y2, and with separate scores."""
+    """Return the boxes x1 y1 x2 y2, classes, scores and masks of a network, without other outputs."""
     names = {base_name(name) for name in outputs}
     if names >= TENSORFLOW_NAMES:
         kept = {
@@ -35,7 +36,7 @@ def standard_outputs(outputs: Outputs) -> Outputs:
     for name, array in outputs.items():
         if base_name(name) == "dets" and array.ndim > 1 and array.shape[-1] == 5:
             standard |= {name: array[..., :4], SCORES: array[..., 4]}
-        elif not ("num" in base_name(name) and array.size == 1):
+        elif HIDDEN not in name and not ("num" in base_name(name) and array.size == 1):
             standard[name] = array
     return standard
 

@@ -28,7 +28,8 @@ Outputs = dict[str, Float32]
 Shape = tuple[int, ...]  # 0 = dynamic
 INPUT_DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(uint8)": "uint8"}  # -> numpy dtype
 SIZE_DTYPES = {"tensor(float)": "float32", "tensor(int64)": "int64", "tensor(int32)": "int32"}
-SIZE_INPUTS = ("orig_target_sizes", "im_shape", "scale_factor")  # of RT-DETR, and of PaddleDetection
+PIXEL_MASK = "pixel_mask"  # 1 = pixel of the image, in DETR networks of transformers
+SIZE_INPUTS = ("orig_target_sizes", "im_shape", "scale_factor", PIXEL_MASK)  # of RT-DETR, PaddleDetection and DETR
 SHOWN_NAMES = 5  # maximum number of class names in messages
 CUDA = "CUDAExecutionProvider"
 
@@ -250,8 +251,11 @@ def _input_shape(
 
 
 def _size_values(tensor: NodeArg, shape: tuple[int, int]) -> Array:
-    """Return the value (1, 2) of an input of the image size, for boxes in px of the network's input."""
+    """Return the value of an input of the image size (1, 2), for boxes in px of the network's input, or a mask."""
     height, width = shape
+    if tensor.name == PIXEL_MASK:
+        _, rows, columns = _shape(tensor)
+        return np.ones((1, rows or height, columns or width), SIZE_DTYPES[tensor.type])
     values = {"orig_target_sizes": (width, height), "im_shape": (height, width), "scale_factor": (1, 1)}
     return np.array([values[tensor.name]], SIZE_DTYPES[tensor.type])
 

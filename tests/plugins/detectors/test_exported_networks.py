@@ -368,6 +368,16 @@ def test_onnx_boxes_input_of_image_size_is_given(tmp_path: Path) -> None:
     assert detector._network._network._sizes["orig_target_sizes"].tolist() == [[640, 480]]
 
 
+def test_onnx_boxes_export_of_transformers_finds_chair(tmp_path: Path) -> None:
+    outputs = {**detr(62), "last_hidden_state": np.zeros((1, 100, 256))}
+    weights = export(
+        tmp_path / "n.onnx", YOLO, outputs, sizes={"pixel_mask": TensorProto.INT64}, size_shape=(1, 64, 64)
+    )
+    detector = OnnxBoxes(weights=weights, device="cpu")
+    assert the_object(detector)[0] == "chair"
+    assert detector._network._network._sizes["pixel_mask"].all()
+
+
 @pytest.mark.parametrize(
     ("detector", "outputs"),
     [

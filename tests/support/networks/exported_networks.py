@@ -26,6 +26,7 @@ def export(
     empty: bool = False,
     element: int = TensorProto.FLOAT,
     sizes: Mapping[str, int] | None = None,
+    size_shape: tuple[int, ...] = (1, 2),
 ) -> Path:
     """Write a network with constant outputs.
 
@@ -36,7 +37,8 @@ def export(
         dynamic: True = the first dimension of every output is dynamic.
         empty: True = the outputs have no rows for a black image, as after suppression.
         element: The type of the image input.
-        sizes: The types of further inputs (1, 2) by name.
+        sizes: The types of further inputs by name.
+        size_shape: The shape of these inputs.
     """
     nodes = [
         helper.make_node("Cast", ["image"], ["values"], to=TensorProto.FLOAT),
@@ -62,7 +64,7 @@ def export(
         kind = helper.np_dtype_to_tensor_dtype(array.dtype)
         described.append(helper.make_tensor_value_info(name, kind, shape_of_output))
     inputs = [helper.make_tensor_value_info("image", element, shape)]
-    inputs += [helper.make_tensor_value_info(name, kind, (1, 2)) for name, kind in (sizes or {}).items()]
+    inputs += [helper.make_tensor_value_info(name, kind, size_shape) for name, kind in (sizes or {}).items()]
     return save(path, nodes, inputs, described, constants)
 
 
