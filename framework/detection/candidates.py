@@ -40,6 +40,7 @@ class OutputLayout(Enum):
     end_to_end = "end_to_end"  # (K, 6): x1 y1 x2 y2 in px or 0..1, score, label from 0 (YOLOv10, YOLO26)
     label_first = "label_first"  # (K, 6): label from 0, score, x1 y1 x2 y2 in px (PaddleDetection)
     image_first = "image_first"  # (K, 7): index of the image, x1 y1 x2 y2 in px, label from 0, score (YOLOv7)
+    yolo_nas = "yolo_nas"  # (K, 7): index of the image, x1 y1 x2 y2 in px, score, label from 0 (flat format)
     efficientdet = "efficientdet"  # (K, 7): index of the image, y1 x1 y2 x2 in px, score, label (automl)
     auto = "auto"  # the layout of a recognized network
 
@@ -52,6 +53,7 @@ PUBLISHED_IDS: Mapping[OutputLayout, CategoryIds | None] = {
     OutputLayout.end_to_end: CategoryIds.FROM_ZERO,
     OutputLayout.label_first: CategoryIds.FROM_ZERO,
     OutputLayout.image_first: CategoryIds.FROM_ZERO,
+    OutputLayout.yolo_nas: CategoryIds.FROM_ZERO,
     OutputLayout.efficientdet: CategoryIds.COCO_91,
 }
 YOLO_FORMAT = ImageFormat(Placement.center, bgr=False, black=0.0, white=1.0)  # as in Ultralytics' exports
@@ -71,6 +73,7 @@ ROW_COLUMNS: Mapping[OutputLayout, RowColumns] = {
     OutputLayout.end_to_end: RowColumns((0, 1, 2, 3), score=4, label=5, count=6),
     OutputLayout.label_first: RowColumns((2, 3, 4, 5), score=1, label=0, count=6),
     OutputLayout.image_first: RowColumns((1, 2, 3, 4), score=6, label=5, count=7),
+    OutputLayout.yolo_nas: RowColumns((1, 2, 3, 4), score=5, label=6, count=7),
     OutputLayout.efficientdet: RowColumns((2, 1, 4, 3), score=5, label=6, count=7),
 }
 """Layouts of networks with suppression and a single table."""

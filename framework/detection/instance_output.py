@@ -36,7 +36,14 @@ from framework.detection.candidates import (
     spread_evenly,
 )
 from framework.detection.masks.binary_masks import masks_from_grids, paste_masks
-from framework.detection.masks.letterbox import ImageFormat, ImageFormatChoice, Letterbox, Placement, choose_format
+from framework.detection.masks.letterbox import (
+    ImageFormat,
+    ImageFormatChoice,
+    Letterbox,
+    Placement,
+    choose_format,
+    warn_of_format,
+)
 from framework.detection.output_conventions import TENSORFLOW_NAMES, YOLO_NAMES, base_name, standard_outputs
 from framework.detection.runtimes.onnx_network import Outputs
 from framework.detection.segmentation_output import BoxKind, MaskOutput
@@ -60,7 +67,7 @@ class NetworkAuthor(Enum):
     TENSORFLOW = "TensorFlow's object detection API"
     YOLO = "YOLO with suppression"
     MMDEPLOY = "MMDeploy"
-    UNKNOWN = "unknown"
+    UNKNOWN = "an unknown network"
 
 
 IMAGENET_BLACK = (-0.485 / 0.229, -0.456 / 0.224, -0.406 / 0.225)  # RGB, (0 - mean) / standard deviation
@@ -143,13 +150,8 @@ class InstanceLayout:
     def image_format(self, preprocessing: ImageFormatChoice, custom: ImageFormat) -> ImageFormat:
         """Return the image format of the network, and log it if it is not the custom format."""
         network = self.names.network
-        if network in (NetworkAuthor.MMDEPLOY, NetworkAuthor.UNKNOWN) and preprocessing is ImageFormatChoice.AUTO:
-            log.warning(
-                "detector.preprocessing: expected a network with a known image format, got %s; set detector.placement, "
-                "detector.bgr, detector.black_level and detector.white_level to the format of its training, and "
-                "detector.preprocessing=CUSTOM to confirm",
-                network.value if network is NetworkAuthor.MMDEPLOY else "unknown outputs",
-            )
+        if network in (NetworkAuthor.MMDEPLOY, NetworkAuthor.UNKNOWN):
+            warn_of_format(network.value, preprocessing)
         return choose_format(network.value, FORMATS.get(network), preprocessing, custom)
 
     def candidates(self, outputs: Outputs) -> Candidates:
@@ -296,7 +298,7 @@ def _recognize_names(outputs: Outputs, integers: Collection[str]) -> OutputNames
         network = NetworkAuthor.YOLO
     elif any(array.shape[-1] == 5 for name, array in outputs.items() if base_name(name) == "dets"):
         network = NetworkAuthor.MMDEPLOY
-    elif sizes or names >= {"pred_boxes", "pred_classes"}:
+    elif sizes or (names >= {"pred_boxes", "pred_classes", "scores"} and outputs[boxes[0]].ndim == 2):
         network = NetworkAuthor.DETECTRON2
     elif names >= {"boxes", "labels", "scores"} and len(outputs) == len(arrays) and outputs[boxes[0]].ndim == 2:
         network = NetworkAuthor.TORCHVISION  # others, such as RT-DETR, have a batch, or a number of detections

@@ -21,6 +21,8 @@ from framework.detection.candidates import (
 from framework.detection.masks.letterbox import ImageFormat, Placement
 from framework.errors import DataError
 
+ROW_NAMES = {"multiclass_nms": OutputLayout.label_first, "flat_predictions": OutputLayout.yolo_nas}
+"""Layouts by a part of the output's name, for networks without detections in a black image."""
 MAX_OFFSET = 16  # cells, limit of the offsets and log sizes of a YOLOX; decoded boxes are in px
 ROW_FORMATS: Mapping[OutputLayout, ImageFormat] = {
     OutputLayout.end_to_end: YOLO_FORMAT,
@@ -72,8 +74,14 @@ def recognize_table(
         return OutputLayout.yolo_objectness, YOLO_FORMAT  # YOLOv5 and YOLOv7 have three boxes per cell
     if count == 4 + classes:
         return OutputLayout.yolo, YOLO_FORMAT
-    rows = _recognize_rows(table, outputs)
-    if rows is None and columns == 4 + classes and not any(count in (number, 3 * number) for number in cells):
+    if columns == 4 + classes and count in cells:  # or a YOLOX with one class less
+        raise DataError(
+            f"detector.layout: expected {5 + classes} columns for a YOLOX with {classes} classes, got "
+            f"{described(outputs)}; set another detector.label_space, or for the layout of Ultralytics "
+            "detector.layout=yolo detector.placement=center detector.bgr=false detector.white_level=1"
+        )
+    rows = _recognize_rows(table, outputs, batched=output.ndim == 3)
+    if rows is None and columns == 4 + classes and count not in [3 * number for number in cells]:
         unit = np.abs(table[:, :4]).max(initial=0) <= LARGEST_UNIT  # as in RT-DETR, whose images are stretched
         return OutputLayout.yolo, replace(YOLO_FORMAT, placement=Placement.stretch) if unit else YOLO_FORMAT
     return rows or (OutputLayout.yolox, None)
@@ -87,22 +95,25 @@ def _with_objectness(table: Float32) -> tuple[OutputLayout, ImageFormat | None]:
     return OutputLayout.yolo_objectness, YOLO_FORMAT if is_constant else None
 
 
-def _recognize_rows(table: Float32, outputs: Mapping[str, Float32]) -> tuple[OutputLayout, ImageFormat | None] | None:
+def _recognize_rows(
+    table: Float32, outputs: Mapping[str, Float32], batched: bool
+) -> tuple[OutputLayout, ImageFormat | None] | None:
     """Recognize a table with one detection per row; None = no such table."""
-    same_count = [layout for layout, columns in ROW_COLUMNS.items() if columns.count == table.shape[1]]
+    # tables with the index of the image have no batch, except those of EfficientDet
+    other = {OutputLayout.image_first, OutputLayout.yolo_nas} if batched else {OutputLayout.efficientdet}
+    counts = {layout: columns.count for layout, columns in ROW_COLUMNS.items() if layout not in other}
+    same_count = [layout for layout, count in counts.items() if count == table.shape[1]]
     fitting = [layout for layout in same_count if _are_rows(table, ROW_COLUMNS[layout])]
     if not fitting:
         return None
     if len(table) and OutputLayout.end_to_end in fitting:
         fitting = [OutputLayout.end_to_end]  # rows of zeros are padding, which only these networks have
-    elif any("multiclass_nms" in name for name in outputs) and OutputLayout.label_first in fitting:
-        fitting = [OutputLayout.label_first]
-    elif not len(table) and OutputLayout.image_first in fitting:
-        fitting = [OutputLayout.image_first]  # EfficientDet has a constant number of rows
+    elif named := [layout for part, layout in ROW_NAMES.items() if any(part in name for name in outputs)]:
+        fitting = [layout for layout in fitting if layout in named] or fitting
     if len(fitting) > 1:
         fixes = " or ".join(f"detector.layout={layout.value}" for layout in fitting)
         raise DataError(f"detector.layout: expected detections in a black image, got {described(outputs)}; set {fixes}")
-    return fitting[0], ROW_FORMATS[fitting[0]]
+    return fitting[0], ROW_FORMATS.get(fitting[0])
 
 
 def _are_rows(table: Float32, columns: RowColumns) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 from framework.config.validation import MAX_DETECTIONS, check_count, check_intervals
 from framework.data import Bool, Detections, Frame
 from framework.detection.candidates import (
+    ROW_COLUMNS,
     Candidates,
     OutputLayout,
     decode,
@@ -18,7 +19,7 @@ from framework.detection.candidates import (
 )
 from framework.detection.instance_output import recognize_instances
 from framework.detection.masks.binary_masks import without_duplicates
-from framework.detection.masks.letterbox import ImageFormatChoice, Placement, choose_format
+from framework.detection.masks.letterbox import ImageFormatChoice, Placement, choose_format, warn_of_format
 from framework.detection.masks.masks_from_boxes import masks_in_boxes
 from framework.detection.runtimes.onnx_network import ImageNetwork, Outputs
 from framework.detection.table_output import recognize_table
@@ -121,6 +122,8 @@ class OnnxBoxes(Detector):
                 network.format = instances.image_format(self.preprocessing, network.format)
                 return instances.candidates_of_boxes
             layout, known = recognize_table(outputs, network.shape, len(self._labels))
+            if known is None and layout in ROW_COLUMNS:
+                warn_of_format(layout.value, self.preprocessing)
             network.format = choose_format(layout.value, known, self.preprocessing, network.format)
         network.check_names(self._labels, self.label_space)
         ids = label_numbers(layout, outputs, self._labels, self.category_ids)

@@ -113,6 +113,17 @@ def choose_format(
     return known
 
 
+def warn_of_format(network: str, choice: ImageFormatChoice) -> None:
+    """Log a warning that the image format of a network is unknown, unless the custom format is chosen."""
+    if choice is ImageFormatChoice.AUTO:
+        log.warning(
+            "detector.preprocessing: expected a network with a known image format, got %s; set detector.placement, "
+            "detector.bgr, detector.black_level and detector.white_level to the format of its training, and "
+            "detector.preprocessing=CUSTOM to confirm",
+            network,
+        )
+
+
 def _level(level: Level) -> str:
     return f"{level:g}" if isinstance(level, float) else " ".join(f"{one:.3f}" for one in level)
 

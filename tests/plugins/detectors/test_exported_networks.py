@@ -262,7 +262,8 @@ BOX_EXPORTS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
     "efficientdet": ((1, 480, 640, 3), rows(62, *SIDES, "efficientdet"), {"element": TensorProto.UINT8}),
     "yolov5": (YOLO, {"output0": cells(56, *SIDES, "objectness classes", 3)}, {}),
     "yolov6": (YOLO, {"outputs": cells(56, *SIDES, "ones classes")}, {}),
-    "yolov7_end2end": (YOLO, rows(56, *SIDES, "yolov7"), {"dynamic": True, "empty": True}),
+    "yolov7_end2end": (YOLO, rows(56, *SIDES, "yolov7"), {}),
+    "yolo_nas": (YOLO, rows(56, *SIDES, "yolo_nas"), {"dynamic": True, "empty": True}),
     "yolov8": (YOLO, {"output0": swapped(cells(56, *SIDES, "classes"))}, {}),
     "yolov9_end2end": (YOLO, end2end(56, *SIDES), {}),
     "yolox_decoded": (YOLO, {"output": cells(56, *SIDES, "objectness classes")}, {}),
@@ -317,6 +318,18 @@ def test_onnx_boxes_common_export_gets_its_image_format(
     assert (found.placement, found.bgr, found.white) == (placement, bgr, white)
 
 
+@pytest.mark.parametrize("export_name", ["mmdeploy", "yolo_nas"])
+def test_onnx_boxes_unknown_image_format_warns(
+    tmp_path: Path, export_name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    shape, outputs, how = BOX_EXPORTS[export_name]
+    weights = export(tmp_path / "n.onnx", shape, outputs, **how)
+    OnnxBoxes(weights=weights, device="cpu", preprocessing=ImageFormatChoice.CUSTOM)
+    assert "known image format" not in caplog.text
+    OnnxBoxes(weights=weights, device="cpu")
+    assert "detector.preprocessing: expected a network with a known image format" in caplog.text
+
+
 def queries() -> dict[str, np.ndarray[Any, Any]]:
     found = rf_detr(56, columns=81, queries=100)
     return {"class_queries_logits": found["labels"], "masks_queries_logits": found["masks"]}
@@ -329,8 +342,11 @@ def queries() -> dict[str, np.ndarray[Any, Any]]:
         ({"boxes": batched()["boxes"], "scores": np.zeros((1, 5, 80))}, r"set detector\.layout=ssd_torchvision if"),
         (queries(), r"set detector=onnx_segmentation for a network with masks"),
         ({"y": np.zeros((0, 6))}, r"set detector\.layout=end_to_end or detector\.layout=label_first"),
+        ({"y": np.zeros((0, 7))}, r"set detector\.layout=image_first or detector\.layout=yolo_nas"),
+        ({"Identity": cells(56, *SIDES, "classes")}, r"Ultralytics detector\.layout=yolo detector\.placement=center"),
+        (pair(cells(56, *SIDES, "classes")), r"set detector=onnx_segmentation for a network with masks"),
     ],
-    ids=["rt_detr_postprocessed", "yolo_nas", "mask2former", "unknown_rows"],
+    ids=["rt_detr_postprocessed", "yolo_nas", "mask2former", "rows", "rows_with_image", "yolov8_tf", "yolov8_seg"],
 )
 def test_onnx_boxes_uncertain_export_error_names_setting(tmp_path: Path, outputs: Any, message: str) -> None:
     with pytest.raises((ConfigError, DataError), match=message):

@@ -191,11 +191,13 @@ def detr(column: int, masks: bool = False) -> Outputs:
 
 
 def rows(label: int, height: int, width: int, layout: str) -> Outputs:
-    """Return one table with suppression: YOLOv7's, EfficientDet's or PaddleDetection's."""
+    """Return one table with suppression: YOLOv7's, YOLO-NAS', EfficientDet's or PaddleDetection's."""
     boxes, scores, labels = detections(label, height, width)
     image, score, number = np.zeros((20, 1)), scores[:, None], labels[:, None]
     if layout == "yolov7":
         return {"output": np.concatenate([image, boxes, number, score], axis=1)}
+    if layout == "yolo_nas":
+        return {"graph2_flat_predictions": np.concatenate([image, boxes, score, number], axis=1)}
     if layout == "efficientdet":
         return {"detections:0": np.concatenate([image, boxes[:, [1, 0, 3, 2]], score, number], axis=1)[None]}
     table = np.concatenate([number, score, boxes], axis=1)
