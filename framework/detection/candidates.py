@@ -16,10 +16,12 @@ from framework.data import Float32, Int32
 from framework.detection.masks.boxes import LARGEST_LOG_SCALE, suppress_boxes
 from framework.detection.masks.letterbox import ImageFormat, Placement
 from framework.errors import DataError
-from framework.vocabulary.category_ids import CategoryIds, label_ids
+from framework.vocabulary.category_ids import CategoryIds, column_ids, label_ids
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
 
 CONFIDENT = 0.5  # minimum score of detections that must have valid boxes and labels
+MIN_CANDIDATES = 20  # minimum number of candidates to find the column of the background
+MIN_BACKGROUND = 0.5  # minimum fraction of candidates without an object in a black image, typically above 0.9
 LARGEST_UNIT = 2.0  # boxes in 0..1 may slightly exceed the image; boxes in px are never all within 2 px of its corner
 YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows
 
@@ -122,13 +124,14 @@ def decode(
         outputs: The output arrays by name.
         shape: The size of the input (height, width), px.
         classes: The number of classes.
-        ids: The label of each class in label outputs; None = 1 to `classes`, or 0 to `classes` - 1 for a single table.
+        ids: The label of each class in label outputs, or its column in class scores; None = 1 to `classes`, or 0 to
+            `classes` - 1 for a single table.
 
     Raises:
         DataError: The outputs do not have this layout.
     """
     if layout in (OutputLayout.ssd_tensorflow, OutputLayout.ssd_torchvision, OutputLayout.ssd_unit):
-        return _decode_ssd(layout, outputs, shape, range(1, classes + 1) if ids is None else ids)
+        return _decode_ssd(layout, outputs, shape, classes, ids)
     output = single_table(outputs)
     if layout in ROW_COLUMNS:
         columns = ROW_COLUMNS[layout]
@@ -148,7 +151,9 @@ def decode(
 def label_numbers(
     layout: OutputLayout, outputs: Mapping[str, Float32], labels: Sequence[str], ids: CategoryIds
 ) -> list[int] | None:
-    """Return the label of each class in the label output of a network, or None for a network with class scores.
+    """Return the label of each class in the label output of a network, or its column in class scores of an SSD.
+
+    The result is None for other networks with class scores.
 
     Args:
         layout: The layout, except auto.
@@ -159,9 +164,14 @@ def label_numbers(
     Raises:
         ConfigError: The numbering is ambiguous, or does not match the labels.
     """
-    has_labels = layout in ROW_COLUMNS or (layout in PUBLISHED_IDS and not _by_class(_tables(outputs), len(labels)))
-    if has_labels:
+    by_class = _by_class(_tables(outputs), len(labels)) if layout not in ROW_COLUMNS else []
+    if layout in PUBLISHED_IDS and not by_class:
         return label_ids(ids, labels, PUBLISHED_IDS[layout])
+    if layout in PUBLISHED_IDS:
+        table = by_class[0]
+        if ids is CategoryIds.AUTO and table.shape[1] == len(labels) + 1:
+            ids = CategoryIds.FROM_ZERO if ends_with_background(table) else CategoryIds.FROM_ONE
+        return column_ids(ids, labels, table.shape[1])
     require(ids is CategoryIds.AUTO, "detector.category_ids", ids.name, "AUTO for a network without labels")
     return None
 
@@ -259,14 +269,17 @@ def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
 
 
 def _decode_ssd(
-    layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], ids: Sequence[int]
+    layout: OutputLayout,
+    outputs: Mapping[str, Float32],
+    shape: tuple[int, int],
+    classes: int,
+    ids: Sequence[int] | None,
 ) -> Candidates:
     """Decode the outputs of an SSD.
 
     The outputs are identified by name. TensorFlow's object detection API uses detection_boxes, detection_classes,
     detection_scores and detection_multiclass_scores. torchvision uses boxes, labels and scores.
     """
-    classes = len(ids)
     tables = _tables(outputs)
     boxes = [array for name, array in tables.items() if "box" in name and array.shape[1:] == (4,)]
     if len(boxes) == 1:
@@ -274,12 +287,12 @@ def _decode_ssd(
         scores = [t for name, t in tables.items() if "score" in name and t.ndim == 1]
         labels = [t for name, t in tables.items() if ("label" in name or "class" in name) and t.ndim == 1]
         if len(by_class) == 1:
-            columns = _columns(by_class[0].shape[1], classes)
+            columns = _columns(by_class[0].shape[1], classes) if ids is None else ids
             return _checked(_ssd_boxes(layout, boxes[0], shape), by_class[0][:, columns])
         if not by_class and len(scores) == len(labels) == 1:
-            return _checked(
-                _ssd_boxes(layout, boxes[0], shape), spread_evenly(class_scores_of_labels(scores[0], labels[0], ids))
-            )
+            numbers = range(1, classes + 1) if ids is None else ids
+            class_scores = class_scores_of_labels(scores[0], labels[0], numbers)
+            return _checked(_ssd_boxes(layout, boxes[0], shape), spread_evenly(class_scores))
     raise DataError(
         f"detector.layout: expected boxes (K, 4) with scores (K, {classes}) or (K, {classes + 1}), or boxes (K, 4) "
         f"with scores (K,) and labels (K,), for {layout.value}, got {described(outputs)}; choose another layout"
@@ -309,6 +322,13 @@ def _by_class(tables: Mapping[str, Float32], classes: int) -> list[Float32]:
     # the first of C + 1 class scores is the background; COCO's ids have 90 or, with the background, 91 columns
     widths = {classes, classes + 1} | ({len(COCO_BY_ID) - 1, len(COCO_BY_ID)} if classes == len(COCO) else set())
     return [t for name, t in tables.items() if "score" in name and t.ndim == 2 and t.shape[1] in widths]
+
+
+def ends_with_background(classes: Float32) -> bool:
+    """Return True if the last class column (K, C) is the background, by the outputs for a black image."""
+    if len(classes) < MIN_CANDIDATES:
+        return False
+    return bool((classes.argmax(axis=1) == classes.shape[1] - 1).mean() > MIN_BACKGROUND)
 
 
 def _columns(width: int, classes: int) -> list[int]:

@@ -33,6 +33,7 @@ from framework.detection.candidates import (
     class_scores_of_labels,
     corners,
     described,
+    ends_with_background,
     spread_evenly,
 )
 from framework.detection.masks.binary_masks import masks_from_grids, paste_masks
@@ -52,7 +53,6 @@ from framework.vocabulary.category_ids import CategoryIds, column_ids, label_ids
 
 LARGEST_GRID = 56  # cells, maximum side of a mask in a box; published networks have 14 to 56
 DOWNSAMPLING = (1, 2, 4, 8)  # px of the input per cell of a mask over the complete input
-MIN_NO_OBJECT = 0.5  # minimum fraction of queries without an object in a black image, typically above 0.9
 DETR_BOXES, DETR_LOGITS = ("dets", "pred_boxes"), ("logits", "pred_logits")  # names of outputs
 
 log = logging.getLogger(__name__)
@@ -250,7 +250,7 @@ def recognize_instances(
                 f"{names.boxes}; export without postprocessing"
             )
         columns = outputs[names.classes].shape[-1]
-        no_object = _has_no_object(_unbatched(outputs)[names.classes])
+        no_object = ends_with_background(_unbatched(outputs)[names.classes])
         ids = column_ids(category_ids, labels, columns - no_object)
         kind = BoxKind.CENTER if boxes is BoxKind.AUTO else boxes
         return InstanceLayout(names, shape, ids, kind, True, columns, no_object)
@@ -329,11 +329,6 @@ def _sigmoid(logits: Float32) -> Float32:
 def _softmax(logits: Float32) -> Float32:
     weights = np.exp(logits - logits.max(axis=1, keepdims=True))
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float32)
-
-
-def _has_no_object(classes: Float32) -> bool:
-    """Return True if the last class column (K, C) is "no object", by the outputs for a black image."""
-    return bool((classes.argmax(axis=1) == classes.shape[1] - 1).mean() > MIN_NO_OBJECT) if len(classes) else False
 
 
 def _in_unit(boxes: Float32) -> bool | None:

@@ -165,10 +165,10 @@ def column_ids(ids: CategoryIds, labels: Sequence[str], columns: int) -> list[in
         ConfigError: The numbering is AUTO, and the table has one more column than classes.
     """
     count, is_coco = len(labels), are_coco(labels)
-    numbering, shift = ids, 0
+    numbering = ids
     if ids is CategoryIds.AUTO:
         if is_coco and columns in (len(COCO_BY_ID) - 1, len(COCO_BY_ID)):
-            numbering, shift = CategoryIds.COCO_91, len(COCO_BY_ID) - columns
+            numbering = CategoryIds.COCO_91
         elif columns == count:
             numbering = CategoryIds.FROM_ZERO
         elif columns == count + 1:
@@ -176,12 +176,14 @@ def column_ids(ids: CategoryIds, labels: Sequence[str], columns: int) -> list[in
                 f"{KEY}: expected the numbering of {columns} class columns for {count} labels, got AUTO; set "
                 f"{KEY}=FROM_ONE (first column unused) or {KEY}=FROM_ZERO (last column unused)"
             )
+    shift = int(numbering is CategoryIds.COCO_91 and columns == len(COCO_BY_ID) - 1)  # no column for the id 0
     wanted = [k - shift for k in numbering.of(labels)] if numbering is not CategoryIds.AUTO else []
     if not wanted or max(wanted) >= columns:
         coco = f", or {len(COCO_BY_ID)}" if is_coco else ""
+        others = f", or {KEY} to another value than {ids.name}" if ids is not CategoryIds.AUTO else ""
         raise DataError(
-            f"detector.label_space: expected {count} or {count + 1}{coco} class columns, got {columns}; set another "
-            f"label_space, or {KEY}=FROM_ONE (first column unused) or {KEY}=FROM_ZERO"
+            f"detector.label_space: expected {count} or {count + 1}{coco} class columns, got {columns}; set "
+            f"detector.label_space to the classes of the network{others}"
         )
     example = _example(labels)
     log.info("%s: class columns read as %s, so column %d is %r", KEY, numbering.name, wanted[example], labels[example])

@@ -215,6 +215,19 @@ def test_onnx_boxes_ssd_class_columns_follow_their_number(tmp_path: Path, column
     assert the_object(detector)[0] == "chair"
 
 
+@pytest.mark.parametrize("ids", [CategoryIds.AUTO, None])
+@pytest.mark.parametrize("last", [False, True])
+def test_onnx_boxes_background_column_is_first_or_last(tmp_path: Path, last: bool, ids: CategoryIds | None) -> None:
+    scores = np.full((1, 40, 81), 0.001)
+    scores[..., 80 if last else 0] = 0.9
+    scores[0, 0, 56 if last else 57], scores[0, 0, 80 if last else 0] = 0.9, 0.01
+    boxes = np.tile(np.array(BOX) * [320, 240, 320, 240], (1, 40, 1))
+    weights = constant_network(tmp_path / "n.onnx", (1, 3, 240, 320), {"boxes": boxes, "scores": scores})
+    given = ids or (CategoryIds.FROM_ZERO if last else CategoryIds.FROM_ONE)
+    detector = OnnxBoxes(weights=weights, device="cpu", layout=OutputLayout.ssd_torchvision, category_ids=given)
+    assert the_object(detector)[0] == "chair"
+
+
 @pytest.mark.parametrize(
     ("label", "fix"), [(12, "FROM_ONE"), (26, "FROM_ONE"), (45, "FROM_ONE"), (83, "FROM_ONE"), (0, "FROM_ZERO")]
 )
