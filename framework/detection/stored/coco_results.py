@@ -65,7 +65,7 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
         with errors_of(where):
             found.append(_read_entry(where, entry, index, names))
             if isinstance(image := found[-1].image, ImageName):
-                path_of_image = PureWindowsPath(_image_of(entry))
+                path_of_image = PureWindowsPath(str(_image_of(entry)))
                 if (other := folders.setdefault(image.stem, path_of_image.parent)) != path_of_image.parent:
                     raise DataError(
                         f"{path_of_image.as_posix()}: expected one image {image.stem}, got another image in "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from pathlib import PureWindowsPath
@@ -9,8 +10,10 @@ from pathlib import PureWindowsPath
 from framework.errors import DataError
 
 MAX_DIGITS = 20  # maximum length of a frame number; times in ns have 19 digits
+EARLIEST_TIME = 1e8  # s since 1970, minimum timestamp
 DIGITS = "0123456789"
-EXPORTED = re.compile(r"_(jpe?g|png)\.rf\.\w+$", re.IGNORECASE)  # end of the names of Roboflow's exports
+# end of a name before the suffix: that of Roboflow's exports, or the suffix of the color image, as in 000012.jpg.png
+EXPORTED = re.compile(r"(_(jpe?g|png)\.rf\.\w+|\.(jpe?g|png))$", re.IGNORECASE)
 NUMBERED = re.compile(r"\D*|.*[a-zA-Z].*[_-]")  # start of a name with a number, such as cam0_; not of a timestamp
 COLOR_ENDING = ".color"  # end of the names of color images in 7-Scenes and ScanNet, before the suffix
 
@@ -57,6 +60,8 @@ def read_image_id(found: object) -> ImageId:
     """
     if isinstance(found, float) and found.is_integer():
         found = int(found)
+    if isinstance(found, float) and EARLIEST_TIME < found < math.inf:
+        found = f"{found:.6f}"  # as in TUM's file names
     if type(found) is int and 0 <= found < 10**MAX_DIGITS:
         return found
     name = ImageName.of(found) if isinstance(found, str) else None

@@ -54,6 +54,8 @@ SEVEN_SCENES = frames_named("frame-{:06d}.color.png", range(14))
         (SCANS, "scene0000_00_00030.png", 3),
         (SCANS, "D:\\scans\\00030.jpg", 3),
         (GAPS, "000004_jpg.rf.0b1f54e2a7.jpg", 2),  # as Roboflow renames images
+        (GAPS, "000004.jpg.png", 2),
+        (STAMPS, 1305031102.208304, 1),
         (FROM_ONE, 3.0, 3),  # as pandas writes whole numbers
     ],
 )
