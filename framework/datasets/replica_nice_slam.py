@@ -52,8 +52,9 @@ class ReplicaNiceSlam(Recording):
     def _own_camera(self) -> OwnCamera:
         """Return the camera of the scene, or of all scenes if the folder of the scene has no file with a camera."""
         parent = self.folder.absolute().parent  # not resolved: the scene may be a symbolic link
-        path = next((one for one in (self.folder / PARAMETERS, parent / PARAMETERS) if one.is_file()), None)
         color = sorted(self.folder.glob("results/*.jpg"))
+        folders = [self.folder, parent] if color else [parent]
+        path = next((folder / PARAMETERS for folder in folders if (folder / PARAMETERS).is_file()), None)
         if color and (path is None or path.parent == parent):
             own = own_camera(self.name, self.folder, color, DEPTH_SCALE)
             if own is not None:
