@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from framework.checking import Finding, Verdict
 from framework.checking.matched_pairs import MatchedPair
@@ -149,9 +150,16 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     if reading == given and now <= MAX_RELATIVE_ERROR * motion and chosen.depth_factor == 1.0:
         return PoseJudgment((Finding(Verdict.FINE, "poses", f"valid: {measured}"),), as_given, as_given, others)
     mirrored = _mirrored_fit(informative, given)
+    angle, turned = _rotated_images(informative, given)
+    if turned < min(MAX_MIRRORED_RATIO * min(chosen.error, mirrored.error), MAX_RELATIVE_ERROR * motion):
+        text = (
+            f"images are rotated by {angle} degrees relative to the poses: {measured}, and {turned:.1f} px without the "
+            f"rotation; rotate color and depth by {360 - angle} degrees clockwise to use the poses"
+        )
+        return PoseJudgment((Finding(Verdict.ERROR, "poses", text, UNPOSED),), as_given, best, others)
     # a mirrored rotation is a rotation with other axes, so translations decide
     if mirrored.error < min(MAX_MIRRORED_RATIO * chosen.error, MAX_RELATIVE_ERROR * motion):
-        text = f"mirrored (a left-handed world): {measured}, and {mirrored.error:.1f} px without the mirroring"
+        text = f"mirrored (a left-handed world, or mirrored images): {measured}, and {mirrored.error:.1f} px without the mirroring"
         finding = Finding(Verdict.ERROR, "poses", text, " ".join(_settings(mirrored.reading, given)))
         return PoseJudgment((finding,), as_given, mirrored, others)
     if chosen.error > MAX_RELATIVE_ERROR * motion:
@@ -177,6 +185,19 @@ def _mirrored_fit(pairs: Sequence[MatchedPair], given: PoseReading) -> PoseFit:
     """Return the best fit of a mirrored convention."""
     fits = [fit(pairs, reading, 1.0) for reading in mirrored_readings(given.pose_unit)]
     return min(_equal_to_best(fits), key=lambda one: (len(_settings(one.reading, given)), one.error))
+
+
+def _rotated_images(pairs: Sequence[MatchedPair], given: PoseReading) -> tuple[int, float]:
+    """Return the clockwise rotation of the images that fits the poses best, degrees, and its median error, px."""
+    errors = {}
+    for angle, kind, axes in product((90, 180, 270), PoseKind, CameraAxes):
+        R = np.eye(4)
+        R[:3, :3] = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+        reading = PoseReading(kind, axes, given.quaternion_order, given.pose_unit)
+        rotated = [error_of(pair, R @ motion_of(pair, reading) @ R.T, 1.0) for pair in pairs]
+        errors[angle] = min(float(np.median(rotated)), errors.get(angle, np.inf))
+    best = min(errors, key=lambda angle: errors[angle])
+    return best, errors[best]
 
 
 def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> PoseFit:

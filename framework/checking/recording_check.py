@@ -11,6 +11,7 @@ import numpy as np
 
 from framework.checking import Finding, Verdict, pose_fit, registration
 from framework.checking.color_timing import check_color_delay
+from framework.checking.depth_kind import check_depth_kind
 from framework.checking.depth_normalization import check_normalization
 from framework.checking.frame_times import check_times
 from framework.checking.image_geometry import check_orientation, check_principal_point
@@ -100,6 +101,9 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     if late:
         matcher = Matcher(DelayedDepth(sequence, late))
     pairs = list(matcher.pairs(starts))
+    kind = check_depth_kind(pairs)
+    if kind is not None and not any(cause.subject == "depth" for cause in causes):
+        causes.append(kind)
     posed = [pair for pair in pairs if _is_posed(pair)]
     if any(frame.T_world_camera is not None for frame in frames):
         judgment, pose_delay = _judge_poses(sequence, posed, given, median_depth)
