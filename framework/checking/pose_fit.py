@@ -159,7 +159,10 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
         return PoseJudgment((Finding(Verdict.ERROR, "poses", text, UNPOSED),), as_given, best, others)
     # a mirrored rotation is a rotation with other axes, so translations decide
     if mirrored.error < min(MAX_MIRRORED_RATIO * chosen.error, MAX_RELATIVE_ERROR * motion):
-        text = f"mirrored (a left-handed world, or mirrored images): {measured}, and {mirrored.error:.1f} px without the mirroring"
+        text = (
+            f"mirrored (a left-handed world, or mirrored images): {measured}, and {mirrored.error:.1f} px without the "
+            "mirroring"
+        )
         finding = Finding(Verdict.ERROR, "poses", text, " ".join(_settings(mirrored.reading, given)))
         return PoseJudgment((finding,), as_given, mirrored, others)
     if chosen.error > MAX_RELATIVE_ERROR * motion:

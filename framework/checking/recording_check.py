@@ -228,14 +228,19 @@ def _stored_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
     return [recorded.T_world_camera for recorded in sequence.contents.frames] if isinstance(sequence, Recording) else []
 
 
-def warn_of_images(sequence: RGBDVideo) -> None:
-    """Log a warning if the camera, the orientation of color images or the unit of depth of a few frames is wrong."""
+def warn_of_images(sequence: RGBDVideo) -> bool:
+    """Log a warning if the camera, the orientation of color images or the unit of depth of a few frames is wrong.
+
+    Returns:
+        True if a warning was logged. Poses then do not fit as a consequence.
+    """
     if not isinstance(sequence, Recording):
-        return
+        return False
     chosen = [int(k) for k in np.unique([int(fraction * len(sequence)) for fraction in QUICK_STARTS])]
-    for finding in _image_findings(sequence, chosen):
-        if finding.verdict is Verdict.ERROR:
-            log.warning("%s: %s; run `instancemap check` for details", finding.subject, finding.text)
+    errors = [finding for finding in _image_findings(sequence, chosen) if finding.verdict is Verdict.ERROR]
+    for finding in errors:
+        log.warning("%s: %s; run `instancemap check` for details", finding.subject, finding.text)
+    return bool(errors)
 
 
 def _image_findings(sequence: RGBDSequence, chosen: Sequence[int]) -> list[Finding]:

@@ -240,8 +240,8 @@ def write_run(
     if isinstance(video, Recording):  # third-party datasets may have another class
         from framework.checking.recording_check import warn_of_images, warn_of_poses
 
-        warn_of_images(video)
-        warn_of_poses(video)
+        if not warn_of_images(video):
+            warn_of_poses(video)
     with signals_deferred(*ENDING) as interruption, watched_run(pipeline.viewer, directory, record.config) as outcome:
         with frozen_garbage_collector():
             result = pipeline.run_to_any_end(video, directory)
