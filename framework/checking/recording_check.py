@@ -14,7 +14,7 @@ from framework.checking.color_timing import check_color_delay
 from framework.checking.depth_kind import check_depth_kind
 from framework.checking.depth_normalization import check_normalization
 from framework.checking.frame_times import check_times
-from framework.checking.image_geometry import check_orientation, check_principal_point
+from framework.checking.image_geometry import check_camera, check_orientation
 from framework.checking.matched_pairs import MatchedPair, Matcher
 from framework.checking.pose_delay import delayed, find_delay
 from framework.checking.pose_fit import PLAUSIBLE, UNPOSED, USUAL_SCALES, PoseJudgment
@@ -101,9 +101,9 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     if late:
         matcher = Matcher(DelayedDepth(sequence, late))
     pairs = list(matcher.pairs(starts))
-    kind = check_depth_kind(pairs)
-    if kind is not None and not any(cause.subject == "depth" for cause in causes):
-        causes.append(kind)
+    if not any(cause.verdict is Verdict.ERROR for cause in causes):
+        cause = check_depth_kind(pairs) or check_camera(sequence.camera, pairs)
+        causes += [cause] if cause is not None else []
     posed = [pair for pair in pairs if _is_posed(pair)]
     if any(frame.T_world_camera is not None for frame in frames):
         judgment, pose_delay = _judge_poses(sequence, posed, given, median_depth)
@@ -120,8 +120,6 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     motion_finding = _check_motion(steps, len(neighbors), sequence.camera.width)
     of_poses = [left_handed] if left_handed and not _has_error(judgment) else judgment.findings
     of_pairs = [*of_poses, registration_finding, check_color_delay(matcher)]
-    if any(one.subject == "poses" and one.verdict is Verdict.FINE for one in of_pairs if judgment.given):
-        causes = [replace(cause, verdict=Verdict.NOTE) if cause.subject == "camera" else cause for cause in causes]
     if any(cause.verdict is Verdict.ERROR for cause in causes):
         of_pairs = []  # the results of frame pairs are consequences
         if any(cause.subject == "depth" for cause in causes):
@@ -237,7 +235,8 @@ def warn_of_images(sequence: RGBDVideo) -> bool:
     if not isinstance(sequence, Recording):
         return False
     chosen = [int(k) for k in np.unique([int(fraction * len(sequence)) for fraction in QUICK_STARTS])]
-    errors = [finding for finding in _image_findings(sequence, chosen) if finding.verdict is Verdict.ERROR]
+    found = [*_image_findings(sequence, chosen), check_camera(sequence.camera)]
+    errors = [finding for finding in found if finding is not None and finding.verdict is Verdict.ERROR]
     for finding in errors:
         log.warning("%s: %s; run `instancemap check` for details", finding.subject, finding.text)
     return bool(errors)
@@ -245,11 +244,7 @@ def warn_of_images(sequence: RGBDVideo) -> bool:
 
 def _image_findings(sequence: RGBDSequence, chosen: Sequence[int]) -> list[Finding]:
     """Return the results for the camera, the color images and the depth images that explain other errors."""
-    found = (
-        check_principal_point(sequence.camera),
-        check_orientation(sequence, chosen),
-        check_normalization(sequence, chosen),
-    )
+    found = (check_orientation(sequence, chosen), check_normalization(sequence, chosen))
     return [finding for finding in found if finding is not None]
 
 

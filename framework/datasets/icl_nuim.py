@@ -48,6 +48,9 @@ class IclNuim(Recording):
         files = sorted(path for path in self.folder.iterdir() if path.name.endswith(POSES))
         if len(files) != 1:
             expected = f"expected one file with poses, such as livingRoom0{POSES}"
+            if any(self.folder.glob("*.depth")):
+                found = "got depth as text (.depth); download the TUM RGB-D compatible PNGs of this trajectory"
+                raise DataError(f"{self.folder}: {expected}, {found}")
             raise DataError(f"{self.folder}: {expected}, got {len(files)}; set dataset.scene to a sequence")
         lines = {int(line.timestamp): line for line in read_tum_lines(files[0])}
         images = paired_images(*(numbered_images(self.folder / name, (".png",)) for name in ("rgb", "depth")))
