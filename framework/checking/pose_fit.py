@@ -29,6 +29,7 @@ MIN_LOG_UNCERTAINTY = 0.07
 # maximum ratio of the errors with the estimated and the stored scale, for a clearly wrong scale
 MAX_ERROR_INCREASE = 1.3
 WRONG_SCALE = 2.5  # minimum factor of a clearly wrong scale; during rotation, the scale is uncertain by up to 1.6
+UNIT_FACTORS = (1000.0, 100.0)  # depth factors for poses in mm and cm, which slow rotations do not determine
 USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
 UNPOSED = "tracker=voxel_hashing_icp"  # setting for recordings with unusable poses
 PLAUSIBLE = (0.2, 12.0)  # m, plausible median depth of a room
@@ -141,6 +142,7 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     as_given = fit(informative, given, 1.0)
     others = tuple(fit(informative, reading, 1.0) for reading in readings(given.pose_unit))
     scaled = [fit(informative, reading) for reading in (given, *readings(given.pose_unit))]
+    scaled += [fit(informative, given, factor) for factor in UNIT_FACTORS]
     alike = _equal_to_best((as_given, *others, *scaled))
     best = min(alike, key=lambda one: (len(_settings(one.reading, given)), one.error))
     now = as_given.error
@@ -209,6 +211,7 @@ def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> Po
     If an estimated scale has a clearly smaller error, return the fit with the estimated scale.
     """
     as_stored, scaled = fit(pairs, reading, 1.0), fit(pairs, reading)
+    scaled = min((scaled, *(fit(pairs, reading, factor) for factor in UNIT_FACTORS)), key=lambda one: one.error)
     far = not 1 / WRONG_SCALE < scaled.depth_factor < WRONG_SCALE
     needed = MAX_ERROR_INCREASE if far else MAX_OTHER_RATIO
     return scaled if scaled.error < needed * as_stored.error else as_stored

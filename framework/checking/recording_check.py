@@ -20,6 +20,7 @@ from framework.checking.pose_delay import delayed, find_delay
 from framework.checking.pose_fit import PLAUSIBLE, UNPOSED, USUAL_SCALES, PoseJudgment
 from framework.checking.pose_jumps import find_jumps
 from framework.checking.registration import EdgeAlignment, EdgeComparison, color_gradient
+from framework.checking.repeated_images import check_repeats
 from framework.data import Camera, Float64, Frame
 from framework.datasets.frames.conventions import MIRRORED_POSE, OF_MATRICES, Mirror, PoseReading
 from framework.datasets.frames.sequence_reader import Recording
@@ -94,7 +95,10 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     matcher = Matcher(sequence)
     starts = sorted({min(k, max(count - 2, 0)) for k in chosen})
     neighbors = [matcher.pair(k, 1) for k in starts if k + 1 < count]
-    steps = np.array([pair.motion for pair in neighbors if pair is not None]) / sequence.camera.width
+    matched = [pair for pair in neighbors if pair is not None]
+    if (repeats := check_repeats(matched)) is not None:
+        causes.append(repeats)
+    steps = np.array([pair.motion for pair in matched]) / sequence.camera.width
     by_zoom = edges.alignments((best, zoom) for zoom in registration.ZOOMS)
     step = float(np.median(steps)) if len(steps) else 0.0
     registration_finding, late = registration.judge(by_delay, by_zoom, depth_delay, step)
