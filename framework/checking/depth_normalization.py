@@ -1,4 +1,4 @@
-"""Detection of depth images that are constant or were scaled frame by frame.
+"""Detection of depth images that are constant, rounded, or scaled frame by frame.
 
 Programs for display, and networks for relative depth, map the nearest and farthest readings of each image to the limits
 of the pixel type. Such values are no distances: their unit differs from frame to frame.
@@ -20,6 +20,7 @@ from framework.interfaces import RGBDSequence
 MIN_FRAMES = 3  # minimum number of readable depth images
 MIN_FRACTION = 0.9  # minimum fraction of frames with the same largest value
 MIN_FULL_FRACTION = 0.25  # minimum fraction of frames that use the full range of the pixel type
+MIN_VALUES = 32  # minimum number of different values in an image; depth in m or dm as integers has fewer
 TYPE_LIMITS = (1.0, 255, 255 * 256, 255 * 257, 65535)  # largest values of normalized images of floats, 8 or 16 bits
 # maximum fraction of readings at the largest value; clipped images have more, at least in some frames
 MAX_AT_LIMIT = 0.03
@@ -32,6 +33,7 @@ class _Range:
     """Range of the values in a depth image."""
 
     largest: float
+    count: int  # number of different values
     nearest: float  # ratio of the smallest value to the largest value; 1 = a constant image
     step: float  # relative step from the second-largest to the largest value
     at_limit: float  # fraction of readings with the largest value
@@ -43,7 +45,7 @@ class _Range:
         if not len(values):
             return None
         first, second, largest = float(values[0]), float(values[-min(2, len(values))]), float(values[-1])
-        return cls(largest, first / largest, 1 - second / largest, float(counts[-1] / counts.sum()))
+        return cls(largest, len(values), first / largest, 1 - second / largest, float(counts[-1] / counts.sum()))
 
     @property
     def is_full(self) -> bool:
@@ -75,6 +77,10 @@ def check_normalization(sequence: RGBDSequence, chosen: Sequence[int]) -> Findin
             found.append(one)
     if len(found) < MIN_FRAMES:
         return None
+    count = int(np.median([one.count for one in found]))
+    if 1 < count < MIN_VALUES:
+        text = f"rounded to {count} different values per image; export depth again, for example as uint16 in mm"
+        return Finding(Verdict.ERROR, "depth", text)
     if all(one.nearest == 1 for one in found):
         text = (
             f"constant: all readings of an image are equal in {len(found)} of {len(found)} images; export depth again"

@@ -30,7 +30,17 @@ MIN_LOG_UNCERTAINTY = 0.07
 MAX_ERROR_INCREASE = 1.3
 WRONG_SCALE = 2.5  # minimum factor of a clearly wrong scale; during rotation, the scale is uncertain by up to 1.6
 UNIT_FACTORS = (1000.0, 100.0)  # depth factors for poses in mm and cm, which slow rotations do not determine
-USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
+USUAL_SCALES = (
+    1000.0,
+    5000.0,
+    10_000.0,
+    4000.0,
+    1.0,
+    100.0,
+    2000.0,
+    256.0,
+    6553.5,
+)  # per m, common ones first
 UNPOSED = "tracker=voxel_hashing_icp"  # setting for recordings with unusable poses
 PLAUSIBLE = (0.2, 12.0)  # m, plausible median depth of a room
 
@@ -142,12 +152,14 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     as_given = fit(informative, given, 1.0)
     others = tuple(fit(informative, reading, 1.0) for reading in readings(given.pose_unit))
     scaled = [fit(informative, reading) for reading in (given, *readings(given.pose_unit))]
-    scaled += [fit(informative, given, factor) for factor in UNIT_FACTORS]
+    factors = _usual_factors(depth_scale, median_depth)
+    if min(one.error for one in (*others, *scaled)) > MAX_RELATIVE_ERROR * motion:
+        scaled += [fit(informative, given, factor) for factor in factors]
     alike = _equal_to_best((as_given, *others, *scaled))
     best = min(alike, key=lambda one: (len(_settings(one.reading, given)), one.error))
     now = as_given.error
     reading = best.reading if now > MAX_RELATIVE_ERROR * motion and best.error < MAX_OTHER_RATIO * now else given
-    chosen = _with_plain_factor(informative, reading)
+    chosen = _with_plain_factor(informative, reading, factors, MAX_RELATIVE_ERROR * motion)
     measured = f"median error of {now:.1f} px in {len(informative)} pairs of frames with a motion of {motion:.0f} px"
     if reading == given and now <= MAX_RELATIVE_ERROR * motion and chosen.depth_factor == 1.0:
         return PoseJudgment((Finding(Verdict.FINE, "poses", f"valid: {measured}"),), as_given, as_given, others)
@@ -205,16 +217,31 @@ def _rotated_images(pairs: Sequence[MatchedPair], given: PoseReading) -> tuple[i
     return best, errors[best]
 
 
-def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> PoseFit:
+def _with_plain_factor(
+    pairs: Sequence[MatchedPair], reading: PoseReading, factors: Sequence[float], limit: float
+) -> PoseFit:
     """Return the fit with the stored depth scale.
 
-    If an estimated scale has a clearly smaller error, return the fit with the estimated scale.
+    If an estimated scale has a clearly smaller error, return the fit with the estimated scale. If its error is above
+    `limit`, px, the usual depth factors are tried, too.
     """
     as_stored, scaled = fit(pairs, reading, 1.0), fit(pairs, reading)
-    scaled = min((scaled, *(fit(pairs, reading, factor) for factor in UNIT_FACTORS)), key=lambda one: one.error)
+    if scaled.error > limit:
+        scaled = min((scaled, *(fit(pairs, reading, factor) for factor in factors)), key=lambda one: one.error)
     far = not 1 / WRONG_SCALE < scaled.depth_factor < WRONG_SCALE
     needed = MAX_ERROR_INCREASE if far else MAX_OTHER_RATIO
     return scaled if scaled.error < needed * as_stored.error else as_stored
+
+
+def _usual_factors(depth_scale: float, median_depth: float) -> list[float]:
+    """Return the depth factors for poses in mm or cm, and for usual depth scales with a plausible depth.
+
+    They are more certain than an estimated factor if the camera mainly rotates.
+    """
+    low, high = PLAUSIBLE
+    factors = [depth_scale / usual for usual in USUAL_SCALES if usual != depth_scale]
+    plausible = [factor for factor in factors if low <= median_depth * factor <= high]
+    return [*plausible, *(UNIT_FACTORS if low <= median_depth <= high else ())]
 
 
 def _scale_finding(chosen: PoseFit, depth_scale: float, median_depth: float) -> Finding:
@@ -225,7 +252,7 @@ def _scale_finding(chosen: PoseFit, depth_scale: float, median_depth: float) -> 
         unit = chosen.reading.pose_unit * 10.0 ** round(np.log10(1 / factor))
         return Finding(Verdict.ERROR, "poses", text, f"dataset.pose_unit={unit:g}")
     scale = depth_scale / factor
-    fitting = [usual for usual in USUAL_SCALES if abs(np.log(usual / scale)) < np.log(chosen.factor_within)]
+    fitting = [usual for usual in USUAL_SCALES if abs(np.log(usual / scale)) < np.log(max(chosen.factor_within, 1.01))]
     setting = fitting[0] if fitting else float(f"{scale:.3g}")
     text = f"expected {scale:.3g} units per m according to the poses, got {depth_scale:g}"
     return Finding(Verdict.ERROR, "depth", text, f"dataset.depth_scale={setting:g}")
