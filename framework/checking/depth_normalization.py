@@ -41,7 +41,8 @@ class _Range:
     @classmethod
     def of(cls, raw: Array) -> _Range | None:
         """Return the range of the readings in a depth image, or None without readings."""
-        values, counts = np.unique(raw[np.isfinite(raw) & (raw > 0)], return_counts=True)
+        depth = np.asarray(raw, np.float64)
+        values, counts = np.unique(depth[np.isfinite(depth) & (depth > 0)], return_counts=True)
         if not len(values):
             return None
         first, second, largest = float(values[0]), float(values[-min(2, len(values))]), float(values[-1])

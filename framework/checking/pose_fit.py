@@ -206,7 +206,7 @@ def _mirrored_fit(pairs: Sequence[MatchedPair], given: PoseReading) -> PoseFit:
 
 def _rotated_images(pairs: Sequence[MatchedPair], given: PoseReading) -> tuple[int, float]:
     """Return the clockwise rotation of the images that fits the poses best, degrees, and its median error, px."""
-    errors = {}
+    errors: dict[int, float] = {}
     for angle, kind, axes in product((90, 180, 270), PoseKind, CameraAxes):
         R = np.eye(4)
         R[:3, :3] = Rotation.from_euler("z", angle, degrees=True).as_matrix()

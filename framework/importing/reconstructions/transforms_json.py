@@ -116,7 +116,7 @@ def _metric_depth(path: Path, units_per_meter: float | None) -> Float32:
     depth = read_depth(path)
     if depth.dtype == np.uint16:
         return meters(np.asarray(depth, np.uint16), units_per_meter or UNITS_PER_METER)
-    metric = readings(depth) / np.float32(units_per_meter or 1.0)
+    metric = readings(np.asarray(depth, np.float32)) / np.float32(units_per_meter or 1.0)
     if metric.any() and (median := float(np.median(metric[metric > 0]))) > FARTHEST:
         fix = f"write {DEPTH_UNITS[0]} (meters per unit), such as 0.001"
         raise FrameError(f"{path}: expected float depth in meters, got a median of {median:.6g}; {fix}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -186,6 +187,8 @@ def disparity(units: float) -> Callable[[np.ndarray], np.ndarray]:
         (disparity(1e7), "got inverse depth or disparities"),
         (lambda depth: np.full(depth.shape, 1500), "constant: all readings of an image are equal"),
         (lambda depth: np.where(depth > 0, 1, 0), "constant: all readings of an image are equal"),
+        (lambda depth: depth / 1000, "rounded to 3 different values per image"),
+        (lambda depth: depth / 100, "rounded to 2"),
     ],
 )
 def test_check_of_other_depth_names_it_alone(tmp_path: Path, change: Callable[..., np.ndarray], text: str) -> None:
@@ -217,6 +220,46 @@ def test_check_of_wrong_depth_scale_does_not_blame_poses(tmp_path: Path) -> None
     reading = DepthReading(depth_scale=5000.0)
     found = errors(check(RgbdFolder(place, stop=12, stride=2, depth_reading=reading), FARTHEST))
     assert [finding.setting for finding in found] == ["dataset.depth_scale=1000"]
+
+
+@pytest.mark.parametrize("unit", [0.001, 0.01])
+def test_check_of_poses_in_other_unit_names_setting(tmp_path: Path, unit: float) -> None:
+    """The camera mainly rotates, so the ratio of translations is uncertain."""
+    place = desk(tmp_path / "room", pose=lambda T: in_units(T, unit))
+    [finding] = errors(check(RgbdFolder(place), FARTHEST))
+    assert finding.setting == f"dataset.pose_unit={unit:g}"
+
+
+def in_units(T: Float64, unit: float) -> Float64:
+    scaled = T.copy()
+    scaled[:3, 3] /= unit
+    return scaled
+
+
+# Repeated images
+
+
+@pytest.mark.parametrize("folder", ["color", "depth"])
+@pytest.mark.parametrize("poses", [True, False])
+def test_check_of_repeated_images_names_them(tmp_path: Path, folder: str, poses: bool) -> None:
+    place = desk(tmp_path / "room", poses)
+    for k in range(1, FRAMES, 2):
+        shutil.copy(place / f"{folder}/{k - 1:06d}.png", place / f"{folder}/{k:06d}.png")
+    found = check(RgbdFolder(place), FARTHEST)
+    [finding] = [finding for finding in found.findings if finding.subject == "frames"]
+    assert f"{folder} images are repeated in" in finding.text
+    assert errors(found) == ([finding] if poses else [])
+
+
+def test_check_of_single_repeated_frame_is_uncertain(tmp_path: Path) -> None:
+    """One view does not show whether depth is registered."""
+    place = desk(tmp_path / "room", poses=False)
+    for folder in ("color", "depth"):
+        for k in range(1, FRAMES):
+            shutil.copy(place / f"{folder}/000000.png", place / f"{folder}/{k:06d}.png")
+    found = check(RgbdFolder(place), FARTHEST)
+    assert not errors(found)
+    assert any("are repeated in 11 of 11 pairs" in finding.text for finding in found.findings)
 
 
 # Timestamps
