@@ -18,11 +18,18 @@ from framework.checking.image_geometry import check_camera, check_orientation
 from framework.checking.matched_pairs import MatchedPair, Matcher
 from framework.checking.pose_delay import delayed, find_delay
 from framework.checking.pose_fit import PLAUSIBLE, UNPOSED, USUAL_SCALES, PoseJudgment
-from framework.checking.pose_jumps import find_jumps
+from framework.checking.pose_jumps import PoseJumps, find_jumps
 from framework.checking.registration import EdgeAlignment, EdgeComparison, color_gradient
 from framework.checking.repeated_images import check_repeats
 from framework.data import Camera, Float64, Frame
-from framework.datasets.frames.conventions import MIRRORED_POSE, OF_MATRICES, Mirror, PoseReading
+from framework.datasets.frames.conventions import (
+    LARGEST_POSE_UNIT,
+    LEAST_POSE_UNIT,
+    MIRRORED_POSE,
+    OF_MATRICES,
+    Mirror,
+    PoseReading,
+)
 from framework.datasets.frames.sequence_reader import Recording
 from framework.errors import DataError, FrameError
 from framework.interfaces import RGBDSequence, RGBDVideo
@@ -210,12 +217,27 @@ def _with_jumps(
     finding = jumps.finding()
     if finding is None:
         return judgment
-    if any(one.verdict is Verdict.ERROR for one in judgment.findings):  # may be an effect of the jumps
+    if _has_error(judgment):  # the cause of the jumps, or an effect
+        if _explains(judgment, jumps, matcher, given):
+            return judgment
         judged = pose_fit.judge(jumps.without(pairs), given, _scale_of(matcher.sequence), median_depth)
         if any(one.verdict is not Verdict.FINE for one in judged.findings):
             return judgment
         judgment = judged
     return replace(judgment, findings=(finding,))
+
+
+def _explains(judgment: PoseJudgment, jumps: PoseJumps, matcher: Matcher, given: PoseReading) -> bool:
+    """Return True if most jumps are absent with the best convention and scale of a judgment."""
+    if judgment.best is None:
+        return False
+    best = judgment.best.reading
+    unit = best.pose_unit / judgment.best.depth_factor  # has the effect of another depth scale
+    if not LEAST_POSE_UNIT <= unit <= LARGEST_POSE_UNIT or replace(best, pose_unit=unit) == given:
+        return False
+    corrected = replace(best, pose_unit=unit)
+    left = find_jumps(matcher, _chosen_poses(matcher.sequence), corrected)
+    return len(left.neighbors) + len(left.revisits) < (len(jumps.neighbors) + len(jumps.revisits)) / 2
 
 
 def _chosen_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
@@ -233,8 +255,7 @@ def _stored_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
 def warn_of_images(sequence: RGBDVideo) -> bool:
     """Log a warning if the camera, the orientation of color images or the unit of depth of a few frames is wrong.
 
-    Returns:
-        True if a warning was logged. Poses then do not fit as a consequence.
+    Return True after a warning.
     """
     if not isinstance(sequence, Recording):
         return False

@@ -167,7 +167,7 @@ def evaluated(
         The metrics, and the overlaps for ScanNet's metrics over several scenes; None = no label space.
     """
     coverage = TruthCoverage.of(predictions.points_world, aligned.points_world)
-    if not coverage.plausible:
+    if len(predictions.points_world) and len(aligned.points_world) and not coverage.plausible:
         log.warning(
             "ground truth: expected the world frame of the map, got only %s; check the ground truth, or transform it",
             coverage,

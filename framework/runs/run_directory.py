@@ -240,7 +240,7 @@ def write_run(
     if isinstance(video, Recording):  # third-party datasets may have another class
         from framework.checking.recording_check import warn_of_images, warn_of_poses
 
-        if not warn_of_images(video):
+        if not warn_of_images(video):  # otherwise, errors of the poses are consequences
             warn_of_poses(video)
     with signals_deferred(*ENDING) as interruption, watched_run(pipeline.viewer, directory, record.config) as outcome:
         with frozen_garbage_collector():

@@ -9,13 +9,16 @@ import subprocess
 import sys
 import tempfile
 import venv
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from tests.acceptance import recording_checks
 from tests.acceptance.runner import CHECKOUT, Measured, measurement
 
 SHARED = CHECKOUT.parent / "shared" / "data"
 PIPELINE = ("framework", "plugins", "conf", "tests/acceptance")
+CHECKS = ("framework/checking", "framework/datasets", "tests/acceptance", "tests/support/recordings/damaged.py")
 
 
 @functools.cache
@@ -36,6 +39,15 @@ def failures(*arguments: str, **variables: str) -> Measured:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", *arguments]
     status = subprocess.run(command, cwd=CHECKOUT, env=os.environ | variables, check=False).returncode
     return status, status == 0
+
+
+def counted(lines: Iterable[str]) -> Measured:
+    """Print the lines, and return their number and whether it is 0."""
+    count = 0
+    for line in lines:
+        print(line)
+        count += 1
+    return count, count == 0
 
 
 def folder(scene: str) -> tuple[str, str]:
@@ -88,6 +100,17 @@ def replica_floor2_ap50() -> Measured:
 @measurement("AP50 >= 0.6, given poses", *PIPELINE)
 def kitchen_ap50() -> Measured:
     return ap50(0.6, "redkitchen")
+
+
+@measurement("0 wrong diagnoses, 75 recordings with one wrong convention, unit or delay", *CHECKS)
+def wrong_diagnoses() -> Measured:
+    return counted(recording_checks.wrong_diagnoses(SHARED))
+
+
+@measurement("<= 1 false alarm, 9 valid recordings and 50 synthetic ones", *CHECKS)
+def false_alarms() -> Measured:
+    count, _ = counted(recording_checks.false_alarms(SHARED))
+    return count, count <= 1
 
 
 @measurement("whole loop >= 6 times as fast as Open3D, kitchen, 1 cm", *PIPELINE, "tests/benchmarks")

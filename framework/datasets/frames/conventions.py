@@ -20,6 +20,7 @@ from framework.geometry import inverse
 
 COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # depth units per meter; most sensors have 1000
 LONGEST_DELAY = 1000  # frames, maximum absolute delay of poses and depth images
+LEAST_POSE_UNIT, LARGEST_POSE_UNIT = 1e-6, 1e6  # m per unit of the translations
 TIME_UNITS = {1e-9: "nanoseconds", 1e-6: "microseconds", 1e-3: "milliseconds"}
 """Units of timestamps other than seconds, s."""
 
@@ -117,7 +118,12 @@ class PoseReading:
     mirrored: Mirror = Mirror.NONE
 
     def __post_init__(self) -> None:
-        require(1e-6 <= self.pose_unit <= 1e6, "dataset.pose_unit", self.pose_unit, "a value in [1e-6, 1e6] m")
+        require(
+            LEAST_POSE_UNIT <= self.pose_unit <= LARGEST_POSE_UNIT,
+            "dataset.pose_unit",
+            self.pose_unit,
+            "a value in [1e-6, 1e6] m",
+        )
         require(
             abs(self.pose_delay) <= LONGEST_DELAY,
             "dataset.pose_delay",

@@ -140,7 +140,7 @@ def test_check_of_double_intrinsics_names_camera_alone(
     [finding] = errors(check(RgbdFolder(place), FARTHEST))
     assert finding.subject == "camera"
     assert f"multiply fx, fy, cx, cy by {1 / factor:g}" in finding.text
-    warn_of_images(RgbdFolder(place))
+    assert warn_of_images(RgbdFolder(place))
     assert "principal point" in caplog.text
 
 
@@ -418,6 +418,6 @@ def write_tagged(path: Path, color: np.ndarray, tag: int) -> None:
 
 def test_valid_recording_logs_no_warning(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     with caplog.at_level(logging.WARNING):
-        warn_of_images(DESK)
-        warn_of_images(RgbdFolder(write_damaged(tmp_path / "desk", DESK, frames=20)))
+        assert not warn_of_images(DESK)
+        assert not warn_of_images(RgbdFolder(write_damaged(tmp_path / "desk", DESK, frames=20)))
     assert not caplog.records

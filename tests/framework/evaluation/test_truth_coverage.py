@@ -76,3 +76,16 @@ def test_evaluation_metrics_warn_of_other_world_frame(points: Float32, caplog: p
     assert (found["coverage.ground_truth"] == 1.0) is same
     assert ("ground truth: expected the world frame of the map" in caplog.text) is not same
     assert is_evaluation("coverage.ground_truth")
+
+
+@pytest.mark.parametrize(("mapped", "annotated"), [(0, 10), (10, 0), (0, 0)])
+def test_evaluation_metrics_without_points_do_not_warn_of_world_frame(
+    mapped: int, annotated: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    predictions = PredictedInstances(
+        moved()[:mapped], np.ones(mapped, np.int32), np.array([1]), np.array([0.9]), ("chair",)
+    )
+    truth = SceneTruth(moved()[:annotated], np.ones(annotated, np.int32), {1: "chair"})
+    evaluation_metrics(predictions, truth, truth, "", ComparedClasses.of({}))
+    assert not caplog.text

@@ -8,10 +8,13 @@ from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from framework.data import Float64
+from framework.datasets.frames.conventions import CameraAxes
 from framework.datasets.frames.sequence_reader import Recording
 from framework.files.tum_trajectory import write_tum
+from framework.geometry import inverse
 
 IDENTITY = np.eye(4)
 
@@ -54,3 +57,28 @@ def write_damaged(
     known = [IDENTITY if T is None else T for T in poses]
     write_tum(place / "poses.txt", [recorded[k].timestamp for k in usable], [pose(T) for T in known])
     return place
+
+
+def in_axes(axes: CameraAxes) -> Callable[[Float64], Float64]:
+    """Return a function that converts a camera pose to other camera axes."""
+    T_axes_camera = np.eye(4)
+    T_axes_camera[:3, :3] = axes.R_axes_camera
+    return lambda T_world_camera: T_world_camera @ inverse(T_axes_camera)
+
+
+def scalar_first(T: Float64) -> Float64:
+    """Return the pose that results if a quaternion in the order w x y z is read as x y z w."""
+    misread = T.copy()
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    misread[:3, :3] = Rotation.from_quat((w, x, y, z)).as_matrix()
+    return misread
+
+
+def in_millimeters(T: Float64) -> Float64:
+    moved = T.copy()
+    moved[:3, 3] *= 1000
+    return moved
+
+
+def inverted_opengl(T: Float64) -> Float64:
+    return inverse(in_axes(CameraAxes.OPENGL)(T))
