@@ -4,12 +4,15 @@ r"""ROS 2 node that maps the images of a depth camera and publishes the objects 
         -r depth:=/camera/aligned_depth_to_color/image_raw -r camera_info:=/camera/color/camera_info
 
 Depth must be registered to color. Images of topics named `image_rect` or similar are rectified. All other images are
-undistorted with the lens model of the camera info. Publishers may be reliable or best effort. Each marker on the topic
-`objects` is the axis-aligned bounding box of one object in the world frame, `map`. The text of a marker is the class
-name.
+undistorted with the lens model of the camera info. Set `--compressed` before `--ros-args` for topics of
+sensor_msgs/CompressedImage, such as `image_raw/compressed`. Publishers may be reliable or best effort. Each marker on
+the topic `objects` is the axis-aligned bounding box of one object in the world frame, `map`. The text of a marker is
+the class name.
 """
 
 from __future__ import annotations
+
+import sys
 
 import message_filters
 import numpy as np
@@ -23,17 +26,21 @@ from instancemap import DataError, Mapper, decode_ros_color, decode_ros_depth, i
 
 
 class InstanceMapNode(Node):
-    """Node that maps synchronized color and depth images. `overrides` are config overrides such as "device=cuda"."""
+    """Node that maps synchronized color and depth images.
+
+    `overrides` are config overrides such as "device=cuda". Set `compressed` for topics of sensor_msgs/CompressedImage.
+    """
 
     rectified = False  # True = the images belong to the matrix P of the camera info, without distortion
 
-    def __init__(self, *overrides: str) -> None:
+    def __init__(self, *overrides: str, compressed: bool = False) -> None:
         from rclpy.qos import qos_profile_sensor_data  # best effort, which also receives from reliable publishers
 
         super().__init__("instancemap")
         self.mapper = Mapper(*overrides)
         self.markers = self.create_publisher(MarkerArray, "objects", 1)
-        topics = (("color", Image), ("depth", Image), ("camera_info", CameraInfo))
+        image = image_type(compressed)
+        topics = (("color", image), ("depth", image), ("camera_info", CameraInfo))
         subscribers = [
             message_filters.Subscriber(self, kind, name, qos_profile=qos_profile_sensor_data) for name, kind in topics
         ]
@@ -68,6 +75,15 @@ class InstanceMapNode(Node):
         return found
 
 
+def image_type(compressed: bool) -> type:
+    """Return the message type of the image topics."""
+    if not compressed:
+        return Image
+    from sensor_msgs.msg import CompressedImage
+
+    return CompressedImage
+
+
 def rgb(image: Image) -> np.ndarray:
     """Convert an image message in any common encoding to an RGB image (H, W, 3), uint8."""
     return decode_ros_color("color", image)
@@ -81,7 +97,7 @@ def meters(image: Image) -> np.ndarray:
 def main() -> None:
     """Run the node."""
     rclpy.init()
-    node = InstanceMapNode("fuser.voxel_size=0.02")
+    node = InstanceMapNode("fuser.voxel_size=0.02", compressed="--compressed" in sys.argv)
     node.rectified = is_rectified(node.resolve_topic_name("color"))
     rclpy.spin(node)
 

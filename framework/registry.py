@@ -431,7 +431,10 @@ def _check_module(where: str, module_name: str) -> None:
             close = _did_you_mean(part, [module.name for module in pkgutil.iter_modules(folders)])
             raise ConfigError(f"{where}: expected an existing module, got {name}{close}")
     if spec is None:
-        raise ConfigError(f"{where}: expected an existing module, got {name}")
+        raise ConfigError(
+            f"{where}: expected an existing module, got {name}; add --config-dir and start in the folder that contains "
+            f"{package}, or install its package"
+        )
 
 
 def _check_plugins_package(plugins: ModuleSpec) -> None:

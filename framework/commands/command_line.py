@@ -47,9 +47,9 @@ EXIT_SIGNAL = 128  # plus the signal's number, as in shells: 130 after Ctrl-C, 1
 
 
 def directory_name(overrides: str) -> str:
-    """Return a directory name of at most 200 characters, without separators, quotes, escapes and references."""
+    """Return a directory name of at most 200 characters, without separators, quotes, escapes, references and ++."""
     name = (
-        re.sub(r"\\(.)|['\"]", r"\1", overrides).replace(os.sep, "_").replace("${", "$").replace("\\", "_")
+        re.sub(r"\\(.)|['\"]|(?<![^,])\++", r"\1", overrides).replace(os.sep, "_").replace("${", "$").replace("\\", "_")
         or "defaults"
     )
     return name if len(name) <= 200 else f"{name[:180]}_{hashlib.sha256(name.encode()).hexdigest()[:16]}"

@@ -76,6 +76,9 @@ KindOf = Callable[[DictConfig, str], TextKind | None]
 def literal(overrides: Sequence[str], kind_of: KindOf, multirun: bool = False) -> list[str]:
     """Return overrides of the main config with quoted text values.
 
+    A key that only the options of a swept group have gets the prefix ++, because Hydra first composes the config of a
+    sweep with the default option.
+
     Args:
         overrides: Overrides as typed, KEY=VALUE.
         kind_of: `text_kind` of the registry.
@@ -87,7 +90,8 @@ def literal(overrides: Sequence[str], kind_of: KindOf, multirun: bool = False) -
     if all(_is_plain(override) for override in overrides):
         return [*overrides]
     choices = _Choices(overrides, kind_of, multirun)
-    return [_quoted(override, choices.kind, choices.sweeps, choices.interpolates) for override in overrides]
+    quoted = [_quoted(override, choices.kind, choices.sweeps, choices.interpolates) for override in overrides]
+    return [f"++{override}" if choices.adds(override.partition("=")[0]) else override for override in quoted]
 
 
 def literal_in_block(block: str, kinds: Mapping[str, Any], overrides: Sequence[str]) -> list[str]:
@@ -174,6 +178,12 @@ class _Choices:
             return TextKind.NONE
         return next(filter(None, (self._kind_of(config, key) for config in self._configs())), TextKind.NONE)
 
+    def adds(self, key: str) -> bool:
+        """Return True if options of a swept group have a key that the default option lacks."""
+        if not self.sweeps or "." not in key or len(self._groups.get(key.partition(".")[0], ())) < 2:
+            return False
+        return not _has(_composed(), key) and any(_has(config, key) for config in self._configs())
+
     def interpolates(self, value: str) -> bool:
         """Return True if all references in a value are to existing keys or resolvers."""
         for name, colon in re.findall(r"\$\{([^:}]*)(:?)", value):
@@ -181,6 +191,12 @@ class _Choices:
             if not (is_resolver if colon else OmegaConf.select(self._base, name) is not None):
                 return False
         return True
+
+
+def _has(config: DictConfig, key: str) -> bool:
+    parent, _, name = key.rpartition(".")
+    node = OmegaConf.select(config, parent)
+    return isinstance(node, DictConfig) and name in [*node]  # `name in node` would be False for a value ???
 
 
 def _composed(*words: str) -> DictConfig:

@@ -145,7 +145,7 @@ class RgbdFolder(Recording):
             if middle > FARTHEST and not self.depth_reading.depth_scale:
                 raise DataError(
                     f"{path}: expected float depth in meters, got a median of {middle:.6g}; set "
-                    "dataset.depth_scale=1000 if it is in millimeters"
+                    "dataset.depth_scale=1000 if it is in millimeters, or 100 if it is in centimeters"
                 )
             return True
         return False

@@ -16,12 +16,13 @@ from framework.data import Float32, Int32
 from framework.detection.masks.boxes import LARGEST_LOG_SCALE, suppress_boxes
 from framework.detection.masks.letterbox import ImageFormat, Placement
 from framework.errors import DataError
-from framework.vocabulary.category_ids import CategoryIds, label_ids
+from framework.vocabulary.category_ids import CategoryIds, column_ids, label_ids
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
 
 CONFIDENT = 0.5  # minimum score of detections that must have valid boxes and labels
+MIN_CANDIDATES = 20  # minimum number of candidates to find the column of the background
+MIN_BACKGROUND = 0.5  # minimum fraction of candidates without an object in a black image, typically above 0.9
 LARGEST_UNIT = 2.0  # boxes in 0..1 may slightly exceed the image; boxes in px are never all within 2 px of its corner
-END_TO_END_COLUMNS = 6  # x1 y1 x2 y2, score, label
 YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows
 
 
@@ -39,7 +40,11 @@ class OutputLayout(Enum):
     ssd_torchvision = "ssd_torchvision"  # boxes (K, 4) x1 y1 x2 y2 in px; scores and labels, or class scores
     ssd_unit = "ssd_unit"  # boxes (K, 4) x1 y1 x2 y2 in 0..1; scores and labels, or class scores
     end_to_end = "end_to_end"  # (K, 6): x1 y1 x2 y2 in px or 0..1, score, label from 0 (YOLOv10, YOLO26)
-    auto = "auto"  # end_to_end, RF-DETR, torchvision or Detectron2 if the outputs are theirs, otherwise yolox
+    label_first = "label_first"  # (K, 6): label from 0, score, x1 y1 x2 y2 in px (PaddleDetection)
+    image_first = "image_first"  # (K, 7): index of the image, x1 y1 x2 y2 in px, label from 0, score (YOLOv7)
+    yolo_nas = "yolo_nas"  # (K, 7): index of the image, x1 y1 x2 y2 in px, score, label from 0 (flat format)
+    efficientdet = "efficientdet"  # (K, 7): index of the image, y1 x1 y2 x2 in px, score, label (automl)
+    auto = "auto"  # the layout of a recognized network
 
 
 # numbering of published networks; other networks with ssd_unit count from 0 or from 1, with or without gaps
@@ -48,8 +53,32 @@ PUBLISHED_IDS: Mapping[OutputLayout, CategoryIds | None] = {
     OutputLayout.ssd_torchvision: CategoryIds.COCO_91,
     OutputLayout.ssd_unit: None,
     OutputLayout.end_to_end: CategoryIds.FROM_ZERO,
+    OutputLayout.label_first: CategoryIds.FROM_ZERO,
+    OutputLayout.image_first: CategoryIds.FROM_ZERO,
+    OutputLayout.yolo_nas: CategoryIds.FROM_ZERO,
+    OutputLayout.efficientdet: CategoryIds.COCO_91,
 }
-END_TO_END_FORMAT = ImageFormat(Placement.center, bgr=False, black=0.0, white=1.0)  # as in Ultralytics' exports
+YOLO_FORMAT = ImageFormat(Placement.center, bgr=False, black=0.0, white=1.0)  # as in Ultralytics' exports
+
+
+@dataclass(frozen=True)
+class RowColumns:
+    """Columns of a table with one detection per row."""
+
+    box: tuple[int, int, int, int]  # x1 y1 x2 y2
+    score: int
+    label: int
+    count: int
+
+
+ROW_COLUMNS: Mapping[OutputLayout, RowColumns] = {
+    OutputLayout.end_to_end: RowColumns((0, 1, 2, 3), score=4, label=5, count=6),
+    OutputLayout.label_first: RowColumns((2, 3, 4, 5), score=1, label=0, count=6),
+    OutputLayout.image_first: RowColumns((1, 2, 3, 4), score=6, label=5, count=7),
+    OutputLayout.yolo_nas: RowColumns((1, 2, 3, 4), score=5, label=6, count=7),
+    OutputLayout.efficientdet: RowColumns((2, 1, 4, 3), score=5, label=6, count=7),
+}
+"""Layouts of networks with suppression and a single table."""
 
 
 @dataclass(frozen=True)
@@ -95,65 +124,36 @@ def decode(
         outputs: The output arrays by name.
         shape: The size of the input (height, width), px.
         classes: The number of classes.
-        ids: The label of each class in label outputs; None = 1 to `classes`, or 0 to `classes` - 1 for end_to_end.
+        ids: The label of each class in label outputs, or its column in class scores; None = 1 to `classes`, or 0 to
+            `classes` - 1 for a single table.
 
     Raises:
         DataError: The outputs do not have this layout.
     """
     if layout in (OutputLayout.ssd_tensorflow, OutputLayout.ssd_torchvision, OutputLayout.ssd_unit):
-        return _decode_ssd(layout, outputs, shape, range(1, classes + 1) if ids is None else ids)
-    if len(outputs) != 1:
-        raise DataError(f"detector.layout: expected one output, got {described(outputs)}; choose another layout")
-    (output,) = outputs.values()
-    if layout is OutputLayout.end_to_end:
-        rows = _rows(output, END_TO_END_COLUMNS, "")
-        class_scores = class_scores_of_labels(rows[:, 4], rows[:, 5], range(classes) if ids is None else ids)
-        unit = 0 < np.abs(rows[:, :4]).max(initial=0) <= LARGEST_UNIT
-        boxes = rows[:, :4] * np.array([shape[1], shape[0]] * 2, np.float32) if unit else rows[:, :4]
-        return Candidates(boxes, spread_evenly(class_scores))
+        return _decode_ssd(layout, outputs, shape, classes, ids)
+    output = single_table(outputs)
+    if layout in ROW_COLUMNS:
+        columns = ROW_COLUMNS[layout]
+        rows = _rows(output, columns.count, "")
+        class_scores = class_scores_of_labels(
+            rows[:, columns.score], rows[:, columns.label], range(classes) if ids is None else ids
+        )
+        return Candidates(_in_px(rows[:, columns.box], shape), spread_evenly(class_scores))
     if layout is OutputLayout.yolo:
         rows = _rows(output, 4 + classes, "yolo_objectness")
-        return _checked(corners(rows[:, :4]), rows[:, 4:])
+        return _checked(corners(_in_px(rows[:, :4], shape)), rows[:, 4:])
     rows = _rows(output, 5 + classes, "yolo" if layout is OutputLayout.yolo_objectness else "")
-    boxes = rows[:, :4] if layout is OutputLayout.yolo_objectness else _yolox_boxes(rows, shape)
+    boxes = _in_px(rows[:, :4], shape) if layout is OutputLayout.yolo_objectness else _yolox_boxes(rows, shape)
     return _checked(corners(boxes), rows[:, 4:5] * rows[:, 5:])
-
-
-def recognize_table(outputs: Mapping[str, Float32], shape: tuple[int, int]) -> OutputLayout:
-    """Return the layout of a network from its outputs for a black image.
-
-    Args:
-        outputs: The output arrays by name.
-        shape: The size of the input (height, width), px.
-
-    Raises:
-        DataError: The outputs are boxes, scores and labels of an unknown layout.
-    """
-    if len(outputs) > 1:
-        tensorflow = any("detection_boxes" in name for name in outputs)
-        fix = (
-            "ssd_tensorflow detector.placement=stretch detector.bgr=false"
-            if tensorflow
-            else "ssd_unit or ssd_torchvision"
-        )
-        raise DataError(
-            f"detector.layout: expected one output, or outputs of RF-DETR, torchvision or Detectron2, got "
-            f"{described(outputs)}; set detector.layout={fix}"
-        )
-    (output,) = outputs.values()
-    table = output[0] if output.ndim == 3 and output.shape[0] == 1 else output
-    cells = sum((shape[0] // stride) * (shape[1] // stride) for stride in YOLOX_STRIDES)
-    if table.ndim != 2 or table.shape[1] != END_TO_END_COLUMNS or len(table) == cells:
-        return OutputLayout.yolox
-    scores, labels = table[:, 4], table[:, 5]
-    are_detections = ((scores >= 0) & (scores <= 1) & (labels == np.rint(labels)) & (labels >= 0)).all()
-    return OutputLayout.end_to_end if are_detections else OutputLayout.yolox
 
 
 def label_numbers(
     layout: OutputLayout, outputs: Mapping[str, Float32], labels: Sequence[str], ids: CategoryIds
 ) -> list[int] | None:
-    """Return the label of each class in the label output of a network, or None for a network with class scores.
+    """Return the label of each class in the label output of a network, or its column in class scores of an SSD.
+
+    The result is None for other networks with class scores.
 
     Args:
         layout: The layout, except auto.
@@ -164,11 +164,14 @@ def label_numbers(
     Raises:
         ConfigError: The numbering is ambiguous, or does not match the labels.
     """
-    has_labels = layout is OutputLayout.end_to_end or (
-        layout in PUBLISHED_IDS and not _by_class(_tables(outputs), len(labels))
-    )
-    if has_labels:
+    by_class = _by_class(_tables(outputs), len(labels)) if layout not in ROW_COLUMNS else []
+    if layout in PUBLISHED_IDS and not by_class:
         return label_ids(ids, labels, PUBLISHED_IDS[layout])
+    if layout in PUBLISHED_IDS:
+        table = by_class[0]
+        if ids is CategoryIds.AUTO and table.shape[1] == len(labels) + 1:
+            ids = CategoryIds.FROM_ZERO if ends_with_background(table) else CategoryIds.FROM_ONE
+        return column_ids(ids, labels, table.shape[1])
     require(ids is CategoryIds.AUTO, "detector.category_ids", ids.name, "AUTO for a network without labels")
     return None
 
@@ -214,6 +217,30 @@ def _rows(output: Float32, columns: int, other_layout: str) -> Float32:
     )
 
 
+def cell_counts(shape: tuple[int, int]) -> tuple[int, int]:
+    """Return the number of cells of a YOLO with the strides 8 to 32, and 8 to 64, for an input (height, width), px."""
+    counts = [-(-shape[0] // stride) * -(-shape[1] // stride) for stride in (*YOLOX_STRIDES, 2 * YOLOX_STRIDES[-1])]
+    return sum(counts[:3]), sum(counts)
+
+
+def single_table(outputs: Mapping[str, Float32]) -> Float32:
+    """Return the single output of a network, without numbers of detections.
+
+    Raises:
+        DataError: The network has several outputs.
+    """
+    tables = [array for array in outputs.values() if array.ndim > 1 and array.shape[-1] > 1]
+    if len(tables) != 1 or any(array.size > 1 for array in outputs.values() if array.ndim == 1):
+        raise DataError(f"detector.layout: expected one output, got {described(outputs)}; choose another layout")
+    return tables[0]
+
+
+def _in_px(boxes: Float32, shape: tuple[int, int]) -> Float32:
+    """Return boxes (K, 4) in px of the input. Boxes in 0..1 are scaled."""
+    unit = 0 < np.abs(boxes).max(initial=0) <= LARGEST_UNIT
+    return boxes * np.array([shape[1], shape[0]] * 2, np.float32) if unit else boxes
+
+
 def corners(boxes: Float32) -> Float32:
     """Convert boxes (N, 4) from center x, center y, width, height to x1 y1 x2 y2."""
     half = boxes[:, 2:] / 2
@@ -242,14 +269,17 @@ def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
 
 
 def _decode_ssd(
-    layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], ids: Sequence[int]
+    layout: OutputLayout,
+    outputs: Mapping[str, Float32],
+    shape: tuple[int, int],
+    classes: int,
+    ids: Sequence[int] | None,
 ) -> Candidates:
     """Decode the outputs of an SSD.
 
     The outputs are identified by name. TensorFlow's object detection API uses detection_boxes, detection_classes,
     detection_scores and detection_multiclass_scores. torchvision uses boxes, labels and scores.
     """
-    classes = len(ids)
     tables = _tables(outputs)
     boxes = [array for name, array in tables.items() if "box" in name and array.shape[1:] == (4,)]
     if len(boxes) == 1:
@@ -257,12 +287,12 @@ def _decode_ssd(
         scores = [t for name, t in tables.items() if "score" in name and t.ndim == 1]
         labels = [t for name, t in tables.items() if ("label" in name or "class" in name) and t.ndim == 1]
         if len(by_class) == 1:
-            columns = _columns(by_class[0].shape[1], classes)
+            columns = _columns(by_class[0].shape[1], classes) if ids is None else ids
             return _checked(_ssd_boxes(layout, boxes[0], shape), by_class[0][:, columns])
         if not by_class and len(scores) == len(labels) == 1:
-            return _checked(
-                _ssd_boxes(layout, boxes[0], shape), spread_evenly(class_scores_of_labels(scores[0], labels[0], ids))
-            )
+            numbers = range(1, classes + 1) if ids is None else ids
+            class_scores = class_scores_of_labels(scores[0], labels[0], numbers)
+            return _checked(_ssd_boxes(layout, boxes[0], shape), spread_evenly(class_scores))
     raise DataError(
         f"detector.layout: expected boxes (K, 4) with scores (K, {classes}) or (K, {classes + 1}), or boxes (K, 4) "
         f"with scores (K,) and labels (K,), for {layout.value}, got {described(outputs)}; choose another layout"
@@ -292,6 +322,13 @@ def _by_class(tables: Mapping[str, Float32], classes: int) -> list[Float32]:
     # the first of C + 1 class scores is the background; COCO's ids have 90 or, with the background, 91 columns
     widths = {classes, classes + 1} | ({len(COCO_BY_ID) - 1, len(COCO_BY_ID)} if classes == len(COCO) else set())
     return [t for name, t in tables.items() if "score" in name and t.ndim == 2 and t.shape[1] in widths]
+
+
+def ends_with_background(classes: Float32) -> bool:
+    """Return True if the last class column (K, C) is the background, by the outputs for a black image."""
+    if len(classes) < MIN_CANDIDATES:
+        return False
+    return bool((classes.argmax(axis=1) == classes.shape[1] - 1).mean() > MIN_BACKGROUND)
 
 
 def _columns(width: int, classes: int) -> list[int]:

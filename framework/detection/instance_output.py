@@ -9,6 +9,9 @@ Networks, and the outputs for K detections or queries and C class columns:
   scores (K,); masks (K, 1, h, w), in the boxes or over the complete input.
 - Detectron2 (`TracingAdapter`, docs/tutorials/deployment.md): pred_boxes (K, 4) x1 y1 x2 y2 in px; pred_classes (K,);
   pred_masks (K, 1, h, w) in the boxes; scores (K,); image_size (2,). The names depend on the version of the exporter.
+- DETR (github.com/facebookresearch/detr), also exported by transformers: softmax over the classes and "no object", the
+  last column. RF-DETR and Deformable DETR have independent sigmoids.
+- Other conventions are converted by `framework.detection.output_conventions`.
 """
 
 from __future__ import annotations
@@ -24,15 +27,25 @@ from framework.data import Bool, Float32, Int32
 from framework.detection.candidates import (
     CONFIDENT,
     LARGEST_UNIT,
+    YOLO_FORMAT,
     Candidates,
     check_scores,
     class_scores_of_labels,
     corners,
     described,
+    ends_with_background,
     spread_evenly,
 )
 from framework.detection.masks.binary_masks import masks_from_grids, paste_masks
-from framework.detection.masks.letterbox import ImageFormat, ImageFormatChoice, Letterbox, Level, Placement
+from framework.detection.masks.letterbox import (
+    ImageFormat,
+    ImageFormatChoice,
+    Letterbox,
+    Placement,
+    choose_format,
+    warn_of_format,
+)
+from framework.detection.output_conventions import TENSORFLOW_NAMES, YOLO_NAMES, base_name, standard_outputs
 from framework.detection.runtimes.onnx_network import Outputs
 from framework.detection.segmentation_output import BoxKind, MaskOutput
 from framework.errors import DataError
@@ -51,18 +64,30 @@ class NetworkAuthor(Enum):
     DETR = "RF-DETR or another DETR"
     TORCHVISION = "torchvision"
     DETECTRON2 = "Detectron2"
-    UNKNOWN = "unknown"
+    TENSORFLOW = "TensorFlow's object detection API"
+    YOLO = "YOLO with suppression"
+    MMDEPLOY = "MMDeploy"
+    UNKNOWN = "an unknown network"
 
 
-TENSORFLOW_BOXES = "detection_boxes"  # of TensorFlow's object detection API
 IMAGENET_BLACK = (-0.485 / 0.229, -0.456 / 0.224, -0.406 / 0.225)  # RGB, (0 - mean) / standard deviation
 IMAGENET_WHITE = (0.515 / 0.229, 0.544 / 0.224, 0.594 / 0.225)  # RGB, (1 - mean) / standard deviation
 FORMATS: Mapping[NetworkAuthor, ImageFormat] = {
     NetworkAuthor.DETR: ImageFormat(Placement.stretch, bgr=False, black=IMAGENET_BLACK, white=IMAGENET_WHITE),
     NetworkAuthor.TORCHVISION: ImageFormat(Placement.top_left, bgr=False, black=0.0, white=1.0),
     NetworkAuthor.DETECTRON2: ImageFormat(Placement.top_left, bgr=True, black=0.0, white=255.0),
+    NetworkAuthor.TENSORFLOW: ImageFormat(Placement.stretch, bgr=False, black=0.0, white=255.0),
+    NetworkAuthor.YOLO: YOLO_FORMAT,
 }
-"""Image formats of published networks. torchvision's and Detectron2's networks normalize the image themselves."""
+"""Image formats of published networks. All but DETR and YOLO normalize the image themselves."""
+PUBLISHED_IDS: Mapping[NetworkAuthor, CategoryIds] = {
+    NetworkAuthor.TORCHVISION: CategoryIds.COCO_91,
+    NetworkAuthor.DETECTRON2: CategoryIds.FROM_ZERO,
+    NetworkAuthor.TENSORFLOW: CategoryIds.COCO_91,
+    NetworkAuthor.YOLO: CategoryIds.FROM_ZERO,
+    NetworkAuthor.MMDEPLOY: CategoryIds.FROM_ZERO,
+}
+"""Numbering of the labels of published networks."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +131,8 @@ class InstanceLayout:
     boxes: BoxKind  # CENTER or CORNER
     unit: bool | None  # True = boxes are in 0..1 of the input's sides, False = in px; None = undetermined
     columns: int  # C, number of class columns; 0 = labels
+    no_object: bool = False  # True = the last column is "no object", and the columns are a softmax
+    byte_masks: bool = False  # True = masks are integers, 0 to 1 or 0 to 255
 
     @property
     def suppressed(self) -> bool:
@@ -122,16 +149,10 @@ class InstanceLayout:
 
     def image_format(self, preprocessing: ImageFormatChoice, custom: ImageFormat) -> ImageFormat:
         """Return the image format of the network, and log it if it is not the custom format."""
-        known = FORMATS.get(self.names.network)
-        if known is None or preprocessing is ImageFormatChoice.CUSTOM:
-            return custom
-        log.info(
-            "detector.preprocessing: image format of %s (%s, %s, black = %s, white = %s); set "
-            "detector.preprocessing=CUSTOM to use placement, bgr, black_level and white_level",
-            self.names.network.value, known.placement.value, "BGR" if known.bgr else "RGB", _level(known.black),
-            _level(known.white),
-        )  # fmt: skip
-        return known
+        network = self.names.network
+        if network in (NetworkAuthor.MMDEPLOY, NetworkAuthor.UNKNOWN):
+            warn_of_format(network.value, preprocessing)
+        return choose_format(network.value, FORMATS.get(network), preprocessing, custom)
 
     def candidates(self, outputs: Outputs) -> Candidates:
         """Decode the boxes and classes of a network.
@@ -144,7 +165,9 @@ class InstanceLayout:
         if self.columns:
             if classes.shape != (len(boxes), self.columns):
                 raise DataError(f"detector.weights: expected {self.columns} class columns, got {described(outputs)}")
-            class_scores = (_sigmoid(classes) if _are_logits(classes) else classes)[:, self.ids]
+            if _are_logits(classes):
+                classes = _softmax(classes) if self.no_object else _sigmoid(classes)
+            class_scores = classes[:, self.ids]
         else:
             class_scores = class_scores_of_labels(arrays[self.names.scores], classes, self.ids)
         check_scores(class_scores, "detector.weights", fix="")
@@ -177,6 +200,8 @@ class InstanceLayout:
         """
         candidates = self.candidates(outputs)
         grids = _unbatched(outputs)[self.names.masks]
+        if self.byte_masks and grids.max(initial=0) > 1:
+            grids = grids / np.float32(255)
         side, other = grids.shape[1:]
         covers = any((side * k, other * k) == self.shape for k in DOWNSAMPLING) and max(side, other) > LARGEST_GRID
         whole = bool(self.columns) or covers
@@ -214,7 +239,7 @@ def recognize_instances(
         DataError: The network has another number of classes.
     """
     names = _recognize_names(outputs, integers)
-    if names is None or names.boxes == TENSORFLOW_BOXES:  # y1 x1 y2 x2
+    if names is None:
         return None
     found = _unbatched(outputs)[names.boxes]
     in_unit = _in_unit(found)
@@ -225,14 +250,17 @@ def recognize_instances(
                 f"{names.boxes}; export without postprocessing"
             )
         columns = outputs[names.classes].shape[-1]
+        no_object = ends_with_background(_unbatched(outputs)[names.classes])
+        ids = column_ids(category_ids, labels, columns - no_object)
         kind = BoxKind.CENTER if boxes is BoxKind.AUTO else boxes
-        return InstanceLayout(names, shape, column_ids(category_ids, labels, columns), kind, True, columns)
+        return InstanceLayout(names, shape, ids, kind, True, columns, no_object)
     if names.network is NetworkAuthor.TORCHVISION and in_unit and not names.masks:
         names = replace(names, network=NetworkAuthor.UNKNOWN)  # another SSD with the same names
-    published = {NetworkAuthor.TORCHVISION: CategoryIds.COCO_91, NetworkAuthor.DETECTRON2: CategoryIds.FROM_ZERO}
-    ids = label_ids(category_ids, labels, published.get(names.network))
+    ids = label_ids(category_ids, labels, PUBLISHED_IDS.get(names.network))
     detected = BoxKind.CENTER if in_unit and (found[:, 2:] < found[:, :2]).any() else BoxKind.CORNER
-    return InstanceLayout(names, shape, ids, detected if boxes is BoxKind.AUTO else boxes, in_unit, 0)
+    return InstanceLayout(
+        names, shape, ids, detected if boxes is BoxKind.AUTO else boxes, in_unit, 0, byte_masks=names.masks in integers
+    )
 
 
 def _recognize_names(outputs: Outputs, integers: Collection[str]) -> OutputNames | None:
@@ -254,36 +282,35 @@ def _recognize_names(outputs: Outputs, integers: Collection[str]) -> OutputNames
     mask = masks[0] if masks else ""
     if len(columns) == 1 and not vectors:
         logits = arrays[columns[0]]
-        is_named = _base(boxes[0]) in DETR_BOXES or _base(columns[0]) in DETR_LOGITS
+        is_named = base_name(boxes[0]) in DETR_BOXES or base_name(columns[0]) in DETR_LOGITS
         is_detr = len(logits) == len(arrays[boxes[0]]) and (_are_logits(logits) or is_named)
         return OutputNames(NetworkAuthor.DETR, boxes[0], columns[0], masks=mask) if is_detr else None
     classes = [name for name in vectors if name in integers] or [name for name in vectors if _means_classes(name)]
     if columns or len(vectors) != 2 or len(classes) != 1:
         return None
     (scores,) = set(vectors) - set(classes)
-    names = {_base(name) for name in outputs}
+    names = {base_name(name) for name in outputs}
     network = NetworkAuthor.UNKNOWN
-    if sizes or names >= {"pred_boxes", "pred_classes"}:
+    if names >= TENSORFLOW_NAMES:
+        # in networks of TensorRT with these names, classes are integers, and boxes may begin with x
+        network = NetworkAuthor.UNKNOWN if classes[0] in integers else NetworkAuthor.TENSORFLOW
+    elif names >= YOLO_NAMES:
+        network = NetworkAuthor.YOLO
+    elif any(array.shape[-1] == 5 for name, array in outputs.items() if base_name(name) == "dets"):
+        network = NetworkAuthor.MMDEPLOY
+    elif sizes or (names >= {"pred_boxes", "pred_classes", "scores"} and outputs[boxes[0]].ndim == 2):
         network = NetworkAuthor.DETECTRON2
-    elif names >= {"boxes", "labels", "scores"}:
-        network = NetworkAuthor.TORCHVISION
+    elif names >= {"boxes", "labels", "scores"} and len(outputs) == len(arrays) and outputs[boxes[0]].ndim == 2:
+        network = NetworkAuthor.TORCHVISION  # others, such as RT-DETR, have a batch, or a number of detections
     return OutputNames(network, boxes[0], classes[0], scores, mask)
 
 
 def _unbatched(outputs: Outputs) -> Outputs:
-    """Return the outputs with the detections as the first axis, and masks as (K, h, w)."""
+    """Return standard outputs with the detections as the first axis, and masks as (K, h, w)."""
+    outputs = standard_outputs(outputs)
     batched = any(array.ndim == 3 and array.shape[::2] == (1, 4) for array in outputs.values())
     arrays = {name: array[0] if batched and array.ndim > 1 else array for name, array in outputs.items()}
     return {name: array[:, 0] if array.ndim == 4 and array.shape[1] == 1 else array for name, array in arrays.items()}
-
-
-def _level(level: Level) -> str:
-    return f"{level:g}" if isinstance(level, float) else " ".join(f"{one:.3f}" for one in level)
-
-
-def _base(name: str) -> str:
-    """Return the name of an output in lower case, without the instance of Detectron2, as in `instances.scores`."""
-    return name.lower().rpartition(".")[2]
 
 
 def _means_classes(name: str) -> bool:
@@ -297,6 +324,11 @@ def _are_logits(values: Float32) -> bool:
 
 def _sigmoid(logits: Float32) -> Float32:
     return np.asarray(1 / (1 + np.exp(-np.clip(logits, -80, 80))), np.float32)
+
+
+def _softmax(logits: Float32) -> Float32:
+    weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float32)
 
 
 def _in_unit(boxes: Float32) -> bool | None:

@@ -6,6 +6,7 @@ for each cell. If the network contains non-maximum suppression, the table has on
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -13,7 +14,15 @@ from enum import Enum
 import numpy as np
 
 from framework.data import Bool, Float32, Int32
-from framework.detection.candidates import CONFIDENT, LARGEST_UNIT, Candidates, check_scores, corners, described
+from framework.detection.candidates import (
+    CONFIDENT,
+    LARGEST_UNIT,
+    Candidates,
+    cell_counts,
+    check_scores,
+    corners,
+    described,
+)
 from framework.detection.masks.binary_masks import masks_from_prototypes
 from framework.detection.masks.letterbox import Letterbox
 from framework.detection.runtimes.onnx_network import ExportMetadata, Outputs
@@ -22,9 +31,10 @@ from framework.errors import DataError
 MIN_ORDERED_CORNERS = 0.9  # minimum fraction of boxes with x2 >= x1 and y2 >= y1, if boxes are corners
 MAX_ORDERED_CENTERS = 0.5  # maximum fraction of such boxes, if boxes are centers and sizes; typically a few percent
 MIN_ROWS = 20  # minimum number of detections to evaluate these fractions
-STRIDES = (8, 16, 32, 64)  # px per cell in the YOLO family, the last only in large networks
 BOXES_PER_CELL = (1, 3)  # 3 up to YOLOv7
 SCORE, LABEL, COEFFICIENTS = 4, 5, 6  # columns of a table with suppression, after x1 y1 x2 y2
+
+log = logging.getLogger(__name__)
 
 
 class BoxKind(Enum):
@@ -174,6 +184,9 @@ def detect_layout(
     channels_last = _is_channels_last(prototypes, shape, input_channels_last, metadata)
     count = prototypes.shape[-1 if channels_last else 1]
     columns = (5 if objectness else 4) + classes + count
+    if not objectness and table.shape[2] == columns + 1 and table.shape[1] in [3 * k for k in cell_counts(shape)]:
+        objectness, columns = True, columns + 1  # YOLOv5 and YOLOv7 have three boxes per cell
+        log.info("detector.objectness: class scores follow an objectness score, as in YOLOv5")
     is_rows, is_columns = table.shape[2] == columns, table.shape[1] == columns
     suppressed = table.shape[2] == COEFFICIENTS + count and (
         not (is_rows or is_columns) or _looks_suppressed(table[0], classes, shape)
@@ -190,12 +203,22 @@ def detect_layout(
 def _table_and_prototypes(outputs: Outputs) -> tuple[Float32, Float32]:
     tables = [output for output in outputs.values() if output.ndim == 3 and output.shape[0] == 1]
     maps = [output for output in outputs.values() if output.ndim == 4 and output.shape[0] == 1]
+    if len(outputs) == 1 and max(len(tables), *(one.ndim == 2 for one in outputs.values())):
+        raise DataError(
+            f"detector.weights: expected masks, got boxes only ({described(outputs)}); set detector=onnx_boxes"
+        )
     if len(outputs) != 2 or len(tables) != 1 or len(maps) != 1:
         raise DataError(
             "detector.weights: expected two outputs, a table (1, 4 + classes + M, K), or (1, K, 6 + M) with "
             f"suppression, and prototypes (1, M, h, w), or boxes, classes and masks of RF-DETR, torchvision or "
             f"Detectron2, got {described(outputs)}; use detector=rf_detr_seg or detector=transformers_segmentation for "
             "models on huggingface.co"
+        )
+    queries = maps[0].shape[1]
+    if tables[0].shape[1] == queries != tables[0].shape[2] - COEFFICIENTS:  # one mask for each query, but no box
+        raise DataError(
+            f"detector.weights: expected boxes, classes and masks, got {described(outputs)}, as of Mask2Former, "
+            "MaskFormer or OneFormer; set detector=transformers_segmentation and detector.model to the network's folder"
         )
     return tables[0], maps[0]
 
@@ -227,8 +250,7 @@ def _are_labels(column: Float32, classes: int) -> bool:
 def _looks_suppressed(rows: Float32, classes: int, shape: tuple[int, int]) -> bool:
     """Return True if the rows of a table are detections, False if they are cells."""
     # labels alone are not sufficient in 8-bit networks, where most scores are 0 and resemble labels
-    cells = [-(-shape[0] // stride) * -(-shape[1] // stride) for stride in STRIDES]
-    counts = {boxes * sum(cells[:levels]) for boxes in BOXES_PER_CELL for levels in (3, 4)}
+    counts = {boxes * cells for boxes in BOXES_PER_CELL for cells in cell_counts(shape)}
     return _are_labels(rows[:, LABEL], classes) and len(rows) not in counts
 
 

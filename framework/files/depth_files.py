@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from PIL.TiffImagePlugin import TiffImageFile
 
@@ -47,17 +48,32 @@ def read_depth(path: Path) -> UInt16 | Float32:
 def _depth_array(path: Path, image: Array) -> UInt16 | Float32:
     if image.ndim == 3 and image.shape[2] == 1:
         image = image[..., 0]
-    is_integer, is_float = image.dtype == np.uint16, np.issubdtype(image.dtype, np.floating)
+    is_float = np.issubdtype(image.dtype, np.floating)
+    is_integer = image.dtype == np.uint16 or _is_uint16(image)
     if image.ndim != 2 or not 0 < image.size <= MAX_PIXELS or not (is_integer or is_float):
         shape = "x".join(map(str, image.shape))
         raise FrameError(f"{path}: expected one channel of uint16 or floats, got {shape} values of {image.dtype}")
     return np.ascontiguousarray(image, np.uint16) if is_integer else np.ascontiguousarray(image, np.float32)
 
 
+def _is_uint16(image: Array) -> bool:
+    """Return True for integers of 16 bits or more within the range of uint16, which some programs write."""
+    is_wide = np.issubdtype(image.dtype, np.integer) and image.dtype.itemsize >= 2 and image.size > 0
+    return bool(is_wide and image.min() >= 0 and image.max() <= np.iinfo(np.uint16).max)
+
+
 def _read_tiff(path: Path) -> Array:
     data = read_image_file(path)
     try:
         image = TiffImageFile(io.BytesIO(data))
+    except SyntaxError:  # Pillow does not read float64
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if decoded is not None and decoded.dtype == np.float64:
+            return np.asarray(decoded)
+        raise FrameError(f"{path}: expected a TIFF image of uint16 or floats, got another type") from None
+    except Exception as error:  # Pillow has no common base exception
+        raise FrameError(f"{path}: expected a TIFF image, got an error ({in_one_line(error)[:SHOWN]})") from error
+    try:
         pages, (width, height) = image.n_frames, image.size
         if pages > 1 or width * height > MAX_PIXELS:
             raise ValueError(f"{pages} pages of {width}x{height} px")

@@ -93,6 +93,15 @@ def decode_uint16(name: Path | str, data: bytes) -> UInt16:
     return np.asarray(_decode_channel(name, data, np.uint16), np.uint16)
 
 
+def read_ids(path: Path) -> UInt16:
+    """Read an 8-bit or 16-bit image (H, W) of ids from a PNG file.
+
+    Raises:
+        FrameError: The file is damaged or has another type.
+    """
+    return np.asarray(_decode_channel(path, read_image_file(path), np.uint16, np.uint8), np.uint16)
+
+
 def read_uint8(path: Path) -> UInt8:
     """Read an 8-bit image (H, W) from a PNG file.
 
@@ -102,12 +111,13 @@ def read_uint8(path: Path) -> UInt8:
     return np.asarray(_decode_channel(path, read_image_file(path), np.uint8), np.uint8)
 
 
-def _decode_channel(name: Path | str, data: bytes, dtype: type[np.generic]) -> Array:
+def _decode_channel(name: Path | str, data: bytes, *dtypes: type[np.generic]) -> Array:
     check_image(name, data)
     image = _decode_png(name, data, cv2.IMREAD_UNCHANGED)
-    if image.dtype != dtype or image.ndim != 2:
+    if image.dtype not in dtypes or image.ndim != 2:
         channels = 1 if image.ndim == 2 else image.shape[2]
-        raise FrameError(f"{name}: expected a PNG with 1 channel of {dtype.__name__}, got {channels} of {image.dtype}")
+        expected = " or ".join(dtype.__name__ for dtype in dtypes)
+        raise FrameError(f"{name}: expected a PNG with 1 channel of {expected}, got {channels} of {image.dtype}")
     return image
 
 

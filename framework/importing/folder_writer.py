@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import asdict, astuple, dataclass, field
 from itertools import islice
@@ -28,6 +29,8 @@ DEPTH_SCALE = 1000.0  # units per meter
 LONGER_SIDE = 640  # px, default for written images; trackers and detectors are tuned for this size
 JPEG_QUALITY = 95  # percent
 ODOMETRY = "odometry.txt"  # file for dataset.odometry, which is not read by default
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
     check_new(directory)
     written = Written()
     turn = writing.turned
+    has_depth = False
     camera = None  # the focal length of phones varies, so all frames are resampled to the camera of the first frame
     for number, frame in _frames(source, writing.stride, written):
         if camera is None:
@@ -104,6 +108,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
             sure = np.where(frame.confidence >= writing.confidence, frame.depth, np.float32(0))
         units = np.rint(upsampled(sure, frame.color, frame.camera, camera, color) * DEPTH_SCALE)
         depth = np.where(units < np.iinfo(np.uint16).max, units, 0).astype(np.uint16)
+        has_depth |= bool(depth.any())
         bgr = cv2.cvtColor(turn.image(color), cv2.COLOR_RGB2BGR)
         _write_image(directory / f"color/{number:06d}.jpg", bgr, cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
         _write_image(directory / f"depth/{number:06d}.png", turn.image(depth), cv2.IMWRITE_PNG_COMPRESSION, 1)
@@ -115,6 +120,10 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
     if camera is None:
         reason = f"first error: {written.errors[0]}" if written.errors else "the recording has no frames"
         raise DataError(f"{source.format}: expected usable frames, got none; {reason}")
+    if not has_depth:
+        text = "%s: expected depth of at most %.3f m, got no reading in %d frames; check the unit of depth%s"
+        limit, unsure = np.iinfo(np.uint16).max / DEPTH_SCALE, ", or set --confidence 0" if writing.confidence else ""
+        log.warning(text, directory, limit, len(written.timestamps), unsure)
     if source.posed:
         write_tum(directory / "poses.txt", written.timestamps, written.poses)
     if source.odometry is not None:

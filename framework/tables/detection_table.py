@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,7 +54,8 @@ class Job:
 
     def called(self, swept: Collection[str]) -> str:
         """Return the overrides of the swept keys, or the folder of the job if there are none."""
-        return " ".join(one for one in self.overrides if one.lstrip("+~").partition("=")[0] in swept) or self.folder
+        chosen = [one.lstrip("+") for one in self.overrides if one.lstrip("+~").partition("=")[0] in swept]
+        return re.sub(r"\\(.)", r"\1", " ".join(chosen)) or self.folder
 
     def value(self, key: str) -> float:
         """Return a metric, or NaN if it is undefined."""

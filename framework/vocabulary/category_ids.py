@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from enum import Enum
 
 from framework.errors import ConfigError, DataError
-from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
+from framework.vocabulary.label_spaces import BENCHMARK_IDS, COCO, COCO_BY_ID, NO_CLASS, SPACES, coco_name
 
 KEY = "detector.category_ids"
 
@@ -19,6 +19,7 @@ class CategoryIds(Enum):
 
     AUTO = "recognized from the ids"
     COCO_91 = "ids of COCO's annotation files: 1 to 90, with gaps"
+    SCANNET = "ids of ScanNet's benchmark files, for scannet20 and scannet200"
     FROM_ONE = "indices of the labels, from 1"
     FROM_ZERO = "indices of the labels, from 0"
 
@@ -32,26 +33,42 @@ class CategoryIds(Enum):
             return list(range(len(labels)))
         if self is CategoryIds.FROM_ONE:
             return list(range(1, len(labels) + 1))
-        if self is CategoryIds.AUTO or tuple(labels) != COCO:
+        if self is CategoryIds.SCANNET and (ids := _scannet_ids(labels)):
+            return list(ids)
+        if self is not CategoryIds.COCO_91 or not are_coco(labels):
             raise ConfigError(
-                f"{KEY}: expected FROM_ONE or FROM_ZERO unless label_space is coco, got {self.name}; "
+                f"{KEY}: expected FROM_ONE or FROM_ZERO for this label_space, got {self.name}; "
                 f"set {KEY}=FROM_ONE or {KEY}=FROM_ZERO"
             )
         return [k for k, name in enumerate(COCO_BY_ID) if name != NO_CLASS]
 
     def names(self, labels: Sequence[str]) -> dict[int, str]:
-        """Return the label of each id.
+        """Return the label of each used id.
 
         Raises:
             ConfigError: The labels do not match this numbering.
         """
-        return dict(zip(self.of(labels), labels, strict=True))
+        return {k: name for k, name in zip(self.of(labels), labels, strict=True) if name != NO_CLASS}
+
+
+def are_coco(labels: Sequence[str]) -> bool:
+    """Return True if labels are COCO's 80 classes in their order, also under other names such as "sofa"."""
+    return len(labels) == len(COCO) and tuple(map(coco_name, labels)) == COCO
+
+
+def _scannet_ids(labels: Sequence[str]) -> tuple[int, ...]:
+    """Return the ids of labels in ScanNet's benchmark files, an empty tuple for other label spaces."""
+    return next((BENCHMARK_IDS[k] for k in ("scannet20", "scannet200") if SPACES[k] == tuple(labels)), ())
 
 
 def possible_numberings(labels: Sequence[str]) -> list[CategoryIds]:
     """Return the numberings that these labels may have, COCO's own first."""
+    if labels[0] == NO_CLASS:  # the background, or the unused id 0 of COCO
+        return [CategoryIds.FROM_ZERO]
     contiguous = [CategoryIds.FROM_ONE, CategoryIds.FROM_ZERO]
-    return [CategoryIds.COCO_91, *contiguous] if tuple(labels) == COCO else contiguous
+    if _scannet_ids(labels):
+        return [CategoryIds.SCANNET, *contiguous]
+    return [CategoryIds.COCO_91, *contiguous] if are_coco(labels) else contiguous
 
 
 def recognize(
@@ -82,6 +99,7 @@ def recognize(
         )
     example = next((k for k in ids if len({names[k] for _, names in fitting}) > 1), ids[0])
     (numbering, names), *others = fitting
+    others = [(one, other) for one, other in others if any(other[k] != names[k] for k in ids)]
     alternatives = " or ".join(f"{other[example]!r} by {one.name}" for one, other in others)
     fixes = " or ".join(f"{KEY}={one.name}" for one, _ in others)
     if others and numbering is not CategoryIds.COCO_91:
@@ -107,12 +125,11 @@ def label_ids(ids: CategoryIds, labels: Sequence[str], published: CategoryIds | 
         ids: The numbering.
         labels: The class names.
         published: The numbering of published networks of this layout; None = unknown. AUTO uses it. For labels other
-            than COCO's, COCO_91 is replaced by FROM_ONE.
+            than COCO's, COCO_91 is replaced by FROM_ONE, or by FROM_ZERO if the first label is unused.
 
     Raises:
         ConfigError: The numbering is AUTO and unknown, or does not match the labels.
     """
-    is_coco = tuple(labels) == COCO
     numbering = ids
     if ids is CategoryIds.AUTO:
         if published is None:
@@ -121,13 +138,16 @@ def label_ids(ids: CategoryIds, labels: Sequence[str], published: CategoryIds | 
                 f"{KEY}: expected the numbering of the network's labels ({', '.join(choices)}), got AUTO for a layout "
                 f"without a known numbering; set {' or '.join(f'{KEY}={choice}' for choice in choices)}"
             )
-        numbering = CategoryIds.FROM_ONE if published is CategoryIds.COCO_91 and not is_coco else published
+        numbering = published
+        if published is CategoryIds.COCO_91:
+            numbering = possible_numberings(labels)[0]
     numbers = numbering.of(labels)
-    example = labels.index("chair") if is_coco else 0
+    example = _example(labels)
     others = " or ".join(f"{KEY}={one.name}" for one in possible_numberings(labels) if one is not numbering)
     log.info(
-        "%s: labels of the network read as %s, so %d is %r; set %s if the network counts otherwise",
-        KEY, numbering.name, numbers[example], labels[example], others,
+        "%s: labels of the network read as %s, so %d is %r%s",
+        KEY, numbering.name, numbers[example], labels[example],
+        f"; set {others} if the network counts otherwise" if others else "",
     )  # fmt: skip
     return numbers
 
@@ -144,11 +164,11 @@ def column_ids(ids: CategoryIds, labels: Sequence[str], columns: int) -> list[in
         DataError: The table has another number of columns.
         ConfigError: The numbering is AUTO, and the table has one more column than classes.
     """
-    count, is_coco = len(labels), tuple(labels) == COCO
-    numbering, shift = ids, 0
+    count, is_coco = len(labels), are_coco(labels)
+    numbering = ids
     if ids is CategoryIds.AUTO:
         if is_coco and columns in (len(COCO_BY_ID) - 1, len(COCO_BY_ID)):
-            numbering, shift = CategoryIds.COCO_91, len(COCO_BY_ID) - columns
+            numbering = CategoryIds.COCO_91
         elif columns == count:
             numbering = CategoryIds.FROM_ZERO
         elif columns == count + 1:
@@ -156,13 +176,20 @@ def column_ids(ids: CategoryIds, labels: Sequence[str], columns: int) -> list[in
                 f"{KEY}: expected the numbering of {columns} class columns for {count} labels, got AUTO; set "
                 f"{KEY}=FROM_ONE (first column unused) or {KEY}=FROM_ZERO (last column unused)"
             )
+    shift = int(numbering is CategoryIds.COCO_91 and columns == len(COCO_BY_ID) - 1)  # no column for the id 0
     wanted = [k - shift for k in numbering.of(labels)] if numbering is not CategoryIds.AUTO else []
     if not wanted or max(wanted) >= columns:
         coco = f", or {len(COCO_BY_ID)}" if is_coco else ""
+        others = f", or {KEY} to another value than {ids.name}" if ids is not CategoryIds.AUTO else ""
         raise DataError(
-            f"detector.label_space: expected {count} or {count + 1}{coco} class columns, got {columns}; set another "
-            f"label_space, or {KEY}=FROM_ONE (first column unused) or {KEY}=FROM_ZERO"
+            f"detector.label_space: expected {count} or {count + 1}{coco} class columns, got {columns}; set "
+            f"detector.label_space to the classes of the network{others}"
         )
-    example = labels.index("chair") if is_coco else 0
+    example = _example(labels)
     log.info("%s: class columns read as %s, so column %d is %r", KEY, numbering.name, wanted[example], labels[example])
     return wanted
+
+
+def _example(labels: Sequence[str]) -> int:
+    """Return the index of the label in log lines."""
+    return labels.index("chair") if "chair" in labels else next((k for k, n in enumerate(labels) if n != NO_CLASS), 0)

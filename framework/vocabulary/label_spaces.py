@@ -7,6 +7,7 @@ names. A detector with classes outside of these label spaces keeps its own names
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -40,6 +41,7 @@ AGNOSTIC = "agnostic"  # label space with the single class OBJECT
 OBJECT = "object"
 OWN_CLASSES = "own classes"  # classes outside of all label spaces
 NO_CLASS = "n/a"  # name of an unused id, in any space
+_UNUSED_NAMES = ("n/a", "???", "background", "__background__")  # of networks' label files, any case
 _UNUSED_IDS = (0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # planned classes without annotations
 _COCO_IDS = [k for k in range(91) if k not in _UNUSED_IDS]
 COCO_BY_ID = tuple(COCO[_COCO_IDS.index(k)] if k in _COCO_IDS else NO_CLASS for k in range(91))
@@ -64,6 +66,8 @@ BENCHMARK_IDS: Mapping[str, tuple[int, ...]] = {
 
 MEANINGS: Mapping[str, str | None] = {name: coco for names in _SECTIONS.values() for name, coco in names.items()}
 """COCO names by lower-case name in any space; None = no object class of COCO."""
+
+_NUMBERED = re.compile(r"\d+[\s:,]+\S")
 
 log = logging.getLogger(__name__)
 
@@ -118,12 +122,18 @@ def read_labels(name_or_path: str, key: str = "detector.label_space", also: Sequ
     """
     if name_or_path in SPACES:
         return SPACES[name_or_path]
+    if name_or_path == AGNOSTIC:
+        return (OBJECT,)
     path = expanded(Path(name_or_path))
+    if path.suffix.lower() in (".yaml", ".yml", ".json", ".pbtxt", ".csv"):
+        raise ConfigError(
+            f"{key}: expected a text file with one name per line, got {path}; write its names to a text file"
+        )
     try:
         lines = read_text(path, LARGEST_FILE).rstrip().splitlines()
     except DataError as error:
         raise ConfigError(
-            f"{key}: expected one of {', '.join([*SPACES, *also])}, or a text file with one name per line, got "
+            f"{key}: expected one of {', '.join([*SPACES, AGNOSTIC])}, or a text file with one name per line, got "
             f"{name_or_path}"
         ) from error
     names = tuple(line.strip() for line in lines)
@@ -134,7 +144,12 @@ def read_labels(name_or_path: str, key: str = "detector.label_space", also: Sequ
         )
     if not names:
         raise ConfigError(f"{key}: {path}: expected one name per line, got an empty file")
-    return names
+    if all(map(_NUMBERED.match, names)):
+        raise ConfigError(
+            f"{key}: {path}: expected names only, got numbers as well, such as {names[0]!r:.40}; remove the numbers, "
+            f"and write {NO_CLASS} for an unused number"
+        )
+    return tuple(NO_CLASS if name.lower() in _UNUSED_NAMES else name for name in names)
 
 
 def read_class_ids(name_or_path: str, key: str, also: Sequence[str] = ()) -> dict[int, str]:

@@ -11,18 +11,18 @@ from pathlib import Path
 from framework.config.validation import MAX_DETECTIONS, check_count, check_intervals
 from framework.data import Bool, Detections, Frame
 from framework.detection.candidates import (
-    END_TO_END_FORMAT,
+    ROW_COLUMNS,
     Candidates,
     OutputLayout,
     decode,
     label_numbers,
-    recognize_table,
 )
 from framework.detection.instance_output import recognize_instances
 from framework.detection.masks.binary_masks import without_duplicates
-from framework.detection.masks.letterbox import ImageFormatChoice, Placement
+from framework.detection.masks.letterbox import ImageFormatChoice, Placement, choose_format, warn_of_format
 from framework.detection.masks.masks_from_boxes import masks_in_boxes
 from framework.detection.runtimes.onnx_network import ImageNetwork, Outputs
+from framework.detection.table_output import recognize_table
 from framework.interfaces import Detector
 from framework.vocabulary.category_ids import CategoryIds
 from framework.vocabulary.label_spaces import ClassNames, read_labels, to_class_names
@@ -121,9 +121,11 @@ class OnnxBoxes(Detector):
             if instances is not None:
                 network.format = instances.image_format(self.preprocessing, network.format)
                 return instances.candidates_of_boxes
-            layout = recognize_table(outputs, network.shape)
-            if layout is OutputLayout.end_to_end and self.preprocessing is ImageFormatChoice.AUTO:
-                network.format = END_TO_END_FORMAT
+            layout, known = recognize_table(outputs, network.shape, len(self._labels))
+            if known is None and layout in ROW_COLUMNS:
+                warn_of_format(layout.value, self.preprocessing)
+            network.format = choose_format(layout.value, known, self.preprocessing, network.format)
+        network.check_names(self._labels, self.label_space)
         ids = label_numbers(layout, outputs, self._labels, self.category_ids)
         decoder = partial(decode, layout, shape=network.shape, classes=len(self._labels), ids=ids)
         decoder(outputs)

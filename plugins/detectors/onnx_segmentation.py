@@ -1,4 +1,4 @@
-"""Instance segmentation networks in ONNX files: the YOLO family, RF-DETR, torchvision and Detectron2."""
+"""Instance segmentation networks in ONNX files, such as the YOLO family, RF-DETR, torchvision and Detectron2."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class OnnxSegmentation(Detector):
     A YOLO network has K candidates with a box, C class scores and M mask coefficients each. Its outputs have the shapes
     (1, 4 + C + M, K), or transposed, and (1, M, h, w) or (1, h, w, M). If the network includes non-maximum suppression,
     the first output is (1, K, 6 + M) with x1, y1, x2, y2, score and label. Boxes are in px of the input or in [0, 1].
-    RF-DETR, torchvision's Mask R-CNN and Detectron2's networks have separate outputs for boxes, classes and masks. The
-    layout is detected automatically; see `framework.detection.segmentation_output` and
+    Other networks, such as those of RF-DETR, torchvision and MMDeploy, have separate outputs for boxes, classes and
+    masks. The layout is detected automatically; see `framework.detection.segmentation_output` and
     `framework.detection.instance_output`. The detector raises an error if the layout is ambiguous.
 
     The class distribution of a detection is its normalized class scores, and its score is the largest class score. If
@@ -58,7 +58,7 @@ class OnnxSegmentation(Detector):
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
     mask_threshold: float = 0.5  # minimum mask probability of a pixel in the mask, in (0, 1)
-    # image format: AUTO (that of RF-DETR, torchvision or Detectron2 if recognized, otherwise CUSTOM) or CUSTOM
+    # image format: AUTO (that of a recognized network, otherwise CUSTOM) or CUSTOM
     # (placement, padding, bgr, black_level and white_level)
     preprocessing: ImageFormatChoice = ImageFormatChoice.AUTO
     input_size: int = 0  # side of the square input, px, for networks with variable input size; 0 = size in the file
@@ -107,6 +107,7 @@ class OnnxSegmentation(Detector):
             network.format = instances.image_format(self.preprocessing, network.format)
             instances.read(outputs)  # raises DataError for another layout
             return instances
+        network.check_names(self._labels, self.label_space)
         require(
             self.category_ids in (CategoryIds.AUTO, CategoryIds.FROM_ZERO),
             "detector.category_ids", self.category_ids.name, "AUTO or FROM_ZERO for a network of the YOLO family",
@@ -122,15 +123,10 @@ class OnnxSegmentation(Detector):
         )
 
     def _log_classes(self) -> None:
-        """Log if the network reports one class per detection, or if its class names differ from `label_space`."""
+        """Log if the network reports one class per detection."""
         if self._layout.suppressed:
             log.info(
                 "detector.class_spread: %s reports one class per detection; the other classes share %g * (1 - score)",
                 self.weights.name,
                 self.class_spread,
             )
-        names = self._network.metadata.names
-        different = [(k, a, b) for k, (a, b) in enumerate(zip(names, self._labels, strict=False)) if a != b]
-        if different:
-            log.warning("%s: %d of its %d classes differ from detector.label_space=%s: class %d is %r, expected %r",
-                        self.weights.name, len(different), len(names), self.label_space, *different[0])  # fmt: skip

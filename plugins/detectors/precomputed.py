@@ -24,7 +24,7 @@ from framework.detection.stored.stored_detection import StoredDetection
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector, RGBDSequence
 from framework.vocabulary.category_ids import CategoryIds
-from framework.vocabulary.label_spaces import ClassNames, read_labels, to_class_names
+from framework.vocabulary.label_spaces import NO_CLASS, ClassNames, read_labels, to_class_names
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +36,10 @@ class Precomputed(Detector):
     """Detections from a COCO results file or a mask folder, by file name or frame index.
 
     COCO results files are written by `instancemap detect` and by other programs. A mask folder contains two files for
-    each frame, such as 000012.png and 000012.json. The first is an image of 16-bit instance ids, and the second is a
-    list of {"id", "class", "score"}.
+    each frame, such as 000012.png and 000012.json. The first is an image of 8-bit or 16-bit instance ids, and the
+    second is a list of {"id", "class", "score"}.
+
+    Annotation files of COCO datasets are also read.
 
     A file name belongs to the frame whose color image has the same name. Folders, the file type and zeros before the
     number are ignored. A whole number is the index of the frame; see `image_ids`.
@@ -69,8 +71,8 @@ class Precomputed(Detector):
         check_bounds(self, score_threshold=(0.0, 1.0), class_spread=(0.0, 1.0))
         self.path = Path(self.path).expanduser()
         self._labels = read_labels(self.label_space)
-        if len(set(self._labels)) < len(self._labels):
-            repeated = next(name for k, name in enumerate(self._labels) if name in self._labels[:k])
+        repeated = next((n for k, n in enumerate(self._labels) if n != NO_CLASS and n in self._labels[:k]), None)
+        if repeated is not None:
             raise ConfigError(f"detector.label_space: expected unique names, got {repeated!r} twice")
         if self.path.is_dir():
             stored = read_mask_folder(self.path, self._labels)
@@ -133,7 +135,7 @@ class Precomputed(Detector):
         The second result is a Boolean array (N,), True for detections whose best label has a class name.
         """
         index = {name: k for k, name in enumerate(self._labels)}
-        one_hot = np.eye(len(index), dtype=np.float32)
+        one_hot = np.eye(len(self._labels), dtype=np.float32)
         given = np.stack([one_hot[index[one.label]] if one.probabilities is None else one.probabilities
                           for one in stored])  # fmt: skip
         only_label = np.array([one.probabilities is None for one in stored])

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from framework.datasets.tum_rgbd import TumRgbd
+from tests.support.recordings.rvl_files import rvl
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 DESK = TumRgbd(CHECKOUT / "data" / "desk", scene="rgbd_dataset_freiburg1_rpy")
@@ -39,6 +40,7 @@ class Node:
     def __init__(self, name: str) -> None:
         self.published: list[Any] = []
         self.warned: list[str] = []
+        self.subscribed: dict[str, str] = {}
 
     def create_publisher(self, kind: type, topic: str, depth: int) -> SimpleNamespace:
         assert topic == "objects"
@@ -61,6 +63,7 @@ SENSOR_DATA = object()  # the QoS profile of sensors
 
 def subscriber(node: Node, kind: type, name: str, qos_profile: object) -> tuple[type, str]:
     assert qos_profile is SENSOR_DATA
+    node.subscribed[name] = kind.__name__
     return kind, name
 
 
@@ -77,11 +80,11 @@ def node_class(monkeypatch: pytest.MonkeyPatch) -> type[Any]:
     fake("message_filters", Subscriber=subscriber, ApproximateTimeSynchronizer=Synchronizer)
     for package, names in {
         "geometry_msgs": ("Point", "Vector3"),
-        "sensor_msgs": ("CameraInfo", "Image"),
+        "sensor_msgs": ("CameraInfo", "CompressedImage", "Image"),
         "visualization_msgs": ("Marker", "MarkerArray"),
     }.items():
         fake(package)
-        fake(f"{package}.msg", **dict.fromkeys(names, Message))
+        fake(f"{package}.msg", **{name: type(name, (Message,), {}) for name in names})
     spec = importlib.util.spec_from_file_location("ros2_node", CHECKOUT / "examples" / "ros2_node.py")
     assert spec is not None
     assert spec.loader is not None
@@ -107,7 +110,7 @@ def messages(k: int, encoding: str, in_meters: bool) -> tuple[Message, Message, 
     return (
         image,
         Message(height=480, width=640, step=640 * depth.itemsize, encoding=kind, is_bigendian=0, data=depth.tobytes()),
-        Message(height=480, width=640, k=K, d=[0.0] * 5, p=P, distortion_model="plumb_bob"),
+        SimpleNamespace(height=480, width=640, k=K, d=[0.0] * 5, p=P, distortion_model="plumb_bob"),
     )
 
 
@@ -249,3 +252,57 @@ def test_ros2_node_rectified_images_use_projection_matrix(node_class: type[Any])
     node.map(color, depth, info)
     assert node.mapper.camera == DESK[0].camera
     np.testing.assert_array_equal(node.mapper.color, DESK[0].color)
+
+
+def compressed(data: bytes, named: str) -> Message:
+    message = SimpleNamespace(format=named, data=array("B", data))
+    message.header = Message(stamp=Message(sec=1, nanosec=0))
+    return message
+
+
+@pytest.mark.parametrize("color_format", [".png", ".jpg"])
+@pytest.mark.parametrize("codec", ["compressedDepth png", "compressedDepth rvl", "png compressed "])
+def test_ros2_node_maps_compressed_images(node_class: type[Any], color_format: str, codec: str) -> None:
+    node = node_class("detector=none", compressed=True)
+    assert node.subscribed == {"color": "CompressedImage", "depth": "CompressedImage", "camera_info": "CameraInfo"}
+    node.mapper = Added()
+    stored = np.rint(1000 * DESK[0].depth).astype(np.uint16)
+    data = rvl(stored) if "rvl" in codec else cv2.imencode(".png", stored)[1].tobytes()
+    color = cv2.imencode(color_format, DESK[0].color[..., ::-1])[1].tobytes()
+    node.map(
+        compressed(color, "bgr8; jpeg compressed bgr8"),
+        compressed(bytes(12 * codec.startswith("compressedDepth")) + data, f"16UC1; {codec}"),
+        messages(0, "rgb8", False)[2],
+    )
+    assert node.warned == []
+    assert np.abs(node.mapper.color.astype(int) - DESK[0].color).mean() < 4
+    np.testing.assert_allclose(node.mapper.depth, stored / 1000, atol=1e-6)
+
+
+def test_ros2_node_subscribes_to_uncompressed_images(node_class: type[Any]) -> None:
+    assert set(node_class("detector=none").subscribed.values()) == {"Image", "CameraInfo"}
+
+
+@pytest.mark.parametrize(
+    ("encoding", "conversion"),
+    [("yuv422", cv2.COLOR_YUV2RGB_UYVY), ("yuv422_yuy2", cv2.COLOR_YUV2RGB_YUY2), ("yuyv", cv2.COLOR_YUV2RGB_YUY2)],
+)
+def test_ros2_node_decodes_yuv(node_class: type[Any], encoding: str, conversion: int) -> None:
+    stored = np.full((24, 32, 2), 128, np.uint8)  # without color
+    stored[..., 0 if conversion == cv2.COLOR_YUV2RGB_YUY2 else 1] = 90
+    decoded = sys.modules["ros2_node"].rgb(image(stored, encoding))
+    assert np.ptp(decoded) == 0
+    assert decoded[0, 0, 0] == pytest.approx((90 - 16) * 255 / 219, abs=1)
+
+
+@pytest.mark.parametrize("binning", [0, 1, 2, 4])
+def test_ros2_node_binned_images_use_reduced_camera(node_class: type[Any], binning: int) -> None:
+    node = node_class("detector=none")
+    node.mapper = Added()
+    color, depth, info = messages(0, "rgb8", False)
+    full = DESK[0].camera.scaled(max(binning, 1))
+    info.width, info.height, info.k = full.width, full.height, full.K.ravel()
+    info.binning_x = info.binning_y = binning
+    node.map(color, depth, info)
+    assert node.warned == []
+    assert vars(node.mapper.camera) == pytest.approx(vars(DESK[0].camera))

@@ -40,8 +40,9 @@ def main() -> None:
     add("--depth", metavar="TOPIC", default="", help="depth images")
     add("--camera-info", metavar="TOPIC", default="", help="intrinsics of the color camera")
     poses = (
-        "camera poses: geometry_msgs/PoseStamped (optical axes), nav_msgs/Odometry of the camera or of a frame that "
-        f"/tf_static connects with it, or /tf; {NO_POSES}: import without poses (all formats)"
+        "camera poses: geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Path (optical axes), "
+        "nav_msgs/Odometry or geometry_msgs/TransformStamped of the camera or of a frame that /tf_static connects with "
+        f"it, or /tf; {NO_POSES}: import without poses (all formats)"
     )
     add("--poses", metavar="TOPIC", default="", help=poses)
     odometry = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -10,6 +11,8 @@ import cv2
 import numpy as np
 
 from framework.data import Float32, UInt8
+
+log = logging.getLogger(__name__)
 
 
 class Placement(Enum):
@@ -23,7 +26,7 @@ class Placement(Enum):
 class ImageFormatChoice(Enum):
     """Source of the image format that a network expects."""
 
-    AUTO = "format of the recognized network (RF-DETR, torchvision, Detectron2, YOLO26), otherwise CUSTOM"
+    AUTO = "format of the recognized network, otherwise CUSTOM"
     CUSTOM = "placement, padding, bgr, black_level and white_level"
 
 
@@ -87,6 +90,42 @@ class ImageFormat:
     black: Level  # network input for a channel value of 0
     white: Level  # network input for a channel value of 255
     padding: int = 114  # gray value of the padding
+
+
+def choose_format(
+    network: str, known: ImageFormat | None, choice: ImageFormatChoice, custom: ImageFormat
+) -> ImageFormat:
+    """Return the image format of a network, and log it if it is not the custom format.
+
+    Args:
+        network: The name of the network, for the log.
+        known: The format of published networks of this kind; None = unknown.
+        choice: The source of the format.
+        custom: The format by the parameters of the detector.
+    """
+    if known is None or choice is ImageFormatChoice.CUSTOM:
+        return custom
+    log.info(
+        "detector.preprocessing: image format of %s (%s, %s, black = %s, white = %s); set "
+        "detector.preprocessing=CUSTOM to use placement, bgr, black_level and white_level",
+        network, known.placement.value, "BGR" if known.bgr else "RGB", _level(known.black), _level(known.white),
+    )  # fmt: skip
+    return known
+
+
+def warn_of_format(network: str, choice: ImageFormatChoice) -> None:
+    """Log a warning that the image format of a network is unknown, unless the custom format is chosen."""
+    if choice is ImageFormatChoice.AUTO:
+        log.warning(
+            "detector.preprocessing: expected a network with a known image format, got %s; set detector.placement, "
+            "detector.bgr, detector.black_level and detector.white_level to the format of its training, and "
+            "detector.preprocessing=CUSTOM to confirm",
+            network,
+        )
+
+
+def _level(level: Level) -> str:
+    return f"{level:g}" if isinstance(level, float) else " ".join(f"{one:.3f}" for one in level)
 
 
 def network_input(canvas: UInt8, dtype: str, bgr: bool, black: Level, white: Level) -> np.ndarray[Any, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,17 +19,23 @@ from framework.errors import ConfigError, DataError, import_optional, in_one_lin
 from framework.files.hashing import path_hash
 from framework.files.search_paths import candidates
 
+log = logging.getLogger(__name__)
+
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession, NodeArg
 
 Outputs = dict[str, Float32]
 Shape = tuple[int, ...]  # 0 = dynamic
 INPUT_DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(uint8)": "uint8"}  # -> numpy dtype
+SIZE_DTYPES = {"tensor(float)": "float32", "tensor(int64)": "int64", "tensor(int32)": "int32"}
+PIXEL_MASK = "pixel_mask"  # 1 = pixel of the image, in DETR networks of transformers
+SIZE_INPUTS = ("orig_target_sizes", "im_shape", "scale_factor", PIXEL_MASK)  # of RT-DETR, PaddleDetection and DETR
+SHOWN_NAMES = 5  # maximum number of class names in messages
 CUDA = "CUDAExecutionProvider"
 
 
 class OnnxNetwork:
-    """An ONNX network with one image as input.
+    """An ONNX network with one image as input, and optionally the image size.
 
     The number of threads is that of OpenCV (`threads` in the config). Idle threads sleep, because mapping runs at the
     same time.
@@ -57,7 +64,8 @@ class OnnxNetwork:
         self.sha256 = checked_hash(self.path, sha256)
         self._session = _loaded(self.path, device)
         self.metadata = ExportMetadata.parse(self._session.get_modelmeta().custom_metadata_map)
-        image, shape = _image_input(self.path, self._session.get_inputs())
+        sizes = [one for one in self._session.get_inputs() if one.name in SIZE_INPUTS and one.type in SIZE_DTYPES]
+        image, shape = _image_input(self.path, [one for one in self._session.get_inputs() if one not in sizes])
         if image.type not in INPUT_DTYPES:
             wanted = ", ".join(INPUT_DTYPES.values())
             raise DataError(f"{self.path}: expected one of {wanted} as input, got {_described(image)}")
@@ -66,6 +74,7 @@ class OnnxNetwork:
         self._batched = len(shape) == 4  # networks of Detectron2 and torchvision have the input (3, H, W)
         self.channels_last = shape[-1] == 3 and shape[-3] != 3  # (1, H, W, 3), as in TensorFlow networks
         self.shape = _input_shape(self.path, image, self.channels_last, input_size, self.metadata)
+        self._sizes = {one.name: _size_values(one, self.shape) for one in sizes}
         self.integers = frozenset(one.name for one in self._session.get_outputs() if "int" in one.type)
 
     def __call__(self, image: Array) -> Outputs:
@@ -78,7 +87,7 @@ class OnnxNetwork:
         blob = blob[None] if self._batched else blob
         names = [output.name for output in self._session.get_outputs()]
         try:
-            arrays = self._session.run(names, {self._name: np.ascontiguousarray(blob)})
+            arrays = self._session.run(names, {self._name: np.ascontiguousarray(blob), **self._sizes})
         except Exception as error:  # errors of onnxruntime have no common base class
             raise DataError(
                 f"{self.path}: expected a successful run in onnxruntime, got an error ({in_one_line(error)})"
@@ -133,9 +142,9 @@ class ImageNetwork:
         onnx = "an ONNX file (converted with tf2onnx, see docs/guides/detectors.md)"
         require(path.suffix.lower() != ".tflite", "detector.weights", path, onnx)
         self._network = OnnxNetwork(path, detector.sha256, device, detector.input_size)
-        levels = f"{black} and {white}"
-        fits = self._network.dtype != "uint8" or (black, white) == (0, 255)
-        require(fits, "detector.black_level and white_level", levels, "0 and 255 for a network with integer input")
+        fits = self._network.dtype != "uint8" or (black, white) in ((0, 255), (0, 1))  # defaults of detectors
+        levels, whole = f"{black} and {white}", "0 and 255 for a network with integer input"
+        require(fits, "detector.black_level and detector.white_level", levels, whole)
         self.shape = self._network.shape  # (height, width) px
         self.channels_last = self._network.channels_last  # the input is (1, H, W, 3)
         self.metadata = self._network.metadata
@@ -150,10 +159,35 @@ class ImageNetwork:
         image = network_input(canvas, self._network.dtype, wanted.bgr, wanted.black, wanted.white)
         return self._network(image), letterbox
 
+    def check_names(self, labels: Sequence[str], label_space: str) -> None:
+        """Compare the class names in the file with the labels, and log a warning if names differ.
+
+        Raises:
+            ConfigError: The file has another number of classes.
+        """
+        names = self.metadata.names
+        if names and len(names) != len(labels):
+            raise ConfigError(
+                f"detector.label_space: expected the class names of {self._network.path.name} ({_listed(names)}), got "
+                f"{len(labels)} names of {label_space}; set detector.label_space to a text file with these names, one "
+                "per line"
+            )
+        different = [(k, a, b) for k, (a, b) in enumerate(zip(names, labels, strict=False)) if a != b]
+        if different:
+            log.warning(
+                "%s: %d of its %d classes differ from detector.label_space=%s: class %d is %r, expected %r",
+                self._network.path.name, len(different), len(names), label_space, *different[0],
+            )  # fmt: skip
+
     def outputs_for_black(self) -> Outputs:
         """Return the outputs for a black image, for example to check their shapes."""
         outputs, _ = self(np.zeros((*self.shape, 3), np.uint8))
         return outputs
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - SHOWN_NAMES} more" if len(names) > SHOWN_NAMES else ""
+    return f"{', '.join(names[:SHOWN_NAMES])}{more}"
 
 
 def _loaded(path: Path, device: str) -> InferenceSession:
@@ -214,6 +248,16 @@ def _input_shape(
             "detector.input_size=640, or the size of the training images"
         )
     return height or open_height, width or open_width
+
+
+def _size_values(tensor: NodeArg, shape: tuple[int, int]) -> Array:
+    """Return the value of an input of the image size (1, 2), for boxes in px of the network's input, or a mask."""
+    height, width = shape
+    if tensor.name == PIXEL_MASK:
+        _, rows, columns = _shape(tensor)
+        return np.ones((1, rows or height, columns or width), SIZE_DTYPES[tensor.type])
+    values = {"orig_target_sizes": (width, height), "im_shape": (height, width), "scale_factor": (1, 1)}
+    return np.array([values[tensor.name]], SIZE_DTYPES[tensor.type])
 
 
 def _described(tensor: NodeArg) -> str:

@@ -1,7 +1,9 @@
 """COCO results files: a JSON list with an entry for each detection (cocodataset.org/#format-results).
 
-In addition to COCO's keys, an entry may contain `category_name` and the distribution `class_probabilities`. pycocotools
-is not used for reading, because it requires an annotation file and does not validate entries.
+In addition to COCO's keys, an entry may contain `category_name`, `file_name` and the distribution
+`class_probabilities`. Annotation files with images, annotations and categories (cocodataset.org/#format-data) are also
+read. pycocotools is not used for reading, because it requires an annotation file for results and does not validate
+entries.
 """
 
 from __future__ import annotations
@@ -30,14 +32,14 @@ from framework.errors import DataError, errors_of
 from framework.files.atomic_write import atomic_write
 from framework.files.json_file import read_json
 from framework.vocabulary.category_ids import CategoryIds, recognize
-from framework.vocabulary.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO, whole_number
 
 
 def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[StoredDetection]:
     """Read the detections in a results file.
 
-    `segmentation` contains run lengths or polygons. `image_id` is a whole number, or a file name such as
-    "color/000012.png".
+    `segmentation` contains run lengths or polygons. The image is `file_name`, such as "color/000012.png", or
+    `image_id`, a whole number or file name.
 
     Args:
         path: The results file.
@@ -48,6 +50,8 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
         DataError: An entry is invalid.
     """
     entries = read_json(path)
+    if isinstance(entries, dict):
+        entries = _annotated(path, entries)
     if not isinstance(entries, list):
         raise DataError(f"{path}: expected a list of results in COCO's format, got {entries!r:.100}")
     index = {name: k for k, name in enumerate(labels)}
@@ -61,7 +65,7 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
         with errors_of(where):
             found.append(_read_entry(where, entry, index, names))
             if isinstance(image := found[-1].image, ImageName):
-                path_of_image = PureWindowsPath(entry["image_id"])
+                path_of_image = PureWindowsPath(str(_image_of(entry)))
                 if (other := folders.setdefault(image.stem, path_of_image.parent)) != path_of_image.parent:
                     raise DataError(
                         f"{path_of_image.as_posix()}: expected one image {image.stem}, got another image in "
@@ -70,16 +74,58 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
     return found
 
 
+def _annotated(path: Path, dataset: Mapping[str, Any]) -> list[Any]:
+    """Return the annotations of a COCO dataset as results, with the names of images and categories.
+
+    Annotations without a score have the score 1.
+    """
+    parts: list[Any] = [dataset.get(key) for key in ("images", "annotations", "categories")]
+    if not all(isinstance(part, list) and all(isinstance(one, dict) for one in part) for part in parts):
+        raise DataError(
+            f"{path}: expected a list of results in COCO's format, or an object with lists of images, annotations and "
+            f"categories, got the keys {', '.join(map(repr, dataset))}"
+        )
+    images, annotations, categories = parts
+    files = {image.get("id"): _file_of(image) for image in images}
+    names = {category.get("id"): category.get("name") for category in categories}
+    found = []
+    for k, one in enumerate(annotations):
+        if one.get("image_id") not in files or one.get("category_id") not in names:
+            raise DataError(
+                f"{path}, annotation {k}: expected ids of images and categories, got image_id="
+                f"{one.get('image_id')!r}, category_id={one.get('category_id')!r}"
+            )
+        image, name = files[one["image_id"]], names[one["category_id"]]
+        found.append({"score": 1.0, **one, "file_name": image, "category_name": name})
+    return found
+
+
+def _file_of(image: Mapping[str, Any]) -> Any:
+    """Return the file name of an image. Roboflow keeps the name before its export in `extra`."""
+    extra = image.get("extra")
+    return extra["name"] if isinstance(extra, dict) and "name" in extra else image.get("file_name")
+
+
+def _image_of(entry: Mapping[str, Any]) -> Any:
+    return entry.get("image_id") if entry.get("file_name") is None else entry["file_name"]
+
+
+def _category_of(entry: Mapping[str, Any]) -> int | None:
+    """Return the `category_id` of an entry, which may also be text or 62.0; None = no whole number."""
+    found = entry.get("category_id")
+    return int(found) if isinstance(found, float) and found.is_integer() else whole_number(found)
+
+
 def _names_by_id(path: Path, entries: Sequence[Any], labels: Sequence[str], ids: CategoryIds) -> dict[int, str]:
     """Return the label of each `category_id`, or an empty dictionary if all entries have a `category_name`."""
     objects = [entry for entry in entries if isinstance(entry, Mapping)]
-    unnamed = [entry.get("category_id") for entry in objects if entry.get("category_name") is None]
-    numbers = [k for k in unnamed if type(k) is int]
+    unnamed = [_category_of(entry) for entry in objects if entry.get("category_name") is None]
+    numbers = [k for k in unnamed if k is not None]
     if not numbers:
         return {}
     if ids is CategoryIds.AUTO:
-        pairs = [(entry.get("category_id"), entry.get("category_name")) for entry in objects]
-        known = [(k, name) for k, name in pairs if type(k) is int and isinstance(name, str)]
+        pairs = [(_category_of(entry), entry.get("category_name")) for entry in objects]
+        known = [(k, name) for k, name in pairs if k is not None and isinstance(name, str)]
         ids = recognize(str(path), numbers, labels, known)
     return ids.names(labels)
 
@@ -87,10 +133,13 @@ def _names_by_id(path: Path, entries: Sequence[Any], labels: Sequence[str], ids:
 def _read_entry(
     where: str, entry: Mapping[str, Any], index: Mapping[str, int], names: Mapping[int, str]
 ) -> StoredDetection:
+    category = _category_of(entry)
     if entry.get("category_name") is not None:
         label = read_label(entry["category_name"], index)
-    elif type(entry.get("category_id")) is int and entry["category_id"] in names:
-        label = names[entry["category_id"]]
+    elif entry.get("category_id") is None:
+        raise DataError("category_id: expected category_id or category_name, got neither; add one of them")
+    elif category is not None and category in names:
+        label = names[category]
     else:
         raise DataError(
             f"category_id: expected the id of a label, got {entry.get('category_id')!r}; set "
@@ -98,7 +147,7 @@ def _read_entry(
         )
     return StoredDetection(
         where=where,
-        image=read_image_id(entry.get("image_id")),
+        image=read_image_id(_image_of(entry)),
         label=label,
         score=read_score(entry.get("score")),
         segmentation=_read_segmentation(entry.get("segmentation")),
@@ -127,7 +176,8 @@ def _read_segmentation(found: Any) -> Segmentation:
     size = found.get("size") if isinstance(found, Mapping) else None
     if not isinstance(size, list) or len(size) != 2 or not all(type(side) is int and side > 0 for side in size):
         raise DataError(
-            f"segmentation: expected run lengths with size [height, width], or a list of polygons, got {found!r:.200}"
+            f"segmentation: expected run lengths with size [height, width], or a list of polygons, got {found!r:.200}; "
+            "write masks as well as boxes"
         )
     shape = (size[0], size[1])
     if shape[0] * shape[1] > MAX_PIXELS:

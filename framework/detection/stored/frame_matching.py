@@ -100,7 +100,8 @@ def check_matches(path: Path, images: Sequence[ImageId], ids: ImageIds, frames: 
     others = [one for one in ImageIds if one is not ids and _complete(path, images, one, frames) not in ({}, matched)]
     first = next(iter(frames.values())) or "frame 0"
     if unmatched and others and ids is ImageIds.AUTO:
-        confirmed = [*others, *([ImageIds.FROM_ZERO] if all(isinstance(image, int) for image in images) else [])]
+        are_indices = matched and all(isinstance(image, int) for image in images)
+        confirmed = [*others, *([ImageIds.FROM_ZERO] if are_indices else [])]
         raise DataError(
             f"{KEY}: expected ids of the {len(frames)} frames (first image: {first}), got {len(unmatched)} of "
             f"{len(images)} ids without a frame (first: {shown(unmatched[0])}) in {path}; set {_settings(confirmed)}"

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import dataclass
 from pathlib import PureWindowsPath
 
 from framework.errors import DataError
 
 MAX_DIGITS = 20  # maximum length of a frame number; times in ns have 19 digits
+EARLIEST_TIME = 1e8  # s since 1970, minimum timestamp
 DIGITS = "0123456789"
+# end of a name before the suffix: that of Roboflow's exports, or the suffix of the color image, as in 000012.jpg.png
+EXPORTED = re.compile(r"(_(jpe?g|png)\.rf\.\w+|\.(jpe?g|png))$", re.IGNORECASE)
+NUMBERED = re.compile(r"\D*|.*[a-zA-Z].*[_-]")  # start of a name with a number, such as cam0_; not of a timestamp
 COLOR_ENDING = ".color"  # end of the names of color images in 7-Scenes and ScanNet, before the suffix
 
 
@@ -18,17 +24,17 @@ class ImageName:
 
     stem: str
     prefix: str  # `stem` before its number
-    number: int | None  # the number at the end of `stem`, if it is the only one; None = no such number
+    number: int | None  # the number at the end of `stem`, unless it is part of a timestamp; None = no such number
 
     @classmethod
     def of(cls, path: str) -> ImageName:
         """Parse a path with slashes or backslashes. The suffix is optional."""
         name = PureWindowsPath(path)  # accepts both separators
         stem = name.name if name.suffix[1:].isdigit() else name.stem  # the suffix of 1305031102.175304 is no file type
-        stem = stem.removesuffix(COLOR_ENDING)
+        stem = EXPORTED.sub("", stem).removesuffix(COLOR_ENDING)
         prefix = stem.rstrip(DIGITS)
         digits = stem[len(prefix) :]
-        has_number = 0 < len(digits) <= MAX_DIGITS and not any(letter in DIGITS for letter in prefix)
+        has_number = 0 < len(digits) <= MAX_DIGITS and NUMBERED.fullmatch(prefix) is not None
         return cls(stem, prefix, int(digits) if has_number else None)
 
     def names(self, other: ImageName) -> bool:
@@ -52,6 +58,10 @@ def read_image_id(found: object) -> ImageId:
     Raises:
         DataError: The value is neither a whole number nor a file name.
     """
+    if isinstance(found, float) and found.is_integer():
+        found = int(found)
+    if isinstance(found, float) and EARLIEST_TIME < found < math.inf:
+        found = f"{found:.6f}"  # as in TUM's file names
     if type(found) is int and 0 <= found < 10**MAX_DIGITS:
         return found
     name = ImageName.of(found) if isinstance(found, str) else None

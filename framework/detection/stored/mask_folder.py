@@ -22,10 +22,10 @@ from framework.detection.stored.stored_detection import (
     read_score,
 )
 from framework.errors import DataError, errors_of
-from framework.files.image_files import read_uint16
+from framework.files.image_files import read_ids
 from framework.files.json_file import read_json
 
-_read_ids = lru_cache(maxsize=1)(read_uint16)  # the detections of a frame share an image
+_read_ids = lru_cache(maxsize=1)(read_ids)  # the detections of a frame share an image
 
 LARGEST_ID = np.iinfo(np.uint16).max
 
@@ -50,8 +50,8 @@ class InstanceOfImage(Segmentation):
 def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetection]:
     """Read the detections in a mask folder.
 
-    The files of a frame have the name of its color image. The PNG has one channel of 16 bits. The JSON is a list of
-    objects with the keys "id", "class", "score" and optionally "class_probabilities". Ids that are not listed are
+    The files of a frame have the name of its color image. The PNG has one channel of 8 or 16 bits. The JSON is a list
+    of objects with the keys "id", "class", "score" and optionally "class_probabilities". Ids that are not listed are
     ignored.
 
     Args:

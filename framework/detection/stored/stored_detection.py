@@ -14,6 +14,7 @@ from framework.data import PROBABILITY_TOLERANCE, Bool, Float32
 from framework.detection.masks.run_length import decode
 from framework.detection.stored.image_names import ImageId
 from framework.errors import DataError
+from framework.vocabulary.label_spaces import coco_name
 
 ROUNDED_SUM = 0.05  # largest |sum - 1| of probabilities with rounded digits
 MAX_PROBABILITY = 1e6  # maximum of a single value, checked before the sum to prevent overflow
@@ -95,17 +96,21 @@ def read_score(found: Any) -> float:
 
 
 def read_label(found: Any, index: Mapping[str, int]) -> str:
-    """Return a class name.
+    """Return a class name. Other known names of a class, such as "sofa" for "couch", are converted.
 
     Raises:
         DataError: The value is not a name in `index`.
     """
-    if not isinstance(found, str) or found not in index:
+    if not isinstance(found, str):
+        raise DataError(f"label: expected a class name, got {found!r}; write the name of the class")
+    if found not in index:
+        found = coco_name(found) or coco_name(found.replace("_", " ")) or found
+    if found not in index:
         raise DataError(
             f"label: expected one of the {len(index)} names in detector.label_space, got {found!r}; set "
             "detector.label_space to the label space of the file"
         )
-    return found
+    return str(found)
 
 
 def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
@@ -123,6 +128,7 @@ def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
     """
     if found is None:
         return None
+    count = max(index.values()) + 1  # not len(index), because several labels may be unused
     if isinstance(found, Mapping):
         unknown = [name for name in found if name not in index]
         if unknown:
@@ -130,13 +136,14 @@ def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
                 f"class_probabilities: expected only the {len(index)} names in detector.label_space, got "
                 f"{', '.join(map(repr, unknown))}; set detector.label_space to the label space of the file"
             )
-        given: Sequence[Any] = [found.get(name, 0.0) for name in index]
+        by_index = {index[name]: value for name, value in found.items()}
+        given: Sequence[Any] = [by_index.get(k, 0.0) for k in range(count)]
     elif isinstance(found, list):
         given = found
     else:
         raise DataError(f"class_probabilities: expected a JSON list or a JSON object, got {found!r:.200}")
-    if len(given) != len(index):
-        raise DataError(f"class_probabilities: expected {len(index)} values, one for each label, got {len(given)}")
+    if len(given) != count:
+        raise DataError(f"class_probabilities: expected {count} values, one for each label, got {len(given)}")
     if not all(isinstance(p, int | float) and 0 <= p <= MAX_PROBABILITY for p in given):  # rejects NaN
         raise DataError(f"class_probabilities: expected numbers of at least 0 with a sum of 1, got {given!r:.200}")
     row = np.array(given, np.float32)

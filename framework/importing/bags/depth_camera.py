@@ -1,25 +1,30 @@
 """The depth camera in a ROS bag: its unit, and its registration to the color camera.
 
-Depth counts as registered if its topic is named so, if it has the frame and the intrinsics of color, or on request. All
-other depth images are registered with their CameraInfo and the transform tree of the bag.
+Depth counts as registered if its topic is named so, if it has the frame of color, or on request. All other depth images
+are registered with their CameraInfo and the transform tree of the bag. Without transforms, depth with the intrinsics of
+color counts as registered.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from framework.data import Camera, Float32
+from framework.data import Camera, Float32, Float64
 from framework.errors import DataError, FrameError
-from framework.importing.bags.ros_camera import RosLens, is_rectified, ros_camera
+from framework.geometry import inverse
+from framework.importing.bags.ros_camera import RosLens, is_rectified, rectification, ros_camera
 from framework.importing.bags.ros_images import MILLIMETER, decode_ros_depth
 from framework.importing.bags.ros_messages import Message, RosBag
-from framework.importing.bags.ros_topics import BagOptions, Topics, camera_info_of
+from framework.importing.bags.ros_topics import BagOptions, Topics, camera_info_of, is_of_camera
 from framework.importing.bags.transform_tree import REALSENSE, TransformTree
 from framework.importing.depth_resampling import DepthRegistration
 
-SAME_CAMERA = 0.01  # fraction of the image width, maximum difference between intrinsics of the same camera
+# fraction of the image width, maximum difference between the intrinsics of cameras with the same pose, and between
+# those of depth and color if the bag does not show the poses
+SIMILAR, COPIED = 0.01, 0.001
 SAME_PROPORTIONS = 0.01  # maximum relative difference between the aspect ratios of registered images
 FARTHEST = 65.535  # m, maximum depth of the written images
 DEPTH_STREAM = "/Depth_"  # in RealSense's topic names
@@ -51,7 +56,7 @@ class BagDepth:
         if middle > FARTHEST:
             raise FrameError(
                 f"{where}: {message.topic}: expected depth up to {FARTHEST:g} m, got a median of {middle:.6g} m; set "
-                "--depth-unit 0.001 if it is in millimeters"
+                "--depth-unit 0.001 if it is in millimeters, or 0.01 if it is in centimeters"
             )
         if self.lens is not None:
             depth = self.lens.exact(depth)
@@ -75,7 +80,7 @@ def find_depth_camera(
         tree: The coordinate frames of the bag.
         options: The options of the user.
         color: The color camera.
-        color_lens: The lens of the color camera, which registered depth images have, too; None = pinhole camera.
+        color_lens: The lens of the color camera; None = pinhole camera.
 
     Raises:
         DataError: The bag does not show where the depth camera is.
@@ -84,9 +89,12 @@ def find_depth_camera(
     integer, single = (options.depth_unit,) * 2 if options.depth_unit else (_integer_unit(bag, topics), 1.0)
     topic = topics.depth
     own = camera_info_of(bag, topic)
-    info = None if own in ("", topics.camera_info) else bag.first(own)
+    if own in ("", topics.camera_info) or not is_of_camera(bag, tree, own, topic):
+        own = ""
+    info = bag.first(own) if own else None
     frames = [tree.frame_of(name) for name in (topics.color, topic)]
     has_same_frame = frames[0] == frames[1] != ""
+    has_equal_rectification = _has_equal_rectification(topics)
     plain = BagDepth(bag, integer, single, color_lens, None)
     if info is None and not (topics.depth_is_registered or options.depth_registered or has_same_frame):
         _check_proportions(bag, topic, color)
@@ -95,27 +103,26 @@ def find_depth_camera(
             f"{frames[1]!r}, color in {frames[0]!r} and no CameraInfo; set --depth-registered if depth is registered "
             f"to color, or {FIX}"
         )
-    if info is None or topics.depth_is_registered:
+    if info is None:
         _check_proportions(bag, topic, color)
-        if _has_equal_rectification(topics):
+        if has_equal_rectification:
             return plain
-        depth, lens = ros_camera(f"{bag.path}: {topics.camera_info}", info or color_info, is_rectified(topic))
-        if lens is None and _is_same(depth, color):
-            return plain
-        return BagDepth(bag, integer, single, lens, DepthRegistration(depth, color, np.eye(4)))
-    depth, lens = ros_camera(f"{bag.path}: {own}", info, is_rectified(topic))
-    T_color_depth = None if has_same_frame else tree.fixed(to=frames[0], of=frames[1])
-    if T_color_depth is None and _is_same(depth, color):
-        return plain
+    rectified = is_rectified(topics.color if has_equal_rectification else topic)
+    depth, lens = ros_camera(f"{bag.path}: {own or topics.camera_info}", info or color_info, rectified)
+    is_registered = info is None or topics.depth_is_registered or has_same_frame
+    T_color_depth = _rotation(topics, color_info) if is_registered else tree.fixed(to=frames[0], of=frames[1])
     if T_color_depth is None and options.depth_registered:
         T_color_depth = np.eye(4)
+    if T_color_depth is None and _is_same(depth, color, COPIED):  # other cameras may be similar
+        return plain
     if T_color_depth is None:
         raise DataError(
             f"{bag.path}: {topic}: expected depth in the camera of {topics.color}, or extrinsics in the bag, got "
             f"the camera of {own} without extrinsics; record /tf_static, or {FIX}; set --depth-registered if both "
             "cameras have the same pose"
         )
-    if _is_same(depth, color) and np.allclose(T_color_depth, np.eye(4), atol=1e-6):
+    has_equal_lens = (lens and lens.coefficients) == (color_lens and color_lens.coefficients)
+    if _is_same(depth, color, SIMILAR) and has_equal_lens and np.allclose(T_color_depth, np.eye(4), atol=1e-6):
         return plain
     return BagDepth(bag, integer, single, lens, DepthRegistration(depth, color, T_color_depth))
 
@@ -126,12 +133,20 @@ def _has_equal_rectification(topics: Topics) -> bool:
     return is_of_color == is_of_depth or (is_of_color and "raw" not in topics.depth)
 
 
-def _is_same(depth: Camera, color: Camera) -> bool:
+def _rotation(topics: Topics, color_info: Any) -> Float64:
+    """Return the rotation (4, 4) from registered depth to color, which differ if only one of them is rectified."""
+    if _has_equal_rectification(topics):
+        return np.eye(4)
+    T_rectified_raw = rectification(color_info)
+    return T_rectified_raw if is_rectified(topics.color) else inverse(T_rectified_raw)
+
+
+def _is_same(depth: Camera, color: Camera, tolerance: float) -> bool:
     scale = color.width / depth.width
     of_depth = np.array([depth.fx, depth.fy, depth.cx + 0.5, depth.cy + 0.5]) * scale
     of_color = np.array([color.fx, color.fy, color.cx + 0.5, color.cy + 0.5])
     has_proportions = abs(depth.height * scale / color.height - 1) <= SAME_PROPORTIONS
-    return has_proportions and bool((np.abs(of_depth - of_color) <= SAME_CAMERA * color.width).all())
+    return has_proportions and bool((np.abs(of_depth - of_color) <= tolerance * color.width).all())
 
 
 def _check_proportions(bag: RosBag, topic: str, color: Camera) -> None:

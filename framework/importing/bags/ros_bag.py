@@ -3,8 +3,10 @@
     sensor_msgs/Image, CompressedImage      color (8 bits) and depth (16UC1 and similar: mm; 32FC1: m)
     sensor_msgs/CameraInfo                  intrinsics of color, and of depth if it is not registered: K and D of raw
                                             images, P of rectified images
-    geometry_msgs/PoseStamped               camera poses in optical axes, optional
-    nav_msgs/Odometry                       poses of the camera or of a frame that /tf_static connects with it, optional
+    geometry_msgs/PoseStamped, PoseWithCovarianceStamped, nav_msgs/Path
+                                            camera poses in optical axes, optional; a path is used on request only
+    nav_msgs/Odometry, geometry_msgs/TransformStamped
+                                            poses of the camera or of a frame that /tf_static connects with it, optional
     tf2_msgs/TFMessage                      transforms between the frames of color, depth, poses and accelerometer; the
                                             poses on /tf are used if the bag has no other poses
     sensor_msgs/Imu                         up direction, optional, from the accelerometer
@@ -20,7 +22,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -71,13 +73,14 @@ def open_source(path: Path, given: Topics, options: BagOptions) -> Source:
     if info is None:
         raise DataError(f"{path}: {topics.camera_info}: expected at least one message, got none")
     camera, lens = ros_camera(f"{path}: {topics.camera_info}", info, is_rectified(topics.color))
-    stored = None if lens is None else lens.distortion
-    depth_camera = find_depth_camera(bag, topics, tree, options, camera, None if stored else lens)
-    if depth_camera.registration is not None:
-        stored = None  # registered depth is of the pinhole camera
+    depth_camera = find_depth_camera(bag, topics, tree, options, camera, lens)
+    # camera.json has one lens for both images; resampled depth is of the pinhole camera
+    stored = None if lens is None or depth_camera.registration is not None else lens.distortion
+    if stored:
+        depth_camera = replace(depth_camera, lens=None)
     pairs = _pairs(bag, topics, options.max_difference)
     accelerometer = find_accelerometer(bag, tree, topics.color, [pair.timestamp for pair in pairs])
-    poses = find_camera_poses(bag, topics, tree, options)
+    poses = find_camera_poses(bag, topics, tree, options, [pair.timestamp for pair in pairs])
     device = Device(bag, topics, camera, None if stored else lens, depth_camera, accelerometer, poses)
     source = poses.source if poses else "none"
     return Source(
@@ -238,7 +241,8 @@ def _odometry(bag: RosBag, topics: Topics, tree: TransformTree) -> StoredOdometr
     camera = tree.frame_of(topics.color)
     T_base_camera = np.eye(4) if base is None or base == camera else tree.fixed(to=base, of=camera)
     if T_base_camera is None:
-        expected = f"expected the transform from {base} to {camera} in /tf_static, got none"
+        name = base or "the unnamed moving frame"
+        expected = f"expected the transform from {name} to {camera} in /tf_static, got none"
         log.warning("%s: %s; set dataset.odometry_camera to the pose of the camera", topics.odometry, expected)
     poses = [line.pose() if T_base_camera is None else line.pose() @ T_base_camera for line in trajectory.lines]
     return StoredOdometry(trajectory.timestamps, poses, of_camera=T_base_camera is not None)

@@ -1,7 +1,8 @@
 """Cameras of sensor_msgs/CameraInfo.
 
 Raw images belong to the intrinsics K and the lens distortion D. Rectified images, whose topics are named `image_rect`
-or similar, belong to the projection matrix P and have no distortion.
+or similar, belong to the projection matrix P and have no distortion. R rotates from the raw to the rectified camera.
+The matrices are of the full resolution. Images may be binned, or a region of interest.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ INVERSE = ("Inverse Brown Conrady",)  # RealSense: the polynomial maps the recor
 FISHEYE = ("equidistant", "fisheye", "Kannala Brandt4")  # lens models of cv2.fisheye
 COEFFICIENTS = (4, 5, 8, 12, 14)  # numbers of coefficients that OpenCV supports
 _RECTIFIED = re.compile("(?<!un)rect", re.IGNORECASE)
+_RECTIFIED_FOLDER = re.compile("(^|_)rect(ified)?(_|$)", re.IGNORECASE)
 TRANSPORTS = ("compressed", "compressedDepth", "theora", "ffmpeg", "zstd")  # ends of topics of image_transport
 
 
@@ -33,7 +35,7 @@ def is_rectified(topic: str) -> bool:
     *folders, name = [part for part in topic.split("/") if part not in TRANSPORTS]
     if _RECTIFIED.search(name):
         return True
-    return "raw" not in name and any(part in ("rect", "rectified") for part in folders)
+    return "raw" not in name and any(map(_RECTIFIED_FOLDER.search, folders))
 
 
 @dataclass(frozen=True)
@@ -95,8 +97,7 @@ def ros_camera(where: str, info: Any, rectified: bool) -> tuple[Camera, RosLens 
     """
     if rectified:
         return _rectified(where, info), None
-    fx, _, cx, _, fy, cy, _, _, _ = _numbers(info, "k")
-    camera = pinhole(where, info.width, info.height, fx, fy, cx, cy)
+    camera = _pinhole(where, info, _numbers(info, "k"), columns=3)
     values = _numbers(info, "d")
     if not any(values):
         return camera, None
@@ -113,15 +114,35 @@ def ros_camera(where: str, info: Any, rectified: bool) -> tuple[Camera, RosLens 
 
 
 def _rectified(where: str, info: Any) -> Camera:
-    fx, _, cx, _, _, fy, cy, _, _, _, _, _ = _numbers(info, "p")
-    if fx and fy:
-        return pinhole(where, info.width, info.height, fx, fy, cx, cy)
+    projection = _numbers(info, "p")
+    if projection[0] and projection[5]:
+        return _pinhole(where, info, projection, columns=4)
     if any(_numbers(info, "d")):
         raise DataError(
             f"{where}: expected a projection matrix P of the rectified images, got zeros; calibrate the camera"
         )
-    fx, _, cx, _, fy, cy, _, _, _ = _numbers(info, "k")  # drivers without rectification leave P empty
-    return pinhole(where, info.width, info.height, fx, fy, cx, cy)
+    return _pinhole(where, info, _numbers(info, "k"), columns=3)  # drivers without rectification leave P empty
+
+
+def _pinhole(where: str, info: Any, matrix: list[float], columns: int) -> Camera:
+    """Return the camera of the recorded images, which may be binned and may be a region of the full resolution."""
+    (fx, _, cx), (_, fy, cy) = np.reshape(matrix, (3, columns))[:2, :3].tolist()
+    width, height, region = info.width, info.height, getattr(info, "roi", None)
+    if region is not None and region.width and region.height:
+        width, height = region.width, region.height
+        cx, cy = cx - region.x_offset, cy - region.y_offset
+    x, y = (max(int(getattr(info, name, 0)), 1) for name in ("binning_x", "binning_y"))  # 0 = none
+    cx, cy = (cx + 0.5) / x - 0.5, (cy + 0.5) / y - 0.5
+    return pinhole(where, width // x, height // y, fx / x, fy / y, cx, cy)
+
+
+def rectification(info: Any) -> Float64:
+    """Return the rotation (4, 4) from the raw to the rectified camera of a CameraInfo."""
+    R = np.reshape(_numbers(info, "r"), (3, 3))
+    T_rectified_raw = np.eye(4)
+    if R.any():  # drivers without rectification leave R empty
+        T_rectified_raw[:3, :3] = R
+    return T_rectified_raw
 
 
 def _numbers(info: Any, name: str) -> list[float]:

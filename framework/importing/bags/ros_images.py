@@ -11,9 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from framework.data import Array, Float32, UInt8
+from framework.data import Array, Float32, UInt8, UInt16
 from framework.errors import FrameError
-from framework.files.image_files import decode_color, decode_uint16
+from framework.files.image_files import PNG_START, decode_color, decode_uint16
+from framework.files.rvl_images import decode_rvl
 from framework.importing.source import readings
 
 COLOR_CHANNELS = {  # by encoding: number of 8-bit channels, and indices of R, G and B
@@ -38,8 +39,8 @@ CONVERTED = {  # by encoding: number of 8-bit channels, and OpenCV's conversion 
 }
 MILLIMETERS, METERS = ("16UC1", "mono16", "Z16"), ("32FC1",)
 MILLIMETER = 0.001  # m
-COMPRESSED_DEPTH = "compressedDepth"  # in the format field of depth images, after the encoding
-DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: unused integer, quantization A and B
+COMPRESSED_DEPTH, RVL = "compressedDepth", "rvl"  # in the format field of depth images
+DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: unused integer, quantization A and B of float depth
 
 
 def decode_ros_color(where: str, message: Any) -> UInt8:
@@ -92,6 +93,15 @@ def decode_ros_depth(where: str, message: Any, unit: float = MILLIMETER, float_u
     raise FrameError(f"{where}: expected one of the depth encodings {known}, got {message.encoding[:60]!r}")
 
 
+def shows_depth(message: Any) -> bool | None:
+    """Return True for the encodings of depth images, False for those of color images, and None for all others."""
+    stored = message.encoding if hasattr(message, "encoding") else message.format
+    encoding = stored.partition(";")[0].strip()  # `16UC1; compressedDepth png`
+    if encoding in COLOR_CHANNELS or encoding in CONVERTED:
+        return False
+    return True if encoding in (MILLIMETERS[0], *METERS) or COMPRESSED_DEPTH in stored else None
+
+
 def _byte_order(message: Any) -> str:
     return ">" if message.is_bigendian else "<"
 
@@ -102,22 +112,24 @@ def _whole(stored: Array, unit: float) -> Float32:
 
 def _compressed_depth(where: str, message: Any, unit: float, float_unit: float) -> Float32:
     """Decode a compressed depth image (H, W), m, 0 = no reading."""
-    encoding, _, codec = message.format.partition(";")
-    data = bytes(message.data)
-    if COMPRESSED_DEPTH not in codec:
+    encoding, data = message.format.partition(";")[0].strip(), bytes(message.data)
+    is_float = encoding in METERS
+    if data.startswith(PNG_START) and not is_float:  # `compressed`, which has no header
         return _whole(decode_uint16(where, data), unit)
-    if "rvl" in codec.lower():
-        raise FrameError(f"{where}: expected PNG or uncompressed depth, got RVL; record depth as PNG or uncompressed")
     if len(data) < DEPTH_HEADER.size:
         raise FrameError(f"{where}: expected a header of {DEPTH_HEADER.size} bytes and an image, got {len(data)} bytes")
-    # for float depth, the header contains the quantization of inverse depth: depth = A / (value - B)
     _, quantization_a, quantization_b = DEPTH_HEADER.unpack_from(data)
-    stored = decode_uint16(where, data[DEPTH_HEADER.size :])
-    if encoding.strip() not in METERS:
+    decode = decode_rvl if RVL in message.format.lower() else decode_uint16
+    stored = decode(where, data[DEPTH_HEADER.size :])
+    if not is_float:
         return _whole(stored, unit)
+    return inverse_depth(stored, quantization_a, quantization_b) * np.float32(float_unit)
+
+
+def inverse_depth(stored: UInt16, quantization_a: float, quantization_b: float) -> Float32:
+    """Return the depth (H, W), m, of a quantized inverse depth image: A / (value - B); 0 = no reading."""
     with np.errstate(all="ignore"):
-        metric = np.where(stored == 0, 0, quantization_a / (stored.astype(np.float64) - quantization_b))
-    return readings(metric) * np.float32(float_unit)
+        return readings(np.where(stored == 0, 0, quantization_a / (stored.astype(np.float64) - quantization_b)))
 
 
 def _pixels(where: str, message: Any, dtype: np.dtype[Any], channels: int) -> Array:

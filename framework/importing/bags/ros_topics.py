@@ -13,16 +13,21 @@ from framework.data import Float64
 from framework.errors import ConfigError, DataError
 from framework.files.number_lines import numbers
 from framework.files.tum_trajectory import rigid_pose
+from framework.importing.bags.ros_camera import TRANSPORTS
+from framework.importing.bags.ros_images import shows_depth
 from framework.importing.bags.ros_messages import (
     CAMERA_INFO,
     COMPRESSED,
     IMAGE,
     ODOMETRY,
+    PATH,
     POSE,
+    POSE_WITH_COVARIANCE,
+    TRANSFORM,
     TRANSFORMS,
     RosBag,
 )
-from framework.importing.bags.transform_tree import TransformTree
+from framework.importing.bags.transform_tree import REALSENSE, TransformTree
 
 COLOR = re.compile("color|rgb", re.IGNORECASE)
 DEPTH = re.compile("depth", re.IGNORECASE)
@@ -38,12 +43,14 @@ OPTIONS = {
 TRANSPORT = ("/compressed", "/compressedDepth")  # ends of the topics of supported transports, preferred last
 NO_POSES = "none"  # value of --poses: import without poses
 IMAGES, POSES = (IMAGE, COMPRESSED), (ODOMETRY, POSE)
+OTHER_POSES = (TRANSFORM, POSE_WITH_COVARIANCE, PATH)  # often sparse or of other objects; selected without POSES only
+COMMANDED = re.compile("goal|initial_?pose|setpoint|waypoint|target|cmd|command|desired", re.IGNORECASE)
 KINDS = {
     "color": IMAGES,
     "depth": IMAGES,
     "camera_info": (CAMERA_INFO,),
-    "poses": (*POSES, *TRANSFORMS),
-    "odometry": POSES,
+    "poses": (*POSES, *OTHER_POSES, *TRANSFORMS),
+    "odometry": (*POSES, *OTHER_POSES),
 }
 
 
@@ -107,17 +114,23 @@ def found_topics(bag: RosBag, given: Topics, tree: TransformTree) -> Topics:
         DataError: The bag has no matching camera info.
     """
     images = [topic for topic in bag.topics(*IMAGES) if not NEITHER.search(topic)]
-    depth = given.depth or _one(bag, "depth", [topic for topic in images if DEPTH.search(topic)], REGISTERED)
-    color = given.color or _one(bag, "color", [topic for topic in images if not DEPTH.search(topic)], COLOR)
+    depths = [topic for topic in images if DEPTH.search(topic) and _shows_depth(bag, topic) is not False]
+    depths = depths or [topic for topic in images if _shows_depth(bag, topic)]
+    depth = given.depth or _one(bag, "depth", depths, REGISTERED)
+    colors = [topic for topic in images if topic not in (*depths, depth)]
+    colors = [topic for topic in colors if not DEPTH.search(topic)] or colors
+    color = given.color or _one(bag, "color", colors, COLOR)
     info = given.camera_info or camera_info_of(bag, color)
-    if not given.camera_info and info and _is_of_depth(bag, tree, info, color, depth):
+    is_of_depth = info and _is_of_depth(bag, tree, info, color, depth)
+    if not given.camera_info and info and (is_of_depth or not is_of_camera(bag, tree, info, color)):
         expected = f"expected a {CAMERA_INFO} topic of {color}"
-        found = f"got only {info}, which belongs to {depth}"
+        found = f"got only {info}, which belongs to {depth if is_of_depth else tree.frame_of(info)}"
         raise DataError(f"{bag.path}: {expected}, {found}; set --camera-info {info} if both have the same intrinsics")
     if not info:
         expected = f"expected a {CAMERA_INFO} topic next to {color}"
         raise DataError(f"{bag.path}: {expected}, got none{_choice(bag, 'camera_info')}")
-    posed = [topic for topic in bag.topics(*POSES) if topic != given.odometry]
+    of_camera = () if bag.topics(*TRANSFORMS) else (POSE_WITH_COVARIANCE,)  # poses of robots are of a base frame
+    posed = pose_topics(bag, given, *POSES) or pose_topics(bag, given, TRANSFORM, *of_camera)
     if len(posed) > 1 and not given.poses:
         raise ConfigError(
             f"{bag.path}: expected one topic with poses, got {', '.join(posed)}; set --poses to one of them or to none"
@@ -139,6 +152,29 @@ def camera_info_of(bag: RosBag, image: str) -> str:
         return next(iter(shared))
     best = max(shared.values(), default=1)  # 1 = only the root is shared
     return min((topic for topic, count in shared.items() if count == best), key=len) if best > 1 else ""
+
+
+def pose_topics(bag: RosBag, topics: Topics, *kinds: str) -> list[str]:
+    """Return the topics of some types that may have poses of the camera, which excludes goals and the odometry."""
+    return [topic for topic in bag.topics(*kinds) if topic != topics.odometry and not COMMANDED.search(topic)]
+
+
+def _shows_depth(bag: RosBag, topic: str) -> bool | None:
+    """Return `shows_depth` of the first message of a topic; None also for a damaged message."""
+    try:
+        message = bag.first(topic)
+        return None if message is None else shows_depth(message)
+    except DataError:
+        return None
+
+
+def is_of_camera(bag: RosBag, tree: TransformTree, info: str, image: str) -> bool:
+    """Return False if a CameraInfo outside of the namespace of an image has the frame of another camera."""
+    parts = [part for part in image.split("/") if part not in TRANSPORTS]
+    if info.split("/")[:-1] in (parts, parts[:-1]) or image.startswith(REALSENSE):
+        return True
+    frames = {tree.frame_of(topic) for topic in (info, image)} - {""}
+    return len(frames) < 2
 
 
 def _shared_parts(topic: str, other: str) -> int:

@@ -30,7 +30,7 @@ STATIC = "tf_static"  # end of the names of topics with transforms between rigid
 SMALLEST_QUATERNION = 0.5  # minimum norm of a valid quaternion
 SAME_POSITION, SAME_ANGLE = 1e-3, 2e-3  # m, radians; maximum difference between equal transforms
 LONGEST_INTERVAL = 0.1  # s, maximum time to the nearest transform of a moving frame
-FIXED_FRAMES = ("map", "odom", "world", "earth")  # names of world frames (REP 105)
+FIXED_FRAME = re.compile("(^|[/_])(map|odom|world|earth)([/_]|$)")  # names of world frames (REP 105)
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +41,11 @@ _DATA = re.compile("/(image|imu)/data(/|$)")
 def stream_of(topic: str) -> str:
     """Return the stream of a topic of RealSense's recorder, such as /device_0/sensor_1/Color_0."""
     return _DATA.split(topic)[0]
+
+
+def is_fixed_frame(name: str) -> bool:
+    """Return True for names of world frames, such as `map`, `robot/odom` and `camera_odom_frame`."""
+    return bool(FIXED_FRAME.search(name))
 
 
 @dataclass(frozen=True)

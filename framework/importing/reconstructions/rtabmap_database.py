@@ -1,25 +1,29 @@
-"""Import of RTAB-Map databases (https://github.com/introlab/rtabmap, versions 0.11.8 and newer), such as rtabmap.db.
+"""Import of RTAB-Map databases (https://github.com/introlab/rtabmap, versions 0.11 and newer), such as rtabmap.db.
 
 An SQLite file with the tables
 
     Node    id, stamp (s), pose: T_odom_base
-    Data    id, image: JPEG or PNG; depth: PNG, uint16 mm or float32 m as four 8-bit channels, also smaller than image;
-            calibration: the camera and T_base_camera
+    Data    id, image: JPEG or PNG; depth, also smaller than image: PNG of uint16 mm, PNG of float32 m as four 8-bit
+            channels, "DEPTHRVL" and an RVL image of mm, or "DEPTHINV", float32 A and B, and an image of uint16
+            in PNG or RVL with the depth A / (value - B); calibration: the camera and T_base_camera
     Admin   opt_ids, opt_poses: T_map_base of the optimized graph
 
 A transform consists of 12 float32 (3 x 4, row-major), with OpenCV's axes of the camera. A calibration consists of 11
 int32 (version: 3, type: 0 = one camera, width, height, and the counts of the values in K, D, R, P and T_base_camera)
 and these values: float64, and float32 for T_base_camera. Images are rectified, so the camera is P, or K without P.
+Before version 0.18, a calibration consists of the float32 fx, fy, cx, cy, width, height and T_base_camera; before
+version 0.11.2, without width and height.
 Arrays of Admin are compressed with zlib, followed by the int32 rows, columns and OpenCV type. All values are
 little-endian.
 
 Sources: corelib/src/resources/DatabaseSchema.sql.in, CameraModel::serialize, compressData and compressImage in
-introlab/rtabmap. Optimized poses are preferred. Nodes outside of the optimized graph are then not imported. Depth in
-RVL or as inverse depth is not supported.
+introlab/rtabmap; DBDriverSqlite3::loadNodeDataQuery for older calibrations. Optimized poses are preferred. Nodes
+outside of the optimized graph are then not imported.
 """
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 import struct
 import zlib
@@ -31,22 +35,31 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from framework.data import Array, Camera, Float32, Float64
+from framework.data import Array, Camera, Float32, Float64, UInt16
 from framework.datasets.calibration.camera_json import pinhole
 from framework.errors import DataError, FrameError, errors_of, in_one_line
 from framework.files.image_files import LARGEST_FILE, check_image, decode_color, decode_uint16
+from framework.files.rvl_images import decode_rvl
 from framework.geometry import nearest_rigid
-from framework.importing.source import DeviceFrame, Format, Source, meters, readings
+from framework.importing.bags.ros_images import inverse_depth
+from framework.importing.source import DeviceFrame, Format, Source, meters, readings, warn_of_zeros
 
 SQLITE_START = b"SQLite format 3\0"
 HEADER = struct.Struct("<11i")
-ONE_CAMERA = 0  # type of a calibration
+ONE_CAMERA, LAST_TYPE = 0, 1  # types of a calibration; 1 = stereo
 NUMBERS = {"K": (9,), "R": (0, 9), "P": (0, 12), "T_base_camera": (12,)}  # possible counts of values
 TRANSFORM = 12  # numbers of a transform
+UNKNOWN = bytes(4 * TRANSFORM)  # transform of a node without a pose
+OLD_CALIBRATIONS = {64: 4, 72: 6}  # numbers before the transform, by the size in bytes
 FLOAT_CHANNELS = 4  # 8-bit channels of float32 depth
+RVL_DEPTH, INVERSE_DEPTH = b"DEPTHRVL", b"DEPTHINV"  # first bytes of depth that is not a PNG
+INVERSE_HEADER = struct.Struct("<8sff")  # INVERSE_DEPTH, A and B
 INT32, FLOAT32 = 4, 5  # OpenCV's types of arrays with one channel
 TRAILER = struct.Struct("<3i")  # rows, columns and type of a compressed array
 LARGEST_ARRAY = 2**28  # bytes
+OPTIMIZE = "open and close the database in RTAB-Map, or run rtabmap-reprocess"
+
+log = logging.getLogger(__name__)
 
 
 def recognized(path: Path) -> bool:
@@ -74,11 +87,16 @@ def open_source(path: Path) -> Source:
         raise DataError(f"{path}: expected nodes with color and depth images, got none; save RGB-D images in RTAB-Map")
     if optimized is None and sessions > 1:
         raise DataError(
-            f"{path}: expected optimized poses for {sessions} sessions, got only odometry with separate origins; open "
-            "and close the database in RTAB-Map, or run rtabmap-reprocess"
+            f"{path}: expected optimized poses for {sessions} sessions, got only odometry with separate origins; "
+            f"{OPTIMIZE}"
         )
+    if optimized is None:
+        log.warning("%s: expected optimized poses, got only odometry, which drifts; %s", path, OPTIMIZE)
     frames = [partial(_read, path, node, stamp, odometry, optimized) for node, stamp, odometry in nodes]
-    return Source("RTAB-Map", frames, len(frames), posed=True)
+    posed = optimized is not None or any(odometry not in (None, UNKNOWN) for _, _, odometry in nodes)
+    if not posed:
+        warn_of_zeros(path)
+    return Source("RTAB-Map", frames, len(frames), posed)
 
 
 @contextmanager
@@ -96,22 +114,21 @@ def _read(path: Path, node: int, stamp: object, odometry: object, optimized: dic
     if not isinstance(stamp, float | int):
         raise FrameError(f"{where}: stamp: expected a time in s, got {stamp!r:.40}")
     T_world_base = _transform(where, odometry) if optimized is None else optimized.get(node)
-    if T_world_base is None:
-        raise FrameError(f"{where}: expected an optimized pose, got none")
     with _database(path) as database:
         query = "SELECT image, depth, calibration FROM Data WHERE id = ?"
         image, depth, calibration = (
             _blob(where, *pair)
             for pair in zip(("image", "depth", "calibration"), database.execute(query, (node,)).fetchone(), strict=True)
         )
-    camera, T_base_camera = _calibration(where, calibration)
+    color = decode_color(f"{where}: image", image)
+    camera, T_base_camera = _calibration(where, calibration, color.shape[:2])
     with errors_of(where):
-        T_world_camera = nearest_rigid(T_world_base) @ T_base_camera
+        T_world_camera = None if T_world_base is None else nearest_rigid(T_world_base) @ T_base_camera
     return DeviceFrame(
         name=where,
         timestamp=float(stamp),
         camera=camera,
-        color=decode_color(f"{where}: image", image),
+        color=color,
         depth=_depth(f"{where}: depth", depth),
         T_world_camera=T_world_camera,
     )
@@ -123,8 +140,10 @@ def _blob(where: str, name: str, value: object) -> bytes:
     return value
 
 
-def _transform(where: str, value: object) -> Float64:
-    """Return a stored transform (4, 4), which may be invalid."""
+def _transform(where: str, value: object) -> Float64 | None:
+    """Return a stored transform (4, 4), which may be invalid; None = unknown."""
+    if value is None or value == UNKNOWN:
+        return None
     if not isinstance(value, bytes) or len(value) != 4 * TRANSFORM:
         raise FrameError(f"{where}: pose: expected {TRANSFORM} float32, got {value!r:.40}")
     return _matrix(np.frombuffer(value, "<f4"))
@@ -134,15 +153,22 @@ def _matrix(values: Array) -> Float64:
     return np.vstack([np.reshape(values, (3, 4)).astype(np.float64), [0.0, 0.0, 0.0, 1.0]])
 
 
-def _calibration(where: str, data: bytes) -> tuple[Camera, Float64]:
-    """Return the camera of the color image and T_base_camera (4, 4)."""
+def _calibration(where: str, data: bytes, shape: tuple[int, int]) -> tuple[Camera, Float64]:
+    """Return the camera of the color image and T_base_camera (4, 4). `shape` is used without a stored size."""
     where = f"{where}: calibration"
     expected = "expected the calibration of one rectified camera"
+    if len(data) in OLD_CALIBRATIONS:
+        fx, fy, cx, cy, *size = np.frombuffer(data, "<f4", OLD_CALIBRATIONS[len(data)]).tolist()
+        width, height = map(int, size or (0, 0))
+        with errors_of(where):
+            T_base_camera = nearest_rigid(_matrix(np.frombuffer(data, "<f4")[-TRANSFORM:]))
+        return pinhole(where, width or shape[1], height or shape[0], fx, fy, cx, cy), T_base_camera
     if len(data) < HEADER.size:
-        raise FrameError(f"{where}: {expected}, got {len(data)} bytes; open the database in RTAB-Map 0.18 or newer")
+        raise FrameError(f"{where}: {expected}, got {len(data)} bytes")
     *_, kind, width, height, n_K, n_D, n_R, n_P, n_T = HEADER.unpack_from(data)
     if kind != ONE_CAMERA:
-        raise FrameError(f"{where}: {expected}, got type {kind}; only RGB-D cameras are supported")
+        found = f"type {kind}" if 0 < kind <= LAST_TYPE else f"{len(data)} bytes"
+        raise FrameError(f"{where}: {expected}, got {found}; only single RGB-D cameras are supported")
     counts = {"K": n_K, "R": n_R, "P": n_P, "T_base_camera": n_T}
     wrong = [name for name, count in counts.items() if count not in NUMBERS[name]]
     if wrong or not 0 <= n_D <= 14:
@@ -157,16 +183,25 @@ def _calibration(where: str, data: bytes) -> tuple[Camera, Float64]:
     (fx, _, cx), (_, fy, cy) = projection[:2, :3].tolist()
     with errors_of(where):
         T_base_camera = nearest_rigid(_matrix(np.frombuffer(data, "<f4", n_T, size - 4 * n_T)))
-    return pinhole(where, width, height, fx, fy, cx, cy), T_base_camera
+    return pinhole(where, width or shape[1], height or shape[0], fx, fy, cx, cy), T_base_camera
 
 
 def _depth(name: str, data: bytes) -> Float32:
     """Return a stored depth image (h, w), m, 0 = no reading."""
+    if data.startswith(INVERSE_DEPTH) and len(data) >= INVERSE_HEADER.size:
+        _, quantization_a, quantization_b = INVERSE_HEADER.unpack_from(data)
+        return inverse_depth(_integers(name, data[INVERSE_HEADER.size :]), quantization_a, quantization_b)
+    if data.startswith(RVL_DEPTH):
+        return meters(_integers(name, data))
     check_image(name, data)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is not None and image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == FLOAT_CHANNELS:
         return readings(np.ascontiguousarray(image).view("<f4")[..., 0])
     return meters(decode_uint16(name, data))
+
+
+def _integers(name: str, data: bytes) -> UInt16:
+    return decode_rvl(name, data[len(RVL_DEPTH) :]) if data.startswith(RVL_DEPTH) else decode_uint16(name, data)
 
 
 def _optimized_poses(path: Path, database: sqlite3.Connection) -> dict[int, Float64] | None:

@@ -130,7 +130,23 @@ def test_commas_separate_values_in_experiment() -> None:
 
 def test_parameter_of_second_swept_option_is_literal() -> None:
     words = ["detector=none,precomputed", "detector.path=Küche,b"]
-    assert literal(words, text_kind, multirun=True)[1] == "detector.path='Küche',b"
+    assert literal(words, text_kind, multirun=True)[1] == "++detector.path='Küche',b"
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("detector.label_space=own.txt", "++detector.label_space=own.txt"),
+        ("detector.weights=a.onnx", "detector.weights=a.onnx"),  # also of the default detector
+        ("detector.lable_space=own.txt", "detector.lable_space=own.txt"),  # of no detector
+        ("++detector.label_space=own.txt", "++detector.label_space=own.txt"),
+        ("detector.box_format=CENTER,CORNER", "++detector.box_format=CENTER,CORNER"),  # of the second detector only
+        ("fuser.voxel_size=0.02", "fuser.voxel_size=0.02"),
+    ],
+)
+def test_key_of_swept_options_is_added(word: str, expected: str) -> None:
+    words = ["detector=onnx_boxes,onnx_segmentation", word]
+    assert literal(words, text_kind, multirun=True)[1] == expected
 
 
 def test_arguments_of_hydra_options_are_unchanged() -> None:
@@ -179,6 +195,7 @@ def test_settings_of_table_are_literal(word: str, expected: str) -> None:
         (r"detector.words=[mug,red\ chair],seed=1", "detector.words=[mug,red chair],seed=1"),
         (r"dataset.root='it\'s'", "dataset.root=its"),
         ("dataset.root='Küche (2)'", "dataset.root=Küche (2)"),
+        ("seed=1,++detector.label_space=own.txt,+a=2", "seed=1,detector.label_space=own.txt,a=2"),
     ],
 )
 def test_directory_name_has_no_escapes(overrides: str, name: str) -> None:

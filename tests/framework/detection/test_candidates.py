@@ -118,7 +118,7 @@ def test_decode_ssd_without_detections_is_empty():
         ),
         (
             OutputLayout.yolo,
-            {"y": np.zeros((1, 9, 7)), "z": np.zeros(1)},
+            {"y": np.zeros((1, 9, 7)), "z": np.zeros(2)},
             r"detector\.layout: expected one output, got",
         ),
         (OutputLayout.yolo, {"y": np.full((1, 9, 7), 3.0)}, "expected scores in .*, got 3 to 3"),

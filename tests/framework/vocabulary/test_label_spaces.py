@@ -194,3 +194,38 @@ def test_benchmark_ids_equal_label_table_of_scannet(label_space: str, name: str,
     with table.open(newline="") as file:
         ids = {row[name]: int(row[number]) for row in csv.DictReader(file, delimiter="\t")}
     assert BENCHMARK_IDS[label_space] == tuple(ids[name] for name in SPACES[label_space])
+
+
+@pytest.mark.parametrize(
+    ("content", "labels"),
+    [
+        ("__background__\nperson\nN/A\nchair\n", ("n/a", "person", "n/a", "chair")),  # torchvision's
+        ("???\nperson\n???\nchair\n", ("n/a", "person", "n/a", "chair")),  # TensorFlow Lite's
+        ("background\r\nforklift\r\n", ("n/a", "forklift")),
+        ("3d printer\n2 door car\nchair\n", ("3d printer", "2 door car", "chair")),
+        ("Gabelstapler\nPalette (groß)\n\n", ("Gabelstapler", "Palette (groß)")),
+    ],
+)
+def test_read_labels_of_other_tools_gives_names(tmp_path: Path, content: str, labels: tuple[str, ...]) -> None:
+    (tmp_path / "labels.txt").write_bytes(content.encode())
+    assert read_labels(str(tmp_path / "labels.txt")) == labels
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("coco_labels.txt", "0  person\n1  bicycle\n", "numbers as well, such as '0  person'; remove the numbers"),
+        ("labels.txt", "1: chair\n2: table\n", "numbers as well, such as '1: chair'"),
+        ("data.yaml", "names:\n  0: forklift\n", "expected a text file with one name per line"),
+        ("classes.json", '["forklift"]', "expected a text file with one name per line"),
+        ("label_map.pbtxt", 'item { id: 1 name: "forklift" }', "expected a text file with one name per line"),
+    ],
+)
+def test_read_labels_of_other_format_raises(tmp_path: Path, name: str, content: str, message: str) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(ConfigError, match=message):
+        read_labels(str(tmp_path / name))
+
+
+def test_read_labels_agnostic_is_single_class() -> None:
+    assert read_labels("agnostic") == ("object",)

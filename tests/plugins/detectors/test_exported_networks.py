@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
+from onnx import TensorProto
 
 from framework.data import Camera, Frame
 from framework.detection.candidates import OutputLayout
@@ -16,7 +18,22 @@ from framework.errors import ConfigError, DataError
 from framework.vocabulary.category_ids import CategoryIds
 from plugins.detectors.onnx_boxes import OnnxBoxes
 from plugins.detectors.onnx_segmentation import OnnxSegmentation
-from tests.support.networks.exported_networks import BOX, detectron2, export, mask_rcnn, rf_detr, yolo26
+from tests.support.networks.exported_networks import (
+    BOX,
+    cells,
+    detections,
+    detectron2,
+    detr,
+    end2end,
+    export,
+    mask_rcnn,
+    mmdeploy,
+    prototypes,
+    rf_detr,
+    rows,
+    tensorflow,
+    yolo26,
+)
 from tests.support.networks.tiny_networks import constant_network
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
@@ -198,6 +215,19 @@ def test_onnx_boxes_ssd_class_columns_follow_their_number(tmp_path: Path, column
     assert the_object(detector)[0] == "chair"
 
 
+@pytest.mark.parametrize("ids", [CategoryIds.AUTO, None])
+@pytest.mark.parametrize("last", [False, True])
+def test_onnx_boxes_background_column_is_first_or_last(tmp_path: Path, last: bool, ids: CategoryIds | None) -> None:
+    scores = np.full((1, 40, 81), 0.001)
+    scores[..., 80 if last else 0] = 0.9
+    scores[0, 0, 56 if last else 57], scores[0, 0, 80 if last else 0] = 0.9, 0.01
+    boxes = np.tile(np.array(BOX) * [320, 240, 320, 240], (1, 40, 1))
+    weights = constant_network(tmp_path / "n.onnx", (1, 3, 240, 320), {"boxes": boxes, "scores": scores})
+    given = ids or (CategoryIds.FROM_ZERO if last else CategoryIds.FROM_ONE)
+    detector = OnnxBoxes(weights=weights, device="cpu", layout=OutputLayout.ssd_torchvision, category_ids=given)
+    assert the_object(detector)[0] == "chair"
+
+
 @pytest.mark.parametrize(
     ("label", "fix"), [(12, "FROM_ONE"), (26, "FROM_ONE"), (45, "FROM_ONE"), (83, "FROM_ONE"), (0, "FROM_ZERO")]
 )
@@ -216,7 +246,182 @@ def test_onnx_boxes_ssd_unit_labels_need_numbering(tmp_path: Path) -> None:
     assert the_object(numbered)[0] == "chair"
 
 
-def test_onnx_boxes_tensorflow_outputs_error_names_layout(tmp_path: Path) -> None:
-    weights = constant_network(tmp_path / "n.onnx", (1, 3, 240, 320), ssd(62))
-    with pytest.raises(DataError, match=r"set detector\.layout=ssd_tensorflow detector\.placement=stretch"):
-        OnnxBoxes(weights=weights, device="cpu")
+SIDES = (480, 640)
+YOLO = (1, 3, *SIDES)
+
+
+def swapped(table: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    return table.transpose(0, 2, 1)
+
+
+def pair(table: np.ndarray[Any, Any], rows_first: bool = False) -> dict[str, np.ndarray[Any, Any]]:
+    with_coefficients, maps = prototypes(table, *SIDES)
+    return {"516": maps, "output0": with_coefficients if rows_first else swapped(with_coefficients)}
+
+
+def rt_detr() -> np.ndarray[Any, Any]:
+    boxes, scores, labels = detections(56, 1, 1)
+    centers = np.concatenate([(boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]], axis=1)
+    return np.concatenate([centers, np.eye(80)[labels] * scores[:, None]], axis=1)[None]
+
+
+def batched() -> dict[str, np.ndarray[Any, Any]]:
+    """Return outputs of an RT-DETR or D-FINE, whose labels count from 0 under torchvision's names."""
+    return {name: array[None] for name, array in mask_rcnn(56, SIDES).items() if name != "masks"}
+
+
+BOX_EXPORTS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
+    "tensorflow": ((1, 240, 320, 3), tensorflow(62), {"element": TensorProto.UINT8}),
+    "efficientdet": ((1, 480, 640, 3), rows(62, *SIDES, "efficientdet"), {"element": TensorProto.UINT8}),
+    "yolov5": (YOLO, {"output0": cells(56, *SIDES, "objectness classes", 3)}, {}),
+    "yolov6": (YOLO, {"outputs": cells(56, *SIDES, "ones classes")}, {}),
+    "yolov7_end2end": (YOLO, rows(56, *SIDES, "yolov7"), {}),
+    "yolo_nas": (YOLO, rows(56, *SIDES, "yolo_nas"), {"dynamic": True, "empty": True}),
+    "yolov8": (YOLO, {"output0": swapped(cells(56, *SIDES, "classes"))}, {}),
+    "yolov9_end2end": (YOLO, end2end(56, *SIDES), {}),
+    "yolox_decoded": (YOLO, {"output": cells(56, *SIDES, "objectness classes")}, {}),
+    "rt_detr": (YOLO, {"output0": rt_detr()}, {}),
+    "detr": (YOLO, detr(62), {}),
+    "mmdeploy": (YOLO, mmdeploy(56, *SIDES, ""), {}),
+    "paddle": (YOLO, rows(56, *SIDES, "paddle"), {"sizes": {"scale_factor": TensorProto.FLOAT}}),
+    "paddle_empty": (YOLO, rows(56, *SIDES, "paddle"), {"dynamic": True, "empty": True}),
+}
+MASK_EXPORTS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
+    "tensorflow": ((1, 240, 320, 3), tensorflow(62, masks=True), {"element": TensorProto.UINT8}),
+    "yolov5": (YOLO, pair(cells(56, *SIDES, "objectness classes", 3), rows_first=True), {}),
+    "yolov8": (YOLO, pair(cells(56, *SIDES, "classes")), {}),
+    "detr": (YOLO, detr(62, masks=True), {}),
+    "mmdeploy": (YOLO, mmdeploy(56, *SIDES, "in boxes"), {}),
+    "mmdeploy_bytes": (YOLO, mmdeploy(56, *SIDES, "bytes"), {}),
+    "mmdeploy_logits": (YOLO, mmdeploy(56, *SIDES, "logits"), {}),
+    "torchvision_int32": (WIDE, mask_rcnn(62, WIDE[1:]) | {"labels": np.full(5, 62, np.int32)}, {"dynamic": True}),
+    "detectron2_bytes": (WIDE, detectron2(56, WIDE[1:]), {"element": TensorProto.UINT8}),
+}
+
+
+@pytest.mark.parametrize(("shape", "outputs", "how"), BOX_EXPORTS.values(), ids=BOX_EXPORTS)
+def test_onnx_boxes_common_export_finds_chair(tmp_path: Path, shape: Any, outputs: Any, how: Any) -> None:
+    name, mask, _ = the_object(OnnxBoxes(weights=export(tmp_path / "n.onnx", shape, outputs, **how), device="cpu"))
+    assert (name, iou(mask) > 0.9) == ("chair", True)
+
+
+@pytest.mark.parametrize(("shape", "outputs", "how"), MASK_EXPORTS.values(), ids=MASK_EXPORTS)
+def test_onnx_segmentation_common_export_finds_chair(tmp_path: Path, shape: Any, outputs: Any, how: Any) -> None:
+    weights = export(tmp_path / "n.onnx", shape, outputs, **how)
+    name, mask, _ = the_object(OnnxSegmentation(weights=weights, device="cpu"))
+    assert (name, iou(mask) > 0.9) == ("chair", True)
+
+
+@pytest.mark.parametrize(
+    ("export_name", "placement", "bgr", "white"),
+    [
+        ("tensorflow", Placement.stretch, False, 255.0),
+        ("yolov5", Placement.center, False, 1.0),
+        ("yolov8", Placement.center, False, 1.0),
+        ("yolox_decoded", Placement.top_left, True, 255.0),
+        ("rt_detr", Placement.stretch, False, 1.0),
+    ],
+)
+def test_onnx_boxes_common_export_gets_its_image_format(
+    tmp_path: Path, export_name: str, placement: Placement, bgr: bool, white: float
+) -> None:
+    shape, outputs, how = BOX_EXPORTS[export_name]
+    detector = OnnxBoxes(weights=export(tmp_path / "n.onnx", shape, outputs, **how), device="cpu")
+    found = detector._network.format
+    assert (found.placement, found.bgr, found.white) == (placement, bgr, white)
+
+
+@pytest.mark.parametrize("export_name", ["mmdeploy", "yolo_nas"])
+def test_onnx_boxes_unknown_image_format_warns(
+    tmp_path: Path, export_name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    shape, outputs, how = BOX_EXPORTS[export_name]
+    weights = export(tmp_path / "n.onnx", shape, outputs, **how)
+    OnnxBoxes(weights=weights, device="cpu", preprocessing=ImageFormatChoice.CUSTOM)
+    assert "known image format" not in caplog.text
+    OnnxBoxes(weights=weights, device="cpu")
+    assert "detector.preprocessing: expected a network with a known image format" in caplog.text
+
+
+def queries() -> dict[str, np.ndarray[Any, Any]]:
+    found = rf_detr(56, columns=81, queries=100)
+    return {"class_queries_logits": found["labels"], "masks_queries_logits": found["masks"]}
+
+
+@pytest.mark.parametrize(
+    ("outputs", "message"),
+    [
+        (batched(), r"set detector\.category_ids=COCO_91 or detector\.category_ids=FROM_ONE or .*=FROM_ZERO"),
+        ({"boxes": batched()["boxes"], "scores": np.zeros((1, 5, 80))}, r"set detector\.layout=ssd_torchvision if"),
+        (queries(), r"set detector=onnx_segmentation for a network with masks"),
+        ({"y": np.zeros((0, 6))}, r"set detector\.layout=end_to_end or detector\.layout=label_first"),
+        ({"y": np.zeros((0, 7))}, r"set detector\.layout=image_first or detector\.layout=yolo_nas"),
+        ({"Identity": cells(56, *SIDES, "classes")}, r"Ultralytics detector\.layout=yolo detector\.placement=center"),
+        (pair(cells(56, *SIDES, "classes")), r"set detector=onnx_segmentation for a network with masks"),
+    ],
+    ids=["rt_detr_postprocessed", "yolo_nas", "mask2former", "rows", "rows_with_image", "yolov8_tf", "yolov8_seg"],
+)
+def test_onnx_boxes_uncertain_export_error_names_setting(tmp_path: Path, outputs: Any, message: str) -> None:
+    with pytest.raises((ConfigError, DataError), match=message):
+        OnnxBoxes(weights=export(tmp_path / "n.onnx", YOLO, outputs), device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("outputs", "message"),
+    [
+        (queries(), r"as of Mask2Former, .*set detector=transformers_segmentation"),
+        (
+            {"output0": swapped(cells(56, *SIDES, "classes"))},
+            r"expected masks, got boxes only .*set detector=onnx_boxes",
+        ),
+        (pair(cells(0, *SIDES, "classes")[..., :5]), r"label_space: expected 116 columns"),
+    ],
+    ids=["mask2former", "boxes", "fastsam"],
+)
+def test_onnx_segmentation_other_export_error_names_setting(tmp_path: Path, outputs: Any, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        OnnxSegmentation(weights=export(tmp_path / "n.onnx", YOLO, outputs), device="cpu")
+
+
+def test_onnx_segmentation_class_agnostic_network_finds_object(tmp_path: Path) -> None:
+    weights = export(tmp_path / "n.onnx", YOLO, pair(cells(0, *SIDES, "classes")[..., :5]))  # as FastSAM
+    name, mask, _ = the_object(OnnxSegmentation(weights=weights, device="cpu", label_space="agnostic"))
+    assert (name, iou(mask) > 0.9) == ("object", True)
+
+
+def test_onnx_boxes_input_of_image_size_is_given(tmp_path: Path) -> None:
+    sizes = {"orig_target_sizes": TensorProto.INT64}  # as in RT-DETR and D-FINE
+    weights = export(tmp_path / "n.onnx", YOLO, batched(), sizes=sizes)
+    detector = OnnxBoxes(weights=weights, device="cpu", category_ids=CategoryIds.FROM_ZERO)
+    assert the_object(detector)[0] == "chair"
+    assert detector._network._network._sizes["orig_target_sizes"].tolist() == [[640, 480]]
+
+
+def test_onnx_boxes_export_of_transformers_finds_chair(tmp_path: Path) -> None:
+    outputs = {**detr(62), "last_hidden_state": np.zeros((1, 100, 256))}
+    weights = export(
+        tmp_path / "n.onnx", YOLO, outputs, sizes={"pixel_mask": TensorProto.INT64}, size_shape=(1, 64, 64)
+    )
+    detector = OnnxBoxes(weights=weights, device="cpu")
+    assert the_object(detector)[0] == "chair"
+    assert detector._network._network._sizes["pixel_mask"].all()
+
+
+@pytest.mark.parametrize(
+    ("detector", "outputs"),
+    [
+        (OnnxBoxes, {"output0": yolo26(0)["output0"][..., :6]}),
+        (OnnxBoxes, {"output0": swapped(cells(0, *SIDES, "classes")[..., :6])}),
+        (OnnxSegmentation, yolo26(0)),
+        (OnnxSegmentation, pair(cells(0, *SIDES, "classes")[..., :6])),
+    ],
+    ids=["boxes_end_to_end", "boxes", "end_to_end", "segmentation"],
+)
+def test_own_classes_of_network_error_lists_names(tmp_path: Path, detector: Any, outputs: Any) -> None:
+    side = 640 if outputs["output0"].shape[1] == 300 else SIDES[0]
+    weights = export(tmp_path / "n.onnx", (1, 3, side, 640), outputs)
+    model = onnx.load(weights)
+    onnx.helper.set_model_props(model, {"names": "{0: 'forklift', 1: 'pallet'}", "author": "Ultralytics"})
+    onnx.save(model, weights)
+    with pytest.raises((ConfigError, DataError), match=r"label_space: expected .*\(forklift, pallet\), got 80 names"):
+        detector(weights=weights, device="cpu")

@@ -123,6 +123,7 @@ def test_precomputed_partial_distribution_is_normalized(tmp_path: Path) -> None:
         (CategoryIds.FROM_ONE, "coco", 57, "chair"),
         (CategoryIds.FROM_ZERO, "coco", 56, "chair"),
         (CategoryIds.FROM_ONE, "nyu40", 5, "chair"),
+        (CategoryIds.SCANNET, "scannet20", 33, "toilet"),
     ],
 )
 def test_precomputed_category_id_maps_to_label(
@@ -210,8 +211,8 @@ def test_precomputed_mask_folder_is_read(tmp_path: Path) -> None:
     [
         ([{"id": 0, "class": "tv", "score": 0.5}], r"id: expected an integer in \[1, 65535\], got 0"),
         (
-            [{"id": 7, "class": "television", "score": 0.5}],
-            r"label: expected one of the 80 names in detector\.label_space, got .*'television'",
+            [{"id": 7, "class": "chairlift", "score": 0.5}],
+            r"label: expected one of the 80 names in detector\.label_space, got .*'chairlift'",
         ),
         ([{"id": 7, "class": "tv"}], r"score: expected a number in \[0, 1\]"),
         ({"id": 7}, "expected a list of"),
@@ -225,6 +226,20 @@ def test_precomputed_invalid_mask_folder_entry_raises(tmp_path: Path, listed: An
     with pytest.raises(DataError, match=message) as raised:
         Precomputed(write_folder(tmp_path, listed=listed))
     assert "000003.json" in str(raised.value)
+
+
+def test_precomputed_mask_folder_of_8_bits_is_read(tmp_path: Path) -> None:
+    found = Precomputed(write_folder(tmp_path, np.where(MASK, np.uint8(7), np.uint8(0)))).detect(frame(3))
+    np.testing.assert_array_equal(found.masks[0], MASK)
+
+
+@pytest.mark.parametrize(
+    ("category_id", "name"),
+    [("62", "chair"), (62.0, "chair"), ("1", "person")],  # as text or by pandas
+)
+def test_precomputed_category_id_of_other_type_is_read(tmp_path: Path, category_id: Any, name: str) -> None:
+    found = detected(tmp_path, entry(category_name=None, category_id=category_id))
+    assert found.classes[int(found.class_probabilities[0].argmax())] == name
 
 
 def test_precomputed_mask_folder_with_unpaired_file_raises(tmp_path: Path) -> None:
@@ -244,7 +259,7 @@ def test_precomputed_mask_folder_with_duplicate_frame_raises(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("ids", "error"), [(np.zeros((6, 9), np.uint16), DataError), (np.zeros((6, 8), np.uint8), FrameError)]
+    ("ids", "error"), [(np.zeros((6, 9), np.uint16), DataError), (np.zeros((6, 8, 3), np.uint8), FrameError)]
 )
 def test_precomputed_mask_image_with_wrong_size_or_type_raises(
     tmp_path: Path, ids: np.ndarray, error: type[DataError]
@@ -264,7 +279,7 @@ def test_precomputed_mask_image_with_wrong_size_or_type_raises(
         ({"image_id": True}, "image_id"),
         ({"image_id": 0.5}, "image_id: expected a frame number, or a file name such as 000012.png, got"),
         ({"category_name": "chiar"}, "label: expected one of the 80 names in detector.label_space, got"),
-        ({"category_name": None}, "category_id: expected the id of a label, got None"),
+        ({"category_name": None}, "category_id: expected category_id or category_name, got neither; add one of them"),
         ({"score": 1.5}, "score: expected a number in [0, 1], got 1.5"),
         ({"score": None}, "score"),
         (
@@ -297,7 +312,9 @@ def test_precomputed_invalid_entry_raises_one_line_error(tmp_path: Path, changes
     ("content", "message"),
     [
         ("[{]", "expected valid JSON"),
-        ('{"annotations": []}', "expected a list of"),
+        ('{"annotations": []}', "expected a list of results in COCO's format, or an object with lists of images, ann"),
+        ('{"images": [], "annotations": [], "categories": []}', "expected at least one detection"),
+        ('{"images": [], "annotations": [{"image_id": 3}], "categories": []}', "annotation 0: expected ids of images"),
         ("[]", "expected at least one detection"),
         ("[3]", "entry 0"),
     ],
@@ -457,7 +474,65 @@ def test_precomputed_file_names_without_numbers_need_named_frames(tmp_path: Path
         detector.detect(frame())
 
 
+def test_precomputed_file_name_precedes_image_id(tmp_path: Path) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id=0, file_name="000006.jpg")))  # as Ultralytics writes
+    detector.check_sequence(NamedRoom())
+    assert len(detector.detect(replace(frame(3), image_name="000006.jpg"))) == 1
+    assert len(detector.detect(replace(frame(0), image_name="000000.jpg"))) == 0
+
+
+def dataset(image: dict[str, Any], category: str, **changes: Any) -> dict[str, Any]:
+    """Return a COCO dataset with one annotation of the image 17 and the category 3."""
+    segmentation = [[2, 1, 7, 1, 7, 4, 2, 4]]
+    annotation = {"id": 1, "image_id": 17, "category_id": 3, "segmentation": segmentation, "iscrowd": 0, "area": 15}
+    return {
+        "images": [{"id": 9, "file_name": "000000.jpg"}, {"id": 17, **image}],
+        "annotations": [annotation | changes],
+        "categories": [{"id": 0, "name": "things"}, {"id": 3, "name": category, "supercategory": "things"}],
+    }
+
+
+@pytest.mark.parametrize(
+    ("image", "category", "changes", "score"),
+    [
+        ({"file_name": "000006.jpg"}, "chair", {}, 1.0),
+        ({"file_name": "C:\\scans\\color\\000006.png"}, "chair", {"score": 0.5}, 0.5),
+        ({"file_name": "000006_jpg.rf.a1b2c3.jpg"}, "Chair", {}, 1.0),  # Roboflow
+        ({"file_name": "x.jpg", "extra": {"name": "000006.jpg"}}, "chair", {}, 1.0),
+        ({"file_name": "6.png"}, "chair", {"segmentation": {"size": [6, 8], "counts": RUN_LENGTHS}}, 1.0),
+    ],
+    ids=["file", "windows", "roboflow", "roboflow_extra", "crowd"],
+)
+def test_precomputed_coco_dataset_is_read(
+    tmp_path: Path, image: dict[str, Any], category: str, changes: dict[str, Any], score: float
+) -> None:
+    (tmp_path / "dataset.json").write_text(json.dumps(dataset(image, category, **changes)))
+    detector = Precomputed(tmp_path / "dataset.json")
+    detector.check_sequence(NamedRoom())
+    found = detector.detect(replace(frame(3), image_name="000006.jpg"))
+    assert (len(found), float(found.scores[0])) == (1, score)
+    np.testing.assert_array_equal(found.masks[0], MASK)
+    assert COCO[found.class_probabilities[0].argmax()] == "chair"
+
+
+@pytest.mark.parametrize(
+    ("written", "name"),
+    [("sofa", "couch"), ("tvmonitor", "tv"), ("Dining Table", "dining table"), ("potted_plant", "potted plant")],
+)
+def test_precomputed_other_name_of_class_is_read(tmp_path: Path, written: str, name: str) -> None:
+    found = detected(tmp_path, entry(category_name=written))
+    assert found.classes[int(found.class_probabilities[0].argmax())] == name
+
+
 # Own classes
+
+
+def test_precomputed_label_file_with_unused_ids_is_read(tmp_path: Path) -> None:
+    (tmp_path / "labels.txt").write_text("\n".join(["__background__", "forklift", "N/A", "pallet"]))
+    entries = [entry(category_name=None, category_id=3), entry(category_name="forklift", score=0.5)]
+    found = detected(tmp_path, *entries, label_space=str(tmp_path / "labels.txt"))
+    assert found.classes == ("forklift", "pallet")
+    assert [found.classes[k] for k in found.class_probabilities.argmax(axis=1)] == ["pallet", "forklift"]
 
 
 @pytest.mark.parametrize(

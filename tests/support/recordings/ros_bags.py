@@ -88,25 +88,30 @@ class BagWriter:
         model: str = "plumb_bob",
         lens: Sequence[float] = (0,) * 5,
         rectified: Camera | None = None,
+        R: Float64 | None = None,
+        binning: int = 0,
+        region: tuple[int, int, int, int] = (0, 0, 0, 0),
+        frame_id: str = "camera_color_optical_frame",
     ) -> None:
+        """Add a CameraInfo of the full resolution; `region` = x offset, y offset, height and width."""
         matrices = {
             "d": np.array(lens, float),
             "k": camera.K.ravel(),
-            "r": np.eye(3).ravel(),
+            "r": (np.eye(3) if R is None else R).ravel(),
             "p": np.pad((rectified or camera).K, ((0, 0), (0, 1))).ravel(),
         }
-        region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
+        roi = dict(zip(("x_offset", "y_offset", "height", "width"), region, strict=True))
         self.add(
             time,
             topic,
             "sensor_msgs/msg/CameraInfo",
-            header=self.header(time),
+            header=self.header(time, frame_id),
             height=camera.height,
             width=camera.width,
             distortion_model=model,
-            binning_x=0,
-            binning_y=0,
-            roi=self.made("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **region),
+            binning_x=binning,
+            binning_y=binning,
+            roi=self.made("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **roi),
             **{name.upper() if self.ros1 else name: matrix for name, matrix in matrices.items()},
         )
 
@@ -120,6 +125,20 @@ class BagWriter:
 
     def add_pose(self, time: float, topic: str, T: Float64) -> None:
         self.add(time, topic, "geometry_msgs/msg/PoseStamped", header=self.header(time, "map"), pose=self.pose(T))
+
+    def add_pose_with_covariance(self, time: float, topic: str, T: Float64) -> None:
+        pose = self.made("geometry_msgs/msg/PoseWithCovariance", pose=self.pose(T), covariance=np.zeros(36))
+        kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
+        self.add(time, topic, kind, header=self.header(time, "map"), pose=pose)
+
+    def add_transform_stamped(self, time: float, topic: str, T: Float64, child: str) -> None:
+        kind = "geometry_msgs/msg/TransformStamped"
+        self.add(time, topic, kind, **vars(self.transform_stamped(time, "world", child, T)))
+
+    def add_path(self, time: float, topic: str, poses: Sequence[tuple[float, Float64]]) -> None:
+        kind = "geometry_msgs/msg/PoseStamped"
+        stamped = [self.made(kind, header=self.header(at, "map"), pose=self.pose(T)) for at, T in poses]
+        self.add(time, topic, "nav_msgs/msg/Path", header=self.header(time, "map"), poses=stamped)
 
     def add_odometry(self, time: float, topic: str, T: Float64, child: str) -> None:
         zero = dict.fromkeys("xyz", 0.0)
@@ -144,6 +163,14 @@ class BagWriter:
         rotation = self.made("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", q.tolist(), strict=True)))
         return {"translation": self.vector(T[:3, 3]), "rotation": rotation}
 
+    def transform_stamped(self, time: float, parent: str, child: str, T: Float64) -> Any:
+        return self.made(
+            "geometry_msgs/msg/TransformStamped",
+            header=self.header(time, parent),
+            child_frame_id=child,
+            transform=self.made("geometry_msgs/msg/Transform", **self.transform(T)),
+        )
+
     def add_transform(self, topic: str, T: Float64) -> None:
         self.add(START, topic, "geometry_msgs/msg/Transform", **self.transform(T))
 
@@ -153,15 +180,7 @@ class BagWriter:
 
     def add_tf(self, time: float, *transforms: tuple[str, str, Float64], topic: str = "/tf") -> None:
         """Add transforms at one time. Each is a tuple of parent, child and T_parent_child."""
-        stamped = [
-            self.made(
-                "geometry_msgs/msg/TransformStamped",
-                header=self.header(time, parent),
-                child_frame_id=child,
-                transform=self.made("geometry_msgs/msg/Transform", **self.transform(T)),
-            )
-            for parent, child, T in transforms
-        ]
+        stamped = [self.transform_stamped(time, *transform) for transform in transforms]
         self.add(time, topic, TF_MESSAGE, transforms=stamped)
 
     def add_imu(self, time: float, topic: str, acceleration: Float64, frame_id: str) -> None:
@@ -214,11 +233,11 @@ def png(image: np.ndarray) -> bytes:
     return bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
-def compressed_depth(depth: np.ndarray) -> tuple[bytes, str]:
+def compressed_depth(depth: np.ndarray, encode: Callable[[np.ndarray], bytes] = png) -> tuple[bytes, str]:
     """Return depth (m) in the inverse depth format of compressed_depth_image_transport, and the format name."""
     a, b = 100.0 * 101.0, 1.0 - 100.0 * 101.0 / 10.0  # for a quantization of 100 and a range of 10 m
     stored = np.where(depth > 0, np.rint(a / np.where(depth > 0, depth, 1) + b), 0).astype(np.uint16)
-    return struct.pack("<iff", 0, a, b) + png(stored), "32FC1; compressedDepth png"
+    return struct.pack("<iff", 0, a, b) + encode(stored), f"32FC1; compressedDepth {encode.__name__}"
 
 
 def millimeters(depth: np.ndarray) -> np.ndarray:

@@ -22,6 +22,9 @@ GAPS = frames_named("{:06d}.jpg", range(0, 28, 2))  # as `import --stride 2` wri
 FROM_ONE = frames_named("{:06d}.jpg", range(1, 15))
 PREFIXED = frames_named("frame_{:06d}.png", range(14))
 STAMPS = frames_named("1305031102.{:06d}.png", range(175304, 600000, 33000))
+CAMERA_0 = frames_named("cam0_{:06d}.jpg", range(0, 28, 2))
+NANOSECONDS = frames_named("{}.png", range(1403636579763555584, 1403636580463555584, 50000000))
+SCANS = frames_named("scene0000_00_{:05d}.jpg", range(0, 140, 10))
 SEVEN_SCENES = frames_named("frame-{:06d}.color.png", range(14))
 
 
@@ -45,6 +48,15 @@ SEVEN_SCENES = frames_named("frame-{:06d}.color.png", range(14))
         (SEVEN_SCENES, "frame-000003.png", 3),
         (SEVEN_SCENES, "chess/seq-01/frame-000003.color.png", 3),
         ({0: "", 1: ""}, "000001.png", 1),  # frames in one file
+        (CAMERA_0, "000012.png", 6),  # a number of a file, although its prefix has a digit
+        (CAMERA_0, "cam0_12.png", 6),
+        (NANOSECONDS, "1403636579813555584.jpg", 1),
+        (SCANS, "scene0000_00_00030.png", 3),
+        (SCANS, "D:\\scans\\00030.jpg", 3),
+        (GAPS, "000004_jpg.rf.0b1f54e2a7.jpg", 2),  # as Roboflow renames images
+        (GAPS, "000004.jpg.png", 2),
+        (STAMPS, 1305031102.208304, 1),
+        (FROM_ONE, 3.0, 3),  # as pandas writes whole numbers
     ],
 )
 def test_image_index_name_means_file_and_number_means_frame(frames: dict[int, str], found: object, index: int) -> None:
@@ -60,6 +72,11 @@ def test_image_index_name_means_file_and_number_means_frame(frames: dict[int, st
         (STAMPS, "1305031102.9.png"),
         (FROM_ONE, "000000.png"),
         (SEVEN_SCENES, "left.png"),
+        (CAMERA_0, "cam1_000012.png"),
+        (SCANS, "scene0001_00_00030.png"),
+        (GAPS, "3f2b8c1e-9d4a-4c1b-8f3e-0a1b2c3d4e04.png"),
+        (STAMPS, "2024-01-05-175304.png"),
+        (NANOSECONDS, "1403636579763.png"),
     ],
 )
 def test_image_index_name_of_no_frame_is_unmatched(frames: dict[int, str], found: str) -> None:
@@ -114,6 +131,12 @@ def test_check_matches_other_numbering_raises_with_setting(
 ) -> None:
     with pytest.raises(DataError, match=rf"image_ids: expected ids .*set .*detector\.image_ids={fix}"):
         check_matches(PATH, found, ImageIds.AUTO, frames, warns=True)
+
+
+def test_check_matches_unusable_numbering_is_not_suggested() -> None:
+    found = images(1403636579763555584, 1403636579813555584)
+    with pytest.raises(DataError, match=r"; set detector\.image_ids=FILE_NUMBER$"):
+        check_matches(PATH, found, ImageIds.AUTO, NANOSECONDS, warns=True)
 
 
 @pytest.mark.parametrize("found", [images("kitchen.png"), images("000001.png", "000003.png"), images(99)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -94,13 +95,15 @@ def test_ros_bag_camera_pose_option_is_applied(tmp_path: Path) -> None:
     check_poses(bag, tmp_path / "bag", tmp_path / "out", camera_pose=ROS_AXES)
 
 
-@pytest.mark.parametrize("layout", ["map", "map and odom", "slow map", "world", "ros1"])
+@pytest.mark.parametrize("layout", ["map", "map and odom", "slow map", "world", "t265", "ros1"])
 def test_ros_bag_poses_on_tf_are_imported(tmp_path: Path, layout: str) -> None:
     bag = BagWriter(ros1=layout == "ros1")
     add_camera_of_ros(bag)
     bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
     T_map_odom = exp_se3(np.array([1.0, 2.0, 0, 0, 0, 0.5])) if layout in ("map and odom", "slow map") else np.eye(4)
-    root = {"world": "/world", "map and odom": "odom", "slow map": "odom"}.get(layout, "map")
+    root = {"world": "/world", "map and odom": "odom", "slow map": "odom", "t265": "camera_odom_frame"}.get(
+        layout, "map"
+    )
     for k in range(-1, COUNT + 1):
         bag.add_tf(START + k / 30, (root, "base_link", inverse(T_map_odom) @ pose_at(k) @ inverse(T_BASE_CAMERA)))
     if layout == "map and odom":
@@ -110,6 +113,107 @@ def test_ros_bag_poses_on_tf_are_imported(tmp_path: Path, layout: str) -> None:
         for n in (-1, 1):
             bag.add_tf(START + n, ("map", "odom", T_map_odom))
     check_poses(bag, tmp_path / ("a.bag" if bag.ros1 else "bag"), tmp_path / "out")
+
+
+def add_camera_path(bag: BagWriter, topic: str) -> None:
+    for n in range(1, COUNT + 1):
+        bag.add_path(time_of(n - 1), topic, [(time_of(k), pose_at(k)) for k in range(n)])
+
+
+POSE_TOPICS: dict[str, Callable[[BagWriter, int], None]] = {
+    "/rtabmap/localization_pose": lambda bag, k: bag.add_pose_with_covariance(
+        time_of(k), "/rtabmap/localization_pose", pose_at(k)
+    ),
+    "/vicon/camera": lambda bag, k: bag.add_transform_stamped(time_of(k), "/vicon/camera", pose_at(k), f"/{OPTICAL}"),
+    "/mocap/robot": lambda bag, k: bag.add_transform_stamped(
+        time_of(k), "/mocap/robot", pose_at(k) @ inverse(T_BASE_CAMERA), "base_link"
+    ),
+    "/slam/pose_stamped": lambda bag, k: bag.add_pose(time_of(k), "/slam/pose_stamped", pose_at(k)),
+    "/t265/odom/sample": lambda bag, k: bag.add_odometry(
+        time_of(k), "/t265/odom/sample", pose_at(k) @ inverse(T_BASE_CAMERA), "/base_link"
+    ),
+}
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+@pytest.mark.parametrize("topic", POSE_TOPICS)
+def test_ros_bag_kinds_of_poses_are_imported(tmp_path: Path, topic: str, ros1: bool) -> None:
+    """Goals and the pose estimate of a user are not poses of the camera."""
+    bag = BagWriter(ros1)
+    add_camera_of_ros(bag)
+    if "localization" not in topic:
+        bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
+    for name in ("/goal_pose", "/move_base_simple/goal", "/mavros/setpoint_position/local"):
+        bag.add_pose(time_of(1), name, np.eye(4))
+    bag.add_pose_with_covariance(time_of(1), "/initialpose", np.eye(4))
+    for k in range(COUNT):
+        POSE_TOPICS[topic](bag, k)
+    check_poses(bag, tmp_path / ("a.bag" if ros1 else "bag"), tmp_path / "out")
+
+
+def test_ros_bag_goals_alone_are_no_poses(tmp_path: Path) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    bag.add_pose(time_of(1), "/goal_pose", np.eye(4))
+    bag.add_pose_with_covariance(time_of(1), "/initialpose", np.eye(4))
+    assert not open_source(bag.write(tmp_path / "bag")).posed
+
+
+def test_ros_bag_path_is_imported_on_request(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_camera_path(bag, "/orb_slam3/path")
+    path = bag.write(tmp_path / "bag")
+    assert not open_source(path).posed
+    assert "without poses; set --poses /orb_slam3/path if this topic has the poses of the camera" in caplog.text
+    assert not imported(path, tmp_path / "out", poses="/orb_slam3/path")
+    check_room(tmp_path / "out")
+
+
+@pytest.mark.parametrize("on_tf", [True, False])
+def test_ros_bag_localization_of_robot_is_not_camera_pose(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, on_tf: bool
+) -> None:
+    """AMCL publishes poses of a base frame without its name."""
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    bag.add_static(("base_link", OPTICAL, T_BASE_CAMERA))
+    for k in range(COUNT):
+        T_world_base = pose_at(k) @ inverse(T_BASE_CAMERA)
+        bag.add_pose_with_covariance(time_of(k), "/amcl_pose", T_world_base)
+        if on_tf:
+            bag.add_tf(time_of(k), ("map", "base_link", T_world_base))
+    path = bag.write(tmp_path / "bag")
+    assert not imported(path, tmp_path / "out")
+    check_room(tmp_path / "out", posed=on_tf)
+    assert (tmp_path / "out/poses.txt").exists() is on_tf
+    assert ("imported without poses; set --poses /amcl_pose if" in caplog.text) is not on_tf
+
+
+@pytest.mark.parametrize("child", ["", "odom", "/odom"])
+def test_ros_bag_odometry_of_unnamed_frame_raises(tmp_path: Path, child: str) -> None:
+    """VINS-Fusion names the fixed frame as the moving frame, and the bag connects it with the camera."""
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    for k in range(COUNT):
+        bag.add_odometry(time_of(k), "/vins/odometry", pose_at(k) @ inverse(T_BASE_CAMERA), child)
+        bag.add_tf(time_of(k), ("odom", "body", pose_at(k) @ inverse(T_BASE_CAMERA)), ("body", OPTICAL, T_BASE_CAMERA))
+    path = bag.write(tmp_path / "bag")
+    with pytest.raises(DataError, match=r"from the moving frame, which has no name, to .*; set --camera-pose"):
+        open_source(path)
+    assert not imported(path, tmp_path / "out", poses="/tf")
+    check_room(tmp_path / "out")
+
+
+@pytest.mark.parametrize("offset", [-START, -3600, 3600, 1.0])
+def test_ros_bag_poses_of_other_times_raise(tmp_path: Path, offset: float) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    for k in range(COUNT):
+        bag.add_odometry(time_of(k) + offset, "/odom", pose_at(k), OPTICAL)
+    path = bag.write(tmp_path / "bag")
+    with pytest.raises(DataError, match=r"/odom: expected poses at the times of the color images .*set --poses none"):
+        open_source(path)
 
 
 def test_ros_bag_tf_with_unknown_root_needs_choice(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -48,6 +48,7 @@ from tests.support.recordings.ros_bags import (
     seen,
     time_of,
 )
+from tests.support.recordings.rvl_files import rvl
 from tests.support.scenes.corner_room import look, pose_at
 
 
@@ -341,18 +342,33 @@ def test_ros_bag_max_difference_option_is_applied(tmp_path: Path, caplog: pytest
         open_source(path, None, BagOptions(max_difference=0.001))
 
 
-def test_ros_bag_float_depth_in_millimeters_needs_unit(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unit", [0.001, 0.01])
+@pytest.mark.parametrize("missing", [0.0, np.nan, np.inf, -np.inf])
+def test_ros_bag_float_depth_in_other_unit_needs_unit(tmp_path: Path, unit: float, missing: float) -> None:
     bag = BagWriter()
     for k in range(COUNT):
         color, depth = seen(k)
+        stored = np.where(np.arange(depth.shape[1]) % 9 == 0, missing, depth / unit).astype("<f4")
         bag.add_image(time_of(k), "/rgb/image", color, "rgb8")
-        bag.add_image(time_of(k), "/depth/image", (1000 * depth).astype("<f4"), "32FC1")
+        bag.add_image(time_of(k), "/depth/image", stored, "32FC1")
     bag.add_camera(time_of(0), "/rgb/camera_info", ROOM)
     path = bag.write(tmp_path / "bag")
-    with pytest.raises(DataError, match=r"expected depth up to 65\.535 m, got a median of .*; set --depth-unit 0\.001"):
+    with pytest.raises(
+        DataError, match=rf"up to 65\.535 m, got a median of .*; set --depth-unit .*{unit:g} if it is in"
+    ):
         imported(path, tmp_path / "failed")
-    assert not imported_with(path, tmp_path / "out", depth_unit=0.001)
-    check_room(tmp_path / "out", posed=False)
+    assert not imported_with(path, tmp_path / "out", depth_unit=unit)
+    check_room(tmp_path / "out", posed=False, holes=0.2)
+
+
+def test_ros_bag_without_depth_readings_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    for k in range(COUNT):
+        bag.add_image(time_of(k), "/rgb/image", seen(k)[0], "rgb8")
+        bag.add_image(time_of(k), "/depth/image", np.full(ROOM.shape, 65535, np.uint16), "16UC1")
+    bag.add_camera(time_of(0), "/rgb/camera_info", ROOM)
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    assert "expected depth of at most 65.535 m, got no reading in 4 frames; check the unit of depth" in caplog.text
 
 
 @pytest.mark.parametrize("transports", ["compressedDepth", "compressed compressedDepth"])
@@ -603,15 +619,37 @@ def test_ros_bag_damaged_compressed_depth_skips_one_frame(tmp_path: Path, depth:
     assert "/depth/image/compressedDepth" in fault
 
 
-def test_ros_bag_rvl_compressed_depth_raises(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("codec", "header", "named"),
+    [
+        ("rvl", bytes(12), "16UC1; compressedDepth rvl"),
+        ("inverse rvl", b"", "32FC1; compressedDepth rvl"),
+        ("png", bytes(12), "16UC1; compressedDepth"),
+        ("png", bytes(12), "png"),
+        ("png", b"", "16UC1; compressedDepth png"),
+        ("png", b"", "16UC1; png compressed "),
+    ],
+)
+def test_ros_bag_compressed_depth_is_decoded(tmp_path: Path, codec: str, header: bytes, named: str) -> None:
+    bag = BagWriter(ros1=codec == "png")
+    for k in range(COUNT):
+        color, metric = seen(k)
+        bag.add_image(time_of(k), "/rgb/image", color, "rgb8")
+        data = header + (png if codec == "png" else rvl)(millimeters(metric))
+        if codec == "inverse rvl":
+            data = compressed_depth(metric, rvl)[0]
+        bag.add_compressed(time_of(k), "/depth/image/compressedDepth", data, named)
+    bag.add_camera(time_of(0), "/rgb/camera_info", ROOM)
+    assert not imported(bag.write(tmp_path / ("a.bag" if bag.ros1 else "bag")), tmp_path / "out")
+    check_room(tmp_path / "out", posed=False)
+
+
+def test_ros_bag_damaged_rvl_depth_raises(tmp_path: Path) -> None:
     bag = BagWriter()
     bag.add_image(time_of(0), "/rgb/image", seen(0)[0], "rgb8")
     bag.add_compressed(time_of(0), "/depth/image/compressedDepth", bytes(100), "16UC1; compressedDepth rvl")
     bag.add_camera(time_of(0), "/rgb/camera_info", ROOM)
-    with pytest.raises(
-        DataError,
-        match=r"expected usable frames, got none; .* expected PNG or uncompressed depth, got RVL; record depth as PNG",
-    ):
+    with pytest.raises(DataError, match=r"expected usable frames, got none; .* an RVL image of .*, got 0x0 px"):
         imported(bag.write(tmp_path / "bag"), tmp_path / "out")
 
 
