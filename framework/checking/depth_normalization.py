@@ -1,4 +1,4 @@
-"""Detection of depth images that were scaled frame by frame.
+"""Detection of depth images that are constant, rounded, or scaled frame by frame.
 
 Programs for display, and networks for relative depth, map the nearest and farthest readings of each image to the limits
 of the pixel type. Such values are no distances: their unit differs from frame to frame.
@@ -12,14 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.checking import Finding, Verdict
-from framework.data import Array, UInt16
+from framework.data import Array
 from framework.datasets.frames.sequence_reader import Recording
 from framework.errors import FrameError
 from framework.interfaces import RGBDSequence
 
 MIN_FRAMES = 3  # minimum number of readable depth images
 MIN_FRACTION = 0.9  # minimum fraction of frames with the same largest value
-TYPE_LIMITS = (255, 255 * 256, 255 * 257, 65535)  # largest values of normalized images of 8 or 16 bits
+MIN_FULL_FRACTION = 0.25  # minimum fraction of frames that use the full range of the pixel type
+MIN_VALUES = 32  # minimum number of different values in an image; depth in m or dm as integers has fewer
+TYPE_LIMITS = (1.0, 255, 255 * 256, 255 * 257, 65535)  # largest values of normalized images of floats, 8 or 16 bits
 # maximum fraction of readings at the largest value; clipped images have more, at least in some frames
 MAX_AT_LIMIT = 0.03
 MAX_STEP = 0.1  # maximum relative step to the next value; 65535 = no reading has a large step
@@ -30,27 +32,35 @@ MAX_NEAREST = 0.01  # maximum ratio of the smallest to the largest value, if zer
 class _Range:
     """Range of the values in a depth image."""
 
-    largest: int
-    nearest: float  # ratio of the smallest value to the largest value
+    largest: float
+    count: int  # number of different values
+    nearest: float  # ratio of the smallest value to the largest value; 1 = a constant image
     step: float  # relative step from the second-largest to the largest value
     at_limit: float  # fraction of readings with the largest value
 
     @classmethod
     def of(cls, raw: Array) -> _Range | None:
-        """Return the range of a uint16 image, or None for another type or with fewer than two values."""
-        if raw.dtype != np.uint16:
+        """Return the range of the readings in a depth image, or None without readings."""
+        depth = np.asarray(raw, np.float64)
+        values, counts = np.unique(depth[np.isfinite(depth) & (depth > 0)], return_counts=True)
+        if not len(values):
             return None
-        pixels: UInt16 = raw.astype(np.uint16)
-        values, counts = np.unique(pixels[pixels > 0], return_counts=True)
-        if len(values) < 2:
-            return None
-        largest = int(values[-1])
-        second, first = float(values[-2]), float(values[0])
-        return cls(largest, first / largest, 1 - second / largest, float(counts[-1] / counts.sum()))
+        first, second, largest = float(values[0]), float(values[-min(2, len(values))]), float(values[-1])
+        return cls(largest, len(values), first / largest, 1 - second / largest, float(counts[-1] / counts.sum()))
+
+    @property
+    def is_full(self) -> bool:
+        """True if the image has the full range of its pixel type, and few readings at the limit."""
+        return self.largest in TYPE_LIMITS and self.nearest <= MAX_NEAREST and self.ends_smoothly
+
+    @property
+    def ends_smoothly(self) -> bool:
+        """True if the readings extend to the largest value and are not clipped."""
+        return self.step <= MAX_STEP and self.at_limit <= MAX_AT_LIMIT
 
 
 def check_normalization(sequence: RGBDSequence, chosen: Sequence[int]) -> Finding | None:
-    """Return an error if each depth image has its own scale, or None.
+    """Return an error if depth images are constant or have their own scale, or None.
 
     Args:
         sequence: The sequence.
@@ -68,13 +78,24 @@ def check_normalization(sequence: RGBDSequence, chosen: Sequence[int]) -> Findin
             found.append(one)
     if len(found) < MIN_FRAMES:
         return None
-    limit = int(np.median([one.largest for one in found]))
-    alike = [one for one in found if one.largest == limit and one.step <= MAX_STEP and one.at_limit <= MAX_AT_LIMIT]
+    count = int(np.median([one.count for one in found]))
+    if 1 < count < MIN_VALUES:
+        text = f"rounded to {count} different values per image; export depth again, for example as uint16 in mm"
+        return Finding(Verdict.ERROR, "depth", text)
+    if all(one.nearest == 1 for one in found):
+        text = (
+            f"constant: all readings of an image are equal in {len(found)} of {len(found)} images; export depth again"
+        )
+        return Finding(Verdict.ERROR, "depth", text)
+    full = [one for one in found if one.is_full]
+    limit = full[0].largest if full else float(np.median([one.largest for one in found]))
+    alike = [one for one in found if one.largest == limit and one.ends_smoothly]
     from_zero = sum(one.nearest <= MAX_NEAREST for one in alike) >= MIN_FRACTION * len(found)
-    if len(alike) < MIN_FRACTION * len(found) or not (from_zero or limit in TYPE_LIMITS):
+    is_normalized = len(alike) >= MIN_FRACTION * len(found) and (from_zero or limit in TYPE_LIMITS)
+    if not is_normalized and len(full) < max(MIN_FRAMES, MIN_FULL_FRACTION * len(found)):
         return None
     text = (
-        f"normalized frame by frame: the largest value is {limit} in {len(alike)} of {len(found)} images"
+        f"normalized frame by frame: the largest value is {limit:g} in {len(alike)} of {len(found)} images"
         f"{', and the smallest values are near 0' * from_zero}; expected distances in a fixed unit, which no setting "
         "can restore: export depth again, for example as uint16 in mm"
     )

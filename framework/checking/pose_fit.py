@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from framework.checking import Finding, Verdict
 from framework.checking.matched_pairs import MatchedPair
@@ -31,7 +32,8 @@ MIN_LOG_UNCERTAINTY = 0.07
 # maximum ratio of the errors with the estimated and the stored scale, for a clearly wrong scale
 MAX_ERROR_INCREASE = 1.3
 WRONG_SCALE = 2.5  # minimum factor of a clearly wrong scale; during rotation, the scale is uncertain by up to 1.6
-USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
+UNIT_FACTORS = (1000.0, 100.0)  # depth factors for poses in mm and cm, which slow rotations do not determine
+USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0, 6553.5)  # per m, common ones first
 INCH, FOOT = 0.0254, 0.3048  # m
 OTHER_UNIT = 20.0  # minimum factor of translations in another unit than meters, such as centimeters
 CERTAIN_FACTOR = 1.1  # maximum ratio of an estimated scale to that of inches or feet
@@ -148,18 +150,31 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     as_given = fit(informative, given, 1.0)
     others = tuple(fit(informative, reading, 1.0) for reading in readings(given.pose_unit))
     scaled = [fit(informative, reading) for reading in (given, *readings(given.pose_unit))]
+    factors = _usual_factors(depth_scale, median_depth)
+    if min(one.error for one in (*others, *scaled)) > MAX_RELATIVE_ERROR * motion:
+        scaled += [fit(informative, given, factor) for factor in factors]
     alike = _equal_to_best((as_given, *others, *scaled))
     best = min(alike, key=lambda one: (len(_settings(one.reading, given)), one.error))
     now = as_given.error
     reading = best.reading if now > MAX_RELATIVE_ERROR * motion and best.error < MAX_OTHER_RATIO * now else given
-    chosen = _with_plain_factor(informative, reading)
+    chosen = _with_plain_factor(informative, reading, factors, MAX_RELATIVE_ERROR * motion)
     measured = f"median error of {now:.1f} px in {len(informative)} pairs of frames with a motion of {motion:.0f} px"
     if reading == given and now <= MAX_RELATIVE_ERROR * motion and chosen.depth_factor == 1.0:
         return PoseJudgment((Finding(Verdict.FINE, "poses", f"valid: {measured}"),), as_given, as_given, others)
     mirrored = _mirrored_fit(informative, given)
+    angle, turned = _rotated_images(informative, given)
+    if turned < min(MAX_MIRRORED_RATIO * min(chosen.error, mirrored.error), MAX_RELATIVE_ERROR * motion):
+        text = (
+            f"images are rotated by {angle} degrees relative to the poses: {measured}, and {turned:.1f} px without the "
+            f"rotation; rotate color and depth by {360 - angle} degrees clockwise to use the poses"
+        )
+        return PoseJudgment((Finding(Verdict.ERROR, "poses", text, UNPOSED),), as_given, best, others)
     # a mirrored rotation is a rotation with other axes, so translations decide
     if mirrored.error < min(MAX_MIRRORED_RATIO * chosen.error, MAX_RELATIVE_ERROR * motion):
-        text = f"mirrored (a left-handed world): {measured}, and {mirrored.error:.1f} px without the mirroring"
+        text = (
+            f"mirrored (a left-handed world, or mirrored images): {measured}, and {mirrored.error:.1f} px without the "
+            "mirroring"
+        )
         findings = [Finding(Verdict.ERROR, "poses", text, " ".join(_settings(mirrored.reading, given)))]
         if mirrored.depth_factor != 1.0:
             findings.append(_scale_finding(mirrored, depth_scale, median_depth))
@@ -193,15 +208,44 @@ def _mirrored_fit(pairs: Sequence[MatchedPair], given: PoseReading) -> PoseFit:
     return min(_equal_to_best(fits), key=lambda one: (len(_settings(one.reading, given)), one.error))
 
 
-def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> PoseFit:
+def _rotated_images(pairs: Sequence[MatchedPair], given: PoseReading) -> tuple[int, float]:
+    """Return the clockwise rotation of the images that fits the poses best, degrees, and its median error, px."""
+    errors: dict[int, float] = {}
+    for angle, kind, axes in product((90, 180, 270), PoseKind, CameraAxes):
+        R = np.eye(4)
+        R[:3, :3] = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+        reading = PoseReading(kind, axes, given.quaternion_order, given.pose_unit)
+        rotated = [error_of(pair, R @ motion_of(pair, reading) @ R.T, 1.0) for pair in pairs]
+        errors[angle] = min(float(np.median(rotated)), errors.get(angle, np.inf))
+    best = min(errors, key=lambda angle: errors[angle])
+    return best, errors[best]
+
+
+def _with_plain_factor(
+    pairs: Sequence[MatchedPair], reading: PoseReading, factors: Sequence[float], limit: float
+) -> PoseFit:
     """Return the fit with the stored depth scale.
 
-    If an estimated scale has a clearly smaller error, return the fit with the estimated scale.
+    If an estimated scale has a clearly smaller error, return the fit with the estimated scale. If its error is above
+    `limit`, px, the usual depth factors are tried, too.
     """
     as_stored, scaled = fit(pairs, reading, 1.0), fit(pairs, reading)
+    if scaled.error > limit:
+        scaled = min((scaled, *(fit(pairs, reading, factor) for factor in factors)), key=lambda one: one.error)
     far = not 1 / WRONG_SCALE < scaled.depth_factor < WRONG_SCALE
     needed = MAX_ERROR_INCREASE if far else MAX_OTHER_RATIO
     return scaled if scaled.error < needed * as_stored.error else as_stored
+
+
+def _usual_factors(depth_scale: float, median_depth: float) -> list[float]:
+    """Return the depth factors for poses in mm or cm, and for usual depth scales with a plausible depth.
+
+    They are more certain than an estimated factor if the camera mainly rotates.
+    """
+    low, high = PLAUSIBLE
+    factors = [depth_scale / usual for usual in USUAL_SCALES if usual != depth_scale]
+    plausible = [factor for factor in factors if low <= median_depth * factor <= high]
+    return [*plausible, *(UNIT_FACTORS if low <= median_depth <= high else ())]
 
 
 def _scale_finding(chosen: PoseFit, depth_scale: float, median_depth: float) -> Finding:
@@ -213,7 +257,7 @@ def _scale_finding(chosen: PoseFit, depth_scale: float, median_depth: float) -> 
         unit = INCH if is_inch else 10.0 ** round(np.log10(1 / factor))
         return Finding(Verdict.ERROR, "poses", text, f"dataset.pose_unit={chosen.reading.pose_unit * unit:g}")
     scale = depth_scale / factor
-    fitting = [usual for usual in USUAL_SCALES if abs(np.log(usual / scale)) < np.log(chosen.factor_within)]
+    fitting = [usual for usual in USUAL_SCALES if abs(np.log(usual / scale)) < np.log(max(chosen.factor_within, 1.01))]
     if not fitting and abs(np.log(FOOT * factor)) < np.log(min(chosen.factor_within, CERTAIN_FACTOR)):
         text = f"translations are {factor:.3g} times as long as in the images: in feet"
         return Finding(Verdict.ERROR, "poses", text, f"dataset.pose_unit={chosen.reading.pose_unit * FOOT:g}")

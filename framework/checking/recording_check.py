@@ -11,14 +11,16 @@ import numpy as np
 
 from framework.checking import Finding, Verdict, pose_fit, registration
 from framework.checking.color_timing import check_color_delay
+from framework.checking.depth_kind import check_depth_kind
 from framework.checking.depth_normalization import check_normalization
 from framework.checking.frame_times import check_times
-from framework.checking.image_geometry import check_orientation, check_principal_point
+from framework.checking.image_geometry import check_camera, check_orientation
 from framework.checking.matched_pairs import MatchedPair, Matcher
 from framework.checking.pose_delay import delayed, find_delay
 from framework.checking.pose_fit import PLAUSIBLE, UNPOSED, USUAL_SCALES, PoseJudgment
 from framework.checking.pose_jumps import PoseJumps, find_jumps
 from framework.checking.registration import EdgeAlignment, EdgeComparison, color_gradient
+from framework.checking.repeated_images import check_repeats
 from framework.data import Camera, Float64, Frame
 from framework.datasets.frames.conventions import (
     LARGEST_POSE_UNIT,
@@ -100,13 +102,19 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     matcher = Matcher(sequence)
     starts = sorted({min(k, max(count - 2, 0)) for k in chosen})
     neighbors = [matcher.pair(k, 1) for k in starts if k + 1 < count]
-    steps = np.array([pair.motion for pair in neighbors if pair is not None]) / sequence.camera.width
+    matched = [pair for pair in neighbors if pair is not None]
+    if (repeats := check_repeats(matched)) is not None:
+        causes.append(repeats)
+    steps = np.array([pair.motion for pair in matched]) / sequence.camera.width
     by_zoom = edges.alignments((best, zoom) for zoom in registration.ZOOMS)
     step = float(np.median(steps)) if len(steps) else 0.0
     registration_finding, late = registration.judge(by_delay, by_zoom, depth_delay, step)
     if late:
         matcher = Matcher(DelayedDepth(sequence, late))
     pairs = list(matcher.pairs(starts))
+    if not any(cause.verdict is Verdict.ERROR for cause in causes):
+        cause = check_depth_kind(pairs) or check_camera(sequence.camera, pairs)
+        causes += [cause] if cause is not None else []
     posed = [pair for pair in pairs if _is_posed(pair)]
     if any(frame.T_world_camera is not None for frame in frames):
         judgment, pose_delay = _judge_poses(sequence, posed, given, median_depth)
@@ -123,8 +131,6 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     motion_finding = _check_motion(steps, len(neighbors), sequence.camera.width)
     of_poses = [left_handed] if left_handed and not _has_error(judgment) else judgment.findings
     of_pairs = [*of_poses, registration_finding, check_color_delay(matcher)]
-    if any(one.subject == "poses" and one.verdict is Verdict.FINE for one in of_pairs if judgment.given):
-        causes = [replace(cause, verdict=Verdict.NOTE) if cause.subject == "camera" else cause for cause in causes]
     if any(cause.verdict is Verdict.ERROR for cause in causes):
         of_pairs = []  # the results of frame pairs are consequences
         if any(cause.subject == "depth" for cause in causes):
@@ -254,7 +260,8 @@ def warn_of_images(sequence: RGBDVideo) -> bool:
     if not isinstance(sequence, Recording):
         return False
     chosen = [int(k) for k in np.unique([int(fraction * len(sequence)) for fraction in QUICK_STARTS])]
-    errors = [finding for finding in _image_findings(sequence, chosen) if finding.verdict is Verdict.ERROR]
+    found = [*_image_findings(sequence, chosen), check_camera(sequence.camera)]
+    errors = [finding for finding in found if finding is not None and finding.verdict is Verdict.ERROR]
     for finding in errors:
         log.warning("%s: %s; run `instancemap check` for details", finding.subject, finding.text)
     return bool(errors)
@@ -262,11 +269,7 @@ def warn_of_images(sequence: RGBDVideo) -> bool:
 
 def _image_findings(sequence: RGBDSequence, chosen: Sequence[int]) -> list[Finding]:
     """Return the results for the camera, the color images and the depth images that explain other errors."""
-    found = (
-        check_principal_point(sequence.camera),
-        check_orientation(sequence, chosen),
-        check_normalization(sequence, chosen),
-    )
+    found = (check_orientation(sequence, chosen), check_normalization(sequence, chosen))
     return [finding for finding in found if finding is not None]
 
 

@@ -64,7 +64,8 @@ class EdgeComparison:
         for delay, zoom in candidates:
             pairs = [(k, k + delay) for k in self.chosen if 0 <= k + delay < len(self.sequence)]
             correlations = [self._correlation(color, depth, zoom) for color, depth in pairs]
-            known = [correlation for correlation in correlations if correlation is not None]
+            # repeated images count once
+            known = list({one.tobytes(): one for one in correlations if one is not None}.values())
             if len(known) < MIN_FRAMES:
                 continue
             mean = np.mean(known, axis=0)

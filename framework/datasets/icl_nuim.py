@@ -16,11 +16,14 @@ contain simulated Kinect noise.
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from framework.data import Camera, Float64
+from framework.datasets.calibration.own_camera import own_camera
 from framework.datasets.frames.conventions import Mirror
 from framework.datasets.frames.numbered_images import numbered_images, paired_images
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording
@@ -31,6 +34,8 @@ from framework.sensors.noise_models import SensorKind
 CAMERA = Camera(640, 480, 481.20, 480.00, 319.50, 239.50)  # as published, with positive fy
 DEPTH_SCALE = 5000.0  # units per meter
 POSES = ".gt.freiburg"
+
+log = logging.getLogger(__name__)
 
 _NOISY = re.compile(r"traj[0-9]n(_|$)")
 
@@ -43,6 +48,9 @@ class IclNuim(Recording):
         files = sorted(path for path in self.folder.iterdir() if path.name.endswith(POSES))
         if len(files) != 1:
             expected = f"expected one file with poses, such as livingRoom0{POSES}"
+            if any(self.folder.glob("*.depth")):
+                found = "got depth as text (.depth); download the TUM RGB-D compatible PNGs of this trajectory"
+                raise DataError(f"{self.folder}: {expected}, {found}")
             raise DataError(f"{self.folder}: {expected}, got {len(files)}; set dataset.scene to a sequence")
         lines = {int(line.timestamp): line for line in read_tum_lines(files[0])}
         images = paired_images(*(numbered_images(self.folder / name, (".png",)) for name in ("rgb", "depth")))
@@ -54,7 +62,13 @@ class IclNuim(Recording):
                 error = f"{pair.color_name}: expected a pose in {files[0].name}, got none for frame {number}"
                 frames.append(RecordedFrame(pair, number / FRAME_RATE, error=error))
         sensor = SensorKind.KINECT_V1 if _NOISY.search(self.name) else SensorKind.EXACT
-        return Contents(CAMERA, "the camera of ICL-NUIM", DEPTH_SCALE, frames, sensor=sensor)
+        own = own_camera(self.name, self.folder, [Path(pair.color_name) for pair in images.values()], DEPTH_SCALE)
+        if own is None:
+            log.info("%s: published camera of ICL-NUIM", self.name)
+            return Contents(CAMERA, "the camera of ICL-NUIM", DEPTH_SCALE, frames, sensor=sensor)
+        frames = [replace(frame, images=own.images(frame.images)) for frame in frames]
+        camera, depth_scale, distortion, _ = own.stored
+        return Contents(camera, own.source, depth_scale, frames, distortion, sensor)
 
 
 def _mirrored(line: TumLine) -> Callable[[], Float64]:

@@ -9,9 +9,10 @@ Handheld Kinect videos with KinectFusion poses:
 Color and depth are not registered in the published files. The offset is 30 px or more. Only the intrinsics of the depth
 camera are published.
 
-Other recordings in this layout have a camera.json, or a text file with the 3x3 intrinsic matrix such as
-camera-intrinsics.txt, in the folder of the sequence or of the scene. Their depth and poses are those of the color
-camera. Color images may be JPEG files, and numbers may have any number of digits.
+Other recordings in this layout have a file with their calibration (`own_camera.py`), such as camera.json,
+camera-intrinsics.txt or the info.txt of BundleFusion and 12-Scenes, in the folder of the sequence or of the scene.
+Their depth is registered to color, and their poses are those of the color camera. Color images may be JPEG files, and
+numbers may have any number of digits.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ import numpy as np
 
 from framework.data import Camera, Float64, UInt16
 from framework.datasets.calibration.camera_json import StoredCamera
-from framework.datasets.calibration.own_camera import CAMERA_JSON, own_camera
+from framework.datasets.calibration.own_camera import CAMERA_JSON, OwnCamera, own_camera
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording, StoredImages
 from framework.datasets.seven_scenes_kernels import register_depth
 from framework.errors import DataError
@@ -68,25 +69,23 @@ class SevenScenes(Recording):
             expected = "expected images such as frame-000000.color.png, got none"
             raise DataError(f"{self.folder}: {expected}; set dataset.scene to a sequence such as chess/seq-01")
         images = {number: StoredImages.of_files(*_paths(self.folder, stems[number])) for number in sorted(stems)}
-        camera, source = self._calibration([Path(one.color_name) for one in images.values()])
-        is_published = camera is PUBLISHED
+        own = self._own_camera([Path(one.color_name) for one in images.values()])
+        camera, source = (own.stored, own.source) if own else (PUBLISHED, "the camera of 7-Scenes")
         frames = []
         for number, files in images.items():
-            stored = replace(files, depth=partial(_registered, files)) if is_published else files
-            pose = partial(_color_pose if is_published else _pose, self.folder / f"{stems[number]}.pose.txt")
+            stored = own.images(files) if own else replace(files, depth=partial(_registered, files))
+            pose = partial(_pose if own else _color_pose, self.folder / f"{stems[number]}.pose.txt")
             frames.append(RecordedFrame.posed(stored, number / FRAME_RATE, pose))
         return Contents(camera.camera, source, camera.depth_scale, frames, camera.distortion, camera.sensor)
 
-    def _calibration(self, color: Sequence[Path]) -> tuple[StoredCamera, Path | str]:
-        """Return the calibration and its source: a file next to the images, or the publication."""
+    def _own_camera(self, color: Sequence[Path]) -> OwnCamera | None:
+        """Return the calibration in a file next to the images or in the folder of the scene, or None without a file."""
         for folder in dict.fromkeys((self.folder, self.folder.absolute().parent)):
-            if (own := own_camera(folder, color, DEPTH_SCALE)) is not None:
-                log.info(
-                    "%s: camera from %s; depth and poses are taken as those of the color camera", self.name, own[1]
-                )
+            if (own := own_camera(self.name, folder, color, DEPTH_SCALE)) is not None:
+                log.info("%s: depth and poses are taken as those of the color camera", self.name)
                 return own
         log.info("%s: published camera of 7-Scenes, because the folder has no %s", self.name, CAMERA_JSON)
-        return PUBLISHED, "the camera of 7-Scenes"
+        return None
 
 
 def _paths(folder: Path, stem: str) -> tuple[Path, Path]:

@@ -6,8 +6,8 @@ Kinect videos with motion-capture poses:
     rgb/, depth/            8-bit color; uint16 depth along z, registered to color, 5000 units per m; 0 = no reading
     groundtruth.txt         optional; TUM format, T_world_camera of the color camera, about 100 poses per second
     camera.json             for other recordings in this layout: intrinsics, depth scale and distortion, with the
-                            same keys as in an RGB-D folder; read with intrinsics=AUTO. A text file with the 3x3
-                            intrinsic matrix, such as camera-intrinsics.txt, is also read.
+                            same keys as in an RGB-D folder; read with intrinsics=AUTO. Other files with intrinsics
+                            (`own_camera.py`), such as the calibration.txt of ETH3D, are also read.
 
 The published depth correction factors are already applied. The images of freiburg1 and freiburg2 have a lens distortion
 of 5 px or more in half of the pixels, which is corrected on reading. The images of freiburg3 were published
@@ -31,7 +31,7 @@ import numpy as np
 from framework.config.validation import require
 from framework.data import Camera, Float64
 from framework.datasets.calibration.camera_json import CAMERA_KEYS, StoredCamera
-from framework.datasets.calibration.own_camera import CAMERA_JSON, own_camera
+from framework.datasets.calibration.own_camera import CAMERA_JSON, OwnCamera, own_camera
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.sequence_reader import Contents, RecordedFrame, Recording, StoredImages
 from framework.errors import ConfigError, DataError
@@ -88,7 +88,8 @@ class TumRgbd(Recording):
 
     def open(self) -> Contents:
         color, depth = _read_list(self.folder / "rgb.txt"), _read_list(self.folder / "depth.txt")
-        (camera, depth_scale, distortion, sensor), source = self._stored_camera(color)
+        own = self._stored_camera(color)
+        camera, depth_scale, distortion, sensor = own.stored
         tolerance = self.max_time_difference / self.time_unit
         color_times, depth_times = ([image.timestamp for image in images] for images in (color, depth))
         pairs = associate(color_times, depth_times, tolerance)
@@ -109,18 +110,17 @@ class TumRgbd(Recording):
         truth = Trajectory.of(path, read_tum_lines(path) if path_exists(path) else [], tolerance)
         frames = []
         for i, j in pairs:
-            images, time = StoredImages.of_files(color[i].path, depth[j].path), color[i].timestamp
+            images, time = own.images(StoredImages.of_files(color[i].path, depth[j].path)), color[i].timestamp
             recorded = RecordedFrame.posed(images, time, partial(truth.at, time))
             frames.append(replace(recorded, color_timestamp=time, depth_timestamp=depth[j].timestamp))
-        return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None, sensor)
+        return Contents(camera, own.source, depth_scale, frames, distortion if self.undistort else None, sensor)
 
-    def _stored_camera(self, color: Sequence[ListedImage]) -> tuple[StoredCamera, Path | str]:
+    def _stored_camera(self, color: Sequence[ListedImage]) -> OwnCamera:
         """Return the camera and the file or parameter that defines it."""
         intrinsics = self.intrinsics
         if intrinsics is Intrinsics.AUTO:
-            own = own_camera(self.folder, [image.path for image in color], DEPTH_SCALE)
+            own = own_camera(self.name, self.folder, [image.path for image in color], DEPTH_SCALE)
             if own is not None:
-                log.info("%s: camera from %s", self.name, own[1])
                 return own
             named = re.search(r"freiburg[123]", self.name)
             if not named:
@@ -131,7 +131,7 @@ class TumRgbd(Recording):
                 )
             intrinsics = Intrinsics(named[0])
         log.info("%s: published camera %s of TUM RGB-D", self.name, intrinsics.name)
-        return PUBLISHED[intrinsics], f"dataset.intrinsics={intrinsics.name}"
+        return OwnCamera(PUBLISHED[intrinsics], f"dataset.intrinsics={intrinsics.name}")
 
 
 @dataclass(frozen=True)

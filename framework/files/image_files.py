@@ -40,7 +40,12 @@ def exif_orientation(path: Path) -> int:
 
 def rotation_command(path: Path) -> str:
     """Return the shell command that applies the EXIF orientation to the pixels of all images next to an image."""
-    return f"mogrify -auto-orient {shlex.quote(str(path.parent))}/*{path.suffix}"
+    return mogrify("-auto-orient", path)
+
+
+def mogrify(option: str, path: Path) -> str:
+    """Return the shell command that applies an option of ImageMagick's mogrify to all images next to an image."""
+    return f"mogrify {option} {shlex.quote(str(path.parent))}/*{path.suffix}"
 
 
 def read_color(path: Path) -> UInt8:

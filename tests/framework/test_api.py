@@ -222,7 +222,7 @@ def test_mapper_camera_matrix_of_any_form_is_camera(room: CornerRoom, converted:
     [
         (2.0, False, "multiply fx, fy, cx, cy by 0.5"),
         (0.5, False, "multiply fx, fy, cx, cy by 2"),
-        (1.0, True, "exchange cx and cy"),
+        (1.0, True, "cx and cy are swapped"),
         (1.0, False, ""),
     ],
 )

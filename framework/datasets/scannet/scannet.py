@@ -127,7 +127,7 @@ def _sens_contents(path: Path) -> Contents:
 def _exported_contents(folder: Path) -> Contents:
     colors = numbered_images(folder / "color", (".jpg", ".jpeg", ".png"))
     depths = numbered_images(folder / "depth", (".png",))
-    intrinsic = folder / "intrinsic"
+    intrinsic = folder / "intrinsic" if (folder / "intrinsic").is_dir() else folder
     depth_camera = _camera(intrinsic / "intrinsic_depth.txt", *first_size(depths.values(), read_uint16))
     color_camera = _color_camera(intrinsic / "intrinsic_color.txt", *first_size(colors.values(), read_color))
     extrinsics = [intrinsic / f"extrinsic_{name}.txt" for name in ("color", "depth")]

@@ -7,7 +7,7 @@ Rooms were scanned with an Asus Xtion or a Kinect v2:
     NNN/timestamp.txt           optional: number, timestamps of color and depth (microseconds)
     NNN/trajectory.log          T_world_camera, m; the pose with id i belongs to image i + 1
     NNN/NNN.ply, NNN/NNN.xml    optional: mesh with vertex labels, and the class of each label
-    intrinsic/asus.ini          fx, fy, cx, cy
+    intrinsic/asus.ini          fx, fy, cx, cy; a file with intrinsics in NNN/, such as camera.json, takes precedence
     release.txt                 optional, one line: annotation release
     synthesize.json             parameters of `instancemap synthesize`, only in synthetic scenes
 
@@ -18,13 +18,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 
 import numpy as np
 
 from framework.data import AnnotatedObjects, Camera
+from framework.datasets.calibration.own_camera import own_camera
 from framework.datasets.frames.numbered_images import first_size, numbered_images, paired_images
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, StoredImages
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
@@ -85,8 +86,14 @@ class SceneNN(LabeledRecording):
         self.load_mesh([self.folder / f"{number}.ply", self.folder / f"{number}.xml"], read_labeled_mesh)
         self.annotation = self.release or _named_release(self.root) if self.mesh else ""
         frames = [_recorded(pair, k - 1, poses, times.get(k)) for k, pair in images.items()]
-        fx, fy, cx, cy = read_intrinsics(self.root / "intrinsic" / f"{self.intrinsics.name.lower()}.ini")
-        camera = Camera(*first_size(colors.values(), read_color), fx, fy, cx, cy)
+        own = own_camera(self.name, self.folder, list(colors.values()), DEPTH_SCALE)
+        if own is not None:
+            camera, depth_scale, distortion, sensor = own.stored
+            frames = [replace(frame, images=own.images(frame.images)) for frame in frames]
+            return Contents(camera, own.source, depth_scale, frames, distortion, sensor)
+        intrinsics = self.root / "intrinsic" / f"{self.intrinsics.name.lower()}.ini"
+        log.info("%s: camera from %s", self.name, intrinsics)
+        camera = Camera(*first_size(colors.values(), read_color), *read_intrinsics(intrinsics))
         return Contents(camera, "the first color image", DEPTH_SCALE, frames, sensor=self.intrinsics.value)
 
 

@@ -1,7 +1,7 @@
 """Import of RGB-D images with the poses of a COLMAP model (https://colmap.github.io/format.html).
 
     sparse/0/               cameras, images and points3D as .bin or .txt, and in newer versions rigs and frames; also
-                            in sparse/, colmap/sparse/0/ or colmap/
+                            in sparse/, colmap/sparse/0/, colmap/ or the folder itself
     images/NAME.jpg         8-bit color with the names in the model; also in color/ or rgb/
     depth/NAME.png          uint16 along z, registered to color; `depth_scale` of camera.json, else 1000 units per meter
     camera.json             optional, as in RGB-D folders; only depth_scale is used
@@ -34,7 +34,7 @@ from framework.files.image_files import read_color, read_uint16
 from framework.geometry import inverse, nearest_rigid
 from framework.importing.source import DeviceFrame, Format, Source, meters
 
-MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap")
+MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", ".")
 COLOR_FOLDERS, DEPTH_FOLDERS = ("images", "color", "rgb"), ("depth", "depths")
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 UNITS_PER_METER = 1000.0  # default of depth
@@ -92,6 +92,7 @@ def open_source(path: Path) -> Source:
     units = read_camera(camera_json).depth_scale if camera_json.is_file() else UNITS_PER_METER
     folders = ImageFolders(model, color, depth, units)
     images = _read_model(model)
+    _log_unregistered(folders, images)
     lenses = {image.lens for image in images}
     if len(lenses) > 1:
         raise DataError(
@@ -101,6 +102,15 @@ def open_source(path: Path) -> Source:
     unit = _unit(folders, images)
     frames = [partial(_read, folders, image, k / FRAME_RATE, unit) for k, image in enumerate(images)]
     return Source("COLMAP", frames, len(frames), posed=True, distortion=None if lens == Distortion() else lens)
+
+
+def _log_unregistered(folders: ImageFolders, images: Sequence[RegisteredImage]) -> None:
+    """Log the number of color images that are not in the model and are therefore skipped."""
+    registered = {image.name for image in images}
+    stored = [path for path in folders.color.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg", ".png")]
+    missing = sum(path.relative_to(folders.color).as_posix() not in registered for path in stored)
+    if missing:
+        log.warning("%s: %d of %d color images have no pose and are skipped", folders.model, missing, len(stored))
 
 
 def _read(folders: ImageFolders, image: RegisteredImage, timestamp: float, unit: float) -> DeviceFrame:

@@ -3,10 +3,13 @@
     transforms.json         fl_x, fl_y, cx, cy, w, h, k1, k2, k3, p1, p2, camera_model: intrinsics for all frames, or in
                             each frame; frames: a list of
       file_path             8-bit color; the suffix .png may be missing
-      depth_file_path       depth along z (depth_path in NeRFCapture and Instant NGP): uint16 PNG
+      depth_file_path       depth along z (depth_path in NeRFCapture and Instant NGP): uint16 PNG, or floats in m as
+                            .npy, .tiff or .exr
       transform_matrix      T_world_camera, 4 x 4, with OpenGL's camera axes (y up, z backward)
       timestamp             s, optional
-    integer_depth_scale     meters per depth unit; without it, depth is in mm (depth_unit_scale_factor of nerfstudio)
+    integer_depth_scale     meters per depth unit, as is depth_unit_scale_factor (a parameter of nerfstudio, which some
+                            programs write to the file); without them, uint16 depth is in mm
+    is_fisheye              true = another lens model (Instant NGP), which is not supported
     applied_scale           length of one meter in the stored poses; 1 if missing
 
 Sources: docs/quickstart/data_conventions.md and nerfstudio_dataparser.py in nerfstudio-project/nerfstudio, and
@@ -17,6 +20,7 @@ nerfstudio.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -24,21 +28,24 @@ from typing import Any
 
 import numpy as np
 
-from framework.data import Camera
+from framework.data import Camera, Float32
 from framework.datasets.calibration.camera_json import number_list, numbers_of, pinhole, read_json_object
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.numbered_images import natural_order
 from framework.datasets.frames.sequence_reader import FRAME_RATE
-from framework.errors import DataError
-from framework.files.image_files import read_color, read_uint16
-from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, meters
+from framework.errors import DataError, FrameError
+from framework.files.depth_files import FARTHEST, read_depth
+from framework.files.image_files import read_color
+from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, meters, readings
 
 NAME = "transforms.json"
 DEPTH_KEYS = ("depth_file_path", "depth_path")
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_PINHOLE", "SIMPLE_RADIAL")  # with the coefficients above
+DEPTH_UNITS = ("integer_depth_scale", "depth_unit_scale_factor")
 UNITS_PER_METER = 1000.0  # default of depth
+log = logging.getLogger(__name__)
 APP_SCALE = "depth_integer_scale"  # written by the app NeRFCapture, which stores no metric depth
 PIXEL_CENTER = 0.5  # px, coordinate of the center of the first pixel
 
@@ -63,6 +70,10 @@ def open_source(path: Path) -> Source:
     if not with_depth:
         found = f"got none in {len(frames)} frames; export depth, too"
         raise DataError(f"{file}: expected frames with {' or '.join(DEPTH_KEYS)}, {found}")
+    if len(with_depth) < len(frames):
+        log.warning(
+            "%s: %d of %d frames have no depth and are skipped", file, len(frames) - len(with_depth), len(frames)
+        )
     units_per_meter = _depth_scale(file, content)
     lens = _lens(file, with_depth)
     length = numbers_of(file, content, "applied_scale")[0] if "applied_scale" in content else 1.0
@@ -77,7 +88,9 @@ def _file(path: Path) -> Path:
     return path if path.name == NAME else path / NAME
 
 
-def _read(file: Path, frame: Mapping[str, Any], number: int, units_per_meter: float, length: float) -> DeviceFrame:
+def _read(
+    file: Path, frame: Mapping[str, Any], number: int, units_per_meter: float | None, length: float
+) -> DeviceFrame:
     color, depth = (_image(file, frame, key) for key in ("file_path", _depth_key(frame)))
     where = f"{file}: {frame['file_path']}"
     matrix = frame.get("transform_matrix")
@@ -87,14 +100,27 @@ def _read(file: Path, frame: Mapping[str, Any], number: int, units_per_meter: fl
         [*(number_list(f"{where}: transform_matrix", row, 4) for row in matrix[:3]), [0, 0, 0, 1]]
     )
     T_world_opengl[:3, 3] /= length
+    image = read_color(color)
     return DeviceFrame(
         name=depth,
         timestamp=_timestamp(where, frame, number),
-        camera=_camera(where, frame),
-        color=read_color(color),
-        depth=meters(read_uint16(depth), units_per_meter),
+        camera=_camera(where, {"h": image.shape[0], "w": image.shape[1], **frame}),
+        color=image,
+        depth=_metric_depth(depth, units_per_meter),
         T_world_camera=arkit_pose(where, T_world_opengl),
     )
+
+
+def _metric_depth(path: Path, units_per_meter: float | None) -> Float32:
+    """Return the depth (h, w), m, in an image. None = uint16 in mm or floats in m."""
+    depth = read_depth(path)
+    if depth.dtype == np.uint16:
+        return meters(np.asarray(depth, np.uint16), units_per_meter or UNITS_PER_METER)
+    metric = readings(np.asarray(depth, np.float32)) / np.float32(units_per_meter or 1.0)
+    if metric.any() and (median := float(np.median(metric[metric > 0]))) > FARTHEST:
+        fix = f"write {DEPTH_UNITS[0]} (meters per unit), such as 0.001"
+        raise FrameError(f"{path}: expected float depth in meters, got a median of {median:.6g}; {fix}")
+    return metric
 
 
 def _depth_key(frame: Mapping[str, Any]) -> str:
@@ -126,6 +152,10 @@ def _lens(file: Path, frames: Sequence[Mapping[str, Any]]) -> Distortion | None:
             raise DataError(
                 f"{file}: camera_model: expected {' or '.join(MODELS)}, got {model!r:.60}; undistort the images"
             )
+        if frame.get("is_fisheye"):
+            raise DataError(
+                f"{file}: is_fisheye: expected false, got {frame['is_fisheye']!r:.60}; undistort the images"
+            )
         if frame.get("k4"):
             raise DataError(f"{file}: k4: expected 0 or no such key, got {frame['k4']!r:.60}; undistort the images")
     found = {tuple(numbers_of(file, dict.fromkeys(COEFFICIENTS, 0) | dict(frame), *COEFFICIENTS)) for frame in frames}
@@ -135,20 +165,20 @@ def _lens(file: Path, frames: Sequence[Mapping[str, Any]]) -> Distortion | None:
     return Distortion(*coefficients) if any(coefficients) else None
 
 
-def _depth_scale(file: Path, content: Mapping[str, Any]) -> float:
-    """Return the number of depth units per meter."""
-    key = "integer_depth_scale"
-    if key in content:
-        [unit] = numbers_of(file, content, key)
-        if not 0 < unit <= 1:
-            raise DataError(f"{file}: {key}: expected meters per unit in (0, 1], got {unit:g}")
-        return 1 / unit
+def _depth_scale(file: Path, content: Mapping[str, Any]) -> float | None:
+    """Return the number of depth units per meter, or None if the file has none."""
+    for key in DEPTH_UNITS:
+        if key in content:
+            [unit] = numbers_of(file, content, key)
+            if not 0 < unit <= 1:
+                raise DataError(f"{file}: {key}: expected meters per unit in (0, 1], got {unit:g}")
+            return 1 / unit
     if APP_SCALE in content:
         raise DataError(
-            f"{file}: expected {key} (meters per depth unit), got {APP_SCALE} of the app's own export; record with "
-            f"nerfcapture_dataset.py, or add {key} (0.001 for millimeters)"
+            f"{file}: expected {DEPTH_UNITS[0]} (meters per depth unit), got {APP_SCALE} of the app's own export; "
+            f"record with nerfcapture_dataset.py, or add {DEPTH_UNITS[0]} (0.001 for millimeters)"
         )
-    return UNITS_PER_METER
+    return None
 
 
 def _in_order(file: Path, frames: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

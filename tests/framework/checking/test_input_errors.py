@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +15,7 @@ import pytest
 from PIL import Image
 
 from framework.checking import Finding, Verdict
-from framework.checking.image_geometry import check_principal_point
+from framework.checking.image_geometry import check_camera
 from framework.checking.recording_check import RecordingCheck, check, warn_of_images
 from framework.data import Camera, Float64
 from framework.datasets.frames.conventions import DepthReading, Mirror, PoseReading
@@ -119,14 +121,14 @@ def test_check_of_clipped_depth_in_fixed_unit_is_not_normalized(tmp_path: Path, 
 )
 def test_principal_point_of_other_resolution_names_factor(x: float, y: float, fix: str) -> None:
     for cx, cy in ((318.6, 235.3), (322.0, 246.0)):
-        finding = check_principal_point(Camera(640, 480, 517 * x, 517 * y, cx * x, cy * y))
+        finding = check_camera(Camera(640, 480, 517 * x, 517 * y, cx * x, cy * y))
         assert finding is not None
         assert fix in finding.text
 
 
 @pytest.mark.parametrize(("cx", "cy"), [(319.5, 239.5), (318.6, 255.3), (300, 270), (365, 205), (639 / 2 + 100, 240)])
 def test_principal_point_near_center_has_no_error(cx: float, cy: float) -> None:
-    assert check_principal_point(Camera(640, 480, 517, 517, cx, cy)) is None
+    assert check_camera(Camera(640, 480, 517, 517, cx, cy)) is None
 
 
 @pytest.mark.parametrize("factor", [2, 0.5])
@@ -142,6 +144,74 @@ def test_check_of_double_intrinsics_names_camera_alone(
     assert "principal point" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("change", "fix"),
+    [
+        (lambda c: {"fx": 1.25 * c.fx, "fy": 1.25 * c.fy, "cx": 1.25 * c.cx, "cy": 1.25 * c.cy}, "800x600 px"),
+        (lambda c: {"fx": 2 * c.fx, "fy": 1.5 * c.fy, "cx": 2 * c.cx, "cy": 1.5 * c.cy}, "1280x720 px"),
+        (lambda c: {"cx": c.cy, "cy": c.cx}, "cx and cy are swapped"),
+        (lambda c: {"cx": c.cx + 320, "cy": c.cy + 120}, "subtract the margins of the cropped images, about 319 px"),
+        (lambda c: {"cx": 0.0, "cy": 0.0}, "set cx and cy to the image center, 319.5 and 239.5 px"),
+        (lambda c: {"fx": 2 * c.fx, "fy": 2 * c.fy}, "multiply fx, fy by 0.5"),
+        (lambda c: {"fy": 2 * c.fy}, "set fy to 517.3"),
+    ],
+)
+def test_check_of_other_intrinsics_names_fix(tmp_path: Path, change: Callable[..., dict[str, float]], fix: str) -> None:
+    place = desk(tmp_path / "room", poses=False)
+    write_camera(place, 1, 1, replace(DESK.camera, **change(DESK.camera)))
+    [finding] = errors(check(RgbdFolder(place), FARTHEST))
+    assert finding.subject == "camera"
+    assert fix in finding.text
+
+
+# Other images than depth along z
+
+
+def along_ray(depth: np.ndarray) -> np.ndarray:
+    c = DESK.camera
+    v, u = np.mgrid[: c.height, : c.width]
+    return depth * np.sqrt(1 + ((u - c.cx) / c.fx) ** 2 + ((v - c.cy) / c.fy) ** 2)
+
+
+def disparity(units: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda depth: np.where(depth > 0, units / np.maximum(depth, 100), 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (along_ray, "got distances to the camera center"),
+        (lambda depth: 5 * along_ray(depth), "got distances to the camera center"),
+        (disparity(1.5e6), "got inverse depth or disparities"),
+        (disparity(8 * 4e4), "got inverse depth or disparities"),
+        (disparity(1e7), "got inverse depth or disparities"),
+        (lambda depth: np.full(depth.shape, 1500), "constant: all readings of an image are equal"),
+        (lambda depth: np.where(depth > 0, 1, 0), "constant: all readings of an image are equal"),
+        (lambda depth: depth / 1000, "rounded to 3 different values per image"),
+        (lambda depth: depth / 100, "rounded to 2"),
+    ],
+)
+def test_check_of_other_depth_names_it_alone(tmp_path: Path, change: Callable[..., np.ndarray], text: str) -> None:
+    place = desk(tmp_path / "room")
+    for path in (place / "depth").iterdir():
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float64)
+        cv2.imwrite(str(path), np.rint(change(depth)).astype(np.uint16))
+    [finding] = errors(check(RgbdFolder(place), FARTHEST))
+    assert (finding.subject, finding.setting) == ("depth", "")
+    assert text in finding.text
+
+
+@pytest.mark.parametrize("part", [2, 3])
+def test_check_of_some_normalized_frames_names_depth(tmp_path: Path, part: int) -> None:
+    """An export that normalizes only some frames, such as those with an outlier."""
+    place = desk(tmp_path / "room")
+    for path in sorted((place / "depth").iterdir())[::part]:
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / 1000
+        cv2.imwrite(str(path), normalized(depth, "16 bits"))
+    [finding] = errors(check(RgbdFolder(place), FARTHEST))
+    assert finding.text.startswith("normalized frame by frame")
+
+
 # Depth scale
 
 
@@ -150,6 +220,46 @@ def test_check_of_wrong_depth_scale_does_not_blame_poses(tmp_path: Path) -> None
     reading = DepthReading(depth_scale=5000.0)
     found = errors(check(RgbdFolder(place, stop=12, stride=2, depth_reading=reading), FARTHEST))
     assert [finding.setting for finding in found] == ["dataset.depth_scale=1000"]
+
+
+@pytest.mark.parametrize("unit", [0.001, 0.01])
+def test_check_of_poses_in_other_unit_names_setting(tmp_path: Path, unit: float) -> None:
+    """The camera mainly rotates, so the ratio of translations is uncertain."""
+    place = desk(tmp_path / "room", pose=lambda T: in_units(T, unit))
+    [finding] = errors(check(RgbdFolder(place), FARTHEST))
+    assert finding.setting == f"dataset.pose_unit={unit:g}"
+
+
+def in_units(T: Float64, unit: float) -> Float64:
+    scaled = T.copy()
+    scaled[:3, 3] /= unit
+    return scaled
+
+
+# Repeated images
+
+
+@pytest.mark.parametrize("folder", ["color", "depth"])
+@pytest.mark.parametrize("poses", [True, False])
+def test_check_of_repeated_images_names_them(tmp_path: Path, folder: str, poses: bool) -> None:
+    place = desk(tmp_path / "room", poses)
+    for k in range(1, FRAMES, 2):
+        shutil.copy(place / f"{folder}/{k - 1:06d}.png", place / f"{folder}/{k:06d}.png")
+    found = check(RgbdFolder(place), FARTHEST)
+    [finding] = [finding for finding in found.findings if finding.subject == "frames"]
+    assert f"{folder} images are repeated in" in finding.text
+    assert errors(found) == ([finding] if poses else [])
+
+
+def test_check_of_single_repeated_frame_is_uncertain(tmp_path: Path) -> None:
+    """One view does not show whether depth is registered."""
+    place = desk(tmp_path / "room", poses=False)
+    for folder in ("color", "depth"):
+        for k in range(1, FRAMES):
+            shutil.copy(place / f"{folder}/000000.png", place / f"{folder}/{k:06d}.png")
+    found = check(RgbdFolder(place), FARTHEST)
+    assert not errors(found)
+    assert any("are repeated in 11 of 11 pairs" in finding.text for finding in found.findings)
 
 
 # Timestamps
@@ -228,6 +338,41 @@ def test_mirrored_setting_of_rigid_poses_raises(mirror: Mirror) -> None:
         PoseReading(mirrored=mirror).pose(np.eye(4))
     with pytest.raises(DataError, match=r"set dataset\.mirrored=WORLD"):
         PoseReading().pose(np.diag([1.0, -1.0, 1.0, 1.0]))
+
+
+# Rotated and mirrored images
+
+
+TURNS = {
+    "-flop": lambda image: image[:, ::-1],
+    "-flip": lambda image: image[::-1],
+    "-rotate 180": lambda image: image[::-1, ::-1],
+}
+
+
+@pytest.mark.parametrize("poses", [True, False])
+@pytest.mark.parametrize(("folder", "turn"), [("color", "-flop"), ("depth", "-flip"), ("depth", "-rotate 180")])
+def test_check_of_mirrored_images_names_command(tmp_path: Path, poses: bool, folder: str, turn: str) -> None:
+    place = desk(tmp_path / "room", poses)
+    turn_images(place / folder, turn)
+    [finding] = errors(check(RgbdFolder(place), FARTHEST))
+    assert finding.subject == "color"
+    assert f"for example with mogrify {turn} {place}/color/*.png" in finding.text
+
+
+def test_check_of_color_and_depth_upside_down_names_rotation(tmp_path: Path) -> None:
+    place = desk(tmp_path / "room")
+    for folder in ("color", "depth"):
+        turn_images(place / folder, "-rotate 180")
+    [finding] = errors(check(RgbdFolder(place), FARTHEST))
+    assert (finding.subject, finding.setting) == ("poses", "tracker=voxel_hashing_icp")
+    assert "images are rotated by 180 degrees relative to the poses" in finding.text
+    assert "rotate color and depth by 180 degrees clockwise" in finding.text
+
+
+def turn_images(folder: Path, turn: str) -> None:
+    for path in folder.iterdir():
+        cv2.imwrite(str(path), TURNS[turn](cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
 
 
 # EXIF orientation

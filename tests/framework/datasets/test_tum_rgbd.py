@@ -13,7 +13,6 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from framework.data import Camera
-from framework.datasets.calibration.own_camera import INTRINSICS
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.tum_rgbd import PUBLISHED, Intrinsics, TumRgbd, associate
 from framework.errors import ConfigError, DataError
@@ -137,7 +136,7 @@ def test_tum_rgbd_camera_json_lens_is_applied_or_raises(folder: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["my_freiburg1_room", "rgbd_dataset_freiburg1_xyz", "freiburg2", "freiburg3_x", "desk"]
 )
-@pytest.mark.parametrize("file", ["camera.json", *INTRINSICS])
+@pytest.mark.parametrize("file", ["camera.json", "camera-intrinsics.txt", "camera_intrinsics.txt", "intrinsics.txt"])
 def test_tum_rgbd_own_camera_overrides_published(
     folder: Path, name: str, file: str, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,8 +13,11 @@ from scipy.spatial import cKDTree
 
 from framework.api import open_dataset
 from framework.data import Float64
+from framework.datasets.icl_nuim import IclNuim
+from framework.datasets.replica_nice_slam import ReplicaNiceSlam
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.datasets.scannet.scannet import ScanNet
+from framework.datasets.seven_scenes import SevenScenes
 from framework.interfaces import RGBDSequence
 from framework.pipeline import Pipeline
 from framework.runtime.run_log import RunResult
@@ -22,7 +26,15 @@ from plugins.trackers.ground_truth import GroundTruth
 from tests.support import registered
 from tests.support.recordings.arkit_scenes_files import write_arkit_scenes
 from tests.support.recordings.colmap_files import write_colmap
-from tests.support.recordings.phone_exports import PhoneFrame
+from tests.support.recordings.layout_files import ICL_CAMERA, write_bundlefusion, write_icl_nuim, write_replica
+from tests.support.recordings.phone_exports import (
+    PhoneFrame,
+    write_polycam,
+    write_r3d,
+    write_record3d_exr,
+    write_scanner_app,
+    write_stray_scanner,
+)
 from tests.support.recordings.recorded_frames import check_round_trip, desk_frames, imported
 from tests.support.recordings.rtabmap_files import write_rtabmap
 from tests.support.recordings.scannet_files import Shot, write_posed_images
@@ -41,6 +53,11 @@ WRITERS: dict[str, Callable[..., None]] = {
     "colmap": partial(write_colmap, unit=0.4),
     "rtabmap.db": write_rtabmap,
     "scannetpp": write_scannetpp,
+    "stray_scanner": write_stray_scanner,
+    "polycam": write_polycam,
+    "record3d.r3d": write_r3d,
+    "record3d_exr": write_record3d_exr,
+    "scanner_app": write_scanner_app,
 }
 
 
@@ -73,13 +90,38 @@ def test_imported_desk_gives_same_map(tmp_path: Path, original: Float64, name: s
     check_same_map(points, original)
 
 
+@pytest.mark.parametrize(
+    ("write", "name", "dataset"),
+    [
+        (write_replica, "room0", ReplicaNiceSlam),
+        (write_bundlefusion, "apt0", SevenScenes),
+        (write_icl_nuim, "living_room_traj0_frei_png", IclNuim),
+        (partial(write_icl_nuim, name="traj1", first=1), "traj1_frei_png", IclNuim),
+    ],
+)
+def test_desk_in_published_layout_gives_same_map(
+    tmp_path: Path, write: Callable[..., None], name: str, dataset: Callable[..., RGBDSequence]
+) -> None:
+    frames = FRAMES
+    if dataset is IclNuim:  # its camera is fixed
+        frames = tuple(replace(frame, camera=ICL_CAMERA) for frame in FRAMES)
+    write(tmp_path / name, frames)
+    write_arkit_scenes(tmp_path / "scan", frames)
+    assert not imported(tmp_path / "scan", tmp_path / "out")
+    sequence = dataset(tmp_path, scene=name)
+    without_times(frames, sequence)
+    for frame, seen in zip(frames, sequence, strict=True):
+        np.testing.assert_allclose(seen.depth, frame.depth_mm / np.float32(1000), atol=6e-4)
+    check_same_map(mapped(sequence)[1], mapped(RgbdFolder(tmp_path / "out"))[1])
+
+
 def test_posed_images_of_desk_give_same_map(tmp_path: Path, original: Float64) -> None:
     shots = [Shot(frame.color, frame.depth_mm, frame.T_world_camera) for frame in FRAMES]
     write_posed_images(tmp_path / "scene", shots, FRAMES[0].camera)
     check_same_map(mapped(ScanNet(tmp_path, "scene"))[1], original)
 
 
-def without_times(frames: tuple[PhoneFrame, ...], sequence: RgbdFolder) -> None:
+def without_times(frames: tuple[PhoneFrame, ...], sequence: RGBDSequence) -> None:
     for frame, seen in zip(frames, sequence, strict=True):
         np.testing.assert_allclose(seen.T_world_camera, frame.T_world_camera, atol=2e-6)
 

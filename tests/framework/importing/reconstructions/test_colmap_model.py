@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -145,3 +146,16 @@ def test_colmap_missing_image_skips_one_frame(tmp_path: Path) -> None:
     [error] = imported(tmp_path / "scene", tmp_path / "out")
     assert re.search("images/frame_1.jpg: expected a readable file", error)
     assert len(RgbdFolder(tmp_path / "out")) == 2
+
+
+@pytest.mark.parametrize("model", ["sparse/0", "sparse", "colmap", "."])
+def test_colmap_unregistered_image_is_counted(tmp_path: Path, model: str, caplog: pytest.LogCaptureFixture) -> None:
+    scene = tmp_path / "scene"
+    write_colmap(scene, FRAMES, unit=1.0)
+    shutil.copy(scene / "images/frame_0.jpg", scene / "images/frame_9.jpg")
+    for path in list((scene / "sparse/0").iterdir()):
+        (scene / model).mkdir(exist_ok=True)
+        path.rename(scene / model / path.name)
+    assert not imported(scene, tmp_path / "out")
+    assert len(RgbdFolder(tmp_path / "out")) == len(FRAMES)
+    assert f"1 of {len(FRAMES) + 1} color images have no pose and are skipped" in caplog.text

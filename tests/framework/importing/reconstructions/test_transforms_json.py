@@ -9,8 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from framework.data import Camera
 from framework.datasets.calibration.undistortion import Distortion
@@ -68,6 +70,85 @@ def test_transforms_timestamps_are_read_in_order(tmp_path: Path) -> None:
     assert [frame.timestamp for frame in RgbdFolder(tmp_path / "out")] == times[::-1]
 
 
+def as_floats(suffix: str, unit: float) -> Callable[[Path], None]:
+    """Return a function that replaces the depth images by float images, with `unit` units per m."""
+
+    def replace_images(folder: Path) -> None:
+        for path in sorted((folder / "depth").iterdir()):
+            depth = np.float32(cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / 1000 * unit)
+            path.unlink()
+            if suffix == ".npy":
+                np.save(path.with_suffix(suffix), depth)
+            else:
+                Image.fromarray(depth).save(path.with_suffix(suffix))
+        change(folder, lambda c: [f.update(depth_file_path=f["depth_file_path"][:-4] + suffix) for f in c["frames"]])
+
+    return replace_images
+
+
+def in_units(unit: float) -> Callable[[Path], None]:
+    """Return a function that scales depth to `unit` units per m."""
+
+    def scale(folder: Path) -> None:
+        for path in (folder / "depth").iterdir():
+            depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(path), np.rint(depth * unit / 1000).astype(np.uint16))
+        change(folder, lambda c: c.update(depth_unit_scale_factor=1 / unit))
+
+    return scale
+
+
+def of_each_frame(folder: Path) -> None:
+    """Move all intrinsics to the frames, as for cameras with autofocus."""
+    keys = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "camera_model")
+    change(folder, lambda c: [frame.update({key: c[key] for key in keys}) for frame in c["frames"]])
+    change(folder, lambda c: [c.pop(key) for key in keys])
+
+
+VARIANTS: dict[str, Callable[[Path], Any]] = {
+    "unit of TUM": in_units(5000.0),
+    "unit of Replica": in_units(6553.5),
+    "unit of KITTI": in_units(256.0),
+    "floats in m": as_floats(".npy", 1.0),
+    "TIFF in m": as_floats(".tiff", 1.0),
+    "floats in mm": lambda folder: (as_floats(".npy", 1000.0)(folder), change_unit(folder, 0.001)),
+    "intrinsics of each frame": of_each_frame,
+    "no image size": lambda folder: change(folder, lambda c: (c.pop("w"), c.pop("h"))),
+    "frame without depth": lambda folder: change(folder, lambda c: c["frames"].append({"file_path": "images/x.jpg"})),
+    "not fisheye": lambda folder: change(folder, lambda c: c.update(is_fisheye=False, aabb_scale=16)),
+    "applied scale": lambda folder: change(folder, apply_scale),
+    "3x4 matrices": lambda folder: change(folder, lambda c: [f["transform_matrix"].pop() for f in c["frames"]]),
+}
+
+
+def change_unit(folder: Path, unit: float) -> None:
+    change(folder, lambda c: c.update(depth_unit_scale_factor=unit))
+
+
+def apply_scale(content: dict[str, Any]) -> None:
+    content["applied_scale"] = 0.25
+    for frame in content["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= 0.25
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_transforms_variant_preserves_frames(tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
+    frames = FRAMES[:2]
+    write_nerfstudio(tmp_path / "scene", frames)
+    VARIANTS[name](tmp_path / "scene")
+    assert not imported(tmp_path / "scene", tmp_path / "out")
+    check_round_trip(frames, RgbdFolder(tmp_path / "out"), depth_tolerance=3e-3)
+    assert ("1 of 3 frames have no depth" in caplog.text) == (name == "frame without depth")
+
+
+def test_transforms_float_depth_in_millimeters_names_unit(tmp_path: Path) -> None:
+    write_nerfstudio(tmp_path / "scene", FRAMES[:1])
+    as_floats(".npy", 1000.0)(tmp_path / "scene")
+    with pytest.raises(DataError, match=r"expected float depth in meters, .*; write integer_depth_scale"):
+        imported(tmp_path / "scene", tmp_path / "out")
+
+
 def change(folder: Path, how: Callable[[dict[str, Any]], Any]) -> None:
     content = json.loads((folder / "transforms.json").read_text())
     how(content)
@@ -86,6 +167,7 @@ INVALID = [
     ),
     (lambda c: c["frames"][1].update(k1=0.1), "expected one lens distortion for all frames, got 2; undistort"),
     (lambda c: c.update(k4=0.1), "k4: expected 0 or no such key, got 0.1; undistort"),
+    (lambda c: c.update(is_fisheye=True), "is_fisheye: expected false, got True; undistort"),
     (lambda c: c.update(k1="a"), "k1: expected a number, got 'a'"),
     (
         lambda c: c.update(integer_depth_scale=1000),
