@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -103,8 +103,8 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     starts = sorted({min(k, max(count - 2, 0)) for k in chosen})
     neighbors = [matcher.pair(k, 1) for k in starts if k + 1 < count]
     matched = [pair for pair in neighbors if pair is not None]
-    if (repeats := check_repeats(matched)) is not None:
-        causes.append(repeats)
+    if not _contain_error(causes):
+        causes += filter(None, [check_repeats(matched)])
     steps = np.array([pair.motion for pair in matched]) / sequence.camera.width
     by_zoom = edges.alignments((best, zoom) for zoom in registration.ZOOMS)
     step = float(np.median(steps)) if len(steps) else 0.0
@@ -112,9 +112,8 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     if late:
         matcher = Matcher(DelayedDepth(sequence, late))
     pairs = list(matcher.pairs(starts))
-    if not any(cause.verdict is Verdict.ERROR for cause in causes):
-        cause = check_depth_kind(pairs) or check_camera(sequence.camera, pairs)
-        causes += [cause] if cause is not None else []
+    if not _contain_error(causes):
+        causes += filter(None, [check_depth_kind(pairs) or check_camera(sequence.camera, pairs)])
     posed = [pair for pair in pairs if _is_posed(pair)]
     if any(frame.T_world_camera is not None for frame in frames):
         judgment, pose_delay = _judge_poses(sequence, posed, given, median_depth)
@@ -129,9 +128,9 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     if not any(finding.subject == "depth" for finding in judgment.findings):
         findings.append(depth_finding)
     motion_finding = _check_motion(steps, len(neighbors), sequence.camera.width)
-    of_poses = [left_handed] if left_handed and not _has_error(judgment) else judgment.findings
+    of_poses = [left_handed] if left_handed and not _contain_error(judgment.findings) else judgment.findings
     of_pairs = [*of_poses, registration_finding, check_color_delay(matcher)]
-    if any(cause.verdict is Verdict.ERROR for cause in causes):
+    if _contain_error(causes):
         of_pairs = []  # the results of frame pairs are consequences
         if any(cause.subject == "depth" for cause in causes):
             findings = [finding for finding in findings if finding.subject != "depth"]
@@ -167,8 +166,8 @@ def _is_inconsistent(judgment: PoseJudgment) -> bool:
     return any(finding.setting == UNPOSED for finding in judgment.findings)
 
 
-def _has_error(judgment: PoseJudgment) -> bool:
-    return any(finding.verdict is Verdict.ERROR for finding in judgment.findings)
+def _contain_error(findings: Iterable[Finding]) -> bool:
+    return any(finding.verdict is Verdict.ERROR for finding in findings)
 
 
 def _judged_at_scale(
@@ -217,7 +216,7 @@ def _with_jumps(
     finding = jumps.finding()
     if finding is None:
         return judgment
-    if _has_error(judgment):  # the cause of the jumps, or an effect
+    if _contain_error(judgment.findings):  # the cause of the jumps, or an effect
         if _explains(judgment, jumps, matcher, given):
             return judgment
         judged = pose_fit.judge(jumps.without(pairs), given, _scale_of(matcher.sequence), median_depth)
