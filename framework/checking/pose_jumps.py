@@ -6,8 +6,8 @@ contradicts the poses if both motions move the points to clearly different place
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from framework.checking import Finding, Verdict
 from framework.checking.matched_pairs import MatchedPair, Matcher
 from framework.checking.pose_fit import UNPOSED, error_of, motion_between, motion_of
-from framework.data import Float64
+from framework.data import Float64, Frame
 from framework.datasets.frames.conventions import PoseReading
 from framework.geometry import inverse, rotation_angle, transform
 
@@ -48,12 +48,38 @@ class PoseJump:
 
 
 @dataclass(frozen=True)
+class ComparedPair:
+    """A pair of frames whose motion in the poses is compared with the motion in the images."""
+
+    pair: MatchedPair
+    factor: float = 1.0  # factor of the limits
+    is_revisit: bool = False  # True for distant frames
+
+
+@dataclass(frozen=True)
 class PoseJumps:
     """The result for all compared pairs of frames."""
 
+    pairs: tuple[ComparedPair, ...]  # without images
     neighbors: tuple[PoseJump, ...]  # between neighboring frames, in the order of the sequence
     revisits: tuple[PoseJump, ...]  # between distant frames
-    compared: int  # number of compared pairs
+
+    @classmethod
+    def of(cls, pairs: Sequence[ComparedPair], reading: PoseReading) -> PoseJumps:
+        """Return the jumps between compared frames with a convention of the poses."""
+        found = [(one, jump_of(one.pair, reading, one.factor)) for one in pairs]
+        jumps = [(one, jump) for one, jump in found if jump is not None]
+        next_frames = [jump for one, jump in jumps if one.factor == 1.0]
+        neighbors = [
+            jump
+            for one, jump in jumps
+            if not one.is_revisit and (jump in next_frames or not any(jump.contains(other) for other in next_frames))
+        ]
+        return cls(tuple(pairs), tuple(neighbors), tuple(jump for one, jump in jumps if one.is_revisit))
+
+    @property
+    def count(self) -> int:
+        return len(self.neighbors) + len(self.revisits)
 
     def without(self, pairs: Sequence[MatchedPair]) -> list[MatchedPair]:
         """Return the pairs without a jump between their frames."""
@@ -71,8 +97,8 @@ class PoseJumps:
         listed = ", ".join(map(str, jumps[:SHOWN])) + (f" and {len(jumps) - SHOWN} more" * (len(jumps) > SHOWN))
         what = "neighboring frames" if self.neighbors else "frames of the same place"
         text = (
-            f"jump between the {what} {listed}: the motion differs from the images in {len(jumps)} of {self.compared} "
-            "pairs, so surfaces are mapped twice"
+            f"jump between the {what} {listed}: the motion differs from the images in {len(jumps)} of "
+            f"{len(self.pairs)} pairs, so surfaces are mapped twice"
         )
         return Finding(Verdict.ERROR, "poses", text, UNPOSED)
 
@@ -94,34 +120,29 @@ def find_jumps(
     posed = [k for k in range(count - 1) if poses[k] is not None and poses[k + 1] is not None]
     chosen = sorted(sorted(posed, key=lambda k: -_motion(poses[k], poses[k + 1], reading))[:neighbors])
     places = [int(k) for k in np.unique(np.linspace(0, count - 1, revisits).round())] if revisits else []
-    distant = [(i, j - i) for i, j in combinations(places, 2) if j > i + 1]
-    nearest = [(k, _nearest(matcher, k)) for k in chosen]
-    matched, blurred = ([pair for pair in nearest if (pair[1] == 1) is is_next] for is_next in (True, False))
-    of_neighbors = list(_compared(matcher, matched, reading))
-    of_blurred = list(_compared(matcher, blurred, reading, REVISIT_FACTOR))
-    of_revisits = list(_compared(matcher, distant, reading, REVISIT_FACTOR))
-    jumps = [jump for jump in of_neighbors if jump is not None]
-    others = [jump for jump in of_blurred if jump is not None and not any(jump.contains(one) for one in jumps)]
-    return PoseJumps(
-        tuple(sorted([*jumps, *others], key=lambda jump: jump.first)),
-        tuple(jump for jump in of_revisits if jump is not None),
-        len(of_neighbors) + len(of_blurred) + len(of_revisits),
-    )
+    compared = [_neighbors(matcher, k) for k in chosen]
+    compared += [_compared(matcher, i, j - i, is_revisit=True) for i, j in combinations(places, 2) if j > i + 1]
+    return PoseJumps.of([one for one in compared if one is not None], reading)
 
 
-def _nearest(matcher: Matcher, k: int) -> int:
-    """Return the step from frame k to the nearest later frame with enough matched points, or 1 without one."""
-    return next((step for step in STEPS if matcher.pair(k, step) is not None), 1)
+def _neighbors(matcher: Matcher, k: int) -> ComparedPair | None:
+    """Return frame k with the nearest later frame that has enough matched points, or None without one."""
+    return next((one for step in STEPS if (one := _compared(matcher, k, step)) is not None), None)
 
 
-def _compared(
-    matcher: Matcher, pairs: Sequence[tuple[int, int]], reading: PoseReading, factor: float = 1.0
-) -> Iterator[PoseJump | None]:
-    """Yield the result of each pair (k, step) with poses and enough matched points; None = no jump."""
-    for k, step in pairs:
-        pair = matcher.pair(k, step)
-        if pair is not None and pair.first.T_world_camera is not None and pair.second.T_world_camera is not None:
-            yield jump_of(pair, reading, factor)
+def _compared(matcher: Matcher, k: int, step: int, is_revisit: bool = False) -> ComparedPair | None:
+    """Return the frames k and k + step, or None without poses or enough matched points."""
+    pair = matcher.pair(k, step)
+    if pair is None or pair.first.T_world_camera is None or pair.second.T_world_camera is None:
+        return None
+    slim = replace(pair, first=_without_images(pair.first), second=_without_images(pair.second))
+    return ComparedPair(slim, 1.0 if step == 1 and not is_revisit else REVISIT_FACTOR, is_revisit)
+
+
+def _without_images(frame: Frame) -> Frame:
+    """Return a frame with images of zeros that need no memory."""
+    color, depth = np.broadcast_to(np.uint8(0), frame.color.shape), np.broadcast_to(np.float32(0), frame.depth.shape)
+    return replace(frame, color=color, depth=depth, truth=None)
 
 
 def jump_of(pair: MatchedPair, reading: PoseReading, factor: float = 1.0) -> PoseJump | None:

@@ -217,7 +217,7 @@ def _with_jumps(
     if finding is None:
         return judgment
     if _contain_error(judgment.findings):  # the cause of the jumps, or an effect
-        if _explains(judgment, jumps, matcher, given):
+        if _explains(judgment, jumps, given):
             return judgment
         judged = pose_fit.judge(jumps.without(pairs), given, _scale_of(matcher.sequence), median_depth)
         if any(one.verdict is not Verdict.FINE for one in judged.findings):
@@ -226,7 +226,7 @@ def _with_jumps(
     return replace(judgment, findings=(finding,))
 
 
-def _explains(judgment: PoseJudgment, jumps: PoseJumps, matcher: Matcher, given: PoseReading) -> bool:
+def _explains(judgment: PoseJudgment, jumps: PoseJumps, given: PoseReading) -> bool:
     """Return True if most jumps are absent with the best convention and scale of a judgment."""
     if judgment.best is None:
         return False
@@ -234,9 +234,7 @@ def _explains(judgment: PoseJudgment, jumps: PoseJumps, matcher: Matcher, given:
     unit = best.pose_unit / judgment.best.depth_factor  # has the effect of another depth scale
     if not LEAST_POSE_UNIT <= unit <= LARGEST_POSE_UNIT or replace(best, pose_unit=unit) == given:
         return False
-    corrected = replace(best, pose_unit=unit)
-    left = find_jumps(matcher, _chosen_poses(matcher.sequence), corrected)
-    return len(left.neighbors) + len(left.revisits) < (len(jumps.neighbors) + len(jumps.revisits)) / 2
+    return PoseJumps.of(jumps.pairs, replace(best, pose_unit=unit)).count < jumps.count / 2
 
 
 def _chosen_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
