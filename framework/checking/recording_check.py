@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from framework.checking import Finding, Verdict, pose_fit, registration
+from framework.checking.changed_sequences import DelayedDepth
 from framework.checking.color_timing import check_color_delay
 from framework.checking.depth_kind import check_depth_kind
 from framework.checking.depth_normalization import check_normalization
@@ -21,7 +22,7 @@ from framework.checking.pose_fit import PLAUSIBLE, UNPOSED, USUAL_SCALES, PoseJu
 from framework.checking.pose_jumps import PoseJumps, find_jumps
 from framework.checking.registration import EdgeAlignment, EdgeComparison, color_gradient
 from framework.checking.repeated_images import check_repeats
-from framework.data import Camera, Float64, Frame
+from framework.data import Float64, Frame
 from framework.datasets.frames.conventions import (
     LARGEST_POSE_UNIT,
     LEAST_POSE_UNIT,
@@ -290,29 +291,6 @@ def warn_of_poses(sequence: RGBDVideo, fix: str = CHECK) -> None:
         errors = [] if jump is None else [jump]
     for finding in errors:
         log.warning("%s: %s; %s", finding.subject, finding.text, fix)
-
-
-@dataclass
-class DelayedDepth(RGBDSequence):
-    """A sequence in which each frame has the depth image from `delay` frames later."""
-
-    sequence: RGBDSequence
-    delay: int  # frames, may be negative
-
-    def __post_init__(self) -> None:
-        self.camera: Camera = self.sequence.camera
-        self.name = self.sequence.name
-
-    def constant_color_delay(self) -> float | None:
-        return self.sequence.constant_color_delay()
-
-    def __len__(self) -> int:
-        return len(self.sequence)
-
-    def __getitem__(self, k: int) -> Frame:
-        if not 0 <= k + self.delay < len(self.sequence):
-            raise FrameError(f"frame {k}: expected a depth image at an offset of {self.delay} frames, got none")
-        return replace(self.sequence[k], depth=self.sequence[k + self.delay].depth)
 
 
 def _is_posed(pair: MatchedPair) -> bool:

@@ -255,7 +255,7 @@ def write_run(
 
 def warn_of_recording(video: Recording, tracker: PoseTracker) -> None:
     """Log a warning if the images or the given poses of a recording are wrong in a few frames."""
-    from framework.checking.posed_sequence import PosedSequence
+    from framework.checking.changed_sequences import PosedSequence
     from framework.checking.recording_check import CHECK, warn_of_images, warn_of_poses
 
     if warn_of_images(video):

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from framework.checking.changed_sequences import PosedSequence
 from framework.checking.matched_pairs import Matcher
 from framework.checking.pose_jumps import find_jumps
-from framework.checking.posed_sequence import PosedSequence
 from framework.checking.recording_check import check, warn_of_poses
 from framework.data import Float64
 from framework.datasets.frames.conventions import PoseReading
