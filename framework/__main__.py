@@ -25,6 +25,7 @@ COMMANDS = {
     "diff": "list objects that appeared, vanished or moved between two runs",
     "edit": "merge, split, rename and delete instances of a run, for use as ground truth",
     "export": "export a run to standard 3D and map formats: GLB, USD, PLY, OBJ, ROS map, scene graph",
+    "verify": "compare the files of runs with the hashes in their manifests",
     "bundle": "pack the runs, tables and plugin code of an experiment into a ZIP file",
     "reproduce": "run stored runs or a bundle again and compare the results",
     "query": 'rank the objects of a run by a text query: "a red chair"',
@@ -47,7 +48,7 @@ FOLDERS = {
     "running": ("run", "detect", "show-refinement"),
     "results": (
         *("tables", "figures", "raycast", "report", "diff", "edit", "export", "query"),
-        *("import-map", "evaluate", "bundle", "reproduce"),
+        *("import-map", "evaluate", "verify", "bundle", "reproduce"),
     ),
     "recordings": ("import", "check", "synthesize", "convert-oni"),
     "installation": ("compile", "doctor", "plugins", "new-plugin", "train-detector", "convert-weights"),

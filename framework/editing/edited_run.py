@@ -17,12 +17,12 @@ from framework.editing.edited_map import EditedMap
 from framework.editing.edits import Edit, write_edits
 from framework.errors import ConfigError, DataError, InstanceMapError
 from framework.files.json_file import write_json
+from framework.files.manifest import Manifest
 from framework.files.tum_trajectory import read_tum
 from framework.mapping.instance_map import FORMAT, InstanceMap
 from framework.mapping.storage.map_file import read_format
 from framework.rendering.overview import InstanceState, write_comparison, write_overview
 from framework.runs.instances_file import write_instances
-from framework.runs.manifest import Manifest
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import TRUTH, is_evaluation
 from framework.runs.reevaluation import Reevaluation, Truth, classes_of

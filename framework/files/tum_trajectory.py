@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
 from framework.files.atomic_write import atomic_write
+from framework.files.manifest import verified
 from framework.files.number_lines import SHOWN, numbers, read_lines
 from framework.files.trajectory_columns import NANOSECOND, TUM, Columns, without_header
 
@@ -90,9 +91,10 @@ def read_tum(path: Path) -> tuple[Float64, Float64]:
     """Read the timestamps (F,), s, and the poses T_world_camera (F, 4, 4) in a TUM file.
 
     Raises:
-        DataError: A line is invalid, or the timestamps do not increase.
+        DataError: A line is invalid, the timestamps do not increase, or the file of a run has changed.
     """
-    lines = read_tum_lines(path)
+    with verified(path):
+        lines = read_tum_lines(path)
     for before, line in pairwise(lines):
         if line.timestamp <= before.timestamp:
             raise line.error(f"expected a timestamp > {before.timestamp:.12g} s, got {line.timestamp:.12g} s")

@@ -12,6 +12,7 @@ import numpy as np
 from framework.data import Box, Float64, Instance, InstanceMesh
 from framework.errors import DataError
 from framework.files.json_file import read_json, write_json
+from framework.files.manifest import verified
 from framework.runs.metrics import class_name
 
 LARGEST_ID = 2**31 - 1
@@ -77,7 +78,8 @@ def read_instances(path: Path) -> list[StoredInstance]:
     Raises:
         DataError: The file is missing or invalid.
     """
-    entries = read_json(path)
+    with verified(path):
+        entries = read_json(path)
     if not isinstance(entries, list):
         raise DataError(f"{path}: expected a JSON array of instances, got {entries!r:.40}")
     found = [_stored(f"{path}, entry {number}", entry) for number, entry in enumerate(entries, start=1)]

@@ -10,6 +10,7 @@ import numpy as np
 
 from framework.data import Array, InstanceMesh
 from framework.errors import DataError
+from framework.files.manifest import verified
 from framework.files.ply import read_ply, write_ply
 
 CHANNELS = ("red", "green", "blue")
@@ -46,7 +47,8 @@ def read_mesh(path: Path) -> InstanceMesh:
     Raises:
         DataError: The file is missing or damaged, or is not the mesh of a run.
     """
-    ply = read_ply(path)
+    with verified(path):
+        ply = read_ply(path)
     for name, kind in TYPES.items():
         if name not in ply.properties or ply.properties[name].dtype != kind:
             got = ply.properties[name].dtype if name in ply.properties else "none"

@@ -20,10 +20,10 @@ from framework.evaluation.scannet_benchmark import BenchmarkScene
 from framework.evaluation.truth_alignment import in_map_world
 from framework.files.directory_lock import locked
 from framework.files.json_file import write_json
+from framework.files.manifest import MANIFEST, Manifest
 from framework.files.tum_trajectory import read_tum
 from framework.interfaces import RGBDVideo
 from framework.registry import build
-from framework.runs.manifest import MANIFEST, Manifest
 from framework.runs.metrics import (
     ANNOTATED,
     CLASS_NAMES,
@@ -174,7 +174,7 @@ class Reevaluation:
         os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
         if (self.record.directory / MANIFEST).exists():
             stored = Manifest.read(self.record.directory)
-            stored.with_files(self.record.directory, stored.files).write(self.record.directory)
+            stored.with_files(self.record.directory, [METRICS]).write(self.record.directory)
 
 
 def read_predictions(record: Record) -> PredictedInstances:

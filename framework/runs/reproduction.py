@@ -10,8 +10,8 @@ from typing import Any
 
 from framework.errors import DataError
 from framework.files.atomic_write import read_text
+from framework.files.manifest import Manifest, verified
 from framework.runs.inputs import ROOT, input_hashes
-from framework.runs.manifest import Manifest
 from framework.runs.plugin_code import changed_code, plugin_code
 from framework.runs.provenance import code_version, leaves, package_version, parameters_of
 from framework.runs.stored_runs import (
@@ -145,7 +145,8 @@ def _first_difference(before: Path, after: Path) -> tuple[int, str] | None:
 def _digests(path: Path) -> dict[tuple[int, str], str]:
     """Read the digests by frame and stage."""
     try:
-        rows = list(csv.DictReader(read_text(path).splitlines()))
+        with verified(path):
+            rows = list(csv.DictReader(read_text(path).splitlines()))
         return {(int(row["frame"]), row["stage"]): row["digest"] for row in rows if row["stage"] in ORDER}
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: expected the columns frame, stage and digest, got an error ({error!r})") from error

@@ -12,7 +12,7 @@ from pathlib import Path
 from framework.config.composition import add_config_dir
 from framework.errors import DataError
 from framework.files.atomic_write import atomic_write
-from framework.runs.manifest import MANIFEST, Manifest
+from framework.files.manifest import MANIFEST, Manifest
 from framework.runs.plugin_code import plugin_files, targets_of
 from framework.runs.reproduction import LARGE
 from framework.runs.stored_runs import completed_runs

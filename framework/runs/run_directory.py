@@ -31,6 +31,7 @@ from framework.errors import DataError, InstanceMapError, PartialRunError
 from framework.evaluation.compared_classes import ComparedClasses
 from framework.files.atomic_write import atomic_write, remove_left_over
 from framework.files.json_file import write_json
+from framework.files.manifest import MANIFEST, Manifest, RunStatus
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import PoseTracker, RGBDSequence, RGBDVideo
 from framework.live_view.guarded_viewer import watched_run
@@ -39,7 +40,6 @@ from framework.registry import STAGES, build
 from framework.rendering.overview import write_overview
 from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import write_instances
-from framework.runs.manifest import MANIFEST, Manifest, RunStatus
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
 from framework.runs.plugin_code import plugin_code

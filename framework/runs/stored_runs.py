@@ -7,6 +7,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,7 @@ from framework.config.composition import resolved
 from framework.errors import DataError, first_line
 from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
 from framework.files.json_file import read_json
+from framework.files.manifest import MANIFEST, verified
 from framework.files.yaml_file import load_yaml
 from framework.registry import STAGES
 from framework.runs.inputs import INPUTS, inputs_sha256
@@ -170,17 +172,17 @@ def commit_of(metrics: Mapping[str, Any]) -> str:
     return f"{str(metrics.get('git_commit'))[:7]}{changes}"
 
 
-def read_record(directory: Path, check_config: bool = True) -> Record:
+def read_record(directory: Path, check_files: bool = True) -> Record:
     """Read the completed run in a directory.
 
     Args:
         directory: The run directory.
-        check_config: Require that config.yaml has not changed since the run.
+        check_files: Require that the config and the metrics have not changed since the run.
 
     Raises:
         DataError: A file is missing, invalid or inconsistent.
     """
-    return _read(directory, METRICS, check_config)
+    return _read(directory, METRICS, check_files)
 
 
 def read_partial(directory: Path) -> tuple[Record, str]:
@@ -193,10 +195,13 @@ def read_partial(directory: Path) -> tuple[Record, str]:
     return record, str(record.metrics.get("partial"))
 
 
-def _read(directory: Path, name: str, check_config: bool = True) -> Record:
+def _read(directory: Path, name: str, check_files: bool = True) -> Record:
     path = directory / name
-    metrics, config = _read_flat(path), read_yaml(directory / CONFIG)
-    if check_config and metrics.get("config_hash") != config_hash(config):
+    with verified(path) if check_files else nullcontext():
+        metrics = _read_flat(path)
+    with verified(directory / CONFIG) if check_files else nullcontext():
+        config = read_yaml(directory / CONFIG)
+    if check_files and metrics.get("config_hash") != config_hash(config):
         raise DataError(
             f"{path}: expected the config_hash of {CONFIG}, {config_hash(config)[:8]}, got "
             f"{metrics.get('config_hash')!s:.8}; repeat the run"
@@ -212,7 +217,7 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
     """Return the completed and the incomplete runs in a folder and its subfolders, sorted by path."""
     records: list[Record] = []
     others: list[Incomplete] = []
-    for directory in _run_directories(root):
+    for directory in run_directories(root):
         if not (directory / METRICS).exists():
             others.append(Incomplete(directory, _why_incomplete(directory)))
             continue
@@ -330,7 +335,8 @@ def read_metrics(directory: Path) -> dict[str, Any]:
     """
     for name in (METRICS, PARTIAL_METRICS):
         if path_exists(directory / name):
-            return _read_flat(directory / name)
+            with verified(directory / name):
+                return _read_flat(directory / name)
     raise DataError(f"{directory}: expected a run directory with {METRICS} or {PARTIAL_METRICS}, got neither")
 
 
@@ -351,10 +357,11 @@ def is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
-def _run_directories(root: Path) -> Iterator[Path]:
+def run_directories(root: Path) -> Iterator[Path]:
+    """Yield the run directories in a folder and its subfolders, sorted by path."""
     for path, folders, files in os.walk(root):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        if not {METRICS, PARTIAL_METRICS, LOG}.isdisjoint(files):
+        if not {METRICS, PARTIAL_METRICS, LOG, MANIFEST}.isdisjoint(files):
             yield Path(path)
 
 
@@ -362,7 +369,7 @@ def _why_incomplete(directory: Path) -> str:
     """Return the reason why a run is incomplete."""
     if (directory / PARTIAL_METRICS).exists():
         try:
-            return f"partial: {_read_flat(directory / PARTIAL_METRICS).get('partial')}"
+            return f"partial: {read_metrics(directory).get('partial')}"
         except DataError as error:
             return str(error)
     try:

@@ -12,6 +12,7 @@ import numpy as np
 from framework.data import Float64, Int64
 from framework.errors import DataError
 from framework.files.atomic_write import read_text
+from framework.files.manifest import verified
 
 HEADER = ["frame", "stage", "milliseconds"]
 OLD_STAGES = {
@@ -47,7 +48,8 @@ def read_timings(path: Path) -> StageTimes:
         DataError: The file cannot be read, is invalid or contains no times.
     """
     try:
-        lines = list(csv.reader(read_text(path).splitlines(keepends=True)))
+        with verified(path):
+            lines = list(csv.reader(read_text(path).splitlines(keepends=True)))
     except csv.Error as error:
         raise DataError(f"{path}: expected valid CSV, got an error ({error})") from error
     if lines[:1] != [HEADER]:

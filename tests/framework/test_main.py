@@ -209,6 +209,7 @@ FAULTY = {
     "show-refinement": ["dataset=synthetic", "detector=simulated"],
     "compile": ["nothing"],
     "plugins": ["detector", "nothing"],
+    "verify": ["nowhere"],
     "bundle": ["nowhere"],
     "reproduce": ["nowhere"],
     "new-plugin": ["refiner", "gmm_em"],

@@ -11,12 +11,12 @@ from omegaconf import DictConfig
 from framework.commands.command_line import arguments, one_line_errors
 from framework.errors import DataError
 from framework.files.atomic_write import path_exists
-from framework.files.json_file import read_json, write_json
+from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum
 from framework.files.yaml_file import load_yaml
 from framework.queries.changes import Change, Kind, Visit, changes
 from framework.queries.labeled_surface import LabeledSurface
-from framework.runs.stored_runs import CONFIG, EDITED_FROM, EXTERNAL, METRICS, TRAJECTORY
+from framework.runs.stored_runs import CONFIG, EDITED_FROM, EXTERNAL, METRICS, TRAJECTORY, read_metrics
 
 log = logging.getLogger(__name__)
 
@@ -69,8 +69,7 @@ def visits_of(*runs: Path) -> list[Visit]:
 
 def is_imported(run: Path) -> bool:
     """Return True for the run directory of an imported map."""
-    metrics = read_json(run / METRICS) if path_exists(run / METRICS) else None
-    return isinstance(metrics, dict) and metrics.get("pose_source") == EXTERNAL
+    return path_exists(run / METRICS) and read_metrics(run).get("pose_source") == EXTERNAL
 
 
 def in_world(run: Path, world: Path) -> bool:
@@ -81,13 +80,12 @@ def in_world(run: Path, world: Path) -> bool:
     """
     config = load_yaml(run / CONFIG) if path_exists(run / CONFIG) else None
     worlds = [config.get(key) for key in ("localize_in", "resume_from")] if isinstance(config, DictConfig) else []
-    records = [read_json(place / METRICS) if path_exists(place / METRICS) else None for place in (run, world)]
-    if isinstance(records[0], dict):
-        worlds.append(records[0].get(EDITED_FROM))
+    metrics = [read_metrics(one) if path_exists(one / METRICS) else {} for one in (run, world)]
+    worlds.append(metrics[0].get(EDITED_FROM))
     if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in worlds):
         return True
     shared = ("ground_truth", EXTERNAL)
-    return all(isinstance(record, dict) and record.get("pose_source") in shared for record in records)
+    return all(one.get("pose_source") in shared for one in metrics)
 
 
 def world_fix(before: Path, after: Path) -> str:

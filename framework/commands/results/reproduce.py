@@ -85,7 +85,7 @@ def reproduce_all(folder: Path, overrides: Sequence[str], row: str | None, out: 
     for one in edited:
         print_error(DataError(one.reason))
         try:
-            _print_changes(read_record(one.directory, check_config=False))
+            _print_changes(read_record(one.directory, check_files=False))
         except KNOWN_ERRORS as error:
             print_error(error, f"error: {one.directory.name}: ")
     for number, record in enumerate(records):

@@ -24,6 +24,7 @@ from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import path_exists
 from framework.files.json_file import read_json
+from framework.files.manifest import verified
 from framework.files.ply import PlyMesh, found_property, read_ply
 from framework.files.search_paths import candidates
 from framework.files.tum_trajectory import read_tum
@@ -74,7 +75,8 @@ def read_named_truth(path: Path, origin: Sequence[float] = ()) -> NamedTruth:
     """
     files = truth_files(path)
     mesh, names = files[0], files[1]
-    ply, content = read_ply(mesh), read_json(names)
+    with verified(mesh), verified(names):
+        ply, content = read_ply(mesh), read_json(names)
     ids = _labels_of(mesh, ply)
     label = f"{mesh.parent.name}/{mesh.name}"
     if isinstance(content, list):
@@ -188,6 +190,7 @@ def _classes_of_run(path: Path, entries: Sequence[Any]) -> dict[int, str | None]
 
 def _trajectory_of_run(directory: Path) -> ReferenceTrajectory:
     timestamps, poses = read_tum(directory / TRAJECTORY)
-    metrics = read_json(directory / METRICS) if path_exists(directory / METRICS) else {}
+    with verified(directory / METRICS):
+        metrics = read_json(directory / METRICS) if path_exists(directory / METRICS) else {}
     given = isinstance(metrics, dict) and metrics.get("pose_source") == "ground_truth"
     return ReferenceTrajectory(timestamps, poses, given)

@@ -17,6 +17,7 @@ from framework.data import Array, check_array
 from framework.errors import DataError, InstanceMapError, in_one_line
 from framework.files.atomic_write import atomic_write, check_regular
 from framework.files.json_file import parse_json
+from framework.files.manifest import verified
 from framework.mapping.instances.instance_table import FrameSet, InstanceRecord, InstanceTable
 from framework.mapping.instances.object_embedding import ARRAYS, SPACE, embedding_arrays, read_embeddings
 from framework.mapping.labels.label_evidence_kernels import Combine
@@ -62,7 +63,7 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
     Raises:
         DataError: If the file is not a map file, has another format or is damaged.
     """
-    with map_file_errors(path), _opened(path) as archive:
+    with verified(Path(path)), map_file_errors(path), _opened(path) as archive:
         header = _header(archive)
         found = header.values.get("format")
         if found != expected_format:

@@ -23,6 +23,7 @@ from framework.evaluation.instances import PredictedInstances
 from framework.files.atomic_write import atomic_write
 from framework.files.hashing import path_hash
 from framework.files.json_file import write_json
+from framework.files.manifest import Manifest, RunStatus
 from framework.interfaces import RGBDVideo
 from framework.mapping.gravity import floor_height
 from framework.registry import STAGES, build, text_kind
@@ -30,7 +31,6 @@ from framework.rendering.overview import write_overview
 from framework.runs.external_maps.conversion import ConvertedMap
 from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import NO_CLASS, write_instances
-from framework.runs.manifest import Manifest, RunStatus
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, evaluation_metrics
 from framework.runs.provenance import code_version, config_hash, parameters_of

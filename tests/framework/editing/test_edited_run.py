@@ -21,10 +21,10 @@ from framework.editing.edited_run import EditedRun
 from framework.editing.edits import read_edits
 from framework.errors import ConfigError, DataError
 from framework.files.hashing import path_hash
+from framework.files.manifest import Manifest, RunStatus
 from framework.mapping.instance_map import InstanceMap
 from framework.registry import assemble
 from framework.runs.instances_file import read_instances
-from framework.runs.manifest import Manifest, RunStatus
 from framework.runs.mesh_file import read_mesh
 from framework.runs.stored_runs import completed_runs, read_record
 from framework.testing.corner_room import exact_clusters, frame_at, pose_at

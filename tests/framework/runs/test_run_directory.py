@@ -20,11 +20,11 @@ from framework.data import InstanceMesh, Pose, SceneTruth
 from framework.errors import DataError, MapFullError
 from framework.evaluation.compared_classes import ComparedClasses
 from framework.evaluation.instances import PredictedInstances, Transfer, evaluate
+from framework.files.manifest import Manifest, RunStatus
 from framework.files.tum_trajectory import read_tum
 from framework.pipeline import Pipeline
 from framework.runs import provenance, run_directory
 from framework.runs.instances_file import write_instances
-from framework.runs.manifest import Manifest, RunStatus
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import instance_metrics, run_metrics, trajectory_metrics
 from framework.runs.run_directory import RunRecord, headline

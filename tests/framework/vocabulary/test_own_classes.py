@@ -14,7 +14,7 @@ import pytest
 
 import instancemap
 from framework.files.json_file import read_json
-from framework.runs.manifest import Manifest
+from framework.files.manifest import Manifest
 from framework.runs.mesh_file import read_mesh
 from instancemap import load_map, load_runs
 from tests.support import option_files

@@ -18,10 +18,10 @@ from framework.api import load_runs
 from framework.commands.results import diff, evaluate, export, import_map, query, reproduce
 from framework.commands.results.report import write_reports
 from framework.config import composition
+from framework.files.manifest import Manifest
 from framework.files.ply import read_ply, write_ply
 from framework.runs import instances_file
 from framework.runs.instances_file import read_instances
-from framework.runs.manifest import Manifest
 from framework.runs.mesh_file import read_mesh
 from framework.runs.stored_runs import read_record
 from framework.tables.experiment_tables import write_tables

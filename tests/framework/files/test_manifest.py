@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from framework.errors import DataError
-from framework.runs.manifest import Manifest, RunStatus
+from framework.files.manifest import Manifest, RunStatus, verified
 
 
 @pytest.fixture
@@ -56,3 +56,54 @@ def test_manifest_without_object_raises(directory: Path) -> None:
     (directory / "manifest.json").write_text("[]")
     with pytest.raises(DataError, match="expected a JSON object, got list"):
         Manifest.read(directory)
+
+
+def read(path: Path) -> str:
+    with verified(path):
+        return path.read_text()
+
+
+def test_verified_unchanged_file_is_read(directory: Path) -> None:
+    assert read(directory / "config.yaml") == "seed: 0\n"
+
+
+def test_verified_changed_file_raises(directory: Path) -> None:
+    (directory / "config.yaml").write_text("seed: 1\n")
+    with pytest.raises(DataError, match=r"config\.yaml: expected the SHA-256 .* --accept config\.yaml"):
+        read(directory / "config.yaml")
+
+
+def test_verified_unlisted_run_file_raises(directory: Path) -> None:
+    (directory / "keyframes.npz").write_text("of another run")
+    (directory / "before.ply").write_text("of the user")
+    assert read(directory / "before.ply") == "of the user"
+    with pytest.raises(DataError, match=r"keyframes\.npz: expected no file in this run"):
+        read(directory / "keyframes.npz")
+
+
+@pytest.mark.parametrize("content", ["{}", '{"name": "scene", "files": ["config.yaml"]}', "[]", "no JSON"])
+def test_verified_manifest_of_other_program_is_ignored(content: str, directory: Path) -> None:
+    (directory / "manifest.json").write_text(content)
+    assert read(directory / "config.yaml") == "seed: 0\n"
+
+
+@pytest.mark.parametrize("key", ["digest", "parameters", "files", "status"])
+def test_verified_damaged_manifest_raises(key: str, directory: Path) -> None:
+    path = directory / "manifest.json"
+    path.write_text(path.read_text().replace(f'"{key}"', f'"{key.upper()}"'))
+    with pytest.raises(DataError, match=r"manifest\.json: expected the digest"):
+        read(directory / "config.yaml")
+
+
+def test_verified_file_replaced_while_read_is_accepted(directory: Path) -> None:
+    metrics = directory / "metrics.json"
+    stored = Manifest.read(directory)
+    with verified(metrics):
+        metrics.write_text('{"fps": 1}\n')
+        stored.with_files(directory, ["metrics.json"]).write(directory)
+
+
+def test_verified_missing_file_is_left_to_reader(directory: Path) -> None:
+    (directory / "metrics.json").unlink()
+    with pytest.raises(FileNotFoundError):
+        read(directory / "metrics.json")
