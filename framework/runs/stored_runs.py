@@ -327,6 +327,11 @@ def _with_text_keys(node: Any) -> Any:
     return [_with_text_keys(one) for one in node] if isinstance(node, list) else node
 
 
+def has_metrics(directory: Path) -> bool:
+    """Return True for the directory of a completed or partial run."""
+    return any(path_exists(directory / name) for name in (METRICS, PARTIAL_METRICS))
+
+
 def read_metrics(directory: Path) -> dict[str, Any]:
     """Read the metrics of a completed or partial run.
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.datasets.frames.world_offset import origin_comments, stored_origin
-from framework.errors import DataError
 from framework.queries.text_search import BY, WITH_EMBEDDINGS, Match, QueryResult
-from framework.runs.stored_runs import read_metrics
+from framework.runs.stored_runs import has_metrics, read_metrics
 
 
 def main() -> None:
@@ -44,7 +42,7 @@ def main() -> None:
         print(heading(answer, parsed.by))
         if shown:
             print(table(shown, "similarity" if answer.by == "embeddings" else "match"))
-            with suppress(DataError):  # a run directory may lack metrics
+            if has_metrics(parsed.run):  # otherwise, a directory with only a map
                 for line in origin_comments(stored_origin(read_metrics(parsed.run))):
                     print(line)
         else:

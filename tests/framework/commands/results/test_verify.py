@@ -110,7 +110,7 @@ READ = {
     "export": ("mesh.ply", "instances.json", "metrics.json"),
     "report": ("config.yaml", "metrics.json", "mesh.ply", "instances.json", "trajectory.txt", "timings.csv"),
     "tables": ("config.yaml", "metrics.json"),
-    "query": ("map.npz",),
+    "query": ("map.npz", "metrics.json"),
 }
 
 
