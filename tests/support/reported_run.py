@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from omegaconf import OmegaConf
 
 from framework.commands.running.run import run
 from framework.config import composition
+from framework.files.manifest import MANIFEST
 
 FAKES = Path(__file__).resolve().parent / "fake_conf"
 CONFIG: dict[str, Any] = {
@@ -36,6 +38,11 @@ def write_run(directory: Path, **dataset: Any) -> Path:
         patched.setattr(composition, "_added", [FAKES])
         run(OmegaConf.create(config), directory, {})
     return directory
+
+
+def unverified_copy(directory: Path, copy: Path) -> Path:
+    """Copy a run directory without the manifest, so that a test can change its files."""
+    return Path(shutil.copytree(directory, copy, ignore=shutil.ignore_patterns(MANIFEST)))
 
 
 def rename_class(directory: Path, name: str) -> None:

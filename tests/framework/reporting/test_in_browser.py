@@ -20,7 +20,7 @@ from framework.commands.results import edit
 from framework.commands.results.report import write_reports
 from framework.config import composition
 from framework.runs.instances_file import read_instances
-from tests.support.reported_run import FAKES, rename_class, write_run
+from tests.support.reported_run import FAKES, rename_class, unverified_copy, write_run
 
 pytestmark = pytest.mark.integration
 
@@ -62,7 +62,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Return the pages of two runs and of their comparison. A class name of the second run contains HTML."""
     folder = tmp_path_factory.mktemp("runs")
     first = write_run(folder / "first")
-    second = Path(shutil.copytree(first, folder / "second"))
+    second = unverified_copy(first, folder / "second")
     rename_class(second, HOSTILE)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(composition, "_added", [FAKES])

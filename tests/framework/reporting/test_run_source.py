@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from framework.reporting.run_contents import RunContents
 from framework.reporting.run_source import MIN_CLARITY, Footage, RunSource, TruePath
 from framework.runs.provenance import config_hash
 from framework.runtime.run_log import STAGES
-from tests.support.reported_run import write_run
+from tests.support.reported_run import unverified_copy, write_run
 from tests.support.scenes.corner_room import pose_at
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
@@ -30,7 +29,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def directory(mapped: Path, tmp_path: Path) -> Path:
     """Return a copy of a run of six frames."""
-    return Path(shutil.copytree(mapped, tmp_path / "run"))
+    return unverified_copy(mapped, tmp_path / "run")
 
 
 def change_config(directory: Path, **dataset: Any) -> None:

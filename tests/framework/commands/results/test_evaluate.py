@@ -22,6 +22,7 @@ from framework.runs import reevaluation, run_directory
 from framework.runs.provenance import config_hash
 from tests.support import reported_run
 from tests.support.command_call import call_command
+from tests.support.reported_run import unverified_copy
 from tests.support.scenes.corner_room import CornerRoom
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
@@ -48,7 +49,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def stored(mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a copy of the run directory, and set a known commit of the evaluation code."""
     monkeypatch.setattr(reevaluation, "code_version", lambda: {"git_commit": "abcdef0", "git_dirty": False})
-    return Path(shutil.copytree(mapped, tmp_path / "runs" / "first"))
+    return unverified_copy(mapped, tmp_path / "runs" / "first")
 
 
 @pytest.fixture
@@ -255,7 +256,7 @@ def test_evaluate_run_without_truth_is_unchanged(stored: Path, command) -> None:
 
 
 def test_evaluate_process_reports_results_and_status(mapped: Path, tmp_path: Path) -> None:
-    shutil.copytree(mapped, tmp_path / "run")
+    unverified_copy(mapped, tmp_path / "run")
     done = subprocess.run(
         [sys.executable, "-m", "framework", "evaluate", "--config-dir", str(reported_run.FAKES), "run", "absent"],
         cwd=tmp_path,

@@ -24,6 +24,7 @@ from framework.runs.inputs import inputs_sha256
 from framework.runs.stored_runs import read_record
 from framework.testing.corner_room import CAMERA, RATE, frame_at, pose_at
 from tests.support import reported_run
+from tests.support.reported_run import unverified_copy
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
 FRAMES = 6
@@ -94,10 +95,7 @@ def test_ground_truth_of_another_run_gives_metrics(made: Path, tmp_path: Path, n
 
 def test_ground_truth_run_aligns_unposed_map(made: Path, tmp_path: Path) -> None:
     """The world frame of the reference is shifted by 0.5 m along x."""
-    reference = tmp_path / "reference"
-    reference.mkdir()
-    for file in (made / "reference").iterdir():
-        (reference / file.name).write_bytes(file.read_bytes())
+    reference = unverified_copy(made / "reference", tmp_path / "reference")
     shift = np.eye(4)
     shift[0, 3] = 0.5
     ply, (times, poses) = read_ply(reference / "mesh.ply"), read_tum(reference / "trajectory.txt")

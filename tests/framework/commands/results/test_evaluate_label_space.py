@@ -21,6 +21,7 @@ from framework.runs.run_rows import rows_of
 from framework.runs.stored_runs import find_records, read_record
 from tests.support import reported_run
 from tests.support.command_call import call_command
+from tests.support.reported_run import unverified_copy
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
 
@@ -32,7 +33,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stored(mapped: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(mapped, tmp_path / "runs" / "first"))
+    return unverified_copy(mapped, tmp_path / "runs" / "first")
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from framework.files.tum_trajectory import read_tum, write_tum
 from framework.reporting.run_source import RunSource
 from framework.reporting.visibility import NOT_CAMERA
 from tests.support.command_call import call_command
-from tests.support.reported_run import write_run
+from tests.support.reported_run import unverified_copy, write_run
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
 
@@ -31,7 +30,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def stored(mapped: Path, tmp_path: Path) -> Path:
     """Return the directory of a run that is lost in frame 2."""
-    run = Path(shutil.copytree(mapped, tmp_path / "run"))
+    run = unverified_copy(mapped, tmp_path / "run")
     timestamps, poses = read_tum(run / "trajectory.txt")
     write_tum(run / "trajectory.txt", np.delete(timestamps, 2), np.delete(poses, 2, axis=0))
     lines = (run / "timings.csv").read_text().splitlines(keepends=True)

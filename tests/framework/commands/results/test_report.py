@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from framework.errors import DataError
 from framework.reporting import run_page
 from framework.reporting.run_page import RunReport
 from tests.support.command_call import call_command
-from tests.support.reported_run import rename_class, write_run
+from tests.support.reported_run import rename_class, unverified_copy, write_run
 from tests.support.scenes.corner_room import CornerRoom
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
@@ -30,7 +29,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stored(mapped: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(mapped, tmp_path / "runs" / "first"))
+    return unverified_copy(mapped, tmp_path / "runs" / "first")
 
 
 @pytest.fixture
@@ -229,7 +228,7 @@ def test_report_invalid_or_repeated_run_is_rejected(stored: Path, command, tmp_p
 
 
 def test_report_of_several_runs_writes_comparison(mapped: Path, stored: Path, command) -> None:
-    second = Path(shutil.copytree(mapped, stored.parent / "sec & ond"))
+    second = unverified_copy(mapped, stored.parent / "sec & ond")
     metrics = json.loads((second / "metrics.json").read_text())
     metrics |= {"instances.ap50": metrics["instances.ap50"] - 0.25, "trajectory.ate_rmse_m": 0.0005, "fps": 1000.0}
     (second / "metrics.json").write_text(json.dumps(metrics))
