@@ -37,6 +37,7 @@ from framework.detection.map_classes import with_classes_of_map
 from framework.detection.stored.cache import with_cache
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.files.directory_lock import locked
+from framework.files.staged_files import finish_replacement
 from framework.geometry import camera_of, pose_of
 from framework.interfaces import (
     ClusterRefiner,
@@ -163,6 +164,7 @@ def scene_of(key: str, run: Path) -> SceneMap:
     Raises:
         DataError: The map is missing or cannot be read.
     """
+    finish_replacement(run)
     if not (run / MAP).is_file():
         raise DataError(
             f"{key}: expected a run directory with {MAP}, got {run} without it (imported maps have only a mesh)"

@@ -18,6 +18,7 @@ from framework.editing.edits import Edit, write_edits
 from framework.errors import ConfigError, DataError, InstanceMapError
 from framework.files.json_file import write_json
 from framework.files.manifest import Manifest
+from framework.files.staged_files import STAGED, finish_replacement, staged_files
 from framework.files.tum_trajectory import read_tum
 from framework.mapping.instance_map import FORMAT, InstanceMap
 from framework.mapping.storage.map_file import read_format
@@ -95,7 +96,7 @@ class EditedRun:
         write_comparison(path, self.scene.mesh(), states, self.poses)
 
     def write(self, out: Path) -> None:
-        """Write the run directory of the edited map.
+        """Write the run directory of the edited map. After an error, it has no files.
 
         It contains the files of the stored run that do not depend on the instances, such as the trajectory. The metrics
         of the instances are evaluated again if the stored run was evaluated.
@@ -105,21 +106,21 @@ class EditedRun:
             DataError: A file cannot be read or written.
         """
         check_empty(out)
-        out.mkdir(parents=True, exist_ok=True)
-        copied = [name for name in self.manifest.files if name not in REWRITTEN]
-        for name in copied:
-            shutil.copyfile(self.record.directory / name, out / name)
         mesh, found = self.scene.mesh(), self.scene.instances()
-        write_edits(out / EDITS, self.edits)
-        write_instances(out / INSTANCES, mesh, found, self.scene.classes)
-        write_mesh(out / MESH, mesh)
-        self.scene.save(out / MAP)
-        self.write_preview(out / PREVIEW)
-        metrics = self._metrics(out, len(found))
-        title = f"{headline(metrics)} | edited"
-        write_overview(out / OVERVIEW, mesh, likely_labels(found, self.scene.classes), self.poses, title)
-        write_json(out / METRICS, metrics)
-        self.manifest.with_files(out, [*copied, *REWRITTEN]).write(out)
+        with staged_files(out) as folder:
+            copied = [name for name in self.manifest.files if name not in REWRITTEN]
+            for name in copied:
+                shutil.copyfile(self.record.directory / name, folder / name)
+            write_edits(folder / EDITS, self.edits)
+            write_instances(folder / INSTANCES, mesh, found, self.scene.classes)
+            write_mesh(folder / MESH, mesh)
+            self.scene.save(folder / MAP)
+            self.write_preview(folder / PREVIEW)
+            metrics = self._metrics(folder, len(found))
+            title = f"{headline(metrics)} | edited"
+            write_overview(folder / OVERVIEW, mesh, likely_labels(found, self.scene.classes), self.poses, title)
+            write_json(folder / METRICS, metrics)
+            self.manifest.with_files(folder, [*copied, *REWRITTEN]).write(folder)
 
     def _metrics(self, out: Path, instances: int) -> Mapping[str, Any]:
         """Return the metrics of the stored run, with the number and the evaluation of the edited instances."""
@@ -147,8 +148,9 @@ class EditedRun:
 
 
 def check_empty(out: Path) -> None:
-    """Raise ConfigError unless a path is a new or empty folder."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    """Raise ConfigError unless a path is a new or empty folder. Unfinished files of a killed process are ignored."""
+    finish_replacement(out)
+    if out.exists() and (not out.is_dir() or any(path.name != STAGED for path in out.iterdir())):
         raise ConfigError(f"out: expected a new or empty folder, got {out}; choose another folder")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import secrets
@@ -13,6 +14,9 @@ from pathlib import Path
 from framework.errors import DataError
 
 MAX_TEXT = 2**28  # maximum size of text and JSON files, bytes; one hour of poses takes 10 MB
+UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EBADF, errno.EACCES)
+"""Error numbers of file systems that cannot sync folders, and of folders without read permission."""
+
 _TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.partial(\..*)?")  # names of temporary files of `atomic_write`
 
 
@@ -22,7 +26,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
     The context manager yields a temporary path with the same suffix. At the end of the block, the temporary file
     replaces `path`. If an exception is raised, the temporary file is deleted. If `path` is a symbolic link, the target
-    of the link is replaced.
+    of the link is replaced. The new file survives a power cut.
 
     Raises:
         DataError: Writing fails, or `path` exists and is not a regular file.
@@ -37,12 +41,44 @@ def atomic_write(path: Path) -> Iterator[Path]:
         with temporary.open("rb+") as file:  # Windows syncs only writable files
             os.fsync(file.fileno())
         temporary.replace(path)
+        sync_folder(path.parent)
     except OSError as error:
         reason = error.strerror or f"{error}; the disk may be full"  # NumPy reports only the number of items
         raise DataError(f"{path}: expected a writable file, got an error ({reason})") from error
     finally:
         with suppress(OSError):  # the disk may be read-only
             temporary.unlink(missing_ok=True)
+
+
+def sync_folder(folder: Path) -> None:
+    """Write the entries of a folder to disk, so that new and renamed files survive a power cut.
+
+    Raises:
+        OSError: Writing fails.
+    """
+    if os.name == "nt":  # Windows cannot open folders
+        return
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        if error.errno not in UNSUPPORTED:
+            raise
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder and its parents, if missing, so that they survive a power cut.
+
+    Raises:
+        OSError: A folder cannot be created.
+    """
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in missing:
+        sync_folder(path.parent)
 
 
 def path_exists(path: Path) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from framework.errors import DataError
-from framework.files.atomic_write import atomic_write, read_text
+from framework.files.atomic_write import atomic_write, make_folder, read_text, sync_folder
 
 # the name of the owner has its own file, because locked files cannot be read on Windows
 LOCK, HOLDER = ".lock", ".lock_holder"
@@ -30,10 +30,11 @@ def new_directory(wanted: str) -> str:
     """
     path, number = Path(wanted), 1
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         while True:
             try:
                 path.mkdir()  # atomic: succeeds in only one process
+                sync_folder(path.parent)
                 return str(path)
             except FileExistsError:
                 number += 1
@@ -56,7 +57,7 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
     Raises:
         DataError: Another process holds the lock, and `wait` is False.
     """
-    directory.mkdir(parents=True, exist_ok=True)
+    make_folder(directory)
     lock = FileLock(directory / LOCK, fallback_to_soft=False)
     try:
         try:

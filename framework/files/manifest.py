@@ -19,6 +19,7 @@ from framework.errors import DataError
 from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
 from framework.files.hashing import path_hash
 from framework.files.json_file import parse_json, write_json
+from framework.files.staged_files import finish_replacement
 
 MANIFEST = "manifest.json"
 RUN_FILES = (
@@ -74,6 +75,7 @@ class Manifest:
         Raises:
             DataError: The file is missing, damaged or invalid.
         """
+        finish_replacement(directory)
         path = directory / MANIFEST
         return cls._parsed(path, read_bytes(path, MAX_TEXT))
 
@@ -86,6 +88,7 @@ class Manifest:
         Raises:
             DataError: The manifest is damaged.
         """
+        finish_replacement(path.parent)
         manifest = path.with_name(MANIFEST)
         if not path_exists(manifest):
             return None

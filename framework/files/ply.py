@@ -111,8 +111,8 @@ def write_ply(
     ]
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode("ascii", "replace"))
-        rows.tofile(file)
-        faces.tofile(file)
+        file.write(rows.data)  # not `tofile`, which does not report that the disk is full
+        file.write(faces.data)
 
 
 def _vertices(path: Path, rows: Element, origin: Sequence[float]) -> Float32:

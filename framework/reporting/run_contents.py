@@ -11,6 +11,7 @@ import numpy as np
 from framework.data import UNIT_TOLERANCE, Float64, InstanceMesh, Int32
 from framework.errors import DataError
 from framework.files.atomic_write import path_exists
+from framework.files.staged_files import finish_replacement
 from framework.files.tum_trajectory import read_tum
 from framework.rendering.viewpoint import surrounding_poses
 from framework.runs.instances_file import StoredInstance, read_instances
@@ -52,6 +53,7 @@ class RunContents:
         Raises:
             DataError: The run is missing, a file is damaged, or the files belong to different runs.
         """
+        finish_replacement(directory)
         if path_exists(directory / METRICS):
             record, partial = read_record(directory), ""
         elif path_exists(directory / PARTIAL_METRICS):

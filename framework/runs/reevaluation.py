@@ -21,6 +21,7 @@ from framework.evaluation.truth_alignment import in_map_world
 from framework.files.directory_lock import locked
 from framework.files.json_file import write_json
 from framework.files.manifest import MANIFEST, Manifest
+from framework.files.staged_files import staged_files
 from framework.files.tum_trajectory import read_tum
 from framework.interfaces import RGBDVideo
 from framework.registry import build
@@ -149,19 +150,20 @@ class Reevaluation:
         return [key for key in self.metrics if is_evaluation(key) and key not in self.record.metrics]
 
     def write(self) -> None:
-        """Replace metrics.json, but keep its modification time.
+        """Replace metrics.json and manifest.json at once, but keep the modification time of metrics.json.
 
         Tables use the modification time to select the latest of several runs.
 
         Raises:
-            DataError: The run has been restarted.
+            DataError: The run has been restarted, or a file cannot be written.
         """
         with locked(self.record.directory):  # a new run in this directory waits
             self.write_locked()
 
     def write_locked(self) -> None:
-        """Replace metrics.json as `write` does, in a directory that this process has locked."""
-        path = self.record.directory / METRICS
+        """Replace the files as `write` does, in a directory that this process has locked."""
+        directory = self.record.directory
+        path = directory / METRICS
         try:
             before = path.stat()
         except OSError:
@@ -170,11 +172,11 @@ class Reevaluation:
             raise DataError(
                 f"{path}: expected an unchanged file, got a file of a restarted run; evaluate it after the run ends"
             )
-        write_json(path, self.metrics)
-        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-        if (self.record.directory / MANIFEST).exists():
-            stored = Manifest.read(self.record.directory)
-            stored.with_files(self.record.directory, [METRICS]).write(self.record.directory)
+        with staged_files(directory) as folder:
+            write_json(folder / METRICS, self.metrics)
+            os.utime(folder / METRICS, ns=(before.st_atime_ns, before.st_mtime_ns))
+            if (directory / MANIFEST).exists():
+                Manifest.read(directory).with_files(folder, [METRICS]).write(folder)
 
 
 def read_predictions(record: Record) -> PredictedInstances:

@@ -1,7 +1,8 @@
 """Writing of the run directory.
 
-Each file is written atomically, and small files are written first. The file metrics.json is written after all results
-and marks a complete run.
+Each file is written atomically. Files that cannot be recomputed are written first, in case the disk becomes full. The
+file metrics.json is written after all results and marks a complete run. A run that reads files of an earlier run in its
+own directory replaces this run when all its files are written.
 """
 
 from __future__ import annotations
@@ -29,9 +30,10 @@ from framework.datasets.frames.world_offset import ORIGIN, as_setting, as_text, 
 from framework.detection.stored.cache import cache_metrics
 from framework.errors import DataError, InstanceMapError, PartialRunError
 from framework.evaluation.compared_classes import ComparedClasses
-from framework.files.atomic_write import atomic_write, remove_left_over
+from framework.files.atomic_write import atomic_write, make_folder, remove_left_over
 from framework.files.json_file import write_json
 from framework.files.manifest import MANIFEST, Manifest, RunStatus
+from framework.files.staged_files import StagedFiles, finish_replacement
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import PoseTracker, RGBDSequence, RGBDVideo
 from framework.live_view.guarded_viewer import watched_run
@@ -42,6 +44,7 @@ from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
+from framework.runs.output_folder import OutputFolder, reads_results_in
 from framework.runs.plugin_code import plugin_code
 from framework.runs.provenance import code_version, config_hash, environment, frozen_environment, parameters_of
 from framework.runs.stored_runs import (
@@ -76,6 +79,19 @@ Arguments = ParamSpec("Arguments")
 Made = TypeVar("Made")
 
 
+LISTED = (*RESULT_FILES, METRICS, PARTIAL_METRICS)  # files in manifest.json, if they exist
+OWN_FILES = (*LISTED, MANIFEST, REPORT)  # files that a later run in the same directory replaces or removes
+
+
+@dataclass(frozen=True)
+class WrittenRun:
+    """The result of writing a run directory."""
+
+    folder: Path  # the run directory, or another folder if the run directory could not be written
+    error: BaseException | None  # None = complete run in the run directory
+    moved: str = ""  # message with the folder, if it is not the run directory
+
+
 @dataclass(frozen=True)
 class RunRecord:
     """Writer of a run directory."""
@@ -86,28 +102,36 @@ class RunRecord:
     inputs: Mapping[str, str]  # SHA-256 of the input files, by config key
     provenance: Metrics  # code and machine at the start of the run
     compared_classes: ComparedClasses  # label space of the evaluation
+    in_place: bool  # the run reads files of an earlier run in the same directory
 
     @classmethod
     def begin(cls, directory: Path, config: DictConfig, choices: Mapping[str, str | None]) -> RunRecord:
-        """Prepare the directory for a run, and remove the metrics, manifest and report of an earlier run."""
+        """Prepare the directory for a run.
+
+        The metrics, manifest and report of an earlier run are removed, unless the new run reads files of this run.
+        """
         plain = resolved(config)
         compared_classes = ComparedClasses.of(plain)
         inputs = input_hashes(plain)
         provenance: Metrics = {**code_version(), **plugin_code(plain), **environment()}
-        directory.mkdir(parents=True, exist_ok=True)
+        make_folder(directory)
+        finish_replacement(directory)
+        StagedFiles(directory).discard()
         remove_left_over(directory)
-        for name in (MANIFEST, METRICS, PARTIAL_METRICS, REPORT):
-            (directory / name).unlink(missing_ok=True)
-        _write_config(directory / CONFIG, plain)
+        in_place = reads_results_in(directory, plain, OWN_FILES)
+        if not in_place:
+            for name in (CONFIG, MANIFEST, METRICS, PARTIAL_METRICS, REPORT):
+                (directory / name).unlink(missing_ok=True)
+            _write_config(directory / CONFIG, plain)
         _reset_peak_memory()
-        return cls(directory, plain, choices, inputs, provenance, compared_classes)
+        return cls(directory, plain, choices, inputs, provenance, compared_classes, in_place)
 
-    def write(
-        self, video: RGBDVideo, result: RunResult, counts: Mapping[str, int] | None = None
-    ) -> BaseException | None:
+    def write(self, video: RGBDVideo, result: RunResult, counts: Mapping[str, int] | None = None) -> WrittenRun:
         """Write all outputs and log the main metrics.
 
-        An error does not prevent the writing of other files. The run is then partial.
+        An error does not prevent the writing of other files. The run is then partial. If the run directory cannot be
+        written, or a file is missing of a run that reads an earlier run in the same directory, the outputs are written
+        to a new folder next to it.
 
         Args:
             video: The mapped video.
@@ -115,53 +139,61 @@ class RunRecord:
             counts: Additional metrics.
 
         Returns:
-            None for a complete run. For a partial run, `result.stopped_by` or the first write error.
+            The folder, and the reason for a partial run: `result.stopped_by` or the first write error.
+
+        Raises:
+            DataError: No folder can be written.
         """
-        self.directory.mkdir(parents=True, exist_ok=True)
-        scene, attempt = result.scene, _Attempts(result.stopped_by)
+        outputs = OutputFolder.open(self.directory, keep_earlier=self.in_place)
+        folder, scene, attempt = outputs.path, result.scene, _Attempts(result.stopped_by)
         for name in (MANIFEST, *MAPPED, KEYFRAMES, DIGESTS, ENVIRONMENT):  # from an earlier run
-            attempt((self.directory / name).unlink, missing_ok=True)
-        if not (self.directory / CONFIG).exists():  # the directory was removed
-            attempt(_write_config, self.directory / CONFIG, self.config)
+            attempt((folder / name).unlink, missing_ok=True)
+        if not (folder / CONFIG).exists():
+            attempt(_write_config, folder / CONFIG, self.config)
         trusted = [frame for frame in result.tracked if not frame.pose.lost]
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
         timestamps = np.array([frame.timestamp for frame in trusted])
-        attempt(write_tum, self.directory / TRAJECTORY, timestamps, poses, origin_comments(video.world_origin))
-        attempt(write_timings, self.directory / "timings.csv", result)
-        attempt(write_digests, self.directory / DIGESTS, result)
-        attempt(lambda: _write_text(self.directory / ENVIRONMENT, frozen_environment()))
+        comments = origin_comments(video.world_origin)
+        attempt(scene.save, folder / MAP)
+        attempt(write_tum, folder / TRAJECTORY, timestamps, poses, comments)
+        if result.keyframes:
+            attempt(write_keyframes, folder / KEYFRAMES, result.keyframes)
+        attempt(write_timings, folder / "timings.csv", result)
+        attempt(write_digests, folder / DIGESTS, result)
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **origin_metrics(video), **(counts or {})}
+        attempt(self._write_partial, folder, video, figures, attempt.error)  # in case the process is killed
+        attempt(lambda: _write_text(folder / ENVIRONMENT, frozen_environment()))
         found = attempt(lambda: (scene.mesh(), scene.instances()))
         if found is not None:
-            attempt(write_instances, self.directory / INSTANCES, *found, scene.classes)
+            attempt(write_instances, folder / INSTANCES, *found, scene.classes)
             figures |= attempt(room_metrics, scene, found[0]) or {}
             figures |= {"label_space": label_space_of(scene.classes), "instances.count": len(found[1])}
-        attempt(self._write_partial, video, figures, attempt.error)  # in case the process is killed
-        if found is not None:  # the map is written before the evaluation, in case the ground truth is unusable
-            attempt(write_mesh, self.directory / MESH, found[0], origin_comments(video.world_origin))
-        attempt(scene.save, self.directory / MAP)
-        if result.keyframes:
-            attempt(write_keyframes, self.directory / KEYFRAMES, result.keyframes)
-        if found is not None:
-            # as written, so that a re-evaluation returns the same metrics
-            stored = attempt(read_tum, self.directory / TRAJECTORY)
+            attempt(self._write_partial, folder, video, figures, attempt.error)
+            attempt(write_mesh, folder / MESH, found[0], comments)
+            # the trajectory as written, so that a re-evaluation returns the same metrics
+            stored = attempt(read_tum, folder / TRAJECTORY)
             if stored is not None:
                 classes = self.compared_classes
                 figures |= attempt(instance_metrics, video, *found, scene.classes, stored, classes) or {}
         figures |= attempt(trajectory_metrics, result) or {}
         title = headline({"sequence": video.name, **figures})
+        labels = {} if found is None else likely_labels(found[1], scene.classes)
         if found is not None:
-            labels = likely_labels(found[1], scene.classes)
-            attempt(write_overview, self.directory / "overview.png", found[0], labels, poses, title)
+            attempt(write_overview, folder / "overview.png", found[0], labels, poses, title)
         if attempt.error is None:
-            attempt(write_json, self.directory / METRICS, self._metrics(video, figures))
+            attempt(write_json, folder / METRICS, self._metrics(video, figures))
         if attempt.error is None:
-            (self.directory / PARTIAL_METRICS).unlink(missing_ok=True)
+            attempt((folder / PARTIAL_METRICS).unlink, missing_ok=True)
         else:
-            attempt(self._write_partial, video, figures, attempt.error)
-        attempt(self._write_manifest, RunStatus.COMPLETE if attempt.error is None else RunStatus.PARTIAL)
-        self._announce(title, labels if found is not None else {}, figures, attempt.error)
-        return attempt.error
+            attempt(self._write_partial, folder, video, figures, attempt.error)
+        attempt(self._write_manifest, folder, RunStatus.COMPLETE if attempt.error is None else RunStatus.PARTIAL)
+        folder, error = outputs.close(attempt.failure is None, OWN_FILES)
+        moved = f"the outputs are in {_from_here(folder)}" if folder != self.directory else ""
+        if moved and self.in_place:
+            moved += f", and the earlier run in {_from_here(self.directory)} is unchanged"
+        written = WrittenRun(folder, attempt.error or error, moved)
+        self._announce(written, title, labels, figures)
+        return written
 
     def _metrics(self, video: RGBDVideo, figures: Metrics) -> Metrics:
         return {
@@ -176,33 +208,31 @@ class RunRecord:
             **self.provenance,
         }
 
-    def _write_partial(self, video: RGBDVideo, figures: Metrics, error: BaseException | None) -> None:
+    def _write_partial(self, folder: Path, video: RGBDVideo, figures: Metrics, error: BaseException | None) -> None:
         """Write the metrics of a partial run, and the reason for its early end.
 
         Without an error, the outputs are still being written.
         """
         why = "the outputs were not completed" if error is None else reason(error)
-        write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
+        write_json(folder / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
 
-    def _write_manifest(self, status: RunStatus) -> None:
+    def _write_manifest(self, folder: Path, status: RunStatus) -> None:
         manifest = Manifest(status, {}, self.inputs, parameters_of(self.config))
-        manifest.with_files(self.directory, [*RESULT_FILES, METRICS, PARTIAL_METRICS]).write(self.directory)
+        manifest.with_files(folder, LISTED).write(folder)
 
-    def _announce(
-        self, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics, error: BaseException | None
-    ) -> None:
+    def _announce(self, run: WrittenRun, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics) -> None:
         log.info("%s", title)
         likely = Counter(name for name, _ in labels.values())
         counted = ", ".join(f"{count} {name}" for name, count in likely.most_common()) or "no likely instance"
         unlikely = int(figures.get("instances.count") or 0) - len(labels)
         rest = f"; {unlikely} with a confidence below {LIKELY} are only in the files" if unlikely else ""
         log.info("objects: %s%s", counted, rest)
-        written = [name for name in ("overview.png", "mesh.ply", "instances.json") if (self.directory / name).exists()]
+        written = [name for name in ("overview.png", "mesh.ply", "instances.json") if (run.folder / name).exists()]
         if written:  # one line: directories of sweep jobs have long names
             others = f", {', '.join(written[1:])}" if written[1:] else ""
-            log.info("%s%s", _from_here(self.directory / written[0]), others)
-        if error is not None:
-            log.warning("partial run (%s): its metrics are in %s", reason(error), PARTIAL_METRICS)
+            log.info("%s%s", _from_here(run.folder / written[0]), others)
+        if run.error is not None and not (run.folder / METRICS).exists():
+            log.warning("partial run (%s): its metrics are in %s", reason(run.error), PARTIAL_METRICS)
 
 
 def write_run(
@@ -243,13 +273,15 @@ def write_run(
         with frozen_garbage_collector():
             result = pipeline.run_to_any_end(video, directory)
         with interruption.second_ends_at_once("after the outputs are written"):
-            error = record.write(video, result, cache_metrics(pipeline.detector))
+            written = record.write(video, result, cache_metrics(pipeline.detector))
         with suppress(DataError):  # the disk may be full
-            outcome.metrics = read_metrics(directory)
-        if isinstance(error, Exception):
-            raise PartialRunError(reason(error)) from error
-        if error is not None:
-            raise error
+            outcome.metrics = read_metrics(written.folder)
+        if isinstance(written.error, Exception):
+            raise PartialRunError("; ".join(filter(None, (reason(written.error), written.moved)))) from written.error
+        if written.error is not None:
+            if written.moved:
+                log.warning("%s", written.moved)
+            raise written.error
     return interruption
 
 
@@ -289,7 +321,12 @@ def check_origin(video: RGBDVideo, resumed: Path) -> None:
 class _Attempts:
     """Callable that runs a function and logs its error instead of raising it."""
 
-    error: BaseException | None  # first error; None = no error
+    stopped_by: BaseException | None  # reason for the early end of the run; None = complete run
+    failure: Exception | None = None  # first error of a function; None = no error
+
+    @property
+    def error(self) -> BaseException | None:
+        return self.stopped_by or self.failure
 
     def __call__(
         self, function: Callable[Arguments, Made], *arguments: Arguments.args, **named: Arguments.kwargs
@@ -299,7 +336,7 @@ class _Attempts:
             return function(*arguments, **named)
         except Exception as error:
             log.warning("%s", reason(error))
-            self.error = self.error or error
+            self.failure = self.failure or error
             return None
 
 

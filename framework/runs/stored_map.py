@@ -11,6 +11,7 @@ import numpy as np
 from framework.data import Float64, InstanceMesh, Int32, SceneTruth
 from framework.errors import DataError
 from framework.evaluation.instances import MAX_DISTANCE, transfer_labels
+from framework.files.staged_files import finish_replacement
 from framework.files.tum_trajectory import read_tum
 from framework.runs.instances_file import StoredInstance, read_instances
 from framework.runs.mesh_file import read_mesh
@@ -71,6 +72,7 @@ def read_labeled_mesh(directory: Path) -> tuple[InstanceMesh, list[StoredInstanc
     Raises:
         DataError: A file is missing or invalid, or the files are from different runs.
     """
+    finish_replacement(directory)
     mesh_path, instances_path = directory / MESH, directory / INSTANCES
     instances, mesh = read_instances(instances_path), read_mesh(mesh_path)
     ids, counts = np.unique(mesh.instance_ids, return_counts=True)

@@ -21,6 +21,7 @@ from framework.errors import DataError, first_line
 from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
 from framework.files.json_file import read_json
 from framework.files.manifest import MANIFEST, verified
+from framework.files.staged_files import REPLACING, finish_replacement
 from framework.files.yaml_file import load_yaml
 from framework.registry import STAGES
 from framework.runs.inputs import INPUTS, inputs_sha256
@@ -47,8 +48,8 @@ INSTANCES = "instances.json"
 TRAJECTORY = "trajectory.txt"
 REPORT = "report.html"  # written by `instancemap report`
 KEYFRAMES = "keyframes.npz"  # keyframes of the tracker, to resume the map; optional
-MAPPED = (TRAJECTORY, "timings.csv", INSTANCES, MESH, MAP, "overview.png")
-"""Files of a map in the order of writing. Small files are first in case the disk becomes full."""
+MAPPED = (MAP, TRAJECTORY, "timings.csv", INSTANCES, MESH, "overview.png")
+"""Files of a map in the order of writing. In case the disk becomes full, files that can be recomputed are last."""
 
 DIGESTS = "digests.csv"  # digest of each stage for each frame, to locate differences between runs
 ENVIRONMENT = "environment.txt"  # versions of all installed packages, as constraints for pip
@@ -196,6 +197,7 @@ def read_partial(directory: Path) -> tuple[Record, str]:
 
 
 def _read(directory: Path, name: str, check_files: bool = True) -> Record:
+    finish_replacement(directory)
     path = directory / name
     with verified(path) if check_files else nullcontext():
         metrics = _read_flat(path)
@@ -218,10 +220,11 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
     records: list[Record] = []
     others: list[Incomplete] = []
     for directory in run_directories(root):
-        if not (directory / METRICS).exists():
-            others.append(Incomplete(directory, _why_incomplete(directory)))
-            continue
         try:
+            finish_replacement(directory)
+            if not (directory / METRICS).exists():
+                others.append(Incomplete(directory, _why_incomplete(directory)))
+                continue
             records.append(read_record(directory))
         except DataError as error:
             others.append(Incomplete(directory, str(error)))
@@ -262,6 +265,7 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
     The input files and the code of the plugins must be the same, too. For experiments with a speed column, this also
     applies to the settings that affect speed. The commit may differ, because most commits do not change results.
     """
+    finish_replacement(directory)
     if not (directory / METRICS).exists():
         return False
     try:
@@ -338,6 +342,7 @@ def read_metrics(directory: Path) -> dict[str, Any]:
     Raises:
         DataError: The metrics are missing or invalid.
     """
+    finish_replacement(directory)
     for name in (METRICS, PARTIAL_METRICS):
         if path_exists(directory / name):
             with verified(directory / name):
@@ -365,8 +370,9 @@ def is_number(value: Any) -> TypeGuard[float]:
 def run_directories(root: Path) -> Iterator[Path]:
     """Yield the run directories in a folder and its subfolders, sorted by path."""
     for path, folders, files in os.walk(root):
+        is_run = not {METRICS, PARTIAL_METRICS, LOG, MANIFEST, REPLACING}.isdisjoint([*files, *folders])
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        if not {METRICS, PARTIAL_METRICS, LOG, MANIFEST}.isdisjoint(files):
+        if is_run:
             yield Path(path)
 
 

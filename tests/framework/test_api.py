@@ -28,6 +28,7 @@ from framework.registry import build
 from framework.runs.metrics import room_metrics
 from framework.sensors.noise_models import SensorKind
 from tests.support import registered
+from tests.support.failing_disk import FailingDisk, Fault
 from tests.support.scenes.analytic_scene import Scene
 from tests.support.scenes.analytic_scene import room as analytic_room
 from tests.support.scenes.corner_room import CornerRoom, pose_at
@@ -347,6 +348,27 @@ def test_load_map_restores_map_of_any_fuser(fuser: str, room: CornerRoom, tmp_pa
 def test_save_map_invalid_path_raises(place: Any) -> None:
     with pytest.raises(DataError, match=f"map file: expected a path, got {place}"):
         Mapper(*STAGES).scene.save(place)
+
+
+def test_mapper_save_on_failing_disk_keeps_a_map(room: CornerRoom, tmp_path: Path) -> None:
+    mapper, path = Mapper(*STAGES), tmp_path / "map.npz"
+    mapper.add(room[0])
+    mapper.save(path)
+    earlier = path.read_bytes()
+    mapper.add(room[1])
+    at = 0
+    while True:
+        disk = FailingDisk(at, Fault.CUT)
+        try:
+            with disk.active():
+                mapper.save(path)
+        except DataError as error:
+            assert "expected a writable file, got an error (No space left on device)" in str(error)
+        assert path.read_bytes() == earlier or len(load_map(path).instances()) == len(mapper.instances())
+        if len(disk.operations) <= at:
+            break
+        at += 1
+    assert at > 5
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", b"[]"])

@@ -27,6 +27,7 @@ from framework.files.json_file import read_json
 from framework.files.manifest import verified
 from framework.files.ply import PlyMesh, found_property, read_ply
 from framework.files.search_paths import candidates
+from framework.files.staged_files import finish_replacement
 from framework.files.tum_trajectory import read_tum
 from framework.geometry import FARTHEST
 from framework.vocabulary.label_spaces import COCO, LONGEST_CLASS_NAME, MEANINGS, with_similar
@@ -105,6 +106,7 @@ def truth_files(path: Path) -> list[Path]:
     if found is None:
         raise ConfigError(f"{KEY}: expected a labeled mesh (PLY) or a run directory, got the nonexistent path {path}")
     mesh = found / MESH if found.is_dir() else found
+    finish_replacement(mesh.parent)
     if not path_exists(mesh):
         raise DataError(f"{KEY}: expected {MESH} in the directory {found}, got none; set {KEY} to the labeled mesh")
     places = [mesh.with_name(INSTANCES), mesh.absolute().parents[1] / INSTANCES]

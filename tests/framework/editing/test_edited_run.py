@@ -17,6 +17,7 @@ from framework.commands.results.reproduce import reproduce_all
 from framework.commands.running.run import run as run_pipeline
 from framework.config import composition
 from framework.datasets.ground_truth.named_truth import read_named_truth
+from framework.editing import edited_run
 from framework.editing.edited_run import EditedRun
 from framework.editing.edits import read_edits
 from framework.errors import ConfigError, DataError
@@ -200,3 +201,18 @@ def test_edit_into_existing_run_raises_config_error(run: Path, edited: Path) -> 
     with pytest.raises(ConfigError, match="expected a new or empty folder, got"):
         instancemap.edit(run, EDITS, edited)
     assert read_edits(edited / "edits.json")
+
+
+def test_interrupted_edit_leaves_no_files_and_can_be_repeated(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "edited"
+    out.mkdir()
+    (out / ".staged").mkdir()  # of a killed process
+    with monkeypatch.context() as patched:
+        patched.setattr(edited_run, "write_overview", lambda path, *_: read_record(path))
+        with pytest.raises(DataError):
+            instancemap.edit(run, EDITS, out)
+    assert list(out.iterdir()) == []
+    instancemap.edit(run, EDITS, out)
+    assert not Manifest.read(out).changed_files(out)

@@ -20,7 +20,7 @@ from framework.detection.mask_rcnn.checkpoint import read_network
 from framework.detection.mask_rcnn.detectron2_checkpoint import read_pickle
 from framework.detection.stored.coco_results import read_results
 from framework.errors import ConfigError, DataError, FrameError
-from framework.files.atomic_write import atomic_write, read_bytes, read_text
+from framework.files.atomic_write import atomic_write, make_folder, read_bytes, read_text
 from framework.files.hashing import path_hash
 from framework.files.image_files import read_color, read_uint16
 from framework.files.json_file import read_json
@@ -31,6 +31,7 @@ from framework.runs.stored_runs import read_yaml
 from framework.runs.timings_file import read_timings
 from framework.vocabulary.category_ids import CategoryIds
 from framework.vocabulary.label_spaces import COCO, read_labels
+from tests.support.failing_disk import FailingDisk, Fault
 
 
 @pytest.mark.parametrize(
@@ -153,3 +154,21 @@ def test_atomic_write_failure_names_requested_file(tmp_path: Path, monkeypatch: 
         atomic_write(tmp_path / "page.html"),
     ):
         refused()
+
+
+def test_atomic_write_syncs_file_and_folder(tmp_path: Path) -> None:
+    disk = FailingDisk(-1, Fault.FAILS)
+    with disk.active(), atomic_write(tmp_path / "page.html") as temporary:
+        temporary.write_text("new")
+    operations = [name for name in disk.operations if name in ("fsync", "replace")]
+    assert operations == ["fsync", "replace", "fsync"]
+
+
+def test_make_folder_syncs_all_parents(tmp_path: Path) -> None:
+    disk = FailingDisk(-1, Fault.FAILS)
+    with disk.active():
+        make_folder(tmp_path / "a" / "b")
+        assert (tmp_path / "a" / "b").is_dir()
+        assert disk.operations.count("fsync") == 2
+        make_folder(tmp_path / "a" / "b")
+    assert disk.operations.count("fsync") == 2

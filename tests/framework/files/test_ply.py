@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -323,3 +324,20 @@ def test_face_properties_belong_to_all_triangles_of_a_face(tmp_path: Path) -> No
     assert mesh.triangles.tolist() == [[0, 1, 3], [0, 3, 2], [0, 1, 2]]
     assert mesh.triangle_properties["object_id"].tolist() == [7, 7, 9]
     assert mesh.properties.keys() == {"label"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit of the file size")
+def test_write_ply_cut_file_raises(tmp_path: Path) -> None:
+    """The limit of the file size cuts the last bytes, as a full disk does."""
+    import resource
+
+    vertices, triangles = np.zeros((500, 3), np.float32), np.zeros((100, 3), np.int32)
+    write_ply(tmp_path / "whole.ply", vertices, triangles, {})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "whole.ply").stat().st_size - 10, limits[1]))
+    try:
+        with pytest.raises(DataError, match=r"cut\.ply: expected a writable file, got an error"):
+            write_ply(tmp_path / "cut.ply", vertices, triangles, {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.ply"]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
 import platform
 import shutil
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -177,7 +179,7 @@ def test_run_directory_failed_write_leaves_partial_metrics(
         raise DataError(f"{path} could not be written: no space left on device")
 
     monkeypatch.setattr(run_directory, "write_overview", full_disk)
-    assert "no space" in str(record.write(room, mapped(room)))
+    assert "no space" in str(record.write(room, mapped(room)).error)
     assert not (record.directory / "metrics.json").exists()
     assert "no space" in metrics_of(record, "metrics.partial.json")["partial"]
 
@@ -188,7 +190,7 @@ def test_run_directory_with_unusable_truth_keeps_map_files(record: RunRecord, ro
 
     result = mapped(room)
     room.scene_truth = far_off  # type: ignore[method-assign]
-    assert str(record.write(room, result)) == "ground truth: a point lies far off"
+    assert str(record.write(room, result).error) == "ground truth: a point lies far off"
     left = {path.name for path in record.directory.iterdir()}
     assert left == {"config.yaml", "digests.csv", "environment.txt", "manifest.json", "metrics.partial.json", *MAPPED}
     assert Manifest.read(record.directory).status is RunStatus.PARTIAL
@@ -200,16 +202,36 @@ def test_run_directory_with_unusable_truth_keeps_map_files(record: RunRecord, ro
 @pytest.mark.parametrize("name", MAPPED)
 def test_run_directory_blocked_file_keeps_other_files(record: RunRecord, room: CornerRoom, name: str) -> None:
     (record.directory / name).mkdir()
-    fault = record.write(room, mapped(room))
+    fault = record.write(room, mapped(room)).error
     assert name in str(fault)
     assert {path.name for path in record.directory.iterdir() if path.is_file()} >= {*MAPPED} - {name}
     assert name in metrics_of(record, "metrics.partial.json")["partial"]
 
 
+def test_run_directory_full_disk_keeps_map_and_trajectory(
+    record: RunRecord, room: CornerRoom, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk is full after the files that cannot be recomputed."""
+    result = replace(mapped(room), keyframes={"poses": np.zeros((1, 4, 4))})
+    replace_file, renamed = Path.replace, list[str]()
+
+    def full_after_five(path: Path, target: Path) -> Path:
+        if len(renamed) == 5:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        renamed.append(target.name)
+        return replace_file(path, target)
+
+    monkeypatch.setattr(Path, "replace", full_after_five)
+    assert "No space left" in str(record.write(room, result).error)
+    kept = ["map.npz", "trajectory.txt", "keyframes.npz", "timings.csv", "digests.csv"]
+    assert renamed == kept
+    assert {path.name for path in record.directory.iterdir()} >= {"config.yaml", *kept}
+
+
 def test_run_directory_removed_during_run_is_recreated(record: RunRecord, room: CornerRoom) -> None:
     config = (record.directory / "config.yaml").read_bytes()
     shutil.rmtree(record.directory)
-    assert record.write(room, mapped(room)) is None
+    assert record.write(room, mapped(room)).error is None
     assert (record.directory / "config.yaml").read_bytes() == config
     assert read_record(record.directory).metrics["frames"] == 6
 
@@ -240,8 +262,18 @@ def test_run_directory_of_stopped_run_has_partial_metrics(record: RunRecord, roo
 def test_run_directory_begin_removes_old_metrics(record: RunRecord) -> None:
     for name in ("metrics.json", "metrics.partial.json"):
         (record.directory / name).write_text("{}")
+    (record.directory / ".staged").mkdir()
     RunRecord.begin(record.directory, CONFIG, CHOICES)
     assert [path.name for path in record.directory.iterdir()] == ["config.yaml"]
+
+
+def test_run_directory_begin_replaces_linked_config(record: RunRecord, tmp_path: Path) -> None:
+    """The run directory may be a copy of another run with links to its files."""
+    (tmp_path / "other.yaml").write_text("seed: 1\n")
+    (record.directory / "config.yaml").unlink()
+    (record.directory / "config.yaml").symlink_to(tmp_path / "other.yaml")
+    RunRecord.begin(record.directory, CONFIG, CHOICES)
+    assert (tmp_path / "other.yaml").read_text() == "seed: 1\n"
 
 
 def test_run_directory_config_is_resolved(record: RunRecord) -> None:

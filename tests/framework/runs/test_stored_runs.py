@@ -156,7 +156,7 @@ def test_is_recorded_logs_missing_map_files(directory: Path, caplog: pytest.LogC
     (directory / "mesh.ply").unlink()
     assert is_recorded(directory, OmegaConf.create(CONFIG))
     assert (
-        f"{directory}: expected mesh.ply, map.npz, got none; set skip_completed=false to repeat the run"
+        f"{directory}: expected map.npz, mesh.ply, got none; set skip_completed=false to repeat the run"
         in caplog.messages
     )
 
@@ -259,3 +259,13 @@ def test_is_recorded_without_inputs_hash_is_true(directory: Path, tmp_path: Path
 def test_is_recorded_empty_folder_is_false(tmp_path: Path) -> None:
     assert not is_recorded(tmp_path, OmegaConf.create(CONFIG))
     assert find_records(tmp_path) == ([], [])
+
+
+def test_find_records_completes_interrupted_replacement(directory: Path) -> None:
+    replacing = directory / ".replacing"
+    replacing.mkdir()
+    for name in ("metrics.json", "config.yaml"):
+        (directory / name).rename(replacing / name)
+    records, others = find_records(directory.parent)
+    assert ([one.directory for one in records], others) == ([directory], [])
+    assert not replacing.exists()

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,15 @@ from omegaconf import OmegaConf
 from framework.commands.results import evaluate
 from framework.commands.running.run import run
 from framework.config import composition
+from framework.errors import DataError
 from framework.files.directory_lock import locked
+from framework.files.manifest import Manifest
 from framework.runs import reevaluation, run_directory
 from framework.runs.provenance import config_hash
+from framework.runs.stored_runs import read_record
 from tests.support import reported_run
 from tests.support.command_call import call_command
+from tests.support.failing_disk import FailingDisk, Fault
 from tests.support.reported_run import unverified_copy
 from tests.support.scenes.corner_room import CornerRoom
 
@@ -310,3 +315,29 @@ def test_evaluate_stored_config_cannot_read_environment(stored: Path, command, m
     assert (status, out) == (1, "")
     assert "dataset.scene: expected a resolved value in the run's config.yaml, got ${oc.env:SECRET}" in err
     assert "hunter2" not in err
+
+
+@pytest.mark.parametrize("fault", [Fault.FAILS, Fault.CUT])
+def test_evaluate_fault_keeps_metrics_and_manifest_together(stored: Path, fault: Fault) -> None:
+    record = read_record(stored)
+    metrics = {**record.metrics, "instances.ap50": 0.25}
+    at = 0
+    while True:
+        disk = FailingDisk(at, fault)
+        with suppress(DataError, OSError), disk.active():
+            reevaluation.Reevaluation(record, metrics).write_locked()
+        assert Manifest.read(stored).changed_files(stored) == []
+        if len(disk.operations) <= at:
+            break
+        at += 1
+    assert at > 10
+    assert metrics_of(stored)["instances.ap50"] == 0.25
+
+
+def test_evaluate_keeps_hashes_of_other_files(stored: Path, command) -> None:
+    """The manifest still shows that a file has changed since the run."""
+    with (stored / "timings.csv").open("a") as file:
+        file.write("2,tracking,1.000\n")
+    assert command(stored)[0] == 0
+    [changed] = Manifest.read(stored).changed_files(stored)
+    assert "timings.csv" in changed
