@@ -120,7 +120,7 @@ class RunRecord:
         remove_left_over(directory)
         in_place = reads_results_in(directory, plain, OWN_FILES)
         if not in_place:
-            for name in (CONFIG, MANIFEST, METRICS, PARTIAL_METRICS, REPORT):
+            for name in (MANIFEST, CONFIG, METRICS, PARTIAL_METRICS, REPORT):  # the manifest is invalid from here on
                 (directory / name).unlink(missing_ok=True)
             _write_config(directory / CONFIG, plain)
         _reset_peak_memory()

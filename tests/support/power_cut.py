@@ -90,6 +90,8 @@ class VolatileDisk:
 
     def _hold(self, path: object, folder: int | None) -> None:
         """Link a file that may be removed, so that its inode is not used again."""
+        if not isinstance(path, str | Path):
+            return
         try:
             found = os.stat(path, dir_fd=folder, follow_symlinks=False)
             link = self.held / "links" / str(found.st_ino)
