@@ -14,6 +14,7 @@ from io import TextIOWrapper
 from pathlib import Path
 
 import framework
+from framework.runtime.plain_output import escape_log_records, escape_streams
 
 COMMANDS = {
     "tables": "write the tables of an experiment or sweep: Markdown, LaTeX, CSV",
@@ -138,6 +139,8 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # file names may contain invalid Unicode
             stream.reconfigure(errors="backslashreplace")
+    escape_streams()
+    escape_log_records()
     program = "python -m framework" if Path(sys.argv[0]).name == "__main__.py" else Path(sys.argv[0]).name
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     of_run = "=" in word or word.startswith(("-", "~"))

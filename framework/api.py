@@ -400,7 +400,7 @@ def run(directory: Path | str, *overrides: str, **named: object) -> Path:
         DataError: The directory is not empty, the sequence cannot be read, or no frame could be mapped.
         PartialRunError: An error ended the run early. The outputs are those of the mapped frames.
     """
-    from framework.importing.folder_writer import check_new
+    from framework.files.restartable_folder import check_new
 
     words = _overrides("run", overrides, named)
     for override in words:
@@ -522,8 +522,7 @@ def edit(run: Path | str, edits: Sequence[Mapping[str, Any]] | Path | str, out: 
         The new run directory.
 
     Raises:
-        ConfigError: The new run directory is not empty.
-        DataError: The run cannot be edited, or an edit is invalid.
+        DataError: The new run directory is not empty, the run cannot be edited, or an edit is invalid.
     """
     from framework.editing import edited_run
     from framework.editing.edits import edits_of, read_edits

@@ -35,6 +35,10 @@ class DataError(InstanceMapError):
     """Unusable input: a missing, corrupt or inconsistent file, or an array of the wrong shape or type."""
 
 
+class StorageError(DataError):
+    """Storage of a recording that is no longer available, such as an unplugged disk. It ends the recording."""
+
+
 class FrameError(DataError):
     """An unusable frame of a usable sequence. The pipeline skips the frame and counts it in `frames_skipped`."""
 

@@ -15,6 +15,7 @@ from typing import cast
 from framework.data import Array, Detections, Float64, Frame, Pose
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError, in_one_line
+from framework.files.storage import check_storage
 from framework.interfaces import (
     ClusterRefiner,
     Detector,
@@ -244,6 +245,9 @@ class Pipeline:
 
         Returns:
             The frame with its detections and stage times, or the error of the frame; None = end of the video.
+
+        Raises:
+            StorageError: The storage of the video is no longer available.
         """
         try:
             with turn:
@@ -255,6 +259,7 @@ class Pipeline:
                 reading = StageTime(frame.index, "reading", 1e3 * (time.perf_counter() - began))
             detections, times = self.detect(frame, number)
         except FrameError as error:
+            check_storage(error)
             return error
         return frame, detections, [reading, *times]
 

@@ -34,7 +34,8 @@ from framework.config.hydra_api import replace_file_source
 from framework.config.text_values import literal
 from framework.errors import ConfigError, InstanceMapError, PartialRunError
 from framework.registry import text_kind
-from framework.runtime.signals import Interrupted
+from framework.runtime.plain_output import escape_log_records, plain
+from framework.runtime.signals import Interrupted, raise_on_signals
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +62,8 @@ OmegaConf.register_new_resolver("directory_name", directory_name, replace=True)
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Print a known error or Ctrl-C in the `with` body as one line, and exit with an error status."""
+    """Print a known error or a signal in the `with` body as one line, and exit with an error status."""
+    raise_on_signals()
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises its errors instead of printing them
     try:
         yield
@@ -77,7 +79,7 @@ def print_error(error: BaseException, prefix: str = "error: ") -> None:
     """Print an error as one line to stderr. With `debug=true`, print its traceback first."""
     if "debug=true" in sys.argv:
         traceback.print_exception(error)
-    tqdm.write(f"{prefix}{one_line(error)}", file=sys.stderr)  # above a progress bar
+    tqdm.write(plain(f"{prefix}{one_line(error)}"), file=sys.stderr)  # above a progress bar
 
 
 def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
@@ -148,6 +150,7 @@ class Jobs:
 
         @wraps(job)
         def reported_job(config: DictConfig) -> Any:
+            escape_log_records()  # in workers, too
             try:
                 check_switches(config)
                 return job(config)

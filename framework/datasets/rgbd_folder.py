@@ -49,6 +49,7 @@ from framework.files.depth_files import DEPTH_SUFFIXES, FARTHEST, read_depth
 from framework.files.image_files import UPRIGHT, decode_uint16, exif_orientation, read_image_file
 from framework.files.number_lines import read_gravity, read_image_times
 from framework.files.pose_lines import PoseLine, read_pose_lines
+from framework.files.storage import check_storage
 from framework.files.tum_trajectory import TumLine
 
 TIMES = ("timestamps.txt", "times.txt")  # names of the file with timestamps, in order of preference
@@ -185,6 +186,7 @@ class RgbdFolder(Recording):
                 depth, truth = self.metric_depth(index), self.truth_in(index)
                 ids = None if truth is None else truth.instance_ids
             except FrameError as error:
+                check_storage(error, self.folder)
                 log.warning("ground truth: frame skipped: %s", error)
                 continue
             if ids is not None and recorded.T_world_camera is not None:

@@ -15,10 +15,11 @@ import numpy as np
 from framework.data import Float64
 from framework.editing.edited_map import EditedMap
 from framework.editing.edits import Edit, write_edits
-from framework.errors import ConfigError, DataError, InstanceMapError
+from framework.errors import DataError, InstanceMapError
 from framework.files.json_file import write_json
 from framework.files.manifest import Manifest
-from framework.files.staged_files import STAGED, finish_replacement, staged_files
+from framework.files.restartable_folder import check_new
+from framework.files.staged_files import finish_replacement, staged_files
 from framework.files.tum_trajectory import read_tum
 from framework.mapping.instance_map import FORMAT, InstanceMap
 from framework.mapping.storage.map_file import read_format
@@ -102,8 +103,7 @@ class EditedRun:
         of the instances are evaluated again if the stored run was evaluated.
 
         Raises:
-            ConfigError: The directory is not empty.
-            DataError: A file cannot be read or written.
+            DataError: The directory is not empty, or a file cannot be read or written.
         """
         check_empty(out)
         mesh, found = self.scene.mesh(), self.scene.instances()
@@ -148,10 +148,9 @@ class EditedRun:
 
 
 def check_empty(out: Path) -> None:
-    """Raise ConfigError unless a path is a new or empty folder. Unfinished files of a killed process are ignored."""
+    """Raise DataError unless a path is a new or empty folder. Unfinished files of a killed process are ignored."""
     finish_replacement(out)
-    if out.exists() and (not out.is_dir() or any(path.name != STAGED for path in out.iterdir())):
-        raise ConfigError(f"out: expected a new or empty folder, got {out}; choose another folder")
+    check_new(out)
 
 
 def default_directory(run: Path) -> Path:

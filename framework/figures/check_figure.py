@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -27,6 +28,7 @@ COLORS = {Verdict.FINE: "#1a7f37", Verdict.UNKNOWN: "#787e86", Verdict.NOTE: "#9
 CHOSEN, OTHER = "#1a7f37", "#b0b6be"
 
 
+@rc_context({"text.parse_math": False})  # names can contain $
 def write_check(path: Path, check: RecordingCheck) -> None:
     """Write the figure of a recording check as a PNG."""
     figure = Figure(SIZE_IN, facecolor="white")

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+from matplotlib import rc_context
 from tqdm import tqdm
 
 from framework.data import SceneTruth
@@ -31,6 +32,7 @@ log = logging.getLogger(__name__)
 Read = TypeVar("Read")
 
 
+@rc_context({"text.parse_math": False})  # names can contain $
 def write_figure(directory: Path, overrides: Sequence[str] = ()) -> list[Path]:
     """Write figure.png and figure.pdf of the runs below `directory` into it, and return their paths.
 

@@ -17,6 +17,7 @@ from matplotlib.textpath import text_to_path
 from framework.data import Int32
 from framework.files.atomic_write import atomic_write
 from framework.rendering.labels import place_labels
+from framework.runtime.plain_output import plain
 
 COLUMN_MM, PAGE_MM = 88.0, 181.0  # widths of one and two columns of a journal
 TEXT_PT, SMALL_PT, NOTE_PT = 7.0, 6.0, 5.0  # font sizes
@@ -51,7 +52,7 @@ class Page:
         return axes
 
     def text(self, x: float, y: float, text: str, **style: Any) -> None:
-        self.figure.text(*self._fraction(x, y), text, **style)
+        self.figure.text(*self._fraction(x, y), plain(text), parse_math=False, **style)
 
     def write(self, path: Path) -> list[Path]:
         """Write the page to `path` with the suffixes .png and .pdf, and return both paths.
@@ -108,6 +109,7 @@ def draw_names(axes: Axes, ids: Int32, names: Mapping[int, str], size: float, wi
     scale = ids.shape[1] / width_mm  # px per mm
     halo = [withStroke(linewidth=0.25 * size, foreground="white", alpha=0.85)]
     style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": size, "color": INK, "path_effects": halo}
+    style["parse_math"] = False
     line = {"arrowstyle": "-", "color": INK, "linewidth": 0.07 * size, "shrinkA": 0, "shrinkB": 0}
     height = size / 72 * INCH_MM
     for label in place_labels(ids, names, lambda text: (text_width(text, size) * scale, height * scale)):

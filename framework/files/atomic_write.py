@@ -29,7 +29,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     of the link is replaced. The new file survives a power cut.
 
     Raises:
-        DataError: Writing fails, or `path` exists and is not a regular file.
+        DataError: Writing fails, the text is not valid Unicode, or `path` exists and is not a regular file.
     """
     path = Path(os.path.realpath(path))
     if path.exists():
@@ -45,6 +45,9 @@ def atomic_write(path: Path) -> Iterator[Path]:
     except OSError as error:
         reason = error.strerror or f"{error}; the disk may be full"  # NumPy reports only the number of items
         raise DataError(f"{path}: expected a writable file, got an error ({reason})") from error
+    except UnicodeEncodeError as error:
+        found = error.object[error.start : error.end]
+        raise DataError(f"{path}: expected text that is valid Unicode, got {found!r:.40}; rename it") from error
     finally:
         with suppress(OSError):  # the disk may be read-only
             temporary.unlink(missing_ok=True)
@@ -92,8 +95,13 @@ def remove_left_over(directory: Path) -> None:
     No other process may write to the directory.
     """
     for path in directory.glob(".*.partial*"):
-        if _TEMPORARY.fullmatch(path.name):
+        if is_temporary(path.name):
             path.unlink(missing_ok=True)
+
+
+def is_temporary(name: str) -> bool:
+    """Return True for the name of a temporary file of `atomic_write`."""
+    return _TEMPORARY.fullmatch(name) is not None
 
 
 def check_regular(path: Path) -> os.stat_result:

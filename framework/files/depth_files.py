@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import io
+import math
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from framework.files.number_lines import SHOWN
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 CHANNELS = ("Z", "V", "Y")  # names of depth channels in EXR files, in order of preference
+NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 FARTHEST = 65.535  # m, maximum plausible median of float depth; larger values are not meters
 
 _load_openexr = partial(import_optional, "OpenEXR", "reads EXR files", "phone")
@@ -83,9 +85,13 @@ def _read_tiff(path: Path) -> Array:
 
 
 def _read_npy(path: Path) -> Array:
-    try:  # a memory map checks the size in the header against the file
-        return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
+    data = read_image_file(path)  # an error of the disk would end the process if the file was mapped to memory
+    try:
+        with io.BytesIO(data) as stream:
+            shape, column_major, dtype = NPY_HEADERS[np.lib.format.read_magic(stream)](stream)
+            values = np.frombuffer(data, dtype, math.prod(shape), stream.tell())
+        return np.array(values.reshape(shape, order="F" if column_major else "C"))
+    except (KeyError, ValueError, EOFError, MemoryError) as error:
         raise FrameError(f"{path}: expected a NumPy array, got an error ({in_one_line(error)[:SHOWN]})") from error
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,14 @@ from framework.files.atomic_write import MAX_TEXT, atomic_write, read_bytes
 
 MAX_DEPTH = 50  # maximum depth of nested objects and lists
 TOO_DEEP = f"expected JSON with at most {MAX_DEPTH} nested lists and objects, got deeper nesting"
+_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 MAX_BITS = 63  # maximum size of an integer, bits; libraries have this limit; timestamps in ns have 61 bits
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write an object to a JSON file atomically.
+    r"""Write an object to a JSON file atomically.
 
-    NaN and infinity are written as null.
+    NaN and infinity are written as null, and bytes of file names that are not UTF-8 as text, such as \udcff.
     """
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
@@ -49,6 +51,12 @@ def parse_json(where: object, content: bytes | str) -> Any:
         raise DataError(f"{where}: expected valid JSON, got an error ({in_one_line(error)})") from error
     if not _is_shallow(found):
         raise DataError(f"{where}: {TOO_DEEP}")
+    if _SURROGATE.search(content if isinstance(content, bytes) else content.encode(errors="backslashreplace")):
+        try:
+            json.dumps(found, ensure_ascii=False).encode()
+        except UnicodeEncodeError as error:
+            character = error.object[error.start]
+            raise DataError(f"{where}: expected valid Unicode, got the lone surrogate {character!r}") from error
     return found
 
 
@@ -79,9 +87,11 @@ def _is_shallow(content: Any) -> bool:
 
 
 def _finite(content: Any) -> Any:
-    """Return the content with None instead of NaN and infinity, which JSON does not support."""
+    """Return the content with None instead of NaN and infinity, and with valid Unicode, as JSON requires."""
     if isinstance(content, Mapping):
-        return {key: _finite(value) for key, value in content.items()}
+        return {_finite(key): _finite(value) for key, value in content.items()}
     if isinstance(content, list):
         return [_finite(value) for value in content]
+    if isinstance(content, str):
+        return content.encode(errors="backslashreplace").decode()
     return None if isinstance(content, float) and not math.isfinite(content) else content

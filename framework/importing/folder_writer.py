@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, astuple, dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,8 @@ from framework.errors import DataError, errors_of
 from framework.files.atomic_write import atomic_write
 from framework.files.json_file import write_json
 from framework.files.number_lines import write_gravity, write_image_times
+from framework.files.restartable_folder import check_startable, restartable_folder
+from framework.files.storage import check_storage
 from framework.files.tum_trajectory import write_tum
 from framework.importing.depth_resampling import upsampled
 from framework.importing.phones.image_rotation import QUARTER, Turn
@@ -29,6 +32,8 @@ DEPTH_SCALE = 1000.0  # units per meter
 LONGER_SIDE = 640  # px, default for written images; trackers and detectors are tuned for this size
 JPEG_QUALITY = 95  # percent
 ODOMETRY = "odometry.txt"  # file for dataset.odometry, which is not read by default
+COMMAND = "import"
+OWN_FILES = re.compile(r"color/\d{6,}\.jpg|depth/\d{6,}\.png|(poses|odometry|timestamps|gravity)\.txt|camera\.json")
 
 log = logging.getLogger(__name__)
 
@@ -74,33 +79,42 @@ class Written:
         return f"{count}; skipped {len(self.errors)}, first error: {self.errors[0]}" if self.errors else count
 
 
-def check_new(directory: Path) -> None:
-    """Raise DataError if the path exists and is not an empty folder."""
-    if directory.is_dir() and not any(directory.iterdir()):
-        return
-    if directory.exists() or directory.is_symlink():
-        found = "got a file or non-empty folder; remove it or set another folder"
-        raise DataError(f"{directory}: expected a new or empty folder, {found}")
-
-
 def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
     """Write the frames of a recording as an RGB-D folder.
 
-    Unusable frames are skipped.
+    Unusable frames are skipped. The files of an interrupted import in the same folder are replaced.
 
     Raises:
         DataError: `directory` is not empty, no frame is usable, or a file cannot be written.
+        StorageError: The storage of the recording is no longer available.
     """
-    check_new(directory)
+    check_startable(directory, COMMAND)
     written = Written()
+    frames = _frames(source, writing.stride, written)
+    first = next(frames, None)
+    if first is None:
+        reason = f"first error: {written.errors[0]}" if written.errors else "the recording has no frames"
+        raise DataError(f"{source.format}: expected usable frames, got none; {reason}")
+    # the focal length of phones varies, so all frames are resampled to the camera of the first frame
+    camera = writing.camera(first[1].camera)
+    with restartable_folder(directory, COMMAND, OWN_FILES):
+        _write_files(source, chain([first], frames), directory, writing, camera, written)
+    return written
+
+
+def _write_files(
+    source: Source,
+    frames: Iterable[tuple[int, DeviceFrame]],
+    directory: Path,
+    writing: Writing,
+    camera: Camera,
+    written: Written,
+) -> None:
     turn = writing.turned
     has_depth = False
-    camera = None  # the focal length of phones varies, so all frames are resampled to the camera of the first frame
-    for number, frame in _frames(source, writing.stride, written):
-        if camera is None:
-            camera = writing.camera(frame.camera)
-            for name in ("color", "depth"):
-                (directory / name).mkdir(parents=True, exist_ok=True)
+    for name in ("color", "depth"):
+        (directory / name).mkdir(exist_ok=True)
+    for number, frame in frames:
         with errors_of(frame.name):
             color = ColorRegistration(frame.camera, camera).apply(frame.color)
         sure = frame.depth
@@ -117,9 +131,6 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
             written.poses.append(turn.pose(frame.T_world_camera))
         written.depth_timestamps.append(frame.depth_timestamp)
         written.ups.append(frame.up)
-    if camera is None:
-        reason = f"first error: {written.errors[0]}" if written.errors else "the recording has no frames"
-        raise DataError(f"{source.format}: expected usable frames, got none; {reason}")
     if not has_depth:
         text = "%s: expected depth of at most %.3f m, got no reading in %d frames; check the unit of depth%s"
         limit, unsure = np.iinfo(np.uint16).max / DEPTH_SCALE, ", or set --confidence 0" if writing.confidence else ""
@@ -139,7 +150,6 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
     lens = {DISTORTION: list(astuple(turn.lens(source.distortion)))} if source.distortion else {}
     sensor = {SENSOR: source.sensor.name} if source.sensor else {}
     write_json(directory / "camera.json", asdict(turn.camera(camera)) | {"depth_scale": DEPTH_SCALE} | lens | sensor)
-    return written
 
 
 def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int, DeviceFrame]]:
@@ -154,6 +164,7 @@ def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int
                 expected = f"expected a timestamp > {written.timestamps[-1]:.6f} s"
                 raise DataError(f"{frame.name}: {expected}, got {frame.timestamp:.6f} s")
         except DataError as error:
+            check_storage(error, source.path)
             written.errors.append(str(error))
         else:
             yield number, frame

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from framework.config.text_values import typed
@@ -50,11 +51,11 @@ def open_source(path: Path, topics: Topics | None = None, options: BagOptions | 
             if not kind.recognized(place):
                 continue
             if kind.has_topics:
-                return kind.open(place, topics or Topics(), options or BagOptions())
+                return replace(kind.open(place, topics or Topics(), options or BagOptions()), path=place)
             given = [*(topics.given if topics else ()), *(options.given if options else ())]
             if given:
                 raise ConfigError(f"{', '.join(given)}: expected a ROS bag, got {path}; omit these options")
-            return kind.open(place)
+            return replace(kind.open(place), path=place)
     if (path / "camera.json").exists() and (path / "depth").is_dir():
         command = f"instancemap dataset=rgbd_folder {typed('dataset.root', path)}"
         raise DataError(f"{path}: expected a recording, got an RGB-D folder; run {command}")

@@ -86,6 +86,7 @@ class Source:
     distortion: Distortion | None = None  # lens distortion of color and depth; None = pinhole camera
     sensor: SensorKind | None = None  # kind of the depth sensor; None = unknown
     odometry: StoredOdometry | None = None  # None = none
+    path: Path | None = None  # file or folder of the recording; None = unknown
 
 
 @dataclass(frozen=True)

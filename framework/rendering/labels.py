@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from framework.data import Bool, Int32
 from framework.rendering.palette import INK, PAPER
+from framework.runtime.plain_output import plain_line
 
 MIN_PIXELS = 60  # px, minimum area of an object with a name
 ROOM = 0.75  # minimum distance from the center of a name to the border of its object, relative to the text height
@@ -52,6 +53,7 @@ def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tup
         names: The name of each object by id.
         size: A function that returns the width and height of a text, px.
     """
+    names = {key: plain_line(name) for key, name in names.items()}
     pixels = np.bincount(ids.ravel(), minlength=max([0, *names]) + 1)
     shown = sorted((key for key in names if pixels[key] >= MIN_PIXELS), key=lambda key: (-pixels[key], key))
     widest = {key: _widest_part(ids == key) for key in shown}

@@ -18,6 +18,7 @@ from framework.rendering.lit_view import LitView
 from framework.rendering.palette import FAINT_INK, INK, PAPER, instance_colors
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import best_view, surrounding_poses
+from framework.runtime.plain_output import plain_line
 
 PANEL_WIDTH, PANEL_HEIGHT = 960, 760  # px, size of each of the two images
 TITLE_HEIGHT = 56  # px, height of the title bar
@@ -151,7 +152,7 @@ def _text_panel(
     text: str, height: int, x: int, ink: tuple[int, int, int], anchor: str, width: int = 2 * PANEL_WIDTH
 ) -> UInt8:
     image = Image.new("RGB", (width, height), PAPER)
-    ImageDraw.Draw(image).text((x, height / 2), text, ink, _font(TITLE_PX), anchor=anchor)
+    ImageDraw.Draw(image).text((x, height / 2), plain_line(text), ink, _font(TITLE_PX), anchor=anchor)
     return np.asarray(image)
 
 
@@ -164,7 +165,8 @@ def _legend(entries: Iterable[tuple[UInt8, str, float]]) -> UInt8:
     places = LEGEND_ROWS * LEGEND_COLUMNS
     shown = ranked if len(ranked) <= places else ranked[: places - 1]
     step = (2 * PANEL_WIDTH - 48) / LEGEND_COLUMNS
-    for k, (color, name, confidence) in enumerate(shown):
+    for k, (color, text, confidence) in enumerate(shown):
+        name = plain_line(text)
         x, y = 24 + step * (k % LEGEND_COLUMNS), 10 + LEGEND_ROW * (k // LEGEND_COLUMNS) + LEGEND_ROW / 2
         canvas.rounded_rectangle((x, y - 8, x + 16, y + 8), 4, fill=tuple(color.tolist()))
         canvas.text((x + 24, y), name, INK, font, anchor="lm")

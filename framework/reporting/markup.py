@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from framework.errors import DataError
 from framework.files.atomic_write import atomic_write
+from framework.runtime.plain_output import plain
 
 ASSETS = files("framework.reporting") / "assets"
 STYLE = "report.css"
@@ -45,13 +47,23 @@ def page(template: str, title: str, context: Mapping[str, Any], data: Mapping[st
         loader=PackageLoader("framework.reporting"),
         autoescape=True,
         undefined=StrictUndefined,
+        finalize=_plain,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":"), "sort_keys": True}
     policy = POLICY.format(style=_hash(style), script=_hash(script))
-    shared = {"title": title, "policy": policy, "style": style, "script": script, "data": data, "maps": maps}
+    shared = {"title": title, "policy": policy, "style": style, "script": script, "data": _plain(data), "maps": maps}
     return environment.get_template(template).render(**context, **shared)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value with the control characters of its texts escaped, such as those that reverse the reading order."""
+    if isinstance(value, Mapping):
+        return {_plain(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return plain(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 def _hash(text: str) -> str:

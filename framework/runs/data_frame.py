@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from framework.runs.stored_runs import CHOICE, Record, completed_runs, is_number
+from framework.runtime.plain_output import plain
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -80,3 +82,19 @@ def _column(values: list[Any]) -> Series:
         return Series(values, dtype="boolean")
     texts = [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]
     return Series(texts, dtype="string")
+
+
+def without_formulas(frame: DataFrame) -> DataFrame:
+    """Return a data frame whose texts are not formulas in a spreadsheet program, with control characters escaped."""
+    return frame.map(lambda value: plain_cell(value) if isinstance(value, str) else value).rename(columns=plain_cell)
+
+
+def plain_cell(text: str) -> str:
+    """Return a text that a spreadsheet program does not interpret as a formula. Numbers are unchanged."""
+    text = plain(text)
+    if not text.startswith(("=", "+", "-", "@", "\t", "\n")):
+        return text
+    with suppress(ValueError):
+        float(text)
+        return text
+    return f"'{text}"

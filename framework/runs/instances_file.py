@@ -14,6 +14,7 @@ from framework.errors import DataError
 from framework.files.json_file import read_json, write_json
 from framework.files.manifest import verified
 from framework.runs.metrics import class_name
+from framework.runtime.plain_output import plain
 
 LARGEST_ID = 2**31 - 1
 FARTHEST = 1e6  # m, maximum coordinate and size; float32 has a resolution of 6 cm there
@@ -22,7 +23,10 @@ NO_CLASS = "object"  # class name in a map without classes
 
 @dataclass(frozen=True)
 class StoredInstance:
-    """An instance in instances.json. Coordinates are in m, in the world frame."""
+    """An instance in instances.json. Coordinates are in m, in the world frame.
+
+    Control characters in class names are escaped.
+    """
 
     id: int  # 1 to LARGEST_ID
     class_name: str  # NO_CLASS in a map without classes
@@ -102,7 +106,7 @@ def _stored(where: str, entry: Any) -> StoredInstance:
         class_name=_class(where, entry),
         confidence=_fraction(where, entry, "confidence"),
         class_probabilities={
-            name: _fraction(f"{where}, class_probabilities", probabilities, name) for name in probabilities
+            plain(name): _fraction(f"{where}, class_probabilities", probabilities, name) for name in probabilities
         },
         observations=_integer(where, entry, "observations", 0),
         first_frame=_integer(where, entry, "first_frame"),
@@ -131,7 +135,7 @@ def _class(where: str, entry: Mapping[str, Any]) -> str:
     if value is not None and not isinstance(value, str):
         got = "no class" if value is ... else repr(value)
         raise DataError(f"{where}: class: expected a name or null, got {got:.40}")
-    return NO_CLASS if value is None else value
+    return NO_CLASS if value is None else plain(value)
 
 
 def _fraction(where: str, entry: Mapping[str, Any], key: str) -> float:

@@ -12,6 +12,7 @@ from framework.data import Array, InstanceMesh
 from framework.errors import DataError
 from framework.files.manifest import verified
 from framework.files.ply import read_ply, write_ply
+from framework.runtime.plain_output import plain
 
 CHANNELS = ("red", "green", "blue")
 TYPES = {**dict.fromkeys(CHANNELS, np.uint8), "instance": np.int32, "class": np.int32}
@@ -36,7 +37,7 @@ def write_mesh(path: Path, mesh: InstanceMesh, comments: Sequence[str] = ()) -> 
     comments = (
         *comments,
         "InstanceMap; meters; instance 0 = none; class -1 = none, else an index into:",
-        f"{CLASSES}{','.join(quote(name, SAFE) for name in mesh.classes)}",
+        f"{CLASSES}{','.join(quote(plain(name), SAFE) for name in mesh.classes)}",
     )
     write_ply(path, mesh.vertices, mesh.triangles, properties, comments)
 
@@ -72,6 +73,6 @@ def read_mesh(path: Path) -> InstanceMesh:
 
 
 def listed_classes(comments: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the class names in each comment of `write_mesh` with classes."""
+    """Return the class names in each comment of `write_mesh` with classes. Control characters are escaped."""
     lists = [comment[len(CLASSES) :] for comment in comments if f"{comment} ".startswith(CLASSES)]
-    return [tuple(map(unquote, names.split(","))) if names else () for names in lists]
+    return [tuple(plain(unquote(name)) for name in names.split(",")) if names else () for names in lists]

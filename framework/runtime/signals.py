@@ -1,6 +1,6 @@
 """Signal handling.
 
-The first signal ends a run after the current step. The second signal ends it immediately.
+The first signal ends a run after the current step. The second signal ends it immediately, unless it is SIGXCPU.
 """
 
 from __future__ import annotations
@@ -10,14 +10,19 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from types import FrameType
+from typing import Any
 
-# SIGINT: Ctrl-C. SIGTERM: `kill`, SLURM and containers. SIGHUP (not on Windows): a closed terminal.
-ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+# SIGINT: Ctrl-C. SIGTERM: `kill`, SLURM and containers. Not on Windows: SIGHUP, a closed terminal; SIGXCPU, SIGUSR1 and
+# SIGUSR2, warnings of batch systems before they kill a job.
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGXCPU", "SIGUSR1", "SIGUSR2")
+ENDING = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
+REPEATED = tuple(number for number in ENDING if number.name == "SIGXCPU")
+"""Signals that the kernel repeats: SIGXCPU for each second of CPU time beyond the soft limit."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -33,7 +38,21 @@ class Interrupted(KeyboardInterrupt):
 
 
 def _raise_interrupted(number: int, _frame: FrameType | None) -> None:
+    _ignore_repetitions(number)
     raise Interrupted(number)
+
+
+def _ignore_repetitions(number: int) -> None:
+    """Ignore a signal of REPEATED from now on."""
+    if number in REPEATED:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _restore(handlers: Mapping[int, Any]) -> None:
+    """Set the handlers of signals again, except for signals that are ignored because the kernel repeats them."""
+    for number, handler in handlers.items():
+        if number not in REPEATED or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 OURS_TO_HANDLE = (signal.SIG_DFL, signal.default_int_handler, _raise_interrupted)
@@ -80,11 +99,12 @@ class Interruption:
             self._at_once = False
 
     def receive(self, number: int, _frame: FrameType | None) -> None:
+        _ignore_repetitions(number)
         if self.received is None:
             self.received = Interrupted(number)
             if not self.quiet:
                 _print(f"{self.received}: stopping {self._when}; a second signal stops immediately\n")
-        elif self._at_once:
+        elif self._at_once and number not in REPEATED:
             raise Interrupted(number)
 
 
@@ -124,20 +144,21 @@ def signals_deferred(*numbers: int) -> Iterator[Interruption]:
             signal.signal(number, interruption.receive)
         yield interruption
     finally:
-        for number, handler in taken.items():
-            signal.signal(number, handler)
+        _restore(taken)
         _deferring = None
 
 
 def received_from_sweep() -> Interruption:
-    """Return the record of a SIGTERM sent to this worker process by the sweep.
+    """Return the record of the SIGTERM that the sweep sends to this worker process, or of its own CPU limit.
 
-    A terminal sends all other signals to both the sweep and its workers. The workers ignore these signals.
+    Terminals and batch systems send all other signals to both the sweep and its workers. The workers ignore these
+    signals.
     """
-    for number in set(ENDING) - {signal.SIGTERM}:
+    own = (signal.SIGTERM, *REPEATED)
+    for number in set(ENDING) - set(own):
         signal.signal(number, signal.SIG_IGN)
     if _deferring is None:
-        _in_worker.enter_context(signals_deferred(signal.SIGTERM)).quiet = True
+        _in_worker.enter_context(signals_deferred(*own)).quiet = True
     assert _deferring is not None
     return _deferring
 
@@ -160,7 +181,7 @@ def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterato
     def end_workers(number: int, _frame: FrameType | None) -> None:
         received = Interrupted(number)
         for each in taken:
-            signal.signal(each, _raise_interrupted)
+            signal.signal(each, signal.SIG_IGN if each in REPEATED else _raise_interrupted)
         _print(
             f"{received}: stopping after the active runs have written their outputs; "
             "a second signal stops immediately\n"
@@ -181,5 +202,4 @@ def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterato
     try:
         yield
     finally:
-        for number in taken:
-            signal.signal(number, _raise_interrupted)
+        _restore(dict.fromkeys(taken, _raise_interrupted))

@@ -28,7 +28,7 @@ from tqdm import tqdm
 from framework.datasets.scenenn.scene_files import write_intrinsics
 from framework.datasets.scenenn.scenenn import MADE_BY
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_write import atomic_write
+from framework.files.atomic_write import atomic_write, is_temporary
 from framework.files.json_file import read_json
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.scenenn_scene import GENERATION, BenchmarkSettings, SceneNNScene, frame_files, trajectory_file
@@ -97,14 +97,15 @@ def _begin(root: Path, recording: BenchmarkSettings) -> None:
             found["camera_speed"] = found.pop("haste")
         if found != wanted:
             raise ConfigError(f"{root}: expected scenes with the parameters {wanted}, got {found}; set another folder")
-    elif root.exists() and (not root.is_dir() or any(root.iterdir())):
+    elif root.exists() and (not root.is_dir() or any(not is_temporary(path.name) for path in root.iterdir())):
         found = f"a folder with {next(iter(root.iterdir())).name}" if root.is_dir() else "a file"
         raise ConfigError(
             f"{root}: expected a new or empty folder, or a benchmark folder, got {found}; set another folder"
         )
-    (root / "intrinsic").mkdir(parents=True, exist_ok=True)
-    with atomic_write(made_by) as temporary:
+    root.mkdir(parents=True, exist_ok=True)
+    with atomic_write(made_by) as temporary:  # first, so that the same command accepts the folder after an interruption
         temporary.write_text(json.dumps(wanted) + "\n")
+    (root / "intrinsic").mkdir(exist_ok=True)
     with atomic_write(root / "release.txt") as temporary:
         temporary.write_text(recording.release + "\n")
     write_intrinsics(root / "intrinsic" / "asus.ini", recording.camera)

@@ -16,8 +16,9 @@ from framework.evaluation.detection_ap import DetectionAp
 from framework.evaluation.detection_errors import FOUND_IOU, DetectionErrors
 from framework.files.atomic_write import atomic_write
 from framework.files.json_file import read_json, write_json
+from framework.runs.data_frame import plain_cell
 from framework.runs.stored_runs import is_number
-from framework.tables.grid import TextTable, decimals, figure, markdown_grid
+from framework.tables.grid import TextTable, decimals, figure, markdown_page
 from framework.tables.latex_table import LatexTable, escaped, latex_file, latex_label
 from framework.tables.metric_columns import Direction
 
@@ -107,7 +108,7 @@ def write_detection_table(directory: Path, swept: Collection[str], min_pixels: i
     incomplete = sorted(path.name for path in directory.iterdir() if path.is_dir() and not (path / METRICS).exists())
     grid = _grid(jobs, swept)
     notes = list(_notes(jobs, incomplete, min_pixels))
-    text = "\n\n".join([f"# {directory.name}", markdown_grid(grid), "\n".join(f"- {note}" for note in notes)]) + "\n"
+    text = markdown_page(directory.name, [grid], notes)
     caption = escaped(f"{directory.name}: 2D metrics of detections. {notes[0]}")
     latex = latex_file([LatexTable(grid, caption, latex_label(directory.name))], notes)
     for name, content in (("md", text), ("tex", latex), ("csv", _comma_separated(jobs))):
@@ -171,6 +172,7 @@ def _comma_separated(jobs: Sequence[Job]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["folder", OVERRIDES, *keys])
     for job in jobs:
-        values = (job.metrics.get(key) for key in keys)
-        writer.writerow([job.folder, " ".join(job.overrides), *("" if one is None else one for one in values)])
+        values = ["" if (one := job.metrics.get(key)) is None else one for key in keys]
+        row = [job.folder, " ".join(job.overrides), *values]
+        writer.writerow([plain_cell(one) if isinstance(one, str) else one for one in row])
     return text.getvalue()

@@ -8,9 +8,9 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from framework.files.atomic_write import atomic_write
-from framework.runs.data_frame import data_frame
+from framework.runs.data_frame import data_frame, without_formulas
 from framework.tables.comparison import ComparisonTable
-from framework.tables.grid import TextTable, markdown_grid
+from framework.tables.grid import TextTable, markdown_page
 from framework.tables.latex_captions import CAPTIONS, DIFFERENCES, STATISTICS, VALUES
 from framework.tables.latex_table import LatexTable, latex_file, latex_label
 from framework.tables.layouts import (
@@ -56,11 +56,10 @@ def rendered_tables(directory: Path, overrides: Sequence[str] = ()) -> dict[str,
     comparison = ComparisonTable.below(directory, overrides)
     grids = dict(_grids(comparison))
     explained = list(notes(comparison))
-    bullets = "\n".join(f"- {note}" for note in explained)
-    text = "\n\n".join([f"# {comparison.title}", *map(markdown_grid, grids.values()), bullets]) + "\n"
+    text = markdown_page(comparison.title, grids.values(), explained)
     latex = latex_file([_latex_table(comparison, name, grid) for name, grid in grids.items()], explained)
     runs = sorted(comparison.records, key=lambda record: record.directory)
-    separated = data_frame(runs, directory).to_csv(index=False, lineterminator="\n")
+    separated = without_formulas(data_frame(runs, directory)).to_csv(index=False, lineterminator="\n")
     return {"table.md": text, "table.tex": latex, "table.csv": separated}
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import html
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+from framework.runtime.plain_output import plain_line
 from framework.tables.metric_columns import Direction
 
 
@@ -33,9 +36,19 @@ def figure(value: float, spread: float, digits: int, signed: bool = False) -> st
     return text if math.isnan(spread) else f"{text} ± {spread:.{digits}f}"
 
 
+_HTML = re.compile(r"<(?=[A-Za-z/!?])|&(?=#?\w+;)")
+_MARKDOWN = re.compile(r"[\\`|]|\](?=[(\[:])|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])|[*~](?=[\w*~])|(?<=[\w*~])[*~]")
+
+
+def markdown_text(text: str) -> str:
+    """Return plain text as one line of Markdown, without links, HTML and emphasis."""
+    line = plain_line(text)
+    return _HTML.sub(lambda match: html.escape(match[0]), _MARKDOWN.sub(r"\\\g<0>", line))
+
+
 def markdown_grid(grid: TextTable) -> str:
     """Return the table as Markdown, with columns padded for terminals."""
-    cells = [[" ".join(cell.replace("|", "\\|").split()) for cell in line] for line in (grid.heads, *grid.body)]
+    cells = [[markdown_text(cell) for cell in line] for line in (grid.heads, *grid.body)]
     for line, column in grid.bold:
         cells[line + 1][column] = f"**{cells[line + 1][column]}**"
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -43,3 +56,9 @@ def markdown_grid(grid: TextTable) -> str:
     adjust = [str.ljust if k < grid.label_columns else str.rjust for k in range(len(widths))]
     padded = ([pad(cell, w) for pad, cell, w in zip(adjust, line, widths, strict=True)] for line in cells)
     return "\n".join("| " + " | ".join(line) + " |" for line in padded)
+
+
+def markdown_page(title: str, grids: Iterable[TextTable], notes: Iterable[str]) -> str:
+    """Return a page of tables with a title and a list of notes as Markdown."""
+    bullets = "\n".join(f"- {markdown_text(note)}" for note in notes)
+    return "\n\n".join([f"# {markdown_text(title)}", *map(markdown_grid, grids), bullets]) + "\n"

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from framework.runtime.plain_output import plain_line
 from framework.tables.grid import TextTable
 from framework.tables.metric_columns import Direction
 
@@ -47,7 +48,7 @@ class LatexTable:
 def latex_file(tables: Sequence[LatexTable], notes: Iterable[str]) -> str:
     """Return the text of a .tex file: the packages to load and the notes as comments, then the tables."""
     packages = " ".join(f"\\usepackage{{{name}}}" for name in PACKAGES)
-    comments = (f"% {note}" for note in notes)
+    comments = (f"% {plain_line(note)}" for note in notes)
     return "\n".join([f"% {packages}", *comments, *(line for table in tables for line in table.lines())])
 
 
@@ -85,7 +86,7 @@ _LATEX = str.maketrans(
 
 def escaped(text: str) -> str:
     """Return plain text as LaTeX."""
-    return " ".join(text.split()).translate(_LATEX)
+    return plain_line(text).translate(_LATEX)
 
 
 def _number(cell: str) -> str:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.config.text_values import typed
+from framework.files.restartable_folder import check_startable
 from framework.importing.bags.ros_topics import NO_POSES, BagOptions, Topics
-from framework.importing.folder_writer import LONGER_SIDE, ODOMETRY, Writing, check_new, write_folder
+from framework.importing.folder_writer import COMMAND, LONGER_SIDE, ODOMETRY, Writing, write_folder
 from framework.importing.formats import FORMATS, open_source
 from framework.importing.phones.image_rotation import QUARTER, upright
 from framework.importing.source import without_poses
@@ -25,7 +26,12 @@ def main() -> None:
     )
     add = parser.add_argument
     add("source", metavar="SOURCE", type=Path, help="recording: a folder or file in a supported format")
-    add("directory", metavar="DIR", type=Path, help="output RGB-D folder; must be new or empty")
+    add(
+        "directory",
+        metavar="DIR",
+        type=Path,
+        help="output RGB-D folder; must be new, empty or of an interrupted import",
+    )
     width = f"image width before rotation, px; default: {LONGER_SIDE} px for the longer side"
     add("--width", metavar="PX", type=int, default=default.width, help=width)
     step = "step between imported frames, in frames; 1 = every frame; default: 1"
@@ -66,7 +72,7 @@ def main() -> None:
     parsed = arguments(parser)
     with one_line_errors():
         writing = Writing(parsed.width, parsed.stride, parsed.confidence, parsed.rotate)
-        check_new(parsed.directory)
+        check_startable(parsed.directory, COMMAND)
         topics = Topics(parsed.color, parsed.depth, parsed.camera_info, parsed.poses, parsed.odometry)
         options = BagOptions(parsed.max_difference, parsed.depth_unit, parsed.depth_registered, parsed.camera_pose)
         source = open_source(parsed.source, topics, options)

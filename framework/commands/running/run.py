@@ -22,7 +22,7 @@ from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.runs.objective import objective_keys, objective_of
 from framework.runs.stored_runs import is_recorded
-from framework.runtime.signals import Interruption, raise_on_signals
+from framework.runtime.signals import Interruption
 from framework.runtime.sweep_worker import job_of_worker
 
 jobs = Jobs()
@@ -71,7 +71,6 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
 
 def main() -> None:
     """Run the pipeline or a sweep from the command line."""
-    raise_on_signals()
     jobs.run(job_or_sweep)
 
 

@@ -43,7 +43,9 @@ from framework.datasets.ground_truth.named_truth import KEY, NamedTruth, read_na
 from framework.errors import ConfigError, DataError, FrameError
 from framework.files.depth_files import read_depth
 from framework.files.image_files import read_color
+from framework.files.restartable_folder import check_finished
 from framework.files.search_paths import folder_of
+from framework.files.storage import check_storage
 from framework.geometry import FARTHEST
 from framework.interfaces import RGBDSequence
 from framework.sensors.noise_models import SensorChoice, SensorKind
@@ -105,6 +107,7 @@ class RecordedFrame:
         try:
             return cls(images, timestamp, pose())
         except DataError as error:
+            check_storage(error)
             return cls(images, timestamp, error=str(error))
 
 
@@ -128,7 +131,7 @@ class Recording(RGBDSequence):
     `ground_truth` is set, its mesh replaces the ground truth of the recording.
 
     Opening an invalid recording raises DataError. Reading an invalid frame raises FrameError, and the pipeline skips
-    the frame.
+    the frame. If the storage is no longer available, reading raises StorageError, which ends the run.
     """
 
     root: Path  # folder of the recording or of the scenes, relative to the working or project directory
@@ -166,6 +169,7 @@ class Recording(RGBDSequence):
         if not self.folder.is_dir():
             project = "" if self.root.is_absolute() else ", found in neither the working nor the project directory"
             raise DataError(f"dataset.root: expected an existing folder, got {self.folder}{project}")
+        check_finished(self.folder)
         self.name = self.folder.resolve().name
         self.named_truth = None if self.ground_truth is None else read_named_truth(Path(self.ground_truth))
         stored = self.open()
@@ -254,6 +258,13 @@ class Recording(RGBDSequence):
         recorded = self.contents.frames[index]
         if recorded.error:
             raise FrameError(f"frame {index}: {recorded.error}")
+        try:
+            return self._read_frame(index, recorded)
+        except FrameError as error:
+            check_storage(error, self.folder)
+            raise
+
+    def _read_frame(self, index: int, recorded: RecordedFrame) -> Frame:
         return Frame(
             index=index,
             timestamp=recorded.timestamp,

@@ -27,7 +27,7 @@ import numpy as np
 from framework.data import MAX_PIXELS, Camera, Float64, UInt8, UInt16
 from framework.datasets.frames.conventions import COARSEST_DEPTH, FINEST_DEPTH
 from framework.datasets.frames.sequence_reader import StoredImages
-from framework.errors import DataError, FrameError
+from framework.errors import DataError, FrameError, StorageError
 from framework.files.atomic_write import check_regular
 from framework.files.image_files import decode_color
 from framework.files.number_lines import PrintedMatrix
@@ -89,7 +89,8 @@ class SensFrame:
         """Return the image (H, W, 3), RGB, of the color camera.
 
         Raises:
-            FrameError: The image cannot be read.
+            FrameError: The image is damaged.
+            StorageError: The file cannot be read.
         """
         data = self._read(self._color_name, self.byte, self.color_bytes)
         if self.header.color_compression != RAW:
@@ -102,7 +103,8 @@ class SensFrame:
         """Return the depth (H, W) of the depth camera in device units, 0 = no reading.
 
         Raises:
-            FrameError: The image cannot be read.
+            FrameError: The image is damaged.
+            StorageError: The file cannot be read.
         """
         data = self._read(self._depth_name, self.byte + self.color_bytes, self.depth_bytes)
         shape = self.header.depth_camera.shape
@@ -118,7 +120,8 @@ class SensFrame:
                 file.seek(byte)
                 data = file.read(length)
         except OSError as error:
-            raise FrameError(f"{name}: expected a readable file, got an error ({error.strerror or error})") from error
+            reason = f"expected a readable file, got an error ({error.strerror or error})"
+            raise StorageError(f"{name}: {reason}; reconnect its disk and repeat the command") from error
         _check_length(name, len(data), length)
         return data
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,12 +12,17 @@ import numpy as np
 from framework.data import Float64
 from framework.errors import ConfigError
 from framework.evaluation.compared_classes import OF_DATASET
-from framework.importing.folder_writer import check_new
+from framework.files.manifest import MANIFEST
+from framework.files.restartable_folder import check_startable, restartable_folder
 from framework.runs.external_maps.conversion import ConvertedMap, MapPlacement, read_transform
 from framework.runs.external_maps.imported_run import ImportOption, MappedData, write_imported_run
 from framework.runs.external_maps.map_formats import read_external_map
 from framework.runs.external_maps.ply_instances import LabelProperties
+from framework.runs.stored_runs import METRICS, RESULT_FILES
 from framework.vocabulary.label_spaces import ClassNames
+
+COMMAND = "import-map"
+OWN_FILES = re.compile("|".join(map(re.escape, (*RESULT_FILES, METRICS, MANIFEST))))
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ class MapImport:
             ConfigError: The directory is not empty, or an option is invalid.
             DataError: A file is missing or invalid.
         """
-        check_new(directory)
+        check_startable(directory, COMMAND)
         placement = MapPlacement(self.scale, self._T_world_map(), None if self.up is None else unit_vector(self.up))
         data = MappedData.of(overrides)
         external = read_external_map(self.mesh, self.labels, self.label_space, self.properties)
@@ -64,7 +70,8 @@ class MapImport:
         converted = ConvertedMap.of(external, placement, class_names)
         row = name or directory.resolve().name
         options = self.chosen_options()
-        title = write_imported_run(directory, row, converted, data, placement.up, options, external.masks)
+        with restartable_folder(directory, COMMAND, OWN_FILES):
+            title = write_imported_run(directory, row, converted, data, placement.up, options, external.masks)
         compared = () if data.dataset else ("no dataset: import the map again with dataset=NAME to evaluate it",)
         return ImportSummary(external.source, (*converted.remarks, *compared), title)
 

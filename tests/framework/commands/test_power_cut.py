@@ -8,7 +8,6 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from framework.files.staged_files import REPLACING, STAGED, finish_replacement
 from omegaconf import OmegaConf
 
 from framework.commands.results import (
@@ -22,6 +21,7 @@ from framework.commands.results import (
 )
 from framework.commands.running.run import run
 from framework.files.manifest import MANIFEST, Manifest, RunStatus
+from framework.files.staged_files import REPLACING, STAGED, finish_replacement
 from framework.runs.stored_runs import read_record
 from tests.support import reported_run
 from tests.support.command_call import call_command

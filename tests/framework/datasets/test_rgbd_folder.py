@@ -1,6 +1,8 @@
 """Tests for RGB-D folders, including folders with missing or invalid files."""
 
+import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -11,7 +13,7 @@ from PIL import Image
 
 from framework.datasets.frames.conventions import DepthReading
 from framework.datasets.rgbd_folder import RgbdFolder
-from framework.errors import ConfigError, DataError, FrameError
+from framework.errors import ConfigError, DataError, FrameError, StorageError
 from framework.sensors.noise_models import SensorChoice, SensorKind
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -821,3 +823,38 @@ def test_rgbd_folder_exif_orientation_is_logged_once(folder, caplog):
         write_oriented(folder, k, 3, picture(k))
     assert len(RgbdFolder(folder)) == FRAMES
     assert caplog.text.count("the EXIF orientation 3 is not applied; the pixels are used as stored") == 1
+
+
+@pytest.mark.parametrize("lost", ["", "color"])
+def test_rgbd_folder_lost_folder_raises_storage_error(folder, tmp_path, lost):
+    sequence = RgbdFolder(folder)
+    (folder / lost).rename(tmp_path / "elsewhere")
+    with pytest.raises(StorageError, match="expected available storage, got an error"):
+        sequence[2]
+
+
+def test_rgbd_folder_device_error_raises_storage_error(folder, monkeypatch):
+    def fail(path):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    sequence = RgbdFolder(folder)
+    monkeypatch.setattr(Path, "read_bytes", fail)
+    with pytest.raises(StorageError, match="Input/output error"):
+        sequence[2]
+
+
+def test_rgbd_folder_missing_image_is_unusable_frame(folder):
+    sequence = RgbdFolder(folder)
+    for image in ("color/000002.jpg", "depth/000002.png"):
+        stored = next((folder / image).parent.glob("*2.*"))
+        stored.rename(folder / "moved")
+        with pytest.raises(FrameError, match=r"expected a readable file, got an error \(No such file"):
+            sequence[2]
+        (folder / "moved").rename(stored)
+
+
+def test_rgbd_folder_scene_truth_of_lost_folder_raises(folder, tmp_path):
+    sequence = RgbdFolder(folder)
+    folder.rename(tmp_path / "elsewhere")
+    with pytest.raises(StorageError):
+        sequence.scene_truth()

@@ -198,7 +198,7 @@ def test_edit_of_map_without_voxel_labels_raises_data_error(tmp_path: Path) -> N
 
 
 def test_edit_into_existing_run_raises_config_error(run: Path, edited: Path) -> None:
-    with pytest.raises(ConfigError, match="expected a new or empty folder, got"):
+    with pytest.raises(DataError, match="expected a new or empty folder, got"):
         instancemap.edit(run, EDITS, edited)
     assert read_edits(edited / "edits.json")
 

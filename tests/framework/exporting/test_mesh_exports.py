@@ -348,13 +348,21 @@ def test_export_converts_class_names_to_identifiers(tmp_path: Path) -> None:
     ]
 
 
-def test_export_escapes_invalid_unicode_class_names(tmp_path: Path) -> None:
+def test_export_escapes_control_characters_in_class_names(tmp_path: Path) -> None:
+    run = ExportedRoom().write(tmp_path / "run")
+    path = run / "instances.json"
+    path.write_text(path.read_text().replace('"class": "cube"', '"class": "cube \\u001b\\u202e"'))
+    export(run, [one for one in ExportFormat if one not in PREDICTIONS], tmp_path / "out")
+    nodes = header((tmp_path / "out/scene.glb").read_bytes())["nodes"]
+    assert r"cube \x1b\u202e" in [node.get("extras", {}).get("class") for node in nodes]
+
+
+def test_export_invalid_unicode_class_name_raises(tmp_path: Path) -> None:
     run = ExportedRoom().write(tmp_path / "run")
     path = run / "instances.json"
     path.write_text(path.read_text().replace('"class": "cube"', '"class": "cube \\ud800"'))
-    export(run, [one for one in ExportFormat if one not in PREDICTIONS], tmp_path / "out")
-    nodes = header((tmp_path / "out/scene.glb").read_bytes())["nodes"]
-    assert "cube \\ud800" in [node.get("extras", {}).get("class") for node in nodes]
+    with pytest.raises(DataError, match=r"instances\.json: expected valid Unicode, got the lone surrogate"):
+        export(run, [ExportFormat.GLB], tmp_path / "out")
 
 
 def test_exported_instance_colors_match_overview(tmp_path: Path) -> None:

@@ -172,3 +172,12 @@ def test_make_folder_syncs_all_parents(tmp_path: Path) -> None:
         assert disk.operations.count("fsync") == 2
         make_folder(tmp_path / "a" / "b")
     assert disk.operations.count("fsync") == 2
+
+
+def test_atomic_write_invalid_unicode_error_names_file(tmp_path: Path) -> None:
+    with (
+        pytest.raises(DataError, match=r"table\.md: expected text that is valid Unicode, got '\\udcff'"),
+        atomic_write(tmp_path / "table.md") as temporary,
+    ):
+        temporary.write_text("room \udcff", "utf-8")
+    assert not [*tmp_path.iterdir()]

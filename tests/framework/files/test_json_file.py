@@ -49,3 +49,18 @@ def test_json_maximum_nesting_depth_is_read(tmp_path: Path) -> None:
     for _ in range(MAX_DEPTH - 1):
         [found] = found
     assert found == []
+
+
+@pytest.mark.parametrize("content", [b'["\\ud800"]', b'{"\\uDFFF": 1}', b'[{"a": ["x\\udc00\\ud800"]}]', '["\\ud800"]'])
+def test_json_lone_surrogate_raises(content: bytes | str) -> None:
+    with pytest.raises(DataError, match=r"^here: expected valid Unicode, got the lone surrogate '\\ud"):
+        parse_json("here", content)
+
+
+def test_json_surrogate_pair_is_character() -> None:
+    assert parse_json("here", b'["\\ud83d\\ude00"]') == ["😀"]
+
+
+def test_json_file_name_without_unicode_is_readable(tmp_path: Path) -> None:
+    write_json(tmp_path / "a.json", {"room \udcff": ["\udcff"]})
+    assert read_json(tmp_path / "a.json") == {r"room \udcff": [r"\udcff"]}

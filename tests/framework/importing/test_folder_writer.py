@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from errno import ENOSPC
 from pathlib import Path
 
 import numpy as np
@@ -76,16 +77,27 @@ def test_folder_writer_nonempty_output_folder_raises(tmp_path: Path) -> None:
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_folder_writer_interrupted_import_has_no_camera_json(tmp_path: Path) -> None:
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(ENOSPC, "No space left on device")])
+def test_folder_writer_starts_interrupted_import_again(tmp_path: Path, error: BaseException) -> None:
     def frames():
         yield lambda: frame(0)
-        raise KeyboardInterrupt
+        yield lambda: frame(1)
+        raise error
 
-    with pytest.raises(KeyboardInterrupt):
-        write_folder(Source("a test", frames(), 2, posed=True), tmp_path / "out", Writing())
-    assert (tmp_path / "out/color/000000.jpg").exists()
-    with pytest.raises(DataError, match=r"camera\.json: expected a camera"):
+    with pytest.raises(type(error)):
+        write_folder(Source("a test", frames(), 3, posed=True), tmp_path / "out", Writing())
+    assert (tmp_path / "out/color/000001.jpg").exists()
+    with pytest.raises(DataError, match=r"out: expected complete data, got an unfinished import; repeat"):
         RgbdFolder(tmp_path / "out")
+    (tmp_path / "out/notes.txt").write_text("mine")
+    for name in ("out", "undisturbed"):
+        write_folder(source(*(frame(k) for k in range(3))), tmp_path / name, Writing(stride=2))
+    left, expected = (
+        {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        for folder in (tmp_path / "out", tmp_path / "undisturbed")
+    )
+    assert left == expected | {Path("notes.txt"): b"mine"}
+    assert len(RgbdFolder(tmp_path / "out")) == 2
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from framework.errors import DataError
-from framework.runs.data_frame import load_runs
+from framework.runs.data_frame import load_runs, without_formulas
 from framework.runs.provenance import config_hash
 
 
@@ -75,3 +75,15 @@ def test_load_runs_without_completed_run_raises(tmp_path: Path) -> None:
         load_runs(tmp_path)
     with pytest.raises(DataError, match="nowhere: expected a folder of runs, got no folder"):
         load_runs(tmp_path / "nowhere")
+
+
+def test_without_formulas_changes_only_texts() -> None:
+    texts = ["=1+1", "@SUM(A1)", "+x", "-x", "-1.5", "+2", "a=b", "\x1b[2J", None]
+    frame = without_formulas(
+        pandas.DataFrame({"=name": pandas.Series(texts, dtype="string"), "x": [-0.5] * len(texts)})
+    )
+    assert list(frame.columns) == ["'=name", "x"]
+    found = frame["'=name"].tolist()
+    assert found[:-1] == ["'=1+1", "'@SUM(A1)", "'+x", "'-x", "-1.5", "+2", "a=b", r"\x1b[2J"]
+    assert found[-1] is pandas.NA
+    assert frame["x"].tolist() == [-0.5] * len(texts)

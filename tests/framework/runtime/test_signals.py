@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from framework.runtime.signals import ENDING, Interrupted, raise_on_signals, signals_deferred
+from framework.runtime.signals import ENDING, REPEATED, Interrupted, raise_on_signals, signals_deferred
 
 
 @pytest.fixture(autouse=True)
@@ -21,7 +21,7 @@ def handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-@pytest.mark.parametrize("number", ENDING)
+@pytest.mark.parametrize("number", sorted({*ENDING} - {*REPEATED}))
 def test_signals_deferred_first_waits_and_second_raises(
     number: signal.Signals, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -41,6 +41,27 @@ def test_signals_deferred_first_waits_and_second_raises(
     message = "interrupted by Ctrl-C" if number == signal.SIGINT else f"ended by {number.name}"
     assert capfd.readouterr().err == f"{message}: stopping after this frame; a second signal stops immediately\n"
     assert signal.getsignal(number) is signal.SIG_DFL
+
+
+@pytest.mark.parametrize("first", sorted({*REPEATED, signal.SIGTERM}))
+def test_signals_deferred_repeated_signal_never_raises(first: signal.Signals) -> None:
+    """The kernel sends SIGXCPU every second, also to a run that another signal is ending."""
+    raise_on_signals()
+    for number in REPEATED:
+        with signals_deferred(*ENDING) as interruption, interruption.second_ends_at_once("after this frame"):
+            for sent in (first, number, number):
+                signal.raise_signal(sent)
+        assert interruption.received is not None
+        assert interruption.received.number == first
+        signal.raise_signal(number)
+
+
+@pytest.mark.parametrize("number", REPEATED)
+def test_raise_on_signals_raises_repeated_signal_once(number: signal.Signals) -> None:
+    raise_on_signals()
+    with pytest.raises(Interrupted):
+        signal.raise_signal(number)
+    signal.raise_signal(number)
 
 
 @pytest.fixture(autouse=True)

@@ -15,6 +15,7 @@ import pytest
 from framework.datasets.scenenn.scenenn import SceneNN
 from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import ConfigError, DataError
+from framework.synthetic import scene_writers
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.furniture.groups import toilet_group
 from framework.synthetic.scene_writers import FRAMES_AT_ONCE, _choose, _Scene, write_scenes
@@ -95,6 +96,19 @@ def test_write_scenes_other_parameters_raise(root: Path, other: BenchmarkSetting
     with pytest.raises(ConfigError, match=r"expected scenes with the parameters .*; set another folder"):
         write_scenes(root, SPECS, other, jobs=1)
     assert times(root) == before
+
+
+def test_write_scenes_interrupted_at_start_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: object) -> str:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(json, "dumps", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            scene_writers._begin(tmp_path, RECORDING)
+    (tmp_path / ".synthetic.4711-0123abcd.partial.json").touch()  # of a killed process
+    scene_writers._begin(tmp_path, RECORDING)
+    assert (tmp_path / "intrinsic" / "asus.ini").exists()
 
 
 def test_write_scenes_foreign_folder_raises(tmp_path: Path) -> None:

@@ -383,7 +383,7 @@ def test_write_tables_without_complete_run_raises_reason(tmp_path: Path) -> None
 
 def test_latex_and_markdown_tables_escape_special_characters(sweep: Path) -> None:
     run(sweep, r"50%_{a}|b\c", 0, 0.5, 1.0)
-    assert r"50%_{a}\|b\c" in write_tables(sweep)
+    assert r"50%\_{a}\|b\\c" in write_tables(sweep)
     latex = (sweep / "table.tex").read_text()
     assert r"50\%\_\{a\}\textbar{}b\textbackslash{}c & 1 & 0.500 &" in latex
     assert r"chain & 3 & 0.700 $\pm$ 0.265 & 151.0 $\pm$ 1.0 & ground\_truth \\" in latex

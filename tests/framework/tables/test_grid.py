@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
-from framework.tables.grid import TextTable, decimals, figure, markdown_grid
+import pytest
+
+from framework.tables.grid import TextTable, decimals, figure, markdown_grid, markdown_page, markdown_text
 
 GRID = TextTable(
     heads=["scene", "a_b", "x"],
@@ -38,3 +40,25 @@ def test_grid_value_includes_known_spread_and_sign() -> None:
     assert figure(0.25, 0.0625, 2) == "0.25 ± 0.06"
     assert figure(0.25, math.nan, 3, signed=True) == "+0.250"
     assert figure(-1e-9, math.nan, 3, signed=True) == "+0.000"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[click](javascript:x)", r"[click\](javascript:x)"),
+        ("[a][b] [a]: http://x", r"[a\][b] [a\]: http://x"),
+        ("<img src=x> <!-- a < b & c &lt;", "&lt;img src=x> &lt;!-- a < b & c &amp;lt;"),
+        ("**best** __best__ *x* ~~x~~", r"\*\*best\*\* \_\_best\_\_ \*x\* \~\~x\~\~"),
+        ("a\\|b `c`", r"a\\\|b \`c\`"),
+        ("\x1b[2J\u202e", r"\\x1b[2J\\u202e"),
+        ("refiner=gmm_em ± 0.1 * in [0, 1]", "refiner=gmm_em ± 0.1 * in [0, 1]"),
+    ],
+)
+def test_markdown_text_has_no_markup(text: str, expected: str) -> None:
+    assert markdown_text(text) == expected
+
+
+def test_markdown_page_escapes_title_and_notes() -> None:
+    page = markdown_page("a\n# <b>", [GRID], ["x\n\n# [y](z)"])
+    assert page.splitlines()[0] == "# a # &lt;b>"
+    assert page.splitlines()[-1] == r"- x # [y\](z)"

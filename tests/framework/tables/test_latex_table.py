@@ -144,3 +144,8 @@ def test_write_tables_overrides_change_stored_settings(sweep: Path) -> None:
         write_tables(sweep, ["table.columns=[a"])
     with pytest.raises(ConfigError, match=r"table\.columns=a,b: expected one value, got a sweep"):
         write_tables(sweep, ["table.columns=a,b"])
+
+
+def test_latex_file_comments_are_single_lines() -> None:
+    text = latex_file([], ["a\n\\input{x}\r\\input{y}\u2028\\input{z} \x1b"])
+    assert text.splitlines()[1:] == [r"% a \input{x} \input{y} \input{z} \x1b"]

@@ -9,6 +9,7 @@ import pytest
 from framework.commands.recordings import convert_oni
 from framework.datasets.scenenn.oni import OniFrame
 from framework.datasets.scenenn.scene_files import read_timestamps
+from framework.datasets.scenenn.scenenn import SceneNN
 from framework.errors import DataError
 from tests.framework.datasets.scenenn.test_oni import colors, depths, played, recording
 from tests.support.recordings.oni_file import OniFile
@@ -110,14 +111,21 @@ def test_convert_oni_existing_output_is_not_overwritten(tmp_path, monkeypatch, s
     assert names(tmp_path / "011") == [file]
 
 
-def test_convert_oni_ctrl_c_leaves_complete_frames(tmp_path, monkeypatch, capsys, source):
-    deliver(monkeypatch, 2, KeyboardInterrupt())
+def test_convert_oni_interrupted_is_started_again(tmp_path, monkeypatch, capsys, source):
+    deliver(monkeypatch, 3, KeyboardInterrupt())
+    (tmp_path / "011").mkdir()
+    (tmp_path / "011/trajectory.log").write_text("0 0 1\n")
     with pytest.raises(SystemExit, match="130"):
         command(monkeypatch, source, tmp_path / "011")
-    assert names(tmp_path / "011") == written(2)
+    assert capsys.readouterr().err.splitlines()[-1] == "interrupted"
+    assert set(written(3)) < set(names(tmp_path / "011"))
+    with pytest.raises(DataError, match="got an unfinished convert-oni; repeat `instancemap convert-oni`"):
+        SceneNN(tmp_path, "011")
+    deliver(monkeypatch, 2)
+    command(monkeypatch, source, tmp_path / "011")
+    assert names(tmp_path / "011") == [*written(2), "trajectory.log"]
     check_images(tmp_path / "011", 2)
     assert list(read_timestamps(tmp_path / "011/timestamp.txt")) == [1, 2]
-    assert capsys.readouterr().err.splitlines()[-1] == "interrupted"
 
 
 def test_convert_oni_damaged_recording_keeps_read_frames(tmp_path, monkeypatch, capsys, source):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +14,14 @@ from framework.api import begin, run
 from framework.checking.recording_check import check
 from framework.commands.recordings import import_recording
 from framework.config.composition import composed
+from framework.data import Array
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.geometry import inverse
+from framework.importing import folder_writer
 from framework.interfaces import RGBDSequence
 from framework.registry import build
+from tests.support.forked_commands import ForkedCommand, completed
 from tests.support.recordings.phone_exports import room_frames, seen_by_phone, write_stray_scanner
 from tests.support.scenes.corner_room import look, pose_at
 
@@ -168,3 +173,39 @@ def test_import_phone_recording_is_mappable(shared_data: Path, tmp_path: Path, m
     both = (seen > 0) & (truth > 0)
     assert both.sum() > 0.85 * (truth > 0).sum()
     assert np.median(np.abs(seen - truth)[both]) < 0.01
+
+
+def write_slowly() -> None:
+    """Make the command take 0.2 s for each image."""
+    write = folder_writer._write_image
+
+    def slow(path: Path, image: Array, *parameters: int) -> None:
+        write(path, image, *parameters)
+        time.sleep(0.2)
+
+    folder_writer._write_image = slow
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGXCPU])
+def test_import_ended_by_signal_is_started_again(tmp_path: Path, number: signal.Signals) -> None:
+    write_stray_scanner(tmp_path / "export", room_frames())
+    words = ("import", str(tmp_path / "export"), str(tmp_path / "out"))
+    process = ForkedCommand(tmp_path, *words, before=write_slowly)
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "out/color/000000.jpg").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    in_use = completed(tmp_path, *words)
+    assert (in_use.returncode, len(in_use.stderr.splitlines())) == (1, 1)
+    assert f"got a directory in use by process {process.pid} on" in in_use.stderr
+    process.send_signal(number)
+    _, stderr = process.communicate(timeout=60)
+    if number != signal.SIGKILL:
+        assert process.returncode == 128 + number
+        how = "interrupted by Ctrl-C" if number == signal.SIGINT else f"ended by {number.name}"
+        assert stderr.splitlines()[-1:] == [how]
+        assert "Traceback" not in stderr
+    again = completed(tmp_path, *words)
+    assert (again.returncode, again.stderr) == (0, "")
+    assert not [path.name for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
+    assert len(RgbdFolder(tmp_path / "out")) == len(room_frames())

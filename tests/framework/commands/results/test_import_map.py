@@ -21,6 +21,7 @@ from framework.config import composition
 from framework.files.manifest import Manifest
 from framework.files.ply import read_ply, write_ply
 from framework.runs import instances_file
+from framework.runs.external_maps import imported_run
 from framework.runs.instances_file import read_instances
 from framework.runs.mesh_file import read_mesh
 from framework.runs.stored_runs import read_record
@@ -350,3 +351,17 @@ def test_existing_directory_is_not_overwritten(folder: Path, command) -> None:
     status, _, err = command(import_map, folder / "ours" / "mesh.ply", folder / "ours", *DATASET)
     assert (status, "expected a new or empty folder" in err) == (1, True)
     assert {path.name: path.stat().st_mtime_ns for path in (folder / "ours").iterdir()} == before
+
+
+def test_interrupted_import_is_started_again(folder: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    words = (folder / "ours" / "mesh.ply", folder / "other", *DATASET)
+    with monkeypatch.context() as patched:
+        patched.setattr(imported_run, "write_overview", interrupted)
+        assert command(import_map, *words)[0] == 130
+    assert (folder / "other" / "mesh.ply").exists()
+    assert command(import_map, *words)[0] == 0
+    assert not Manifest.read(folder / "other").changed_files(folder / "other")
+    assert not (folder / "other" / ".unfinished").exists()

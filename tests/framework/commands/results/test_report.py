@@ -104,10 +104,11 @@ def test_report_different_sequence_is_detected(stored: Path, command, tmp_path: 
     assert "the first frame differs from the first frame of the run" in texts((stored / "report.html").read_text())
 
 
-def test_report_invalid_unicode_names_are_escaped(stored: Path, command) -> None:
+def test_report_invalid_unicode_name_error_names_file(stored: Path, command) -> None:
     rename_class(stored, "cup \ud800")
-    assert command(stored)[0] == 0
-    assert "cup \\ud800" in texts((stored / "report.html").read_text())
+    status, _, err = command(stored)
+    expected = r"instances.json: expected valid Unicode, got the lone surrogate '\ud800'"
+    assert (status, err.startswith(f"error: {stored / expected}")) == (1, True)
 
 
 def test_report_object_without_class_is_listed(stored: Path, command) -> None:

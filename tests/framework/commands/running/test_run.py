@@ -10,12 +10,17 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+import psutil
 import pytest
 
 from framework.files.directory_lock import locked
+from framework.importing.folder_writer import Writing, write_folder
+from framework.importing.source import DeviceFrame, Source
 from framework.runs.stored_runs import MAPPED
+from framework.testing.corner_room import frame_at
 from tests.support.forked_commands import FAKE_CONF, ForkedCommand
 from tests.support.noted_calls import CALLS
 
@@ -66,7 +71,11 @@ def ignore_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGTERM, signal.SIGHUP, signal.SIGXCPU, signal.SIGUSR1, signal.SIGUSR2],
+    ids=lambda number: number.name,
+)
 @pytest.mark.parametrize("background", [False, True])
 def test_run_signal_leaves_partial_outputs(tmp_path: Path, number: signal.Signals, background: bool) -> None:
     """A run in the background of a shell script ignores Ctrl-C, but other signals end the run."""
@@ -82,6 +91,35 @@ def test_run_signal_leaves_partial_outputs(tmp_path: Path, number: signal.Signal
     assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json"}
     assert figures(place)["partial"] == f"ended by {number.name}"
     assert not (place / "metrics.json").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGXCPU])
+def test_run_repeated_sigxcpu_completes_partial_outputs(tmp_path: Path, number: signal.Signals) -> None:
+    """The kernel sends SIGXCPU every second, also while the outputs are written."""
+    place = tmp_path / "run"
+    process = begin(tmp_path, *ENDLESS, "fuser.slow_save_s=1", f"hydra.run.dir={place}")
+    wait_for(tmp_path / "note", process)
+    process.send_signal(number)
+    while process.poll() is None:
+        process.send_signal(signal.SIGXCPU)
+        time.sleep(0.02)
+    status, stderr = end(process)
+    assert (status, stderr.splitlines()[-1]) == (128 + number, f"ended by {number.name}")
+    assert "Traceback" not in stderr
+    assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json", "manifest.json"}
+    assert figures(place)["partial"] == f"ended by {number.name}"
+    assert figures(place, "manifest.json")["status"] == "PARTIAL"
+
+
+def test_run_cpu_limit_leaves_partial_outputs(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    process = begin(tmp_path, *ENDLESS, f"hydra.run.dir={place}")
+    wait_for(tmp_path / "note", process)
+    used = sum(psutil.Process(process.pid).cpu_times()[:2])
+    resource.prlimit(process.pid, resource.RLIMIT_CPU, (int(used) + 1, int(used) + 60))
+    status, stderr = end(process)
+    assert (status, stderr.splitlines()[-1]) == (128 + signal.SIGXCPU, "ended by SIGXCPU")
+    assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json"}
 
 
 @pytest.mark.parametrize(
@@ -104,6 +142,38 @@ def test_run_stage_error_leaves_partial_outputs(tmp_path: Path, kind: str, messa
     assert message in str(left["partial"])
     assert left["frames"] in (3, 4)  # a detector error is raised before the frame is counted, a mask error after that
     assert len((place / "trajectory.txt").read_text().splitlines()) in (3, 4)
+
+
+def test_run_lost_recording_leaves_partial_outputs(tmp_path: Path) -> None:
+    """A sweep repeats the run when the disk is connected again."""
+    recording, place = tmp_path / "recording", tmp_path / "sweep" / "run"
+    frames = [frame_at(k % 4) for k in range(40)]
+    given = [
+        DeviceFrame(f"{k}", k / 30, one.camera, one.color, one.depth, None, one.T_world_camera)
+        for k, one in enumerate(frames)
+    ]
+    write_folder(
+        Source("a test", [partial(lambda stored: stored, one) for one in given], 40, posed=True), recording, Writing()
+    )
+    words = (
+        *("hydra.mode=MULTIRUN", f"hydra.sweep.dir={place.parent}", "hydra.sweep.subdir=run", "skip_completed=true"),
+        *("dataset=rgbd_folder", f"dataset.root={recording}", "fuser.note=note", "fuser.slow_s=0.05", "detector=none"),
+    )
+    process = begin(tmp_path, *words)
+    wait_for(tmp_path / "note", process)
+    recording.rename(tmp_path / "unplugged")
+    status, stderr = end(process)
+    assert status == 1
+    assert "Traceback" not in stderr
+    assert "expected available storage, got an error" in str(figures(place)["partial"])
+    left = figures(place)
+    assert left["frames_skipped"] == 0
+    assert 0 < left["frames"] == len((place / "trajectory.txt").read_text().splitlines()) < 40
+    assert figures(place, "manifest.json")["status"] == "PARTIAL"
+    assert not (place / "metrics.json").exists()
+    (tmp_path / "unplugged").rename(recording)
+    assert end(begin(tmp_path, *words))[0] == 0
+    assert (figures(place, "metrics.json")["frames"], figures(place, "manifest.json")["status"]) == (40, "COMPLETE")
 
 
 def test_run_folder_deleted_during_run_is_recreated(tmp_path: Path) -> None:
@@ -319,3 +389,19 @@ def test_run_calls_viewer_from_begin_run_to_end_run(
     assert calls[:-1] == [["begin_run", 3, True], ["begin", "corner_room"], *shown, ["end"]]
     assert calls[-1][:3] == ["end_run", *outcome[:2]]
     assert calls[-1][3].startswith(str(outcome[2]))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGXCPU])
+def test_detect_signal_ends_in_one_line(tmp_path: Path, number: signal.Signals) -> None:
+    words = ("dataset=fake", "dataset.frames=100000", "dataset.slow_s=0.01", "detector=fake", "out=found.json")
+    process = ForkedCommand(tmp_path, "detect", "--config-dir", str(FAKE_CONF), *words)
+    deadline = time.monotonic() + PATIENCE_S
+    while not list(tmp_path.glob(".found.*")):  # the temporary file
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(number)
+    status, stderr = end(process)
+    assert (status, stderr.splitlines()[-1]) == (128 + number, f"ended by {number.name}")
+    assert "Traceback" not in stderr
+    assert not list(tmp_path.glob("*found*"))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from framework.datasets.scannet.sens_file import FRAME, MAX_FRAMES, SensFile, open_sens
-from framework.errors import DataError, FrameError
+from framework.errors import DataError, FrameError, StorageError
 from tests.support.recordings.scannet_files import (
     COLOR_CAMERA,
     DEPTH_CAMERA,
@@ -194,7 +194,7 @@ def test_sens_file_raw_image_length_mismatch_raises(path: Path) -> None:
 def test_sens_file_frame_of_deleted_file_raises(path: Path) -> None:
     [frame] = opened(path, sens(shots(1))).frames
     path.unlink()
-    with pytest.raises(FrameError, match=r"expected a readable file, got an error \(No such file"):
+    with pytest.raises(StorageError, match=r"expected a readable file, got an error \(No such file"):
         frame.color()
     with pytest.raises(DataError, match=r"expected a readable file, got an error \(No such file"):
         open_sens(path)
