@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from weakref import finalize
 
+import numpy as np
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig
 
@@ -35,8 +36,9 @@ from framework.datasets.frames.sequence_reader import FRAME_RATE
 from framework.detection.domain import warn_outside_domain
 from framework.detection.map_classes import with_classes_of_map
 from framework.detection.stored.cache import with_cache
-from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
+from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError, errors_of
 from framework.files.directory_lock import locked
+from framework.files.search_paths import usable_path
 from framework.files.staged_files import finish_replacement
 from framework.geometry import camera_of, pose_of
 from framework.interfaces import (
@@ -62,6 +64,7 @@ from framework.runs.data_frame import load_runs
 from framework.runs.run_directory import write_run
 from framework.runs.stored_runs import KEYFRAMES, MAP, REPORT
 from framework.runtime.cpu_budget import limited_threads
+from framework.runtime.forked_process import check_not_forked
 from framework.runtime.process_settings import Settings, configure_process
 from framework.runtime.run_log import Journal
 from framework.sensors.noise_models import SensorKind
@@ -118,6 +121,8 @@ __all__ = [
 OF_COMMAND_LINE = ("experiment", "hydra", "launcher")
 """Config groups that only the command line supports."""
 
+LATEST_TIME = 1e11  # s, maximum absolute timestamp, in the year 5138; timestamps in ms, us or ns are larger
+
 log = logging.getLogger(__name__)
 
 
@@ -145,7 +150,9 @@ def begin(config: DictConfig) -> Pipeline:
         if key == "resume_from":
             fuser.resume(scene)
             classes, resumed = scene.classes, True
-        tracker.load_keyframes(read_keyframes(run / KEYFRAMES), scene)
+        keyframes = read_keyframes(run / KEYFRAMES)
+        with errors_of(run / KEYFRAMES):
+            tracker.load_keyframes(keyframes, scene)
     detector = build(Detector, config.get("detector"))  # last, because loading a network is slow
     detector = with_cache(with_classes_of_map(detector, classes), config)
     compile_for_run()
@@ -190,7 +197,8 @@ class Mapper(Map):
     the map of a run. `viewer="rerun"` records or shows the map until the mapper is deleted.
 
     All methods are thread-safe. While another thread may call `add`, hold the lock to read `scene` itself:
-    `with mapper.lock: mesh = mapper.scene.mesh()`.
+    `with mapper.lock: mesh = mapper.scene.mesh()`. A process that was forked after mapping began cannot use a mapper
+    or map; start it with the multiprocessing method "spawn".
 
     Raises:
         ConfigError: A name is unknown, or a value is invalid.
@@ -207,6 +215,7 @@ class Mapper(Map):
                 )
         config = composed("~dataset", *words)
         self._threads = Settings.of(config).threads
+        check_not_forked()
         self.pipeline = begin(config)
         warn_outside_domain(self.pipeline.detector, None)
         super().__init__(self.pipeline.fuser.scene)
@@ -253,7 +262,7 @@ class Mapper(Map):
 
         Raises:
             FrameError: The frame is unusable, for example because a required pose is missing. The map is unchanged.
-            DataError: The arrays do not form a frame.
+            DataError: The arrays do not form a frame, or the index of the Frame is not larger than those before.
             MapFullError: The map has reached `fuser.max_blocks`.
         """
         with self.lock, limited_threads(self._threads):
@@ -272,16 +281,22 @@ class Mapper(Map):
                     )
                 if used != self._camera:
                     warn_of_camera(used)
+                index = max(self._frames, self._journal.last_index + 1)  # a Frame of the caller may be ahead
                 T_world_camera, T_odom_camera = (
-                    None if T is None else pose_of(f"frame {self._frames}", T) for T in (pose, odometry)
+                    None if T is None else pose_of(f"frame {index}", T) for T in (pose, odometry)
                 )
-                time = self._frames / FRAME_RATE if timestamp is None else timestamp
+                time = index / FRAME_RATE if timestamp is None else timestamp
                 frame = Frame(
-                    self._frames, time, color, depth, used, T_world_camera, up=up, depth_timestamp=depth_timestamp,
+                    index, time, color, depth, used, T_world_camera, up=up, depth_timestamp=depth_timestamp,
                     sensor=sensor or self._sensor, T_odom_camera=T_odom_camera,
                 )  # fmt: skip
                 if pose is not None:
                     self._warn_of_ignored_pose()
+            if max(abs(frame.timestamp), abs(frame.color_time), abs(frame.depth_time)) > LATEST_TIME:
+                raise DataError(
+                    f"frame {frame.index}: timestamp: expected a time within {LATEST_TIME:g} s, got "
+                    f"{frame.timestamp:g} s; pass seconds, such as nanoseconds / 1e9"
+                )
             self._camera, self._sensor = frame.camera, frame.sensor
             self._frames += 1
             self._journal.timings.clear()  # unused here; the list would grow without limit for a live camera
@@ -343,14 +358,20 @@ class Mapper(Map):
 
 def _overrides(where: str, overrides: Sequence[str], named: Mapping[str, object]) -> list[str]:
     words = [*overrides, *(_override(name, value) for name, value in named.items())]
-    for override in words:
-        if not isinstance(override, str):
-            raise ConfigError(f"{where}: expected overrides such as 'fuser.voxel_size=0.02', got {override!r}")
+    _check_overrides(where, words)
     with config_errors():
         return literal(words, text_kind)
 
 
+def _check_overrides(where: str, words: Sequence[str]) -> None:
+    for override in words:
+        if not isinstance(cast(object, override), str):
+            raise ConfigError(f"{where}: expected overrides such as 'fuser.voxel_size=0.02', got {override!r:.60}")
+
+
 def _override(name: str, value: object) -> str:
+    if isinstance(value, np.generic):
+        value = value.item()
     if value is None or isinstance(value, bool | int | float):
         return f"{name}={'null' if value is None else value}"
     if isinstance(value, str | Path):
@@ -409,13 +430,14 @@ def run(directory: Path | str, *overrides: str, **named: object) -> Path:
                 f"run: expected an override of a single run, got {override}; use {', '.join(OF_COMMAND_LINE)} "
                 "overrides only on the command line"
             )
-    check_new(Path(directory))
+    target = usable_path("directory", directory)
+    check_new(target)
     config, choices = composed_with_choices(*words)
     settings = Settings.of(config)
-    with locked(Path(directory)), limited_threads(settings.threads):
+    with locked(target), limited_threads(settings.threads):
         settings.seed_generators()
-        write_run(begin(config), config, Path(directory), choices).check()
-    return Path(directory)
+        write_run(begin(config), config, target, choices).check()
+    return target
 
 
 def report(run: Path | str, out: Path | str | None = None) -> Path:
@@ -435,8 +457,9 @@ def report(run: Path | str, out: Path | str | None = None) -> Path:
     from framework.reporting.run_contents import RunContents
     from framework.reporting.run_page import RunReport
 
-    path = Path(run) / REPORT if out is None else Path(out)
-    page = RunReport.of(RunContents.read(Path(run))).html()
+    source = usable_path("run", run)
+    path = source / REPORT if out is None else usable_path("out", out)
+    page = RunReport.of(RunContents.read(source)).html()
     write_page(path, page)
     return path
 
@@ -452,7 +475,8 @@ def tables(directory: Path | str, *overrides: str) -> str:
         DataError: No run is complete.
         ConfigError: A setting is invalid.
     """
-    return write_tables(Path(directory), overrides)
+    _check_overrides("tables", overrides)
+    return write_tables(usable_path("directory", directory), overrides)
 
 
 def load_map(path: Path | str) -> Map:
@@ -505,7 +529,8 @@ def export(
 
     kinds = [exports.one_of(exports.ExportFormat, "a format", one) for one in formats]
     chosen = exports.Chosen.named(objects, **choices)
-    return exports.export(Path(run), kinds, None if out is None else Path(out), chosen, up, floor)
+    target = None if out is None else usable_path("out", out)
+    return exports.export(usable_path("run", run), kinds, target, chosen, up, floor)
 
 
 def edit(run: Path | str, edits: Sequence[Mapping[str, Any]] | Path | str, out: Path | str | None = None) -> Path:
@@ -527,10 +552,11 @@ def edit(run: Path | str, edits: Sequence[Mapping[str, Any]] | Path | str, out: 
     from framework.editing import edited_run
     from framework.editing.edits import edits_of, read_edits
 
-    directory = edited_run.default_directory(Path(run)) if out is None else Path(out)
+    source = usable_path("run", run)
+    directory = edited_run.default_directory(source) if out is None else usable_path("out", out)
     edited_run.check_empty(directory)
-    entries = read_edits(Path(edits)) if isinstance(edits, str | Path) else edits_of("edits", edits)
-    edited_run.EditedRun.of(Path(run), entries).write(directory)
+    entries = read_edits(usable_path("edits", edits)) if isinstance(edits, str | Path) else edits_of("edits", edits)
+    edited_run.EditedRun.of(source, entries).write(directory)
     return directory
 
 
@@ -588,20 +614,22 @@ def import_map(
         known = ", ".join(ClassNames.__members__)
         raise ConfigError(f"class_names: expected one of {known}, got {class_names!r:.60}")
     chosen = MapImport(
-        mesh=Path(mesh),
-        labels=None if labels is None else Path(labels),
+        mesh=usable_path("mesh", mesh),
+        labels=None if labels is None else usable_path("labels", labels),
         label_space=None if label_space is None else str(label_space),
         class_names=ClassNames[class_names],
         properties=LabelProperties(instance_property, class_property, no_instance),
         scale=scale,
-        transform=Path(transform) if isinstance(transform, str) else transform,
+        transform=usable_path("transform", transform) if isinstance(transform, str) else transform,
         up=up,
     )
-    found = chosen.write(Path(directory), name, overrides)
+    target = usable_path("directory", directory)
+    _check_overrides("import_map", overrides)
+    found = chosen.write(target, name, overrides)
     log.info("import_map: %s; %s", found.source, found.title)
     for remark in found.remarks:
         log.warning("import_map: %s", remark)
-    return Path(directory)
+    return target
 
 
 def query(run: Map | Path | str, words: str, by: str | None = None, model: Path | str | None = None) -> QueryResult:
@@ -625,7 +653,8 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
     question = TextQuery(words, by, None if model is None else str(model))
     if isinstance(run, Map):
         return search(run, question)
-    return search(Map(scene_of("query", Path(run))), question, Path(run))
+    directory = usable_path("run", run)
+    return search(Map(scene_of("query", directory)), question, directory)
 
 
 def load_scene(path: Path | str) -> SceneMap:
@@ -644,4 +673,5 @@ def load_scene(path: Path | str) -> SceneMap:
         open3d_map.FORMAT: open3d_map.Open3DMap,
         semantic_map.FORMAT: semantic_map.SemanticMap,
     }
+    check_not_forked()
     return kinds.get(read_format(path), instance_map.InstanceMap).load(path)

@@ -49,6 +49,8 @@ LONGEST_FOCAL_LENGTH = 1e6  # maximum focal length, px
 UNIT_TOLERANCE = 1e-3  # maximum | |v| - 1 | of a unit vector
 LONGEST_EMBEDDING = 65_536  # maximum number of dimensions; published networks have 500 to 4,000
 LONGEST_SPACE = 300  # maximum number of characters of an embedding space name
+LARGEST_INDEX = 2**53  # limit of frame numbers; smaller numbers are exact in double precision and in JSON files
+LATEST = 1e19  # s, maximum absolute timestamp; stored timestamps in ns, of which `check` warns, have up to 2^63
 SAME_TIME = 1e-5  # s, maximum difference of equal timestamps; rounding: trajectory.txt 1e-9 s, Unix time 2e-7 s
 PROBABILITY_TOLERANCE = 1e-3  # maximum error of a sum of probabilities, due to softmax in half precision
 
@@ -74,7 +76,13 @@ class Camera:
             raise DataError(f"Camera: expected an image of at least 1x1 px, got {self.width}x{self.height}")
         if self.width * self.height > MAX_PIXELS:
             raise DataError(f"Camera: expected an image of at most {MAX_PIXELS} px, got {self.width}x{self.height}")
-        numbers = (self.fx, self.fy, self.cx, self.cy)
+        try:
+            numbers = (float(self.fx), float(self.fy), float(self.cx), float(self.cy))
+        except OverflowError:
+            raise DataError("Camera: expected fx, fy, cx, cy in px, got an integer beyond double precision") from None
+        for name, number in zip(("fx", "fy", "cx", "cy"), numbers, strict=True):
+            if not isinstance(getattr(self, name), int | float | np.number):  # kernels do not support other types
+                object.__setattr__(self, name, number)
         if not np.isfinite(numbers).all() or self.fx <= 0 or self.fy <= 0:
             raise DataError(f"Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy = {numbers}")
         if max(self.fx, self.fy) > LONGEST_FOCAL_LENGTH:
@@ -104,7 +112,12 @@ class Camera:
         return self.height, self.width
 
     def scaled(self, factor: float) -> Camera:
-        """Return the camera of the image resized by `factor`. Width and height are rounded to integers."""
+        """Return the camera of the image resized by `factor`. Width and height are rounded to integers.
+
+        Raises DataError unless `factor` is a positive number.
+        """
+        if not isinstance(cast(object, factor), Real) or not 0 < factor < math.inf:
+            raise DataError(f"Camera.scaled: factor: expected a positive number, got {factor!r:.60}")
         width, height = round(self.width * factor), round(self.height * factor)
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
@@ -183,15 +196,19 @@ class Frame:
 
     def __post_init__(self) -> None:
         index, camera = cast(object, self.index), cast(object, self.camera)  # the caller may pass any type
-        if isinstance(index, bool) or not isinstance(index, int | np.integer) or index < 0:
-            raise DataError(f"Frame.index: expected an integer of at least 0, got {index!r}")
+        if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < LARGEST_INDEX:
+            raise DataError(f"Frame.index: expected an integer of at least 0 and below 2^53, got {index!r:.60}")
         where = f"frame {self.index}: "
         if not isinstance(camera, Camera):
             raise DataError(f"{where}camera: expected a Camera, got {type(camera).__name__}")
         times = {"timestamp": self.timestamp, "color_timestamp": self.color_time, "depth_timestamp": self.depth_time}
         for name, time in times.items():
-            if not isinstance(time, int | float | np.integer | np.floating) or not math.isfinite(time):
-                raise DataError(f"{where}{name}: expected a finite number of seconds, got {time!r}")
+            number = isinstance(time, int | float | np.integer | np.floating)
+            number &= not isinstance(time, bool | np.timedelta64)
+            if not number or not -LATEST <= time <= LATEST:
+                raise DataError(
+                    f"{where}{name}: expected a number of seconds in [{-LATEST:g}, {LATEST:g}], got {time!r:.60}"
+                )
         check_array(where + "color", self.color, (*self.camera.shape, 3), np.uint8)
         check_array(where + "depth", self.depth, self.camera.shape, np.float32)
         if self.depth.size and self.depth.min() < 0:
@@ -212,8 +229,8 @@ class Frame:
             )
         object.__setattr__(self, "_depth_cache", {})
         # kernels require contiguous writable arrays; views such as bgr[..., ::-1] and read-only arrays are copied
-        object.__setattr__(self, "color", np.require(self.color, requirements=("C", "W")))
-        object.__setattr__(self, "depth", np.require(self.depth, requirements=("C", "W")))
+        object.__setattr__(self, "color", np.require(np.asarray(self.color), requirements=("C", "W")))
+        object.__setattr__(self, "depth", np.require(np.asarray(self.depth), requirements=("C", "W")))
         if self.truth is not None and not isinstance(cast(object, self.truth), FrameTruth):
             raise DataError(f"{where}truth: expected a FrameTruth, got {type(self.truth).__name__}")
         if self.truth is not None and self.truth.shape != self.camera.shape:
@@ -294,6 +311,7 @@ class Detections:
     detected: bool = True  # False = the detector did not run, so a missing object is no evidence of absence
 
     def __post_init__(self) -> None:
+        check_array("Detections.scores", self.scores, (None,), np.float32)
         n, c = len(self.scores), len(self.classes)
         check_array("Detections.masks", self.masks, (n, None, None), np.bool_)
         check_array("Detections.boxes", self.boxes, (n, 4), np.float32)
@@ -335,8 +353,9 @@ class PointClusters:
     detected: bool = True  # as in Detections
 
     def __post_init__(self) -> None:
+        check_array("PointClusters.points_world", self.points_world, (None, 3), np.float32)
+        check_array("PointClusters.scores", self.scores, (None,), np.float32)
         p, n, c = len(self.points_world), len(self.scores), len(self.classes)
-        check_array("PointClusters.points_world", self.points_world, (p, 3), np.float32)
         check_array("PointClusters.pixels", self.pixels, (p, 2), np.int32)
         check_array("PointClusters.cluster", self.cluster, (p,), np.int32)
         _check_objects(self, n, c)
@@ -503,8 +522,11 @@ def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: n
     if not isinstance(array, np.ndarray) or array.dtype != dtype:
         found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
         raise DataError(f"{name}: expected an array of {np.dtype(dtype)}, got {found}")
+    variable = name.rpartition(" ")[2]
+    if isinstance(array, np.matrix):  # products and slices of matrices have other shapes
+        raise DataError(f"{name}: expected an array, got a matrix; pass np.asarray({variable})")
     if isinstance(array, np.ma.MaskedArray):
-        raise DataError(f"{name}: expected an array without a mask, got a masked array; fill it: {name}.filled(0)")
+        raise DataError(f"{name}: expected an array without a mask, got a masked array; pass {variable}.filled(0)")
     matches = len(array.shape) == len(shape) and all(
         want in (None, have) for have, want in zip(array.shape, shape, strict=True)
     )

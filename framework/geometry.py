@@ -138,10 +138,13 @@ def as_array(name: str, value: object, form: str) -> Float64:
     """Return an array, tensor or list of numbers as float64.
 
     Raises:
-        DataError: The value is not an array of numbers in the given form.
+        DataError: The value is not an array of real numbers in the given form, or it has masked entries.
     """
     try:
-        return np.asarray(value, np.float64)
+        found = np.asarray(value)
+        if found.dtype.kind == "c" or np.ma.is_masked(value):
+            raise DataError(f"{name}: expected {form}, got an array with complex or masked entries")
+        return np.asarray(found, np.float64)
     except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor on another device, or with a gradient
         raise DataError(f"{name}: expected {form}, got {type(value).__name__}") from None
 

@@ -37,7 +37,7 @@ from framework.data import (
     SurfaceView,
     View,
 )
-from framework.errors import ConfigError
+from framework.errors import ConfigError, FrameError
 from framework.sensors.noise_models import SensorKind
 
 FrameReader = Callable[[], Frame]
@@ -120,8 +120,11 @@ class LiveVideo(RGBDVideo):
     """The stream of a running camera. If mapping falls behind, frames are dropped."""
 
     @abstractmethod
-    def frames(self) -> Generator[FrameReader | None]:
+    def frames(self) -> Generator[FrameReader | FrameError | None]:
         """Yield a reader for each new frame, and None at least ten times per second while there is no new frame.
+
+        A frame whose damage is known without reading it is yielded as its FrameError. It is skipped and counted, and
+        does not replace a usable frame that waits.
 
         Frame indices increase. Timestamps are capture times, s since 1970 on this computer's clock. Each reader is
         called at most once, in another thread, while the generator waits. The first `next` opens the device. Closing

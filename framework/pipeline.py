@@ -28,9 +28,11 @@ from framework.interfaces import (
     Viewer,
 )
 from framework.live_view.guarded_viewer import GuardedViewer, watched_run
+from framework.mapping.instances.association import agreed_classes
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 from framework.runtime.cpu_budget import CpuBudget, parallel_kernels_are_thread_safe
+from framework.runtime.forked_process import check_not_forked
 from framework.runtime.frame_stream import FrameStream, Turns, prefetched_map, stream_of
 from framework.runtime.run_log import Journal, RunResult, StageTime
 from framework.runtime.signals import Interruption, signals_deferred
@@ -107,12 +109,16 @@ class Pipeline:
             video: The sequence or live video.
             directory: Output folder of the viewer.
         """
+        check_not_forked()
+        if not isinstance(cast(object, video), RGBDVideo):
+            raise DataError(f"dataset: expected an RGBDSequence or a LiveVideo, got {type(video).__name__}")
         frames_expected = len(video) if isinstance(video, RGBDSequence) else None
         if frames_expected == 0:
             raise DataError(f"{video.name}: expected at least 1 frame, got 0; change start, stop or stride")
         if self.tracker.pose_source == "ground_truth" and not video.has_poses():
             frames = "its frames" if frames_expected is None else f"the {frames_expected} frames"
             raise DataError(f"{video.name}: expected ground-truth poses, got none for {frames}; {WITHOUT_POSES}")
+        agreed_classes(self.fuser.scene.classes, self.detector.classes)  # of a resumed map
         warn_outside_domain(self.detector, video)
         if isinstance(video, RGBDSequence):
             self.detector.check_sequence(video)
@@ -218,20 +224,26 @@ class Pipeline:
             with budget.prefetching(workers):
                 return self.read_and_detect(stream, turns.turn(number), number)
 
-        # close the stream first: a worker may be waiting for a frame
-        with closing(prefetched_map(work, count(), prefetch, workers)) as outcomes, stream:
-            for outcome in outcomes:
-                interruption.check()  # after a possibly long wait
-                journal.frames_dropped = stream.dropped
-                if outcome is None:
-                    return
+        try:
+            # close the stream first: a worker may be waiting for a frame
+            with closing(prefetched_map(work, count(), prefetch, workers)) as outcomes, stream:
+                for outcome in outcomes:
+                    interruption.check()  # after a possibly long wait
+                    journal.frames_dropped = stream.dropped
+                    if outcome is None:
+                        return
+                    journal.frame_begins()
+                    if isinstance(outcome, FrameError):
+                        self.skip(outcome, journal)
+                        continue
+                    frame, detections, timings = outcome
+                    journal.timings += timings
+                    yield frame, detections
+        finally:
+            for error in stream.unreported():
                 journal.frame_begins()
-                if isinstance(outcome, FrameError):
-                    self.skip(outcome, journal)
-                    continue
-                frame, detections, timings = outcome
-                journal.timings += timings
-                yield frame, detections
+                self.skip(error, journal)
+            journal.frames_dropped = stream.dropped_of(journal.frames)
 
     def read_and_detect(
         self, stream: FrameStream, turn: AbstractContextManager[None], number: int
@@ -252,8 +264,8 @@ class Pipeline:
         try:
             with turn:
                 read_frame = stream.take()
-                if read_frame is None:
-                    return None
+                if read_frame is None or isinstance(read_frame, FrameError):
+                    return read_frame
                 began = time.perf_counter()
                 frame = read_frame()
                 reading = StageTime(frame.index, "reading", 1e3 * (time.perf_counter() - began))
@@ -281,7 +293,9 @@ class Pipeline:
 
         Raises:
             FrameError: The frame is unusable.
+            DataError: The frame has the index of an earlier frame.
         """
+        journal.check_order(frame)
         with journal.timed(frame.index, "tracking"):
             pose = self.tracker.track(self.color_to_depth.predicted(frame), self.fuser.scene)
             if not isinstance(cast(object, pose), Pose):

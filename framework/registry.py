@@ -29,7 +29,7 @@ from framework.config.renamed_keys import rename_hint
 from framework.config.text_values import TextKind
 from framework.config.validation import values_of, without_interpolation
 from framework.errors import ConfigError, InstanceMapError, first_line
-from framework.files.search_paths import PROJECT_ROOT
+from framework.files.search_paths import PROJECT_ROOT, usable_path
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDVideo, Viewer
 
 STAGES: Mapping[str, type[Any]] = {
@@ -82,6 +82,9 @@ def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
     plugin_class = find_class(interface, target)
     where = f"{stage} {target}"
     arguments = parameters(where, plugin_class, node)
+    for name, value in arguments.items():
+        if isinstance(value, Path):
+            usable_path(f"{stage}.{name}", value)
     try:
         with _errors_at(where):
             plugin: Plugin = assemble(plugin_class, **arguments)

@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from framework.config.renamed_keys import rename_hint
 from framework.errors import ConfigError
+from framework.files.search_paths import usable_path
 
 MAX_DETECTIONS = 1000  # maximum number of detections per image; each has a mask of the image size; COCO evaluates 100
 MAX_PROPOSALS = 100_000  # maximum number of proposals of a network per image
@@ -84,9 +85,10 @@ def checked_path(name: str, value: object) -> Path:
 
     Raises:
         ConfigError: The value is not a nonempty string.
+        DataError: The value contains NUL or has a too long name.
     """
     require(isinstance(value, str) and value != "", name, repr(value), "a path (in quotes if it looks like a number)")
-    return Path(str(value)).expanduser().absolute()
+    return usable_path(name, value).expanduser().absolute()
 
 
 def checked_file(name: str, value: object, suffix: str = "") -> Path:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from framework.errors import DataError
 from framework.files.json_file import read_json, write_json
@@ -114,8 +114,10 @@ def edits_of(name: str, entries: Sequence[Any]) -> list[Edit]:
         entries: The entries.
 
     Raises:
-        DataError: An entry is invalid.
+        DataError: An entry is invalid, or `entries` is not a sequence.
     """
+    if not isinstance(cast(object, entries), Sequence):
+        raise DataError(f"{name}: expected a list of edits, got {type(entries).__name__}")
     edits = []
     for number, entry in enumerate(entries, start=1):
         if not isinstance(entry, dict) or len(entry) != 1 or not entry.keys() <= FORMS.keys():

@@ -31,11 +31,16 @@ def atomic_write(path: Path) -> Iterator[Path]:
     Raises:
         DataError: Writing fails, the text is not valid Unicode, or `path` exists and is not a regular file.
     """
-    path = Path(os.path.realpath(path))
-    if path.exists():
+    try:
+        path = Path(os.path.realpath(path))
+        exists = path.exists()
+    except (OSError, ValueError) as error:  # the name is too long or contains NUL
+        reason = getattr(error, "strerror", None) or error
+        raise DataError(f"{path}: expected a writable file, got an error ({reason})") from error
+    if exists:
         check_regular(path)
     # processes in containers that share a folder may have the same process id
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.partial{path.suffix}")
+    temporary = path.with_name(f".{path.stem[:50]}.{os.getpid()}-{secrets.token_hex(4)}.partial{path.suffix}")
     try:
         yield temporary
         with temporary.open("rb+") as file:  # Windows syncs only writable files

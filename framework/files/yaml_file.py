@@ -34,7 +34,10 @@ def load_yaml(path: Path) -> Any:
     text = read_text(path, LARGEST_FILE)
     with yaml_errors(path):
         check_yaml(path, text)
-        return OmegaConf.create(text)
+        try:
+            return OmegaConf.create(text)
+        except AssertionError as error:  # of OmegaConf, without a message
+            raise DataError(f"{path}: expected keys and values, got a single value") from error
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
@@ -15,24 +14,25 @@ from framework.data import Camera, Float64, Instance, InstanceMesh, View
 from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.gravity import floor_height
+from framework.runtime.forked_process import ProcessLock
 
 
 class Map:
     """Thread-safe queries of a map, independent of the fuser."""
 
     scene: SceneMap
-    lock: threading.RLock  # held during a query and while a frame is mapped
+    lock: ProcessLock  # held during a query and while a frame is mapped
 
     def __init__(self, scene: SceneMap) -> None:
         self.scene = scene
-        self.lock = threading.RLock()
+        self.lock = ProcessLock()
 
     def __getstate__(self) -> dict[str, Any]:
         with self.lock:
             return {name: value for name, value in vars(self).items() if name != "lock"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, lock=threading.RLock())
+        vars(self).update(state, lock=ProcessLock())
 
     @property
     def classes(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from framework.data import UNIT_TOLERANCE, Float64, InstanceMesh, Int32
 from framework.errors import DataError
-from framework.files.atomic_write import path_exists
+from framework.files.atomic_write import check_regular, path_exists
 from framework.files.staged_files import finish_replacement
 from framework.files.tum_trajectory import read_tum
 from framework.rendering.viewpoint import surrounding_poses
@@ -72,7 +72,9 @@ class RunContents:
             tuple(sorted(objects, key=lambda one: one.id)),
             timestamps,
             poses,
-            read_timings(timings) if path_exists(timings) and timings.stat().st_size > len(TIMINGS_HEADER) else None,
+            read_timings(timings)
+            if path_exists(timings) and check_regular(timings).st_size > len(TIMINGS_HEADER)
+            else None,
         )
 
     @property

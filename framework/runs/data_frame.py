@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from framework.files.search_paths import usable_path
 from framework.runs.stored_runs import CHOICE, Record, completed_runs, is_number
 from framework.runtime.plain_output import plain
 
@@ -45,7 +46,7 @@ def load_runs(folder: Path | str) -> DataFrame:
     Raises:
         DataError: The folder is missing or contains no completed run.
     """
-    root = Path(folder)
+    root = usable_path("folder", folder)
     records, others = completed_runs(root)
     for one in others:
         log.warning("load_runs: omitted %s: %s", one.directory, one.reason)

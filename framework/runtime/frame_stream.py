@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -13,24 +14,39 @@ from typing import TypeVar
 
 import numba
 
-from framework.errors import DataError
+from framework.errors import DataError, FrameError
 from framework.interfaces import FrameReader, LiveVideo, RGBDSequence, RGBDVideo
 
 POLL_INTERVAL_S = 0.1  # s, interval of checks for the end while waiting for a frame
 
+_EPOCH = time.time() - time.monotonic()  # s since 1970 at which the monotonic clock was 0, if it started with this one
+
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
+
+
+def steady_time() -> float:
+    """Return the time, s since 1970. Later changes of the system clock have no effect."""
+    return _EPOCH + time.monotonic()
 
 
 class FrameStream(AbstractContextManager["FrameStream"]):
     """Stream of frame readers, in order. Any thread may take a reader."""
 
     max_prefetched: int | None = None  # maximum number of prefetched frames; None = no limit
-    dropped: int = 0  # number of frames that were not taken
+    dropped: int = 0  # number of usable frames that a newer frame replaced before they were taken
 
     @abstractmethod
-    def take(self) -> FrameReader | None:
-        """Return the reader of the next frame, or None at the end."""
+    def take(self) -> FrameReader | FrameError | None:
+        """Return the reader of the next frame, the error of an unusable frame, or None at the end."""
+
+    def unreported(self) -> Iterator[FrameError]:
+        """Yield the errors of unusable frames that were not taken. Called after the end of the stream."""
+        yield from ()
+
+    def dropped_of(self, frames: int) -> int:
+        """Return the number of dropped frames after the end of the stream, given the number of processed frames."""
+        return 0
 
 
 def stream_of(video: RGBDVideo, ended: Callable[[], bool]) -> FrameStream:
@@ -56,7 +72,7 @@ class RecordedFrames(FrameStream):
 
 
 class LiveFrames(FrameStream):
-    """Stream of the newest frames of a live video. Older frames are dropped.
+    """Stream of the newest frames of a live video. Older frames are dropped, and unusable frames are reported.
 
     A thread receives the frames, so that they do not accumulate in the video source. Only one frame is prefetched.
     """
@@ -65,7 +81,9 @@ class LiveFrames(FrameStream):
 
     def __init__(self, video: LiveVideo, ended: Callable[[], bool]) -> None:
         self._video, self._ended = video, ended
+        self._received = 0  # number of frames, including unusable frames
         self._newest: FrameReader | None = None
+        self._unusable: deque[FrameError] = deque()
         self._error: Exception | None = None
         self._over = False  # no more frames arrive or are needed
         self._changed = threading.Condition()
@@ -79,38 +97,51 @@ class LiveFrames(FrameStream):
         self._end(None)
         self._listener.join()
 
-    def take(self) -> FrameReader | None:
-        """Wait for a frame and return its reader.
+    def take(self) -> FrameReader | FrameError | None:
+        """Wait for a frame and return its reader, or the error of an unusable frame.
 
         An error of the video is raised after all earlier frames.
         """
         with self._changed:
-            while self._newest is None and not self._over and not self._ended():
+            while not (self._newest or self._unusable or self._over or self._ended()):
                 self._changed.wait(POLL_INTERVAL_S)
             if self._ended():
                 return None
+            if self._unusable:
+                return self._unusable.popleft()
             reader, self._newest = self._newest, None
         if reader is None and self._error is not None:
             raise self._error
         return reader
 
+    def unreported(self) -> Iterator[FrameError]:
+        while self._unusable:
+            yield self._unusable.popleft()
+
+    def dropped_of(self, frames: int) -> int:
+        return self._received - frames
+
     def _listen(self) -> None:
         try:
             with closing(self._video.frames()) as readers:
-                for reader in readers:
+                for found in readers:
                     if self._over:
                         break
-                    if reader is not None:
-                        self._keep(reader)
+                    if found is not None:
+                        self._keep(found)
         except Exception as error:
             self._end(error)
         else:
             self._end(None)
 
-    def _keep(self, reader: FrameReader) -> None:
+    def _keep(self, found: FrameReader | FrameError) -> None:
         with self._changed:
-            self.dropped += self._newest is not None
-            self._newest = reader
+            self._received += 1
+            if isinstance(found, FrameError):
+                self._unusable.append(found)
+            else:
+                self.dropped += self._newest is not None
+                self._newest = found
             self._changed.notify_all()
 
     def _end(self, error: Exception | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,9 +16,10 @@ import numpy as np
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from framework.data import Array, DelayEstimate, Float64, Frame, Pose
-from framework.errors import FrameError, NoPoseError
+from framework.errors import DataError, FrameError, NoPoseError
 from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
 from framework.runtime.digests import StageDigest, digest_of
+from framework.runtime.frame_stream import steady_time
 from framework.runtime.progress import Progress
 from framework.sensors.noise_models import SensorKind
 
@@ -55,7 +57,7 @@ class TrackedFrame:
 class LiveFigures:
     """Statistics of a live video."""
 
-    frames_dropped: int  # number of frames that a newer frame replaced before mapping
+    frames_dropped: int  # number of usable frames that were not mapped: a newer frame replaced them, or the run ended
     latencies: tuple[float, ...]  # s, from capture to map, of each fused frame
 
 
@@ -110,6 +112,9 @@ class Journal:
     digests: list[StageDigest] = field(default_factory=list)
     frames_in_map: int = 0  # number of frames that are at least partly fused
     stopped_by: BaseException | None = None
+    last_index: int = -1  # Frame.index of the last tracked frame; -1 = none
+    unordered: bool = False  # True once a timestamp did not increase
+    last_time: float = -math.inf  # s, latest timestamp of the tracked frames
     frames_began: list[float] = field(default_factory=list)  # start of each frame, s
     lost_for: int = 0  # number of consecutive lost frames
     frames_dropped: int = 0
@@ -142,7 +147,7 @@ class Journal:
                 len(self.disagreeing), self.frames, frame_ranges(self.disagreeing),
             )  # fmt: skip
         if self.frames_dropped:
-            log.warning("%d frames dropped because mapping fell behind", self.frames_dropped)
+            log.warning("%d frames dropped because newer frames replaced them or the run ended", self.frames_dropped)
 
     @contextmanager
     def timed(self, frame: int, stage: str) -> Iterator[None]:
@@ -213,8 +218,28 @@ class Journal:
         """Number of skipped frames that have a pose."""
         return self.frames_skipped - self.without_pose
 
+    def check_order(self, frame: Frame) -> None:
+        """Raise DataError unless the index of a frame exceeds those of the tracked frames.
+
+        Observations of an instance are counted by index, so an instance in frames of one index is never confirmed.
+        """
+        if frame.index <= self.last_index:
+            raise DataError(
+                f"frame {frame.index}: index: expected at least {self.last_index + 1} after frame {self.last_index}, "
+                f"got {frame.index}; number the frames in their order, and map another recording with resume_from"
+            )
+
     def frame_tracked(self, frame: Frame, pose: Pose) -> None:
         """Record a pose. Log a change of the depth sensor, and the loss and recovery of tracking."""
+        self.last_index = int(frame.index)
+        if frame.timestamp <= self.last_time and not self.unordered:
+            self.unordered = True
+            log.warning(
+                "frame %d: expected a timestamp after %.6f s, got %.6f s; the color delay is estimated only from "
+                "frames in temporal order",
+                frame.index, self.last_time, frame.timestamp,
+            )  # fmt: skip
+        self.last_time = max(self.last_time, float(frame.timestamp))
         if frame.sensor is not self.sensor:
             self.sensor = frame.sensor
             log.info("depth sensor: %s", frame.sensor)
@@ -258,7 +283,7 @@ class Journal:
     def frame_fused(self, frame: Frame) -> None:
         """Record the latency of a frame if the video is live."""
         if self.frames_expected is None:
-            self.latencies.append(time.time() - frame.timestamp)
+            self.latencies.append(steady_time() - frame.timestamp)
 
     def result(self) -> RunResult:
         """Return the result after the loop."""

@@ -301,4 +301,7 @@ def read_keyframes(path: Path) -> dict[str, Array]:
     """
     if not path_exists(path):
         return {}
-    return read_arrays(path, FILE_FORMAT)
+    arrays = read_arrays(path, FILE_FORMAT)
+    if not arrays:
+        raise DataError(f"{path}: expected the arrays {list(SAVED)}, got none; map again")
+    return arrays

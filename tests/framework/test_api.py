@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import pickle
 import subprocess
 import sys
@@ -130,7 +131,8 @@ def test_mapper_sensor_up_direction_is_saved_in_map(fuser: str, tmp_path: Path) 
 
 def test_mapper_is_thread_safe(room: CornerRoom) -> None:
     """Without the lock, kernels would write to the same buffers."""
-    mapper, alone, faults = Mapper(*STAGES), Mapper(*STAGES), []
+    stages = ("detector=none", *STAGES[1:])  # frames with ground truth need increasing indices
+    mapper, alone, faults = Mapper(*stages), Mapper(*stages), []
 
     def work(one: Callable[[], object]) -> None:
         try:
@@ -144,7 +146,11 @@ def test_mapper_is_thread_safe(room: CornerRoom) -> None:
             assert set(mapper.scene.mesh().instance_ids.tolist()) - {0} == set(mapper.instances())
 
     frame = room[0]
-    tasks = [lambda: mapper.add(frame)] * 3 + [look, lambda: mapper.instances()]
+
+    def add(one: Mapper) -> None:
+        one.add(frame.color, frame.depth, frame.T_world_camera, frame.camera)
+
+    tasks = [lambda: add(mapper)] * 3 + [look, lambda: mapper.instances()]
     threads = [threading.Thread(target=work, args=(task,)) for task in tasks]
     for thread in threads:
         thread.start()
@@ -152,7 +158,7 @@ def test_mapper_is_thread_safe(room: CornerRoom) -> None:
         thread.join()
     assert not faults
     for _ in range(30):
-        alone.add(frame)
+        add(alone)
     np.testing.assert_array_equal(mapper.scene.mesh().vertices, alone.scene.mesh().vertices)
 
 
@@ -295,6 +301,122 @@ def test_mapper_ignored_poses_are_logged_once(
         assert "Mapper.add: pose" not in caplog.text or k > 1
         mapper.add(room[k].color, room[k].depth, pose=room[k].T_world_camera, camera=room[k].camera)
     assert caplog.text.count('set tracker="ground_truth", or omit pose after the first frame') == int(warned)
+
+
+@pytest.mark.parametrize("index", [1, 0], ids=["repeated", "decreasing"])
+def test_mapper_frame_index_not_increasing_raises(room: CornerRoom, index: int) -> None:
+    """Observations are counted by index. Repeated frames would never confirm an instance."""
+    mapper = Mapper(*STAGES)
+    mapper.add(room[1])
+    before = mapper.mesh().vertices
+    with pytest.raises(DataError, match=f"frame {index}: index: expected at least 2 after frame 1, got {index}"):
+        mapper.add(replace(room[2], index=index))
+    np.testing.assert_array_equal(mapper.mesh().vertices, before)
+    assert not mapper.add(room[2]).lost
+
+
+def test_mapper_arrays_follow_frame_of_any_index(room: CornerRoom) -> None:
+    mapper = Mapper("detector=none", *STAGES[1:])
+    mapper.add(replace(room[0], index=41))
+    mapper.add(room[1].color, room[1].depth, room[1].T_world_camera)
+    assert mapper._journal.last_index == 42
+
+
+def test_mapper_timestamp_order_is_logged_once(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+    mapper = Mapper("detector=none", *STAGES[1:])
+    for k, time in enumerate((5.0, 4.0, 4.0, 6.0)):
+        mapper.add(room[k].color, room[k].depth, room[k].T_world_camera, room[k].camera, timestamp=time)
+    assert caplog.text.count("frame 1: expected a timestamp after 5.000000 s, got 4.000000 s") == 1
+    assert caplog.text.count("expected a timestamp after") == 1
+
+
+def test_mapper_timestamp_in_nanoseconds_raises(room: CornerRoom) -> None:
+    frame = room[0]
+    with pytest.raises(DataError, match=r"frame 0: timestamp: expected a time within .* pass seconds, such as nanosec"):
+        Mapper("detector=none", *STAGES[1:]).add(
+            frame.color, frame.depth, frame.T_world_camera, frame.camera, timestamp=1_700_000_000_123_456_789
+        )
+
+
+def test_mapper_matrix_arguments_are_arrays_or_rejected(room: CornerRoom) -> None:
+    frame, mapper = room[0], Mapper("detector=none", *STAGES[1:])
+    with pytest.raises(DataError, match=r"frame 0: depth: expected an array, got a matrix; pass np\.asarray\(depth\)"):
+        mapper.add(frame.color, np.matrix(frame.depth), frame.T_world_camera, frame.camera)
+    found = mapper.add(frame.color, frame.depth, np.matrix(frame.T_world_camera), np.matrix(frame.camera.K))
+    np.testing.assert_allclose(found.T_world_camera, frame.T_world_camera, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("path", "reason"),
+    [("x" * 300, "got 300 characters"), ("a\0b", "null byte"), ("\ud800", "surrogates not allowed"), ("", "got ''")],
+    ids=["long", "nul", "surrogate", "empty"],
+)
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda path: Mapper(*STAGES).save(path),
+        load_map,
+        lambda path: Mapper(*STAGES, resume_from=path),
+        lambda path: Mapper("tracker=trajectory_file", **{"tracker.path": path}),
+        lambda path: instancemap.open_dataset("rgbd_folder", root=path),
+        lambda path: instancemap.run(path, dataset="desk"),
+        instancemap.report,
+        instancemap.tables,
+        instancemap.load_runs,
+        lambda path: instancemap.export(path, "glb"),
+        lambda path: instancemap.export("run", "glb", out=path),
+        lambda path: instancemap.edit(path, []),
+        lambda path: instancemap.edit("run", path),
+        lambda path: instancemap.query(path, "chair"),
+        lambda path: instancemap.import_map(path, "run"),
+        lambda path: instancemap.import_map("mesh.ply", path),
+    ],
+)
+def test_path_argument_invalid_name_raises_one_line(
+    use: Any, path: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InstanceMapError) as refused:
+        use(path)
+    assert "\n" not in str(refused.value)
+    assert reason in str(refused.value) or path == ""
+
+
+def test_save_map_name_of_240_characters_is_written(tmp_path: Path) -> None:
+    """The name of the temporary file must not be longer than the limit of the file system."""
+    Mapper(*STAGES).save(tmp_path / ("x" * 240))
+    assert [len(path.name) for path in tmp_path.iterdir()] == [240]
+
+
+def test_forked_process_refuses_to_map(room: CornerRoom, tmp_path: Path) -> None:
+    """OpenMP would terminate the process."""
+    mapper = Mapper(*STAGES)
+    mapper.add(room[0])
+    mapper.save(tmp_path / "map.npz")
+    context = multiprocessing.get_context("fork")
+    receiving, sending = context.Pipe(duplex=False)
+    uses: list[Callable[[], object]] = [
+        lambda: mapper.add(room[1]),
+        lambda: mapper.instances(),
+        lambda: Mapper(*STAGES),
+        lambda: load_map(tmp_path / "map.npz"),
+        lambda: mapper.pipeline.run(room),
+    ]
+
+    def use_all() -> None:
+        for use in uses:
+            try:
+                sending.send(use())
+            except ConfigError as error:
+                sending.send(str(error))
+
+    process = context.Process(target=use_all)
+    process.start()
+    process.join(60)
+    assert process.exitcode == 0
+    for _ in uses:
+        assert 'multiprocessing.get_context("spawn")' in receiving.recv()
+    assert not mapper.add(room[1]).lost, "expected no effect on the parent process"
 
 
 def test_mapper_add_none_raises() -> None:

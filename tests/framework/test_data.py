@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ def frame(**changes: Any) -> Frame:
 
 @pytest.mark.parametrize("index", [1.5, "a", -5, None, True])
 def test_frame_invalid_index_raises(index: object) -> None:
-    with pytest.raises(DataError, match=r"Frame\.index: expected an integer of at least 0, got"):
+    with pytest.raises(DataError, match=r"Frame\.index: expected an integer of at least 0 and below 2\^53, got"):
         frame(index=index)
 
 
@@ -125,6 +126,15 @@ def with_nan(shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
     return array
 
 
+def test_camera_unusual_numbers_are_converted_or_rejected() -> None:
+    assert type(Camera(4, 3, Fraction(4), 4, 2, 2).fx) is float
+    with pytest.raises(DataError, match="got an integer beyond double precision"):
+        Camera(4, 3, 10**400, 4, 2, 2)
+    for factor in (0, -1, float("nan"), float("inf"), "2"):
+        with pytest.raises(DataError, match=r"Camera\.scaled: factor: expected a positive number"):
+            Camera(4, 3, 4, 4, 2, 2).scaled(factor)  # type: ignore[arg-type]
+
+
 def test_data_objects_accept_valid_values() -> None:
     assert len(detections()) == len(clusters()) == 2
     assert len(Detections.none((3, 4), ("chair",))) == 0
@@ -148,8 +158,34 @@ def test_data_objects_accept_valid_values() -> None:
             {"depth": np.ma.masked_less(np.ones((3, 4), np.float32), 2)},
             "depth: expected an array without a mask, got a masked array",
         ),
-        (frame, {"timestamp": float("nan")}, "frame 7: timestamp: expected a finite number of seconds, got nan"),
-        (frame, {"timestamp": "5"}, "timestamp: expected a finite number of seconds, got '5'"),
+        (frame, {"timestamp": float("nan")}, r"frame 7: timestamp: expected a number of seconds in \[.*, got nan"),
+        (frame, {"timestamp": "5"}, r"timestamp: expected a number of seconds in \[-1e\+19, 1e\+19\], got '5'"),
+        (detections, {"scores": None}, "Detections.scores: expected an array of float32, got NoneType"),
+        (clusters, {"points_world": None}, "points_world: expected an array of float32, got NoneType"),
+        (
+            frame,
+            {"index": 2**53},
+            r"Frame\.index: expected an integer of at least 0 and below 2\^53, got 9007199254740992",
+        ),
+        (frame, {"timestamp": 1e300}, r"timestamp: expected a number of seconds in \[.*, got 1e\+300"),
+        (frame, {"timestamp": 10**400}, r"timestamp: expected a number of seconds in \[.*, got 1000"),
+        (frame, {"timestamp": True}, r"timestamp: expected a number of seconds in \[.*, got True"),
+        (frame, {"timestamp": np.timedelta64(5, "s")}, r"timestamp: expected a number of seconds in \[.*timedelta64"),
+        (
+            frame,
+            {"timestamp": np.datetime64("2020-01-01")},
+            r"timestamp: expected a number of seconds in \[.*datetime64",
+        ),
+        (frame, {"depth_timestamp": 1e200}, r"depth_timestamp: expected a number of seconds in \["),
+        (
+            frame,
+            {"depth": np.matrix(np.ones((3, 4), np.float32))},
+            r"depth: expected an array, got a matrix; .*asarray\(depth",
+        ),
+        (frame, {"T_world_camera": np.matrix(np.eye(4))}, "T_world_camera: expected an array, got a matrix"),
+        (frame, {"depth": np.ones((3, 4), ">f4")}, "depth: expected an array of float32, got >f4"),
+        (frame, {"depth": np.ones((3, 4), object)}, "depth: expected an array of float32, got object"),
+        (frame, {"depth": np.ones((3, 4), np.bool_)}, "depth: expected an array of float32, got bool"),
         (frame, {"sensor": "EXACT"}, "frame 7: sensor: expected a SensorKind, got 'EXACT'"),
         (frame, {"T_world_camera": with_nan((4, 4), np.float64)}, "frame 7: T_world_camera: expected finite values"),
         (frame, {"T_world_camera": 2 * np.eye(4)}, r"expected a rigid transform, got \|R R\^T - I\| = .*, det R ="),

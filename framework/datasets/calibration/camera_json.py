@@ -13,8 +13,8 @@ from framework.data import Camera
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import COARSEST_DEPTH, FINEST_DEPTH
 from framework.errors import DataError, errors_of
-from framework.files.atomic_write import MAX_TEXT
-from framework.files.json_file import read_json
+from framework.files.atomic_write import MAX_TEXT, read_bytes
+from framework.files.json_file import parse_json
 from framework.sensors.noise_models import SensorKind
 
 CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")  # of camera.json
@@ -43,7 +43,16 @@ def read_json_object(path: Path, most: int = MAX_TEXT) -> dict[str, Any]:
     Raises:
         DataError: The file cannot be read, is too large or contains no JSON object.
     """
-    found = read_json(path, most)
+    return json_object(path, read_bytes(path, most))
+
+
+def json_object(path: Path, content: bytes) -> dict[str, Any]:
+    """Return the JSON object in the content of a file.
+
+    Raises:
+        DataError: The content is no JSON object. The message contains the path.
+    """
+    found = parse_json(path, content)
     if not isinstance(found, dict):
         raise DataError(f"{path}: expected a JSON object, got {type(found).__name__}")
     return found
@@ -55,7 +64,15 @@ def read_camera(path: Path) -> StoredCamera:
     Raises:
         DataError: The file is invalid, or a key is missing or has an invalid value.
     """
-    content = read_json_object(path)
+    return stored_camera(path, read_json_object(path))
+
+
+def stored_camera(path: Path, content: Mapping[str, Any]) -> StoredCamera:
+    """Return the calibration in the content of a camera.json.
+
+    Raises:
+        DataError: A key is missing or has an invalid value.
+    """
     check_keys(path, content, (*CAMERA_KEYS, DISTORTION, SENSOR))
     camera = camera_of(path, content, CAMERA_KEYS)
     return StoredCamera(*camera, distortion_of(path, content), sensor_of(path, content))

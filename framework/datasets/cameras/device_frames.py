@@ -18,6 +18,7 @@ from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import AUTO, color_delay_of
 from framework.errors import DataError, FrameError, in_one_line
 from framework.interfaces import FrameReader, LiveVideo
+from framework.runtime.frame_stream import steady_time
 from framework.sensors.noise_models import SensorChoice, SensorKind, kind_of_device
 
 WAIT_MS = 100  # ms, maximum wait for a frame
@@ -140,7 +141,7 @@ class DepthCamera(LiveVideo):
                 if images is None or calibration is None:
                     yield None
                 else:
-                    yield partial(self._frame, images, next(number), time.time(), calibration, sensor)
+                    yield partial(self._frame, images, next(number), steady_time(), calibration, sensor)
         except self.errors as error:
             raise DataError(
                 f"{self.brand}: expected a running camera, got an error ({in_one_line(error)}); check its connection"

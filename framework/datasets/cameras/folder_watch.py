@@ -2,14 +2,15 @@
 
 The layout is that of `dataset=rgbd_folder`:
 
-    camera.json         as in an RGB-D folder; may appear after the start
+    camera.json         as in an RGB-D folder; may appear after the start, but must not change then
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
     end                 an empty file, written after the last frame
 
 A frame is complete when both of its files exist, in any order. To write a file, use a temporary name that begins with a
 dot, then rename the file. Frame numbers must increase. A frame is skipped if it is still incomplete when a later frame
-is complete or the sequence ends. Files of earlier frames can be deleted during the run.
+is complete or the sequence ends. Files of earlier frames can be deleted during the run. The run ends with an error if
+the folder, `color` or `depth` is removed, or if camera.json gets other values.
 """
 
 from __future__ import annotations
@@ -23,21 +24,21 @@ from functools import partial
 from pathlib import Path
 
 from framework.config.validation import check_bounds
-from framework.data import Frame
-from framework.datasets.calibration.camera_json import read_camera, read_json_object
+from framework.data import LARGEST_INDEX, Frame
+from framework.datasets.calibration.camera_json import StoredCamera, json_object, stored_camera
 from framework.datasets.calibration.raw_images import Calibration, check_max_depth
 from framework.datasets.frames.numbered_images import check_one_number, number_of
 from framework.datasets.frames.sequence_reader import StoredImages
 from framework.errors import DataError, FrameError
-from framework.files.atomic_write import read_bytes
-from framework.files.image_files import LARGEST_FILE, check_image
+from framework.files.atomic_write import MAX_TEXT, read_bytes
+from framework.files.image_files import check_image, read_image_file
 from framework.files.search_paths import folder_of
 from framework.interfaces import FrameReader, LiveVideo
+from framework.runtime.frame_stream import steady_time
 from framework.sensors.noise_models import SensorChoice, SensorKind
 
 COLOR, DEPTH = (".jpg", ".jpeg", ".png"), (".png",)
 LONGEST_WAIT = 86_400.0  # s, limit of both timeouts
-LARGEST_NUMBER = 2**53  # limit of frame numbers; smaller numbers are exact in double precision
 MIN_REST = 3.0  # minimum pause between polls, as a multiple of the last poll's duration; listing a folder can be slow
 CLOCK_TICK = 1e-6  # s, minimum difference between the timestamps of two frames of the same poll
 
@@ -66,28 +67,41 @@ class FolderWatch(LiveVideo):
             raise DataError(f"dataset.root: expected an existing folder, got {self.folder}")
         self.name = self.folder.resolve().name
 
-    def frames(self) -> Generator[FrameReader | None]:
-        calibration, sensor = yield from self._calibration()
+    def frames(self) -> Generator[FrameReader | FrameError | None]:
+        path = self.folder / "camera.json"
+        content, stored = yield from self._camera(path)
+        calibration = Calibration(stored.camera, path, stored.depth_scale, self.max_depth, stored.distortion)
+        sensor = self.sensor.kind(stored.sensor)
         arrivals = Arrivals(self.folder)
         last_time, last_arrival = 0.0, time.monotonic()
         while True:
             began = time.monotonic()
             # checked before the images, so that all files written before `end` are read
             over = (self.folder / "end").exists() or 0 < self.idle_timeout < began - last_arrival
-            for number, images in arrivals.look(to_the_end=over):
-                last_time, last_arrival = max(time.time(), last_time + CLOCK_TICK), began
-                yield partial(_read, number, images, last_time, calibration, sensor)
+            self._check_root()
+            arrivals.look()
+            if _content(path) != content:  # checked after the images, so that all of them are older than a change
+                content, found = yield from self._camera(path)
+                _check_unchanged(path, stored, found)
+            for number, images in arrivals.take(to_the_end=over):
+                last_time, last_arrival = max(steady_time(), last_time + CLOCK_TICK), began
+                if isinstance(images, FrameError):
+                    yield images
+                else:
+                    yield partial(_read, number, images, last_time, calibration, sensor)
             if over:
                 return
             yield None
             time.sleep(min(max(self.poll_interval, MIN_REST * (time.monotonic() - began)), 0.1))
 
-    def _calibration(self) -> Generator[None, None, tuple[Calibration, SensorKind]]:
-        """Wait for camera.json and return the calibration and the kind of the depth sensor."""
-        path, deadline = self.folder / "camera.json", time.monotonic() + self.camera_timeout
+    def _camera(self, path: Path) -> Generator[None, None, tuple[bytes, StoredCamera]]:
+        """Wait for a complete camera.json, and return its content and calibration."""
+        deadline = time.monotonic() + self.camera_timeout
         while True:
+            self._check_root()
             try:
-                read_json_object(path)
+                content = read_bytes(path, MAX_TEXT)
+                values = json_object(path, content)
                 break
             except DataError as error:
                 if time.monotonic() > deadline:
@@ -96,15 +110,39 @@ class FolderWatch(LiveVideo):
                     ) from error
             yield None
             time.sleep(self.poll_interval)
-        camera, depth_scale, distortion, stored = read_camera(path)
-        return Calibration(camera, path, depth_scale, self.max_depth, distortion), self.sensor.kind(stored)
+        return content, stored_camera(path, values)
+
+    def _check_root(self) -> None:
+        """Raise DataError if the folder was removed or cannot be read."""
+        try:
+            self.folder.stat()
+        except OSError as error:
+            raise DataError(
+                f"dataset.root: expected the folder {self.folder} until the end of the run, got an error "
+                f"({error.strerror}); write a file `end` into it to end the run"
+            ) from error
 
 
-def _read(
-    number: int, images: StoredImages | str, timestamp: float, calibration: Calibration, sensor: SensorKind
-) -> Frame:
-    if isinstance(images, str):
-        raise FrameError(images)
+def _content(path: Path) -> bytes:
+    """Return the content of a file, or nothing if it cannot be read."""
+    try:
+        return read_bytes(path, MAX_TEXT)
+    except DataError:
+        return b""
+
+
+def _check_unchanged(path: Path, stored: StoredCamera, found: StoredCamera) -> None:
+    """Raise DataError if the calibration in camera.json differs from that at the start of the run."""
+    before, now = ({**vars(one.camera), **one._asdict()} for one in (stored, found))
+    for key, value in before.items():
+        if key != "camera" and now[key] != value:
+            raise DataError(
+                f"{path}: {key}: expected {value} as at the start of the run, got {now[key]}; map the frames of the "
+                "other camera in another run"
+            )
+
+
+def _read(number: int, images: StoredImages, timestamp: float, calibration: Calibration, sensor: SensorKind) -> Frame:
     color = calibration.color(images.color(), images.color_name)
     depth = calibration.depth(images.depth(), images.depth_name)
     name = images.image_name
@@ -119,19 +157,22 @@ class Arrivals:
         self._last = -1  # number of the last complete or skipped frame
         self._halves: set[int] = set()  # numbers of skipped frames with only one image so far
 
-    def look(self, to_the_end: bool) -> Iterator[tuple[int, StoredImages | str]]:
-        """Yield the new frames in ascending order.
+    def look(self) -> None:
+        """List the files that appeared since the last call."""
+        self._color.look()
+        self._depth.look()
 
-        Each item consists of the frame number and either the images or the reason for skipping the frame.
+    def take(self, to_the_end: bool) -> Iterator[tuple[int, StoredImages | FrameError]]:
+        """Yield the new frames among the listed files in ascending order.
+
+        Each item consists of the frame number and either the complete images or the reason for skipping the frame.
 
         Args:
             to_the_end: True = include all frames; False = include frames up to the newest complete frame.
         """
-        self._color.look()
-        self._depth.look()
         color, depth = self._color.waiting, self._depth.waiting
         both, any_of = sorted(color.keys() & depth.keys()), sorted(color.keys() | depth.keys())
-        newest = next((n for n in reversed(both) if _is_whole(color[n]) and _is_whole(depth[n])), -1)
+        newest = next((n for n in reversed(both) if _damage(color[n], depth[n]) is None), -1)
         newest = max(newest, self._last)  # a frame that arrives after a later frame is skipped
         for number in any_of if to_the_end else [number for number in any_of if number <= newest]:
             color_file, depth_file = color.pop(number, None), depth.pop(number, None)
@@ -141,12 +182,16 @@ class Arrivals:
             if color_file is None or depth_file is None:
                 self._halves.add(number)
             if number <= self._last:
-                yield number, f"{color_file or depth_file}: expected a frame number > {self._last}, got {number}"
+                found = f"{color_file or depth_file}: expected a frame number > {self._last}, got {number}"
+                yield number, FrameError(found)
                 continue
             self._last = number
             if color_file is None or depth_file is None:
                 until = f"before frame {newest}" if newest > number else "before the end"
-                yield number, f"{color_file or depth_file}: expected the frame's other image {until}, got none"
+                found = f"{color_file or depth_file}: expected the frame's other image {until}, got none"
+                yield number, FrameError(found)
+            elif number != newest and (damage := _damage(color_file, depth_file)) is not None:
+                yield number, damage
             else:
                 yield number, StoredImages.of_files(color_file, depth_file)
 
@@ -158,26 +203,33 @@ class NewImages:
         self.folder, self.suffixes = folder, suffixes
         self.waiting: dict[int, Path] = {}  # by frame number
         self._names: set[str] = set()
+        self._exists = False  # True once the folder has been listed
         self._first: Path | None = None
 
     def look(self) -> None:
         """Add the images that appeared since the last call.
 
         Raises:
-            DataError: The names differ in more than one number, so that their order is ambiguous.
+            DataError: The folder was removed or cannot be read, or the names differ in more than one number, so that
+                their order is ambiguous.
         """
         try:
             with os.scandir(self.folder) as entries:
                 names = {entry.name for entry in entries}
-        except OSError:  # the folder does not exist yet
-            return
+        except OSError as error:
+            if isinstance(error, FileNotFoundError) and not self._exists:
+                return  # it may appear later
+            raise DataError(
+                f"{self.folder}: expected a folder of images until the end of the run, got an error ({error.strerror})"
+            ) from error
+        self._exists = True
         new, self._names = names - self._names, names
         for name in sorted(new):
             path = self.folder / name
             if name.startswith(".") or path.suffix.lower() not in self.suffixes:
                 continue
             number = number_of(path)
-            if number is None or number >= LARGEST_NUMBER:
+            if number is None or number >= LARGEST_INDEX:
                 message = "%s: expected a frame number below 2^53 at the end of the name, got %r; image ignored"
                 log.warning(message, self.folder, name)
                 continue
@@ -186,9 +238,11 @@ class NewImages:
             self.waiting[number] = path
 
 
-def _is_whole(path: Path) -> bool:
+def _damage(*paths: Path) -> FrameError | None:
+    """Return the error of the first incomplete image, or None if all images are complete."""
     try:
-        check_image(path, read_bytes(path, LARGEST_FILE))
-    except DataError:
-        return False
-    return True
+        for path in paths:
+            check_image(path, read_image_file(path))
+    except FrameError as error:
+        return error
+    return None

@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from framework.errors import DataError, InstanceMapError, in_one_line
 from framework.files.atomic_write import atomic_write, check_regular
 from framework.files.json_file import parse_json
 from framework.files.manifest import verified
+from framework.files.search_paths import usable_path
 from framework.mapping.instances.instance_table import FrameSet, InstanceRecord, InstanceTable
 from framework.mapping.instances.object_embedding import ARRAYS, SPACE, embedding_arrays, read_embeddings
 from framework.mapping.labels.label_evidence_kernels import Combine
@@ -43,11 +44,10 @@ def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, 
 
     The file has no timestamps and can be read by np.load.
     """
-    if not isinstance(cast(object, path), str | Path):
-        raise DataError(f"map file: expected a path, got {path!r:.60}")
+    target = usable_path("map file", path)
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
     with (
-        atomic_write(Path(path)) as temporary,
+        atomic_write(target) as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=DEFLATE_LEVEL) as archive,
     ):
         for name, array in {HEADER: encoded, **arrays}.items():
@@ -63,7 +63,7 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
     Raises:
         DataError: If the file is not a map file, has another format or is damaged.
     """
-    with verified(Path(path)), map_file_errors(path), _opened(path) as archive:
+    with verified(Path(path)), _opened(path) as archive:
         header = _header(archive)
         found = header.values.get("format")
         if found != expected_format:
@@ -82,7 +82,7 @@ def read_arrays(path: Path | str, expected_format: object) -> dict[str, Array]:
     Raises:
         DataError: If the file has another format or is damaged.
     """
-    with map_file_errors(path), _opened(path) as archive:
+    with _opened(path) as archive:
         names = _header(archive).items("names")
     return read_map(path, expected_format, [str(name) for name in names[:MAX_ARRAYS]])[1]
 
@@ -93,7 +93,7 @@ def read_format(path: Path | str) -> str:
     Raises:
         DataError: If the file is not a map file.
     """
-    with map_file_errors(path), _opened(path) as archive:
+    with _opened(path) as archive:
         return str(_header(archive).values.get("format"))
 
 
@@ -114,8 +114,8 @@ def map_file_errors(path: Path | str) -> Iterator[None]:
 
 @contextmanager
 def _opened(path: Path | str) -> Iterator[zipfile.ZipFile]:
-    check_regular(Path(path))
-    with zipfile.ZipFile(path) as archive:
+    check_regular(usable_path("map file", path))  # its errors contain the path
+    with map_file_errors(path), zipfile.ZipFile(path) as archive:
         unpacked = sum(info.file_size for info in archive.infolist())
         limit = MAX_MEMORY_FRACTION * machine_memory()
         if unpacked > limit:

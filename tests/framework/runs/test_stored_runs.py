@@ -71,6 +71,7 @@ def test_read_record_returns_config_and_metrics(directory: Path) -> None:
         ("config.yaml", "", "expected the config_hash of config.yaml, "),
         ("config.yaml", "seed: [", "config.yaml: expected valid YAML"),
         ("config.yaml", "word", "expected the config_hash of config.yaml, "),
+        ("config.yaml", "7", r"config\.yaml: expected keys and values, got a single value"),
         ("config.yaml", "- 1", r"config\.yaml: expected keys and values, got a list"),
         (
             "config.yaml",

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from framework.data import Frame, PointClusters, Pose
-from framework.errors import DataError
-from framework.interfaces import FrameReader, LiveVideo, RGBDVideo, StageTimer, untimed
+from framework.errors import DataError, FrameError
+from framework.interfaces import FrameReader, LiveVideo, RGBDVideo, SceneMap, StageTimer, untimed
 from framework.runs.metrics import run_metrics
 from framework.runs.run_directory import headline
 from framework.runtime.frame_stream import LiveFrames, stream_of
@@ -40,21 +40,22 @@ class Handed(LiveVideo):
 
     def __post_init__(self) -> None:
         self.name = "handed"
-        self.coming: list[int] = []
+        self.coming: list[int | FrameError] = []
         self.asked = threading.Semaphore(0)
         self.over = False
 
-    def frames(self) -> Generator[FrameReader | None]:
+    def frames(self) -> Generator[FrameReader | FrameError | None]:
         while not self.over:
             while self.coming:
-                yield partial(int, self.coming.pop(0))  # type: ignore[misc]
+                one = self.coming.pop(0)
+                yield one if isinstance(one, FrameError) else partial(int, one)  # type: ignore[misc]
             self.asked.release()
             time.sleep(0.001)
             yield None
 
-    def come(self, *numbers: int) -> None:
-        self.coming.extend(numbers)
-        for _ in range(3):  # iterations of the listener; the last one begins after the numbers were added
+    def come(self, *frames: int | FrameError) -> None:
+        self.coming.extend(frames)
+        for _ in range(3):  # iterations of the listener; the last one begins after the frames were added
             while self.asked.acquire(blocking=False):
                 pass
             assert self.asked.acquire(timeout=PATIENCE_S)
@@ -62,8 +63,8 @@ class Handed(LiveVideo):
 
 
 def taken(stream: LiveFrames) -> object:
-    reader = stream.take()
-    return reader and reader()
+    found = stream.take()
+    return found if found is None or isinstance(found, FrameError) else found()
 
 
 def test_live_frames_return_newest_and_count_dropped() -> None:
@@ -79,6 +80,49 @@ def test_live_frames_return_newest_and_count_dropped() -> None:
         assert (taken(stream), stream.dropped) == (5, 3), "expected the last frame at the end of the video"
         assert taken(stream) is None
         assert taken(stream) is None
+
+
+def test_live_frames_unusable_frame_does_not_replace_usable_frame() -> None:
+    video, errors = Handed(), [FrameError(f"frame {k}") for k in range(3)]
+    with LiveFrames(video, lambda: False) as stream:
+        video.come(1, *errors[:2])
+        assert [taken(stream) for _ in range(3)] == [*errors[:2], 1]
+        assert (stream.dropped, stream.dropped_of(frames=3)) == (0, 0)
+        video.come(4, errors[2], 6, 7)
+    assert stream.dropped == 2
+    assert [*stream.unreported()] == errors[2:]
+    assert stream.dropped_of(frames=4) == 3, "expected frame 7, which was not taken, among the dropped frames"
+
+
+@PREFETCH
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_live_run_counts_every_frame_once(prefetch: int, interrupted: bool) -> None:
+    """Every third frame is unusable; the others come faster than they are mapped."""
+
+    @dataclass
+    class Interrupts(GivenPose):
+        def track(self, frame: Frame, scene: SceneMap) -> Pose:
+            if interrupted:
+                os.kill(os.getpid(), signal.SIGINT)
+            return super().track(frame, scene)
+
+    @dataclass
+    class Unusable(LiveRoom):
+        def frames(self) -> Generator[FrameReader | FrameError | None]:
+            self.bad = 0
+            for reader in super().frames():
+                if reader is None or self.sent % 3:
+                    yield reader
+                else:
+                    self.bad += 1
+                    yield FrameError(f"frame {self.sent}: unusable")
+
+    video = Unusable(frames_sent=40, period_s=0.003)
+    result = pipeline(prefetch, tracker=Interrupts(), fuser=GridFuser(slow_s=SLOW_S)).run(video)
+    assert result.live is not None
+    assert result.frames_skipped == video.bad
+    assert result.frames + result.live.frames_dropped == video.sent
+    assert (result.frames - result.frames_skipped == 1) == interrupted
 
 
 def test_live_frames_take_waits_for_frame_or_end() -> None:
@@ -154,7 +198,9 @@ def test_live_video_at_fast_rate_drops_and_counts_frames(prefetch: int, caplog: 
     indices = [frame.index for frame in result.tracked]
     assert indices == sorted(set(indices))
     assert indices[-1] == 59, "expected the last frame of the video"
-    assert caplog.messages == [f"{result.live.frames_dropped} frames dropped because mapping fell behind"]
+    assert caplog.messages == [
+        f"{result.live.frames_dropped} frames dropped because newer frames replaced them or the run ended"
+    ]
 
 
 def test_live_video_frames_are_not_queued() -> None:

@@ -106,7 +106,7 @@ def test_resume_lost_camera_relocalizes_in_known_view(tmp_path: Path) -> None:
     desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *TRACKED)
     before = stored_files(desk, tmp_path / "desk")
     black = replace(DESK[5], color=np.zeros_like(DESK[5].color))
-    empty = replace(DESK[5], depth=np.zeros_like(DESK[5].depth))
+    empty = replace(DESK[6], depth=np.zeros_like(DESK[6].depth))
     _, poses = mapped([black, empty, DESK[11], DESK[12]], *TRACKED, f"resume_from={before}")
     assert [pose.lost for pose in poses] == [True, True, False, False]
 
@@ -182,6 +182,35 @@ def test_keyframes_invalid_arrays_or_file_raise(desk: Mapper, tmp_path: Path) ->
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(DataError, match=r"keyframes\.npz"):
         read_keyframes(path)
+
+
+@pytest.mark.parametrize("damage", ["scaled", "none", "cut", "folder", "dangling"])
+def test_resumed_keyframes_error_has_file_name_once(desk: Mapper, tmp_path: Path, damage: str) -> None:
+    path = stored_files(desk, tmp_path / "run") / "keyframes.npz"
+    keyframes = dict(desk.pipeline.tracker.keyframes())
+    path.unlink(missing_ok=True)
+    if damage == "folder":
+        path.mkdir()
+    elif damage == "dangling":
+        path.symlink_to(tmp_path / "missing")
+    else:
+        scaled = keyframes | {"poses": np.array(keyframes["poses"]) * 2}
+        write_keyframes(path, {"scaled": scaled, "none": {}, "cut": keyframes}[damage])
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DataError) as refused:
+        Mapper(*TRACKED, f"resume_from={path.parent}")
+    assert str(refused.value).count("keyframes.npz") == 1
+
+
+def test_pipeline_other_classes_raise_before_first_frame(room: CornerRoom) -> None:
+    first, _ = mapped(room, *GIVEN)
+    stages = Mapper(*GIVEN, "detector=none").pipeline
+    stages.fuser.resume(first.scene)
+    stages.detector.classes = ("lamp",)
+    with pytest.raises(DataError, match=r"detector: expected the label space of the map \(length 80\), .*length 1\)"):
+        stages.run(CornerRoom(unreadable=0))
+    assert first.scene.mesh().classes != ("lamp",)
 
 
 def test_resumed_map_of_two_recordings_round_trips(tmp_path: Path, room: CornerRoom) -> None:

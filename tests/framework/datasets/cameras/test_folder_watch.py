@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import threading
 import time
 from collections.abc import Iterator
@@ -25,6 +27,7 @@ from framework.datasets.cameras.folder_watch import FolderWatch
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError, FrameError
 from framework.interfaces import FrameReader, PoseTracker, SceneMap
+from framework.runtime.frame_stream import LiveFrames
 from framework.sensors.noise_models import SensorChoice, SensorKind
 from plugins.detectors.none import NoDetections
 from tests.framework.test_pipeline import mapped, pipeline
@@ -65,22 +68,30 @@ class Watched:
         self.over = False
         self._frames = FolderWatch(folder, poll_interval=0.001, **parameters).frames()
 
-    def readers(self) -> Iterator[FrameReader]:
-        """Yield the frame readers of one scan."""
-        while (reader := next(self._frames, self)) is not None:
-            if isinstance(reader, Watched):
+    def found(self) -> Iterator[FrameReader | FrameError]:
+        """Yield the frame readers and the errors of one scan."""
+        while (found := next(self._frames, self)) is not None:
+            if isinstance(found, Watched):
                 self.over = True
                 return
-            yield reader
+            yield found
+
+    def readers(self) -> Iterator[FrameReader]:
+        """Yield the frame readers of one scan without an unusable frame."""
+        for found in self.found():
+            assert not isinstance(found, FrameError)
+            yield found
 
     def look(self) -> list[int | str]:
         """Scan the folder and return the index of each readable frame and the error message of each other frame."""
-        return [outcome(reader) for reader in self.readers()]
+        return [outcome(found) for found in self.found()]
 
 
-def outcome(reader: FrameReader) -> int | str:
+def outcome(found: FrameReader | FrameError) -> int | str:
     try:
-        return reader().index
+        if isinstance(found, FrameError):
+            raise found
+        return found().index
     except FrameError as error:
         assert "\n" not in str(error)
         return str(error)
@@ -251,6 +262,120 @@ def test_folder_watch_unusable_camera_file_raises_after_timeout(folder: Path, te
 
 
 @pytest.mark.parametrize(
+    ("key", "value", "found"),
+    [
+        ("fx", 45, "fx: expected 90.0 as at the start of the run, got 45.0"),
+        ("depth_scale", 5000, "depth_scale: expected 1000.0 as at the start of the run, got 5000.0"),
+        ("distortion", [0.1, 0, 0, 0, 0], "distortion: expected None as at the start of the run, got Distortion"),
+        ("sensor", "PHONE_LIDAR", "sensor: expected KINECT_V1"),
+        ("height", "72", "height: expected a number, got '72'"),
+    ],
+)
+def test_folder_watch_changed_camera_raises(folder: Path, key: str, value: object, found: str) -> None:
+    """The frames that appear after the change are not read with the camera of the start."""
+    watched = Watched(folder)
+    write(folder, 0)
+    assert watched.look() == [0]
+    (folder / "camera.json").write_text(json.dumps(CALIBRATION | {"depth_scale": 1000, key: value}))
+    write(folder, 1)
+    with pytest.raises(DataError, match=re.escape(f"{folder}/camera.json: {found}")):
+        watched.look()
+
+
+def test_folder_watch_rewritten_camera_file_is_accepted(folder: Path) -> None:
+    """Frames wait while the file is incomplete or missing."""
+    watched = Watched(folder)
+    assert watched.look() == []
+    for number, part in enumerate((b"{", b"", None)):
+        write(folder, number)
+        if part is None:
+            (folder / "camera.json").unlink()
+        else:
+            (folder / "camera.json").write_bytes(part)
+        assert watched.look() == watched.look() == []
+        values = CALIBRATION | {"depth_scale": 1000}
+        (folder / "camera.json").write_text(json.dumps(values, indent=number))
+        assert watched.look() == [number]
+
+
+def test_folder_watch_camera_file_lost_for_too_long_raises(folder: Path) -> None:
+    watched = Watched(folder, camera_timeout=0)
+    assert watched.look() == []
+    (folder / "camera.json").unlink()
+    with pytest.raises(DataError, match=r"camera\.json: expected a readable file"):  # noqa: PT012
+        while True:
+            watched.look()
+
+
+@pytest.mark.parametrize("with_camera", [True, False])
+def test_folder_watch_removed_root_raises(folder: Path, with_camera: bool) -> None:
+    if not with_camera:
+        (folder / "camera.json").unlink()
+    watched = Watched(folder)
+    assert watched.look() == []
+    shutil.rmtree(folder)
+    message = f"dataset.root: expected the folder {folder} until the end of the run, got an error (No such file"
+    with pytest.raises(DataError, match=re.escape(message)):
+        watched.look()
+
+
+@pytest.mark.parametrize("name", ["color", "depth"])
+def test_folder_watch_image_folder_may_appear_but_not_vanish(folder: Path, name: str) -> None:
+    (folder / name).rmdir()
+    watched = Watched(folder)
+    assert watched.look() == []
+    (folder / name).mkdir()
+    write(folder, 0)
+    assert watched.look() == [0]
+    shutil.rmtree(folder / name)
+    with pytest.raises(DataError, match=f"{name}: expected a folder of images until the end of the run"):
+        watched.look()
+
+
+def test_folder_watch_file_in_place_of_image_folder_raises(folder: Path) -> None:
+    (folder / "color").rmdir()
+    (folder / "color").touch()
+    with pytest.raises(DataError, match=r"color: expected a folder of images .*, got an error \(Not a directory\)"):
+        Watched(folder).look()
+
+
+def test_folder_watch_dangling_root_raises(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "missing")
+    with pytest.raises(DataError, match=r"dataset\.root: expected an existing folder, got .*link"):
+        FolderWatch(tmp_path / "link")
+
+
+def test_folder_watch_timestamps_increase_when_clock_goes_back(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    watched, times = Watched(folder), [time.time()]
+    for k in range(3):
+        write(folder, k)
+        [reader] = watched.readers()
+        times.append(reader().timestamp)
+        monkeypatch.setattr(time, "time", lambda hours=k + 1: times[0] - 3600 * hours)
+    assert times == sorted(times)
+    assert times[-1] - times[0] < 600
+
+
+def test_folder_watch_unusable_frames_do_not_replace_waiting_frame(folder: Path) -> None:
+    """The frames are taken only after all of them have arrived, and all files are counted."""
+    write(folder, 5)
+    for number, name in ((3, "color/000003.jpg"), (4, "depth/000004.png"), (6, "color/000006.jpg")):
+        (folder / name).write_bytes(encoded(number)[name])
+    for name in ("color/000007.jpg", "depth/000007.png"):
+        (folder / name).write_bytes(encoded(7)[name][:99])
+    (folder / "end").touch()
+    video = FolderWatch(folder)
+    with LiveFrames(video, lambda: False) as stream:
+        stream._listener.join()
+        taken = []
+        while (found := stream.take()) is not None:
+            taken.append(outcome(found))
+    assert [one for one in taken if isinstance(one, int)] == [5]
+    assert len(taken) == 5
+    assert stream.dropped == stream.dropped_of(len(taken)) == 0
+
+
+@pytest.mark.parametrize(
     "parameter",
     [{"idle_timeout": -1}, {"camera_timeout": float("nan")}, {"poll_interval": 0.2}, {"max_depth": -1}],
     ids=str,
@@ -288,3 +413,17 @@ def test_watched_folder_is_mapped_while_written(folder: Path) -> None:
     assert result.frames + result.live.frames_dropped == len(ROOM)
     assert result.frames_skipped == 0
     assert len(mapped(result).vertices) == result.frames > 0
+
+
+def test_watched_folder_with_changed_camera_is_partial_run(folder: Path) -> None:
+    @dataclass
+    class Changes(Known):
+        def track(self, frame: Frame, scene: SceneMap) -> Pose:
+            (folder / "camera.json").write_text(json.dumps(CALIBRATION | {"depth_scale": 1}))
+            write(folder, frame.index + 1)
+            return super().track(frame, scene)
+
+    write(folder, 0)
+    result = pipeline(detector=NoDetections(), tracker=Changes()).run_to_any_end(FolderWatch(folder))
+    assert "depth_scale: expected 1000.0" in str(result.stopped_by)
+    assert len(mapped(result).vertices) == result.frames == 1
