@@ -33,6 +33,7 @@ from framework.evaluation.compared_classes import ComparedClasses
 from framework.files.atomic_write import atomic_write, make_folder, remove_left_over
 from framework.files.json_file import write_json
 from framework.files.manifest import MANIFEST, Manifest, RunStatus
+from framework.files.output_folder import OutputFolder, reads_results_in
 from framework.files.staged_files import StagedFiles, finish_replacement
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import PoseTracker, RGBDSequence, RGBDVideo
@@ -44,9 +45,8 @@ from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
-from framework.runs.output_folder import OutputFolder, reads_results_in
 from framework.runs.plugin_code import plugin_code
-from framework.runs.provenance import code_version, config_hash, environment, frozen_environment, parameters_of
+from framework.runs.provenance import code_version, config_hash, environment, frozen_environment, leaves, parameters_of
 from framework.runs.stored_runs import (
     CHOICE,
     CONFIG,
@@ -118,7 +118,7 @@ class RunRecord:
         finish_replacement(directory)
         StagedFiles(directory).discard()
         remove_left_over(directory)
-        in_place = reads_results_in(directory, plain, OWN_FILES)
+        in_place = reads_results_in(directory, (value for _, value in leaves(plain)), OWN_FILES)
         if not in_place:
             for name in (MANIFEST, CONFIG, METRICS, PARTIAL_METRICS, REPORT):  # the manifest is invalid from here on
                 (directory / name).unlink(missing_ok=True)

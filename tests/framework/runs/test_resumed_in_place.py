@@ -15,10 +15,10 @@ from omegaconf import OmegaConf
 
 from framework.errors import DataError, PartialRunError
 from framework.files.manifest import Manifest, RunStatus
+from framework.files.output_folder import reads_results_in
 from framework.files.tum_trajectory import read_tum
 from framework.pipeline import Pipeline
 from framework.runs import run_directory
-from framework.runs.output_folder import reads_results_in
 from framework.runs.run_directory import OWN_FILES, RunRecord, write_run
 from framework.runs.stored_runs import read_metrics, read_record
 from framework.runtime.run_log import RunResult
@@ -100,9 +100,9 @@ def link_to(run: Path) -> str:
     [str, link_to, os.path.relpath, lambda run: f"{run}/../run/", lambda run: str(run / "trajectory.txt")],
 )
 def test_paths_of_run_directory_are_recognized(run: Path, setting: Callable[[Path], str]) -> None:
-    config = {"tracker": {"path": setting(run)}, "device": "cpu", "empty": "", "nul": "\0", "none": None}
-    assert reads_results_in(run, config, OWN_FILES)
-    assert not reads_results_in(run.parent, config, OWN_FILES)
+    settings = ["cpu", "", "\0", "~missing/map.npz", None, 7, setting(run)]
+    assert reads_results_in(run, settings, OWN_FILES)
+    assert not reads_results_in(run.parent, settings, OWN_FILES)
 
 
 def test_failed_run_in_place_keeps_earlier_run(

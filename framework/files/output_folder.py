@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from framework.errors import DataError
 from framework.files.atomic_write import make_folder, path_exists, sync_folder
 from framework.files.directory_lock import new_directory
 from framework.files.staged_files import StagedFiles
-from framework.runs.provenance import leaves
 
 RESCUED = "rescued"  # suffix of the folder for outputs that cannot be written to the run directory
 
@@ -89,13 +87,13 @@ class OutputFolder:
         raise DataError(f"{self.path}: expected a folder that can be moved, got an error ({reason})") from reason
 
 
-def reads_results_in(directory: Path, config: Mapping[str, Any], names: Iterable[str]) -> bool:
-    """Return True if a value of a resolved config is the path of a directory, or of a named file in this directory.
+def reads_results_in(directory: Path, settings: Iterable[object], names: Iterable[str]) -> bool:
+    """Return True if a setting is the path of a directory, or of a named file in this directory.
 
-    Examples are `resume_from=DIR`, also through links, and `tracker.path=DIR/trajectory.txt`.
+    Examples are DIR, also through links, and DIR/trajectory.txt.
     """
     results = {_identity(str(path)) for path in (directory, *(directory / name for name in names))} - {None}
-    return any(isinstance(value, str) and value and _identity(value) in results for _, value in leaves(config))
+    return any(isinstance(value, str) and value != "" and _identity(value) in results for value in settings)
 
 
 def _identity(path: str) -> tuple[int, int] | None:
