@@ -37,9 +37,9 @@ from framework.detection.domain import warn_outside_domain
 from framework.detection.map_classes import with_classes_of_map
 from framework.detection.stored.cache import with_cache
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError, errors_of
-from framework.files.directory_lock import locked
+from framework.files.folders.directory_lock import locked
+from framework.files.folders.staged_files import finish_replacement
 from framework.files.search_paths import usable_path
-from framework.files.staged_files import finish_replacement
 from framework.geometry import camera_of, pose_of
 from framework.interfaces import (
     ClusterRefiner,
@@ -421,7 +421,7 @@ def run(directory: Path | str, *overrides: str, **named: object) -> Path:
         DataError: The directory is not empty, the sequence cannot be read, or no frame could be mapped.
         PartialRunError: An error ended the run early. The outputs are those of the mapped frames.
     """
-    from framework.files.restartable_folder import check_new
+    from framework.files.folders.restartable_folder import check_new
 
     words = _overrides("run", overrides, named)
     for override in words:

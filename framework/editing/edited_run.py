@@ -16,10 +16,10 @@ from framework.data import Float64
 from framework.editing.edited_map import EditedMap
 from framework.editing.edits import Edit, write_edits
 from framework.errors import DataError, InstanceMapError
+from framework.files.folders.restartable_folder import check_new
+from framework.files.folders.staged_files import finish_replacement, staged_files
 from framework.files.json_file import write_json
 from framework.files.manifest import Manifest
-from framework.files.restartable_folder import check_new
-from framework.files.staged_files import finish_replacement, staged_files
 from framework.files.tum_trajectory import read_tum
 from framework.mapping.instance_map import FORMAT, InstanceMap
 from framework.mapping.storage.map_file import read_format

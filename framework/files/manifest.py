@@ -17,9 +17,9 @@ from typing import Any
 
 from framework.errors import DataError
 from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
+from framework.files.folders.staged_files import finish_replacement
 from framework.files.hashing import path_hash
 from framework.files.json_file import parse_json, write_json
-from framework.files.staged_files import finish_replacement
 
 MANIFEST = "manifest.json"
 RUN_FILES = (

@@ -19,9 +19,9 @@ from framework.datasets.calibration.camera_json import DISTORTION, SENSOR
 from framework.datasets.calibration.color_registration import ColorRegistration
 from framework.errors import DataError, errors_of
 from framework.files.atomic_write import atomic_write
+from framework.files.folders.restartable_folder import check_startable, restartable_folder
 from framework.files.json_file import write_json
 from framework.files.number_lines import write_gravity, write_image_times
-from framework.files.restartable_folder import check_startable, restartable_folder
 from framework.files.storage import check_storage
 from framework.files.tum_trajectory import write_tum
 from framework.importing.depth_resampling import upsampled

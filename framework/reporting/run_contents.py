@@ -11,7 +11,7 @@ import numpy as np
 from framework.data import UNIT_TOLERANCE, Float64, InstanceMesh, Int32
 from framework.errors import DataError
 from framework.files.atomic_write import check_regular, path_exists
-from framework.files.staged_files import finish_replacement
+from framework.files.folders.staged_files import finish_replacement
 from framework.files.tum_trajectory import read_tum
 from framework.rendering.viewpoint import surrounding_poses
 from framework.runs.instances_file import StoredInstance, read_instances

@@ -18,10 +18,10 @@ from framework.evaluation.compared_classes import ComparedClasses
 from framework.evaluation.instances import PredictedInstances
 from framework.evaluation.scannet_benchmark import BenchmarkScene
 from framework.evaluation.truth_alignment import in_map_world
-from framework.files.directory_lock import locked
+from framework.files.folders.directory_lock import locked
+from framework.files.folders.staged_files import staged_files
 from framework.files.json_file import write_json
 from framework.files.manifest import MANIFEST, Manifest
-from framework.files.staged_files import staged_files
 from framework.files.tum_trajectory import read_tum
 from framework.interfaces import RGBDVideo
 from framework.registry import build

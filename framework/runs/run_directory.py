@@ -31,10 +31,10 @@ from framework.detection.stored.cache import cache_metrics
 from framework.errors import DataError, InstanceMapError, PartialRunError
 from framework.evaluation.compared_classes import ComparedClasses
 from framework.files.atomic_write import atomic_write, make_folder, remove_left_over
+from framework.files.folders.output_folder import OutputFolder, reads_results_in
+from framework.files.folders.staged_files import StagedFiles, finish_replacement
 from framework.files.json_file import write_json
 from framework.files.manifest import MANIFEST, Manifest, RunStatus
-from framework.files.output_folder import OutputFolder, reads_results_in
-from framework.files.staged_files import StagedFiles, finish_replacement
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import PoseTracker, RGBDSequence, RGBDVideo
 from framework.live_view.guarded_viewer import watched_run

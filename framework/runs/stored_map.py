@@ -11,7 +11,7 @@ import numpy as np
 from framework.data import Float64, InstanceMesh, Int32, SceneTruth
 from framework.errors import DataError
 from framework.evaluation.instances import MAX_DISTANCE, transfer_labels
-from framework.files.staged_files import finish_replacement
+from framework.files.folders.staged_files import finish_replacement
 from framework.files.tum_trajectory import read_tum
 from framework.runs.instances_file import StoredInstance, read_instances
 from framework.runs.mesh_file import read_mesh

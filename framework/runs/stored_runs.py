@@ -19,9 +19,9 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.config.composition import resolved
 from framework.errors import DataError, first_line
 from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
+from framework.files.folders.staged_files import REPLACING, finish_replacement
 from framework.files.json_file import read_json
 from framework.files.manifest import MANIFEST, verified
-from framework.files.staged_files import REPLACING, finish_replacement
 from framework.files.yaml_file import load_yaml
 from framework.registry import STAGES
 from framework.runs.inputs import INPUTS, inputs_sha256

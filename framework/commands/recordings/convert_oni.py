@@ -21,7 +21,7 @@ from framework.datasets.scenenn.oni_records import OniContents, Stream, read_con
 from framework.datasets.scenenn.scene_files import MICROSECONDS, write_timestamps
 from framework.errors import DataError
 from framework.files.atomic_write import atomic_write
-from framework.files.restartable_folder import restartable_folder
+from framework.files.folders.restartable_folder import restartable_folder
 
 COMMAND = "convert-oni"
 IMAGE, DEPTH, TIMESTAMP = "image", "depth", "timestamp.txt"

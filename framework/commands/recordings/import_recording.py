@@ -7,7 +7,7 @@ from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.config.text_values import typed
-from framework.files.restartable_folder import check_startable
+from framework.files.folders.restartable_folder import check_startable
 from framework.importing.bags.ros_topics import NO_POSES, BagOptions, Topics
 from framework.importing.folder_writer import COMMAND, LONGER_SIDE, ODOMETRY, Writing, write_folder
 from framework.importing.formats import FORMATS, open_source

@@ -18,7 +18,7 @@ from framework.commands.command_line import Jobs, is_of_sweep
 from framework.commands.running.choices import error_of_first_run, with_row
 from framework.commands.running.sweep import by_joblib, ending
 from framework.config.composition import resolved
-from framework.files.directory_lock import locked
+from framework.files.folders.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.runs.objective import objective_keys, objective_of
 from framework.runs.stored_runs import is_recorded

@@ -24,7 +24,7 @@ from framework.config.composition import one_line
 from framework.config.validation import checked_rows
 from framework.errors import ConfigError, InstanceMapError
 from framework.files.atomic_write import check_regular, remove_left_over
-from framework.files.directory_lock import holder, holder_name, is_locked, locked, new_directory
+from framework.files.folders.directory_lock import holder, holder_name, is_locked, locked, new_directory
 from framework.runs.objective import objective_keys
 from framework.runs.stored_runs import LOG
 from framework.runtime.process_settings import available_cores

@@ -42,8 +42,8 @@ from framework.datasets.ground_truth.labeled_mesh import unseen
 from framework.datasets.ground_truth.named_truth import KEY, NamedTruth, read_named_truth
 from framework.errors import ConfigError, DataError, FrameError
 from framework.files.depth_files import read_depth
+from framework.files.folders.restartable_folder import check_finished
 from framework.files.image_files import read_color
-from framework.files.restartable_folder import check_finished
 from framework.files.search_paths import folder_of
 from framework.files.storage import check_storage
 from framework.geometry import FARTHEST

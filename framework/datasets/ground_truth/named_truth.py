@@ -23,11 +23,11 @@ from framework.data import Float64, Int32, ReferenceTrajectory
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import path_exists
+from framework.files.folders.staged_files import finish_replacement
 from framework.files.json_file import read_json
 from framework.files.manifest import verified
 from framework.files.ply import PlyMesh, found_property, read_ply
 from framework.files.search_paths import candidates
-from framework.files.staged_files import finish_replacement
 from framework.files.tum_trajectory import read_tum
 from framework.geometry import FARTHEST
 from framework.vocabulary.label_spaces import COCO, LONGEST_CLASS_NAME, MEANINGS, with_similar

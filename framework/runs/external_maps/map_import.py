@@ -12,8 +12,8 @@ import numpy as np
 from framework.data import Float64
 from framework.errors import ConfigError
 from framework.evaluation.compared_classes import OF_DATASET
+from framework.files.folders.restartable_folder import check_startable, restartable_folder
 from framework.files.manifest import MANIFEST
-from framework.files.restartable_folder import check_startable, restartable_folder
 from framework.runs.external_maps.conversion import ConvertedMap, MapPlacement, read_transform
 from framework.runs.external_maps.imported_run import ImportOption, MappedData, write_imported_run
 from framework.runs.external_maps.map_formats import read_external_map

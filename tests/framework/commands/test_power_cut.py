@@ -20,8 +20,8 @@ from framework.commands.results import (
     verify,
 )
 from framework.commands.running.run import run
+from framework.files.folders.staged_files import REPLACING, STAGED, finish_replacement
 from framework.files.manifest import MANIFEST, Manifest, RunStatus
-from framework.files.staged_files import REPLACING, STAGED, finish_replacement
 from framework.runs.stored_runs import read_record
 from tests.support import reported_run
 from tests.support.command_call import call_command

@@ -14,8 +14,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from framework.errors import DataError, PartialRunError
+from framework.files.folders.output_folder import reads_results_in
 from framework.files.manifest import Manifest, RunStatus
-from framework.files.output_folder import reads_results_in
 from framework.files.tum_trajectory import read_tum
 from framework.pipeline import Pipeline
 from framework.runs import run_directory

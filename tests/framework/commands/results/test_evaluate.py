@@ -19,7 +19,7 @@ from framework.commands.results import evaluate
 from framework.commands.running.run import run
 from framework.config import composition
 from framework.errors import DataError
-from framework.files.directory_lock import locked
+from framework.files.folders.directory_lock import locked
 from framework.files.manifest import Manifest
 from framework.runs import reevaluation, run_directory
 from framework.runs.provenance import config_hash

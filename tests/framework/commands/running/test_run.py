@@ -16,7 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from framework.files.directory_lock import locked
+from framework.files.folders.directory_lock import locked
 from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.source import DeviceFrame, Source
 from framework.runs.stored_runs import MAPPED

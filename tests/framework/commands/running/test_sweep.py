@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 
 from framework.commands.running.sweep import jobs_at_once
 from framework.config.composition import one_line
-from framework.files.directory_lock import locked
+from framework.files.folders.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.runs.provenance import config_hash
 from framework.runs.run_directory import MAPPED

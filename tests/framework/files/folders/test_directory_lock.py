@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from framework.errors import DataError
-from framework.files.directory_lock import HOLDER, is_locked, locked, new_directory
+from framework.files.folders.directory_lock import HOLDER, is_locked, locked, new_directory
 
 pytestmark = pytest.mark.integration
 
@@ -69,7 +69,7 @@ def test_directory_lock_waiting_is_acquired_after_release(tmp_path: Path, caplog
 def test_directory_lock_of_killed_process_is_released(tmp_path: Path) -> None:
     code = f"""
 from pathlib import Path
-from framework.files.directory_lock import locked
+from framework.files.folders.directory_lock import locked
 with locked(Path({str(tmp_path)!r})):
     print("locked", flush=True)
     input()

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from framework.errors import DataError
-from framework.files.directory_lock import locked
-from framework.files.restartable_folder import check_finished, check_startable, restartable_folder
+from framework.files.folders.directory_lock import locked
+from framework.files.folders.restartable_folder import check_finished, check_startable, restartable_folder
 
 OWN = re.compile(r"images/\d\.png|done\.txt")
 

@@ -9,7 +9,7 @@ import pytest
 
 from framework.errors import DataError
 from framework.files.atomic_write import atomic_write
-from framework.files.staged_files import REPLACING, STAGED, StagedFiles, finish_replacement, staged_files
+from framework.files.folders.staged_files import REPLACING, STAGED, StagedFiles, finish_replacement, staged_files
 from tests.support.failing_disk import FailingDisk, Fault
 
 

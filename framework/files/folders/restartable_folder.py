@@ -13,8 +13,8 @@ from pathlib import Path
 
 from framework.errors import DataError
 from framework.files.atomic_write import atomic_write, is_temporary, path_exists, read_text, sync_folder
-from framework.files.directory_lock import HOLDER, LOCK, holder, is_locked, locked
-from framework.files.staged_files import STAGED
+from framework.files.folders.directory_lock import HOLDER, LOCK, holder, is_locked, locked
+from framework.files.folders.staged_files import STAGED
 
 UNFINISHED = ".unfinished"  # marker file with the name of the command
 

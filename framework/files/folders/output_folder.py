@@ -10,8 +10,8 @@ from pathlib import Path
 
 from framework.errors import DataError
 from framework.files.atomic_write import make_folder, path_exists, sync_folder
-from framework.files.directory_lock import new_directory
-from framework.files.staged_files import StagedFiles
+from framework.files.folders.directory_lock import new_directory
+from framework.files.folders.staged_files import StagedFiles
 
 RESCUED = "rescued"  # suffix of the folder for outputs that cannot be written to the run directory
 
