@@ -1,0 +1,1 @@
+"""Writing of folders: locks, replacement of several files at once, restarts after interruptions."""
