@@ -28,7 +28,6 @@ from framework.interfaces import (
     Viewer,
 )
 from framework.live_view.guarded_viewer import GuardedViewer, watched_run
-from framework.mapping.instances.association import agreed_classes
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 from framework.runtime.cpu_budget import CpuBudget, parallel_kernels_are_thread_safe
@@ -118,7 +117,6 @@ class Pipeline:
         if self.tracker.pose_source == "ground_truth" and not video.has_poses():
             frames = "its frames" if frames_expected is None else f"the {frames_expected} frames"
             raise DataError(f"{video.name}: expected ground-truth poses, got none for {frames}; {WITHOUT_POSES}")
-        agreed_classes(self.fuser.scene.classes, self.detector.classes)  # of a resumed map
         warn_outside_domain(self.detector, video)
         if isinstance(video, RGBDSequence):
             self.detector.check_sequence(video)

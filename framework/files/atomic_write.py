@@ -64,8 +64,6 @@ def sync_folder(folder: Path) -> None:
     Raises:
         OSError: Writing fails.
     """
-    if os.name == "nt":  # Windows cannot open folders
-        return
     try:
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -16,15 +16,20 @@ CHECKOUT = Path(__file__).resolve().parents[3]
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
 
 ELSEWHERE = """
-import fcntl, os, signal, sys
+import errno, fcntl, os, signal, sys
 
-flags, synced = fcntl.fcntl, os.fsync
+flags, synced, opened = fcntl.fcntl, os.fsync, os.open
 
 def fsync(descriptor):
     assert flags(descriptor, 3) & os.O_ACCMODE, "Windows syncs only writable files"  # 3: F_GETFL
     synced(descriptor)
 
-os.fsync = fsync
+def open_file(path, *arguments, **named):
+    if os.path.isdir(path) and "dir_fd" not in named:
+        raise PermissionError(errno.EACCES, "Windows cannot open folders")
+    return opened(path, *arguments, **named)
+
+os.fsync, os.open = fsync, open_file
 sys.modules["fcntl"] = sys.modules["resource"] = None
 del os.sched_getaffinity, signal.SIGPIPE
 from framework.__main__ import main

@@ -203,16 +203,6 @@ def test_resumed_keyframes_error_has_file_name_once(desk: Mapper, tmp_path: Path
     assert str(refused.value).count("keyframes.npz") == 1
 
 
-def test_pipeline_other_classes_raise_before_first_frame(room: CornerRoom) -> None:
-    first, _ = mapped(room, *GIVEN)
-    stages = Mapper(*GIVEN, "detector=none").pipeline
-    stages.fuser.resume(first.scene)
-    stages.detector.classes = ("lamp",)
-    with pytest.raises(DataError, match=r"detector: expected the label space of the map \(length 80\), .*length 1\)"):
-        stages.run(CornerRoom(unreadable=0))
-    assert first.scene.mesh().classes != ("lamp",)
-
-
 def test_resumed_map_of_two_recordings_round_trips(tmp_path: Path, room: CornerRoom) -> None:
     first, _ = mapped(room, *GIVEN)
     again, _ = mapped(room, *GIVEN, f"resume_from={stored_files(first, tmp_path / 'first')}")
