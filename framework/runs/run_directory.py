@@ -1,6 +1,6 @@
 """Writing of the run directory.
 
-Each file is written atomically. Files that cannot be recomputed are written first, in case the disk becomes full. The
+Each file is written atomically. Files that cannot be recomputed are written first, the small ones before the map. The
 file metrics.json is written after all results and marks a complete run. A run that reads files of an earlier run in its
 own directory replaces this run when all its files are written.
 """
@@ -154,14 +154,14 @@ class RunRecord:
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
         timestamps = np.array([frame.timestamp for frame in trusted])
         comments = origin_comments(video.world_origin)
-        attempt(scene.save, folder / MAP)
         attempt(write_tum, folder / TRAJECTORY, timestamps, poses, comments)
-        if result.keyframes:
-            attempt(write_keyframes, folder / KEYFRAMES, result.keyframes)
         attempt(write_timings, folder / "timings.csv", result)
         attempt(write_digests, folder / DIGESTS, result)
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **origin_metrics(video), **(counts or {})}
         attempt(self._write_partial, folder, video, figures, attempt.error)  # in case the process is killed
+        attempt(scene.save, folder / MAP)
+        if result.keyframes:
+            attempt(write_keyframes, folder / KEYFRAMES, result.keyframes)
         attempt(lambda: _write_text(folder / ENVIRONMENT, frozen_environment()))
         found = attempt(lambda: (scene.mesh(), scene.instances()))
         if found is not None:

@@ -48,7 +48,7 @@ INSTANCES = "instances.json"
 TRAJECTORY = "trajectory.txt"
 REPORT = "report.html"  # written by `instancemap report`
 KEYFRAMES = "keyframes.npz"  # keyframes of the tracker, to resume the map; optional
-MAPPED = (MAP, TRAJECTORY, "timings.csv", INSTANCES, MESH, "overview.png")
+MAPPED = (TRAJECTORY, "timings.csv", MAP, INSTANCES, MESH, "overview.png")
 """Files of a map in the order of writing. In case the disk becomes full, files that can be recomputed are last."""
 
 DIGESTS = "digests.csv"  # digest of each stage for each frame, to locate differences between runs

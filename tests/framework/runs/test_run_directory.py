@@ -215,15 +215,15 @@ def test_run_directory_full_disk_keeps_map_and_trajectory(
     result = replace(mapped(room), keyframes={"poses": np.zeros((1, 4, 4))})
     replace_file, renamed = Path.replace, list[str]()
 
-    def full_after_five(path: Path, target: Path) -> Path:
-        if len(renamed) == 5:
+    def full_after_six(path: Path, target: Path) -> Path:
+        if len(renamed) == 6:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         renamed.append(target.name)
         return replace_file(path, target)
 
-    monkeypatch.setattr(Path, "replace", full_after_five)
+    monkeypatch.setattr(Path, "replace", full_after_six)
     assert "No space left" in str(record.write(room, result).error)
-    kept = ["map.npz", "trajectory.txt", "keyframes.npz", "timings.csv", "digests.csv"]
+    kept = ["trajectory.txt", "timings.csv", "digests.csv", "metrics.partial.json", "map.npz", "keyframes.npz"]
     assert renamed == kept
     assert {path.name for path in record.directory.iterdir()} >= {"config.yaml", *kept}
 

@@ -214,8 +214,7 @@ def test_run_on_full_disk_writes_small_files(tmp_path: Path) -> None:
     assert left.isdisjoint({"mesh.ply", "map.npz", "metrics.json"})
     assert not list(place.glob(".*partial*"))
     fault = str(figures(place)["partial"])
-    assert fault.startswith(f"{place / 'mesh.ply'}: expected a writable file, got ")
-    assert fault.endswith("the disk may be full)")
+    assert fault.startswith(f"{place / 'map.npz'}: expected a writable file, got an error (")
     assert figures(place)["instances.ap50"] == 1.0
 
 
@@ -235,7 +234,7 @@ def test_run_signal_during_saving_completes_outputs(tmp_path: Path, number: sign
 def test_run_second_signal_in_saving_leaves_complete_files(tmp_path: Path) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, "fuser.slow_save_s=30", f"hydra.run.dir={place}")
-    wait_for(place / "mesh.ply", process)
+    wait_for(place / "metrics.partial.json", process)
     time.sleep(0.2)
     for number in (signal.SIGINT, signal.SIGTERM):
         process.send_signal(number)
@@ -243,7 +242,7 @@ def test_run_second_signal_in_saving_leaves_complete_files(tmp_path: Path) -> No
     status, stderr = end(process)
     assert status == 143, stderr
     left = {path.name for path in place.iterdir()}
-    assert left >= {*SMALL, "mesh.ply", "metrics.partial.json"}
+    assert left >= {"trajectory.txt", "timings.csv", "metrics.partial.json"}
     assert left.isdisjoint({"map.npz", "metrics.json"})
     assert not list(place.glob(".*partial*"))
     assert figures(place)["partial"] == "the outputs were not completed"
