@@ -129,6 +129,25 @@ def open_standard_streams() -> None:
 
 def main() -> None:
     """Run the console script `instancemap`."""
+    status = 1
+    try:
+        run_command()
+        status = 0
+    except SystemExit as error:
+        status = error.code if isinstance(error.code, int) else int(error.code is not None)
+        raise
+    except KeyboardInterrupt as error:  # while libraries are loaded
+        status = 128 + getattr(error, "number", signal.SIGINT)
+        print(str(error) or "interrupted", file=sys.stderr)
+        sys.exit(status)
+    finally:
+        from framework.runtime.signals import exit_on_signals
+
+        exit_on_signals(status)
+
+
+def run_command() -> None:
+    """Run the command that the arguments of the process name."""
     open_standard_streams()
     leave_working_folder(sys.argv[1:])
     if any(word.startswith("--e") and RERUN.startswith(word.partition("=")[0]) for word in sys.argv[1:]):
@@ -163,10 +182,33 @@ def main() -> None:
         word = "run"
     if word in PRINTING and hasattr(signal, "SIGPIPE"):  # not on Windows
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    from framework.runtime.signals import interruptible_imports
+
     try:
-        import_module(module_of(word)).main()
+        with interruptible_imports():
+            check_environment(word)
+            module = import_module(module_of(word))
+        module.main()
     finally:
         flush_output()
+
+
+def check_environment(command: str) -> None:
+    """Exit with an error if a command cannot run in the environment of this process.
+
+    `doctor` reports the variables itself.
+    """
+    import_module("framework.commands")  # sets variables
+    from framework.errors import ConfigError
+    from framework.runtime.environment_checks import check_thread_limit, environment_errors
+
+    errors = [] if command == "doctor" else environment_errors()
+    try:
+        check_thread_limit()
+    except ConfigError as error:
+        errors.append(str(error))
+    if errors:
+        sys.exit("\n".join(f"error: {error}" for error in errors))
 
 
 def flush_output(rest: str = "") -> None:

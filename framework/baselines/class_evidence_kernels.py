@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from framework.compilation.kernel_cache import njit
 from framework.mapping.labels.class_slots import ALL_NAMED, NEW_CLASSES, NO_CLASS
 from framework.mapping.labels.label_evidence_kernels import best_first
 from framework.mapping.voxels.voxel_grid_kernels import device

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Float32, Int32, UInt16
 from framework.mapping.labels.vertex_labels_kernels import CHUNK, CORNERS, corner_voxels, keep_near
 from framework.mapping.voxels.integration_parameters import Pinhole

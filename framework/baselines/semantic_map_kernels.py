@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from framework.baselines.class_evidence_kernels import best_class
+from framework.compilation.kernel_cache import njit
 from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.vertex_labels_kernels import CHUNK, CORNERS, color_of, corner_voxels, keep_near, majority
 from framework.mapping.voxels.raycasting_kernels import voxel_seen

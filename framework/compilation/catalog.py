@@ -28,6 +28,7 @@ from filelock import FileLock, Timeout
 from numba import types
 from numba.core.dispatcher import Dispatcher
 
+from framework.compilation.kernel_cache import KernelCache, check_storage, warn_of_storage
 from framework.errors import DataError
 from framework.runtime.process_settings import available_cores
 from framework.runtime.progress import Progress
@@ -71,21 +72,18 @@ class Kernel:
     def is_compiled(self) -> bool:
         """Return True if the cache of numba contains the kernel for the current code."""
         cache = self.dispatcher._cache
-        index = Path(cache._cache_file._index_path) if cache._enabled else None
-        if index is None or not index.exists():
+        if not isinstance(cache, KernelCache):  # no folder is writable
             return False
-        written = index.stat().st_mtime
+        try:
+            written = cache.index.stat().st_mtime
+        except OSError:
+            return False
         # numba checks only the file of the kernel itself, not the files of called kernels
         files = {kernel.py_func.__code__.co_filename for kernel in called_by(self.dispatcher)}
         if any(Path(path).stat().st_mtime > written for path in files):
             cache.flush()
             return False
-        try:
-            compiled = cache._cache_file._load_index()
-        except (AttributeError, ImportError):  # a class in the pickled argument types was renamed or moved
-            index.unlink(missing_ok=True)
-            return False
-        return cache._index_key(self.signature, self.dispatcher.targetctx.codegen()) in compiled
+        return cache.contains(self.signature, self.dispatcher.targetctx.codegen())
 
     def compile(self) -> None:
         self.dispatcher.compile(self.signature)
@@ -118,6 +116,11 @@ def compile_for_run() -> None:
     loaded = [kernel for kernel in listed(DEFAULT, OTHERS) if kernel.module in sys.modules]
     missing = [kernel for kernel in loaded if not kernel.is_compiled()]
     if not missing:
+        return
+    try:
+        check_storage(kernel.dispatcher._cache for kernel in missing)
+    except DataError as error:
+        warn_of_storage(error)
         return
     with _one_process_at_a_time(missing):
         missing = [kernel for kernel in missing if not kernel.is_compiled()]  # another process may have compiled them

@@ -11,6 +11,7 @@ inlining are still optimized separately, because otherwise their loops are not v
 from __future__ import annotations
 
 import gc
+import logging
 import sys
 from typing import Any
 
@@ -18,6 +19,7 @@ import numba
 from numba.core.caching import NullCache
 
 from framework.compilation.catalog import DEFAULT, OTHERS, Kernel, called_by, listed
+from framework.compilation.kernel_cache import KernelCache
 
 TESTED = ("0.68.1",)
 """Versions of numba whose internals this process replaces. With other versions, compilation takes 1.4 times as long."""
@@ -25,6 +27,8 @@ TESTED = ("0.68.1",)
 
 def work() -> None:
     """Read one kernel per line from stdin, compile it, and print an error or an empty line."""
+    logging.disable()  # the main process reports problems of the cache
+    KernelCache.storage_required = True
     gc.freeze()  # numba's many permanent objects slow down garbage collection
     gc.set_threshold(200_000, 20, 20)
     wanted = {(kernel.module, kernel.name) for kernel in listed(DEFAULT, OTHERS)}

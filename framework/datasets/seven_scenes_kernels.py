@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from numba import njit
-
+from framework.compilation.kernel_cache import njit
 from framework.data import UInt16
 from framework.datasets.calibration.raw_images import NO_READING
 

@@ -18,7 +18,9 @@ from framework.doctor.check_result import anonymous
 
 TIMEOUT_S = 120.0  # s, maximum run time of a process
 ROOT = Path(__file__).resolve().parents[2]
-ACCELERATION, KERNELS = (f"from {__name__} import {name}; {name}()" for name in ("acceleration", "kernels"))
+ACCELERATION, KERNELS, REPAIR = (
+    f"from {__name__} import {name}; {name}()" for name in ("acceleration", "kernels", "repair")
+)
 
 Outcomes = Mapping[str, tuple[str, str]]  # last printed line and error ("" = success) by code
 
@@ -58,9 +60,27 @@ def acceleration() -> None:
 
 
 def kernels() -> None:
-    """Print, as JSON, the folder of the kernel cache and the numbers of compiled and all kernels."""
+    """Print, as JSON, the folder and the damaged files of the kernel cache, and the numbers of compiled kernels."""
     from framework.compilation.catalog import DEFAULT, OTHERS, listed
 
+    damaged = _damaged_kernels()
     sections = [listed(DEFAULT), listed(OTHERS)]
     counts = [(sum(kernel.is_compiled() for kernel in section), len(section)) for section in sections]
-    print(json.dumps({"folder": sections[0][0].dispatcher._cache.cache_path, "counts": counts}))
+    folder = sections[0][0].dispatcher._cache.cache_path
+    print(json.dumps({"folder": folder, "damaged": [*map(str, damaged)], "counts": counts}))
+
+
+def repair() -> None:
+    """Delete the damaged files of the kernel cache, and print their number."""
+    damaged = _damaged_kernels()
+    for path in damaged:
+        path.unlink()
+    print(len(damaged))
+
+
+def _damaged_kernels() -> list[Path]:
+    from framework.compilation.catalog import DEFAULT, OTHERS, listed
+    from framework.compilation.kernel_cache import damaged_files
+
+    folders = {kernel.dispatcher._cache.cache_path for kernel in listed(DEFAULT, OTHERS)}
+    return damaged_files(sorted(folders - {None}))  # None = no folder is writable

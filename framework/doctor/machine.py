@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from framework.doctor.check_result import Check, Status, anonymous
+from framework.runtime.environment_checks import environment_errors
 
 MIN_DISK_GB = 2.0  # minimum free disk space; a run writes 20 to 200 MB, a synthetic benchmark several GB
 MIN_MEMORY_GIB = 2.0  # minimum available memory; the demo requires 1.2 GiB
@@ -76,6 +77,9 @@ def system_libraries() -> Iterator[Check]:
 
 
 def environment() -> Iterator[Check]:
-    """List the environment variables that affect runs."""
+    """List the environment variables that affect runs, and check those of numba."""
+    errors = {error.partition(":")[0]: error for error in environment_errors()}
     for name in sorted(name for name in os.environ if name.startswith(PREFIXES)):
-        yield Check(name, Status.OK, anonymous(os.environ[name]) or '""')
+        _, _, error = errors.get(name, "").partition(": ")
+        detail, _, fix = error.partition("; ")
+        yield Check.of(name, not error, detail or anonymous(os.environ[name]) or '""', fix, required=True)

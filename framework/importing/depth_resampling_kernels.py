@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Float32, Float64, UInt8
 
 ONE_SURFACE = 0.05  # maximum range of four depth readings on one surface, as a fraction of the nearest reading

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Bool, Float32, Int32, Int64
 from framework.refinement.neighborhood_kernels import ThreadSchedule, bounding_box
 from framework.refinement.segmentation.union_find import root, unite

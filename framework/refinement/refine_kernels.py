@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Bool, Float32, Int32, Int64
 
 PART = 8192  # number of rows that a thread processes at once

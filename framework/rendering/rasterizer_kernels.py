@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Float32, Float64, Int32
 
 NO_TRIANGLE = -1  # index for pixels without a triangle

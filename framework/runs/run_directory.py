@@ -67,7 +67,7 @@ from framework.runs.stored_runs import (
 )
 from framework.runtime.process_settings import frozen_garbage_collector
 from framework.runtime.run_log import RunResult
-from framework.runtime.signals import ENDING, Interruption, signals_deferred
+from framework.runtime.signals import ENDING, Interruption, interruptible_imports, signals_deferred
 from framework.tracking.keyframes import write_keyframes
 from framework.vocabulary.label_spaces import label_space_of
 
@@ -259,7 +259,8 @@ def write_run(
             is raised.
     """
     gc.collect()  # otherwise, a garbage collection would delay one of the first few hundred frames
-    video = build(RGBDVideo, config.get("dataset"))  # last, because a synthetic scene takes the longest to build
+    with interruptible_imports():
+        video = build(RGBDVideo, config.get("dataset"))  # last, because a synthetic scene takes the longest to build
     compile_for_run()  # kernels of the synthetic renderer
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")

@@ -14,7 +14,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -59,14 +59,15 @@ def set_environment() -> None:
         os.environ.setdefault(name, value)
     home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("HOME") or os.environ.get("USERPROFILE") or "/"
     if "NUMBA_CACHE_DIR" not in os.environ and not any(map(_is_writable, (Path(__file__).parent, Path(home)))):
-        os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="instancemap-kernels-")
-        atexit.register(shutil.rmtree, os.environ["NUMBA_CACHE_DIR"], ignore_errors=True)
+        with suppress(OSError):  # without any writable folder, kernels are kept in memory
+            os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="instancemap-kernels-")
+            atexit.register(shutil.rmtree, os.environ["NUMBA_CACHE_DIR"], ignore_errors=True)
 
 
 def _is_writable(folder: Path) -> bool:
     """Return True if the folder, or its nearest existing parent, is writable."""
     existing = next((path for path in (folder, *folder.parents) if path.exists()), Path())
-    return os.access(existing, os.W_OK)
+    return existing.is_dir() and os.access(existing, os.W_OK)
 
 
 def configure_process(threads: int = 0, seed: int | None = None) -> None:

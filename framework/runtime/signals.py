@@ -5,6 +5,7 @@ The first signal ends a run after the current step. The second signal ends it im
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -55,7 +56,14 @@ def _restore(handlers: Mapping[int, Any]) -> None:
             signal.signal(number, handler)
 
 
-OURS_TO_HANDLE = (signal.SIG_DFL, signal.default_int_handler, _raise_interrupted)
+def _exit(_number: int, _frame: FrameType | None) -> None:
+    os._exit(_exit_status)
+
+
+_exit_status = 0  # of `exit_on_signals`
+
+RAISING = (signal.default_int_handler, _raise_interrupted)
+OURS_TO_HANDLE = (signal.SIG_DFL, *RAISING, _exit)
 """Handlers that may be replaced. Ignored signals, and signals with other handlers, are not changed."""
 
 
@@ -67,6 +75,52 @@ def raise_on_signals() -> None:
     for number in ENDING:
         if signal.getsignal(number) in OURS_TO_HANDLE:
             signal.signal(number, _raise_interrupted)
+
+
+def exit_on_signals(status: int) -> None:
+    """Exit with `status` when this process receives a signal of ENDING.
+
+    Call this function when all work is done. Otherwise, a signal while the interpreter exits would print a traceback.
+    """
+    global _exit_status
+    _exit_status = status
+    _set_handlers(_exit)
+    # after the exit functions, Python replaces handlers written in Python by the default, which loses the status
+    atexit.register(_set_handlers, signal.SIG_IGN)
+
+
+def _set_handlers(handler: Any) -> None:
+    for number in ENDING:
+        if signal.getsignal(number) in OURS_TO_HANDLE:
+            signal.signal(number, handler)
+
+
+@contextmanager
+def interruptible_imports() -> Iterator[None]:
+    """Raise Interrupted at a signal in the `with` body, and again at its end.
+
+    An extension module that is interrupted while it is loaded may suppress the exception, or raise another one.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    received: list[Interrupted] = []
+
+    def receive(number: int, _frame: FrameType | None) -> None:
+        received.append(Interrupted(number))
+        raise received[0]
+
+    before = {number: signal.getsignal(number) for number in ENDING}
+    taken = {number: handler for number, handler in before.items() if handler in RAISING}
+    try:
+        for number in taken:
+            signal.signal(number, receive)
+        yield
+    finally:
+        for number, handler in taken.items():
+            signal.signal(number, handler)
+        if received:
+            raise received[0] from None
 
 
 @dataclass

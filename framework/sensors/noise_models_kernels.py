@@ -15,8 +15,9 @@ LARGEST_THETA = np.float32(np.deg2rad(80))  # maximum angle of the fits, rad; th
 
 _KINECT_V1 = SensorKind.KINECT_V1.noise
 
-# explicit fastmath: without it, numba caches the function with the flags of its first caller
-device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fastmath=False, _nrt=False)
+# explicit fastmath: without it, numba compiles the function with the flags of its first caller;
+# not stored: these functions are part of each kernel that calls them
+device = njit(nogil=True, forceinline=True, error_model="numpy", fastmath=False, _nrt=False)
 
 
 @device

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Bool, Float32, UInt8, UInt16
 from framework.sensors.noise_models import FLOOR, DepthNoise
 from framework.sensors.noise_models_kernels import axial_sigma_at_angle

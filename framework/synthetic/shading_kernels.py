@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Bool, Float32, Float64, Int32, Int64, UInt8
 from framework.rendering.rasterizer_kernels import NO_TRIANGLE
 from framework.synthetic.paints import DARK, EMISSION, SHINY

@@ -11,8 +11,8 @@ first color of the material, and a color mix of 1 is the second color. A *bright
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Float32
 from framework.synthetic.paints import Texture
 

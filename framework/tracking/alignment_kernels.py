@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from framework.compilation.kernel_cache import njit
 from framework.mapping.voxels.voxel_grid_kernels import device, one_more
 from framework.sensors.noise_models_kernels import axial_sigma_single
 

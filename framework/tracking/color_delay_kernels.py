@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from framework.compilation.kernel_cache import njit
 
 DEPTH_STEP = 0.05  # minimum depth step of an edge, fraction of the depth
 REACH = 4  # px, maximum width of the missing depth at an edge

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from framework.compilation.kernel_cache import njit
 
 DEPTH_GAP = 0.05  # minimum depth difference between surfaces, fraction of the depth
 MIN_MAPPED = np.float32(2.0)  # minimum number of mapped pixels among four for a mean intensity

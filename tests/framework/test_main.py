@@ -132,6 +132,61 @@ def test_module_search_path_excludes_working_directory(
     assert sys.path == [str(CHECKOUT)], "expected only the project folder"
 
 
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [("NUMBA_NUM_THREADS", "0"), ("NUMBA_DISABLE_JIT", "1"), ("NUMBA_THREADING_LAYER", "foo"), ("NUMBA_OPT", "9")],
+)
+def test_command_invalid_variable_is_one_line_error(tmp_path: Path, variable: str, value: str) -> None:
+    line = [sys.executable, "-m", "framework", "compile", "nothing"]
+    done = subprocess.run(
+        line, cwd=tmp_path, env=environment() | {variable: value}, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.fullmatch(rf"error: {variable}: expected .*, got '{value}'; unset it.*\n", done.stderr), done.stderr
+
+
+def test_commands_ignore_matplotlib_backend_of_user(tmp_path: Path) -> None:
+    code = "import framework.commands, matplotlib; print(matplotlib.get_backend())"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment() | {"MPLBACKEND": "foo"}, stdout=subprocess.PIPE,
+        text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout == "agg\n"
+
+
+LIBRARY = """
+import os, signal
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    import time; time.sleep(10)
+except KeyboardInterrupt:
+    raise ImportError("expected a working library") from None
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="requires signals of POSIX")
+@pytest.mark.parametrize(
+    ("library", "arguments"),
+    [("filelock", ["compile", "nothing"]), ("pycolmap", ["detector=simulated", "dataset=synthetic"])],
+)
+def test_command_ctrl_c_while_loading_is_one_line(tmp_path: Path, library: str, arguments: list[str]) -> None:
+    (tmp_path / f"{library}.py").write_text(LIBRARY)
+    path = os.pathsep.join([str(tmp_path), str(CHECKOUT)])
+    done = subprocess.run(
+        [sys.executable, "-m", "framework", *arguments], cwd=tmp_path, env=environment() | {"PYTHONPATH": path},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (130, "interrupted by Ctrl-C\n")
+
+
+def test_run_log_not_writable_is_one_warning(tmp_path: Path) -> None:
+    (tmp_path / "instancemap.log").symlink_to(tmp_path / "missing" / "run.log")
+    done = start(tmp_path, "dataset.frames=2")
+    assert done.returncode == 0
+    assert done.stderr.count("instancemap.log: expected a writable file, got an error (No such file or directory)") == 1
+    assert {path.name for path in tmp_path.iterdir()} >= RECORD
+
+
 def test_run_directory_creation_error_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "outputs").touch()
     line = command("seed=0")

@@ -9,6 +9,7 @@ import time
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.compilation.catalog import DEFAULT, OTHERS, Kernel, compile_all, listed
+from framework.compilation.kernel_cache import check_storage
 from framework.errors import ConfigError
 
 
@@ -34,7 +35,7 @@ def compile_named(kernels: list[Kernel], parts: list[str]) -> str:
 
     Raises:
         ConfigError: No kernel is selected.
-        DataError: A kernel cannot be compiled.
+        DataError: A kernel cannot be compiled or stored.
     """
     if parts:
         kernels = [kernel for kernel in kernels if any(part in f"{kernel.module}.{kernel.name}" for part in parts)]
@@ -45,6 +46,7 @@ def compile_named(kernels: list[Kernel], parts: list[str]) -> str:
         )
     missing = [kernel for kernel in kernels if not kernel.is_compiled()]
     if missing:
+        check_storage(kernel.dispatcher._cache for kernel in missing)
         started = time.perf_counter()
         compile_all(missing)
         return f"{len(missing)} of {len(kernels)} kernels compiled in {time.perf_counter() - started:.0f} s"

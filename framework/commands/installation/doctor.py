@@ -16,7 +16,7 @@ from typing import Any
 import framework
 from framework.doctor import machine, networks, packages
 from framework.doctor.check_result import Check, Status, anonymous, run_checks
-from framework.doctor.isolated import ACCELERATION, KERNELS, Outcomes, run_all
+from framework.doctor.isolated import ACCELERATION, KERNELS, REPAIR, Outcomes, run_all
 
 LEGEND = "ok: available   --: missing, optional   !!: missing or broken, required by the default stages"
 
@@ -28,18 +28,22 @@ def main() -> None:
         "home folder, so you can paste it into an issue. Exit status 1 means that the default pipeline cannot run."
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--repair", action="store_true", help="first delete the damaged files of the kernel cache")
     options = parser.parse_args([word for word in sys.argv[1:] if not word.startswith("debug=")])
-    sections = examine()
+    sections = examine(options.repair)
     errors = sum(check.status is Status.ERROR for checks in sections.values() for check in checks)
     print(_as_json(sections) if options.json else _as_text(sections, errors), flush=True)
     if errors:
         sys.exit(1)
 
 
-def examine() -> dict[str, list[Check]]:
-    """Run all checks and return them by section. Nothing is downloaded, compiled or written."""
+def examine(repair: bool = False) -> dict[str, list[Check]]:
+    """Run all checks and return them by section. Nothing is downloaded, compiled or written.
+
+    With `repair`, the damaged files of the kernel cache are deleted first.
+    """
     imports = [packages.import_statement(line.name) for line in packages.declared()[1]]
-    outcomes = run_all([ACCELERATION, KERNELS, *imports])
+    outcomes = {**run_all([REPAIR] if repair else []), **run_all([ACCELERATION, KERNELS, *imports])}
     libraries, acceleration, kernels = (
         update_wrapper(partial(check, outcomes), check) for check in (packages.libraries, _acceleration, _kernels)
     )
@@ -93,12 +97,23 @@ def _kernels(outcomes: Outcomes) -> Iterator[Check]:
         yield Check("kernels", Status.ERROR, error)
         return
     found = json.loads(answer)
+    if REPAIR in outcomes:
+        count, error = outcomes[REPAIR]
+        detail = error or f"{count} damaged files deleted"
+        yield Check.of("repair", not error, detail, "delete the *.nbi and *.nbc files of the kernel cache")
     commands = {"default stages": "instancemap compile", "other stages": "instancemap compile --all"}
     for (name, command), (compiled, count) in zip(commands.items(), found["counts"], strict=True):
         yield Check.of(name, compiled == count, f"{compiled} of {count} kernels compiled", command)
+    fix = "set the variable NUMBA_CACHE_DIR to a writable folder"
+    if found["folder"] is None:
+        yield Check.of("kernel cache", False, "no writable folder; each process compiles again", fix)
+        return
     _, writable = machine.writable_parent(Path(found["folder"]))
     detail = anonymous(found["folder"]) + ("" if writable else " is not writable; each process compiles again")
-    yield Check.of("kernel cache", writable, detail, "set the variable NUMBA_CACHE_DIR to a writable folder")
+    yield Check.of("kernel cache", writable, detail, fix)
+    damaged = found["damaged"]
+    detail = f"{len(damaged)} damaged, such as {anonymous(damaged[0])}" if damaged else "no damaged files"
+    yield Check.of("cache files", not damaged, detail, "instancemap doctor --repair")
 
 
 def _as_text(sections: Mapping[str, list[Check]], errors: int) -> str:

@@ -22,7 +22,7 @@ from framework.files.folders.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.runs.objective import objective_keys, objective_of
 from framework.runs.stored_runs import is_recorded
-from framework.runtime.signals import Interruption
+from framework.runtime.signals import Interruption, interruptible_imports
 from framework.runtime.sweep_worker import job_of_worker
 
 jobs = Jobs()
@@ -63,9 +63,10 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     from framework.runtime.process_settings import Settings
 
     settings = Settings.of(config)
-    settings.apply()
-    pipeline = begin(config)
-    settings.apply()  # apply to torch, if a stage has loaded it
+    with interruptible_imports():
+        settings.apply()
+        pipeline = begin(config)
+        settings.apply()  # apply to torch, if a stage has loaded it
     return write_run(pipeline, config, directory, choices)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Float32, Float64, Int32, Int64
 
 KEY_BITS = 21  # bits per voxel coordinate in a packed key; 2^20 voxels of 2 cm in each direction are 20 km

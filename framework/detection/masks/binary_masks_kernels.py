@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from framework.compilation.kernel_cache import njit
 
 CONTACT_DEPTH = 0.1  # largest difference in depth between neighboring pixels of two touching instances, m
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from framework.compilation.kernel_cache import njit
 from framework.sensors.noise_models_kernels import axial_sigma
 
 BIN = 0.02  # width of a bin of log depth: 2% of the depth

@@ -6,7 +6,8 @@ This module does not import torch, because kernel compilation should not load to
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from framework.compilation.kernel_cache import njit
 
 MAX_UINT8 = 255  # largest uint8
 

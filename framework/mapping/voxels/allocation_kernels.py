@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from framework.compilation.kernel_cache import njit
 from framework.mapping.voxels.bit_slices import ONE, lowest_bit
 from framework.mapping.voxels.voxel_grid import REGION_BLOCKS, REGION_SIDE
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, NO_KEY, device, pack_key, unpack_key

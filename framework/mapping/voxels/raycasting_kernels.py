@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from framework.compilation.kernel_cache import njit
 from framework.mapping.labels.label_evidence_kernels import best_class, best_instance, labeled_voxel
 from framework.mapping.voxels.voxel_grid import REGION_SIDE
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, NO_LOOK_UP, UNSEEN, device, find_block

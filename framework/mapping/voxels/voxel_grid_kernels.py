@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from framework.compilation.kernel_cache import njit
 
 BLOCK_SIDE = 8  # side of a block, voxels
 BLOCK_VOXELS = BLOCK_SIDE**3

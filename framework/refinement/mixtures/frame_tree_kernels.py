@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Bool, Float32, Int32
 from framework.refinement.mixtures.gaussian import ABSENT, log_densities
 from framework.refinement.mixtures.mixture_kernels import BLOCK

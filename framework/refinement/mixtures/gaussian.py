@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Float32, Float64
 
 LOG_2PI = float(np.log(2 * np.pi))

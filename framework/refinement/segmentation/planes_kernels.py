@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from framework.compilation.kernel_cache import njit
 from framework.data import Bool, Float32, Float64, Int32, Int64, UInt8
 from framework.refinement.refine_kernels import PART
 from framework.sensors.noise_models import DepthNoise

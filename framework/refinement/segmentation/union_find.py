@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-from numba import njit
-
+from framework.compilation.kernel_cache import njit
 from framework.data import Int32
 
 

@@ -17,6 +17,7 @@ import pytest
 import yaml
 from packaging.requirements import Requirement
 
+from framework.commands.installation.doctor import _kernels as kernel_checks
 from framework.compilation.catalog import DEFAULT, listed
 from framework.detection.mask_rcnn.published_weights import PUBLISHED
 from framework.doctor import isolated, machine, networks, packages
@@ -203,3 +204,21 @@ def test_doctor_reports_nearly_full_disk(monkeypatch: pytest.MonkeyPatch) -> Non
     checks = list(machine.disk())
     assert [check.detail.partition(" in ")[0] for check in checks] == ["0.1 GB free"] * 3
     assert all(check.status is Status.MISSING and check.fix for check in checks)
+
+
+def test_doctor_repair_deletes_damaged_cache_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    compile_one = [sys.executable, "-m", "framework", "compile", "binary_masks_kernels.mask_bounds"]
+    subprocess.run(compile_one, cwd=CHECKOUT, check=True)
+    [path] = tmp_path.rglob("*.nbc")
+    content = path.read_bytes()
+    path.write_bytes(content[:-1])
+    before = {check.name: check for check in kernel_checks(isolated.run_all([isolated.KERNELS]))}
+    assert before["cache files"].detail == f"1 damaged, such as {anonymous(path)}"
+    assert before["cache files"].fix == "instancemap doctor --repair"
+    assert path.read_bytes() == content[:-1]
+    repaired = isolated.run_all([isolated.REPAIR])
+    after = {check.name: check for check in kernel_checks({**repaired, **isolated.run_all([isolated.KERNELS])})}
+    assert after["repair"].detail == "1 damaged files deleted"
+    assert after["cache files"].status is Status.OK
+    assert not path.exists()

@@ -4,12 +4,26 @@ from __future__ import annotations
 
 import pickle
 import signal
+import subprocess
+import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
-from framework.runtime.signals import ENDING, REPEATED, Interrupted, raise_on_signals, signals_deferred
+from framework.runtime.signals import (
+    ENDING,
+    REPEATED,
+    Interrupted,
+    interruptible_imports,
+    raise_on_signals,
+    signals_deferred,
+)
+
+CHECKOUT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(autouse=True)
@@ -125,3 +139,63 @@ def test_signals_deferred_in_other_thread_has_no_effect() -> None:
     thread.start()
     thread.join()
     assert seen == [before]
+
+
+def suppress_signal() -> None:
+    with suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def replace_signal() -> None:
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise ImportError("expected a working extension module") from None
+
+
+@pytest.mark.parametrize("load", [suppress_signal, replace_signal])
+def test_import_that_suppresses_signal_is_interrupted(load: Callable[[], None]) -> None:
+    before = {number: signal.getsignal(number) for number in ENDING}
+    with pytest.raises(Interrupted, match="interrupted by Ctrl-C"), interruptible_imports():
+        load()
+    assert {number: signal.getsignal(number) for number in ENDING} == before
+
+
+EXITING = """
+import atexit, signal, sys, threading, time
+from framework.runtime.signals import exit_on_signals, raise_on_signals
+
+def wait(name):
+    print(name, flush=True)
+    time.sleep(20)
+
+raise_on_signals()
+threading.Thread(target=wait, args=("thread",)).start() if sys.argv[1] == "thread" else atexit.register(wait, "exit")
+exit_on_signals(143)
+sys.exit(143)
+"""
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("number", ENDING)
+def test_signal_to_waiting_thread_at_exit_keeps_status(number: int) -> None:
+    line = [sys.executable, "-c", EXITING, "thread"]
+    with subprocess.Popen(line, cwd=CHECKOUT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "thread\n"
+        time.sleep(0.3)  # the main thread waits for the other thread
+        process.send_signal(number)
+        _, stderr = process.communicate(timeout=10)
+    assert (process.returncode, stderr) == (143, "")
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("number", ENDING)
+def test_signal_to_exit_function_keeps_status(number: int) -> None:
+    line = [sys.executable, "-c", EXITING.replace("sleep(20)", "sleep(1)"), "exit"]
+    with subprocess.Popen(line, cwd=CHECKOUT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "exit\n"
+        process.send_signal(number)
+        _, stderr = process.communicate(timeout=10)
+    assert (process.returncode, stderr) == (143, "")

@@ -44,7 +44,7 @@ def test_compile_ctrl_c_prints_one_line(tmp_path: Path) -> None:
     assert time.monotonic() - asked < 5
     assert process.returncode == 128 + signal.SIGINT
     assert "Traceback" not in message
-    assert message.splitlines()[-1] == "interrupted"
+    assert message.splitlines()[-1].startswith("interrupted")
 
 
 def test_compile_unknown_kernel_name_raises() -> None:
