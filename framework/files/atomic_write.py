@@ -21,12 +21,17 @@ _TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.partial(\..*)?")  # names of te
 
 
 @contextmanager
-def atomic_write(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path, sync_entry: bool = True) -> Iterator[Path]:
     """Write a file atomically.
 
     The context manager yields a temporary path with the same suffix. At the end of the block, the temporary file
     replaces `path`. If an exception is raised, the temporary file is deleted. If `path` is a symbolic link, the target
     of the link is replaced. The new file survives a power cut.
+
+    Args:
+        path: The file.
+        sync_entry: Write the entry of the folder to disk. Otherwise, a power cut can undo the replacement. Writers of
+            many files sync the folder once.
 
     Raises:
         DataError: Writing fails, the text is not valid Unicode, or `path` exists and is not a regular file.
@@ -46,7 +51,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
         with temporary.open("rb+") as file:  # Windows syncs only writable files
             os.fsync(file.fileno())
         temporary.replace(path)
-        sync_folder(path.parent)
+        if sync_entry:
+            sync_folder(path.parent)
     except OSError as error:
         reason = error.strerror or f"{error}; the disk may be full"  # NumPy reports only the number of items
         raise DataError(f"{path}: expected a writable file, got an error ({reason})") from error

@@ -172,5 +172,5 @@ def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int
 
 def _write_image(path: Path, image: Array, *parameters: int) -> None:
     _, data = cv2.imencode(path.suffix, image, parameters)
-    with atomic_write(path) as temporary:
+    with atomic_write(path, sync_entry=False) as temporary:
         temporary.write_bytes(data.tobytes())

@@ -202,5 +202,5 @@ def trajectory_file(folder: Path) -> Path:
 
 def _write_png(path: Path, image: Array) -> None:
     _, data = cv2.imencode(".png", image, PNG)
-    with atomic_write(path) as temporary:
+    with atomic_write(path, sync_entry=False) as temporary:
         temporary.write_bytes(data.tobytes())

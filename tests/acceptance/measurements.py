@@ -5,13 +5,17 @@ from __future__ import annotations
 import functools
 import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
+import time
 import venv
 from collections.abc import Iterable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from tests.acceptance import recording_checks
 from tests.acceptance.runner import CHECKOUT, Measured, measurement
@@ -127,6 +131,34 @@ def speed_ratio() -> Measured:
 @measurement("exit status 0, 2,000 cases a test", *PIPELINE, "tests")
 def fuzzing() -> Measured:
     return failures("tests", "-k", "fuzz", INSTANCEMAP_FUZZ="2000")
+
+
+@measurement(
+    "<= 5% of the time to load a map, kitchen, 1 cm", "framework/files", "framework/mapping", "tests/acceptance"
+)
+def hashing_cost() -> Measured:
+    """Load a map with and without a comparison with its manifest, in turns."""
+    from framework.api import load_map
+    from framework.mapping.storage import map_file
+
+    with tempfile.TemporaryDirectory() as directory:
+        run = Path(directory, "run")
+        command = [sys.executable, "-m", "framework", *folder("redkitchen"), "detector=none", f"hydra.run.dir={run}"]
+        subprocess.run(command, cwd=CHECKOUT, check=True)
+
+        def seconds() -> float:
+            began = time.perf_counter()
+            load_map(run / "map.npz")
+            return time.perf_counter() - began
+
+        seconds()  # compiles the kernels, and reads the file into the page cache
+        ratios = []
+        for _ in range(15):
+            verified = seconds()
+            with mock.patch.object(map_file, "verified", nullcontext):
+                ratios.append(verified / seconds())
+    cost = 100 * (statistics.median(ratios) - 1)
+    return cost, cost <= 5
 
 
 @measurement("exit status 0, 30 kills", *PIPELINE, "tests/framework/commands/running")

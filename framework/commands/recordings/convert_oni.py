@@ -116,5 +116,5 @@ def write_frames(contents: OniContents, target: Path) -> tuple[int, DataError | 
 def _write_png(path: Path, image: Array) -> None:
     """Write a depth image (H, W) in mm, or a BGR color image (H, W, 3)."""
     _, data = cv2.imencode(".png", image, PNG)
-    with atomic_write(path) as temporary:
+    with atomic_write(path, sync_entry=False) as temporary:
         temporary.write_bytes(data.tobytes())

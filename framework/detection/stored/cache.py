@@ -137,7 +137,7 @@ class CachedDetector(Detector):
     def _write(self, path: Path, detections: Detections) -> None:
         content = pack(detections)
         try:
-            with atomic_write(path) as temporary:
+            with atomic_write(path, sync_entry=False) as temporary:  # a lost entry is computed again
                 temporary.write_bytes(_checksum(path, content) + content)
         except DataError as error:
             self._writes = False
