@@ -1,7 +1,7 @@
 """Fuzz tests of the files of a run. A damaged file must be read, or raise a one-line error that names the file.
 
-The run has no manifest, so that the readers get the damaged contents. `INSTANCEMAP_FUZZ=2000` tries 2,000 cases for each
-file.
+The copies have no manifest, so that the readers get the damaged contents. `INSTANCEMAP_FUZZ=2000` tries 2,000 cases for
+each file.
 """
 
 from __future__ import annotations
