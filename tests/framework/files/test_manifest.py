@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from framework.errors import DataError
 from framework.files.manifest import Manifest, RunStatus, verified
+
+CHECKOUT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture
@@ -107,3 +111,28 @@ def test_verified_missing_file_is_left_to_reader(directory: Path) -> None:
     (directory / "metrics.json").unlink()
     with pytest.raises(FileNotFoundError):
         read(directory / "metrics.json")
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from framework.files.folders.staged_files import staged_files
+from framework.files.json_file import write_json
+from framework.files.manifest import Manifest
+directory = Path(sys.argv[1])
+for k in range(100):
+    with staged_files(directory) as folder:
+        write_json(folder / "metrics.json", {"fps": k})
+        Manifest.read(directory).with_files(folder, ["metrics.json"]).write(folder)
+"""
+
+
+@pytest.mark.integration
+def test_verified_file_replaced_by_other_process_is_read(directory: Path) -> None:
+    values = []
+    with subprocess.Popen([sys.executable, "-c", WRITER, str(directory)], cwd=CHECKOUT) as writer:
+        while writer.poll() is None:
+            values.append(json.loads(read(directory / "metrics.json")).get("fps", -1))
+    assert writer.returncode == 0
+    assert values == sorted(values)
+    assert Manifest.read(directory).changed_files(directory) == []
