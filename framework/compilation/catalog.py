@@ -28,7 +28,7 @@ from filelock import FileLock, Timeout
 from numba import types
 from numba.core.dispatcher import Dispatcher
 
-from framework.compilation.kernel_cache import KernelCache, check_storage, warn_of_storage
+from framework.compilation.kernel_cache import KernelCache, check_cache_folders, warn_of_storage
 from framework.errors import DataError
 from framework.runtime.process_settings import available_cores
 from framework.runtime.progress import Progress
@@ -118,7 +118,7 @@ def compile_for_run() -> None:
     if not missing:
         return
     try:
-        check_storage(kernel.dispatcher._cache for kernel in missing)
+        check_cache_folders(kernel.dispatcher._cache for kernel in missing)
     except DataError as error:
         warn_of_storage(error)
         return

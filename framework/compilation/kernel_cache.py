@@ -144,7 +144,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         warn_of_storage(storage_error(self.cache_path, error))
 
 
-def check_storage(caches: Iterable[Any]) -> None:
+def check_cache_folders(caches: Iterable[Any]) -> None:
     """Raise DataError if a kernel cannot be stored, because its folder is not writable or its disk is full."""
     for folder in {cache.cache_path for cache in caches}:
         if folder is None:

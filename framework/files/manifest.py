@@ -17,6 +17,7 @@ from typing import Any
 
 from framework.errors import DataError
 from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
+from framework.files.folders.restartable_folder import check_finished
 from framework.files.folders.staged_files import finish_replacement
 from framework.files.hashing import path_hash
 from framework.files.json_file import parse_json, write_json
@@ -37,6 +38,8 @@ RUN_FILES = (
     "environment.txt",
 )
 """Files that are listed in a manifest if they exist."""
+
+_START = b'{\n  "status": "'  # first bytes of a manifest
 
 VERIFY = "instancemap verify"  # command that verifies all files of a run
 
@@ -94,7 +97,8 @@ class Manifest:
             return None
         content = read_bytes(manifest, MAX_TEXT)
         is_ours = b'"digest"' in content or b'"parameters"' in content  # also if one of the keys is damaged
-        return cls._parsed(manifest, content) if is_ours else None
+        is_cut_off = _START.startswith(content[: len(_START)].rstrip(b"\0"))  # or empty
+        return cls._parsed(manifest, content) if is_ours or is_cut_off else None
 
     @classmethod
     def _parsed(cls, path: Path, text: bytes) -> Manifest:
@@ -158,8 +162,9 @@ def verified(path: Path) -> Iterator[None]:
     Files without a manifest are not verified.
 
     Raises:
-        DataError: The file or the manifest has changed since the run.
+        DataError: The file or the manifest has changed since the run, or the folder is unfinished.
     """
+    check_finished(path.parent)
     manifest = Manifest.of_file(path)
     if manifest is None or not path.is_file():
         yield

@@ -10,9 +10,8 @@ import numpy as np
 
 from framework.data import Float32, Float64, Instance, InstanceMesh
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_write import path_exists
 from framework.queries.map_queries import Map
-from framework.runs.stored_runs import CONFIG, read_yaml
+from framework.runs.stored_runs import CONFIG, read_config
 from framework.vocabulary.color_names import COLOR_NAMES, fits, nearest_names
 from framework.vocabulary.text_queries import object_words
 
@@ -101,7 +100,7 @@ def _model_of(run: Path | None) -> tuple[str, str]:
     """Return the model and revision of the detector of a run."""
     if run is None:
         raise DataError(f"model: expected the model of the map's embeddings, got none; {NAME_IT}, or query its run")
-    node = read_yaml(run / CONFIG).get("detector") if path_exists(run / CONFIG) else None
+    node = read_config(run).get("detector")
     if isinstance(node, dict) and isinstance(node.get("model"), str):
         return node["model"], str(node.get("revision", "main"))
     raise DataError(f"{run / CONFIG}: expected the model of the embeddings in detector.model, got none; {NAME_IT}")

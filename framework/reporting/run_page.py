@@ -16,6 +16,7 @@ from framework.data import Float64
 from framework.editing.edited_run import EDITS, default_directory
 from framework.errors import DataError, FrameError
 from framework.files.image_files import read_color
+from framework.files.manifest import verified
 from framework.mapping.instance_map import FORMAT
 from framework.mapping.storage.map_file import read_format
 from framework.registry import STAGES
@@ -246,9 +247,14 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
 
 
 def overview_url(path: Path) -> str:
-    """Return a reduced overview.png as a `data:` URL, or "" if it cannot be read."""
+    """Return a reduced overview.png as a `data:` URL, or "" if it cannot be read.
+
+    Raises:
+        DataError: The file has changed since the run.
+    """
     try:
-        small = Image.fromarray(read_color(path))
+        with verified(path):
+            small = Image.fromarray(read_color(path))
     except FrameError:
         return ""
     small.thumbnail((OVERVIEW_WIDTH, OVERVIEW_WIDTH))

@@ -1,7 +1,7 @@
 """Writing of the run directory.
 
-Each file is written atomically. Files that cannot be recomputed are written first, the small ones before the map. The
-file metrics.json is written after all results and marks a complete run. A run that reads files of an earlier run in its
+Each file is written atomically. Files that cannot be recomputed are written first, the small ones before the map. Only
+complete runs have metrics.json. The file manifest.json is written last. A run that reads files of an earlier run in its
 own directory replaces this run when all its files are written.
 """
 
@@ -34,7 +34,7 @@ from framework.files.atomic_write import atomic_write, make_folder, remove_left_
 from framework.files.folders.output_folder import OutputFolder, reads_results_in
 from framework.files.folders.staged_files import StagedFiles, finish_replacement
 from framework.files.json_file import write_json
-from framework.files.manifest import MANIFEST, Manifest, RunStatus
+from framework.files.manifest import MANIFEST, RUN_FILES, Manifest, RunStatus
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import PoseTracker, RGBDSequence, RGBDVideo
 from framework.live_view.guarded_viewer import watched_run
@@ -61,7 +61,6 @@ from framework.runs.stored_runs import (
     METRICS,
     PARTIAL_METRICS,
     REPORT,
-    RESULT_FILES,
     TRAJECTORY,
     read_metrics,
 )
@@ -79,8 +78,7 @@ Arguments = ParamSpec("Arguments")
 Made = TypeVar("Made")
 
 
-LISTED = (*RESULT_FILES, METRICS, PARTIAL_METRICS)  # files in manifest.json, if they exist
-OWN_FILES = (*LISTED, MANIFEST, REPORT)  # files that a later run in the same directory replaces or removes
+OWN_FILES = (*RUN_FILES, MANIFEST, REPORT)  # files that a later run in the same directory replaces or removes
 
 
 @dataclass(frozen=True)
@@ -218,7 +216,7 @@ class RunRecord:
 
     def _write_manifest(self, folder: Path, status: RunStatus) -> None:
         manifest = Manifest(status, {}, self.inputs, parameters_of(self.config))
-        manifest.with_files(folder, LISTED).write(folder)
+        manifest.with_files(folder, RUN_FILES).write(folder)
 
     def _announce(self, run: WrittenRun, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics) -> None:
         log.info("%s", title)

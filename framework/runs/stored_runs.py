@@ -268,6 +268,9 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
     finish_replacement(directory)
     if not (directory / METRICS).exists():
         return False
+    if not path_exists(directory / MANIFEST):  # killed between the two files
+        log.warning("repeating the run: %s: expected a file, got none", directory / MANIFEST)
+        return False
     try:
         record = read_record(directory)
     except DataError as error:
@@ -329,6 +332,20 @@ def _with_text_keys(node: Any) -> Any:
     if isinstance(node, dict):
         return {str(key): _with_text_keys(value) for key, value in node.items()}
     return [_with_text_keys(one) for one in node] if isinstance(node, list) else node
+
+
+def read_config(directory: Path) -> dict[str, Any]:
+    """Read the config of a run without resolving interpolations, {} if there is none.
+
+    Raises:
+        DataError: The config is invalid or has changed since the run.
+    """
+    finish_replacement(directory)
+    path = directory / CONFIG
+    if not path_exists(path):
+        return {}
+    with verified(path):
+        return read_yaml(path)
 
 
 def has_metrics(directory: Path) -> bool:

@@ -19,7 +19,7 @@ from framework.interfaces import FrameReader, LiveVideo, RGBDSequence, RGBDVideo
 
 POLL_INTERVAL_S = 0.1  # s, interval of checks for the end while waiting for a frame
 
-_EPOCH = time.time() - time.monotonic()  # s since 1970 at which the monotonic clock was 0, if it started with this one
+_EPOCH = time.time() - time.monotonic()  # s since 1970, time at which the monotonic clock is 0
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")

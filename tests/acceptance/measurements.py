@@ -137,7 +137,7 @@ def fuzzing() -> Measured:
     "<= 5% of the time to load a map, kitchen, 1 cm", "framework/files", "framework/mapping", "tests/acceptance"
 )
 def hashing_cost() -> Measured:
-    """Load a map with and without a comparison with its manifest, in turns."""
+    """Load a map alternately with and without a comparison with its manifest."""
     from framework.api import load_map
     from framework.mapping.storage import map_file
 

@@ -9,7 +9,7 @@ import time
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.compilation.catalog import DEFAULT, OTHERS, Kernel, compile_all, listed
-from framework.compilation.kernel_cache import check_storage
+from framework.compilation.kernel_cache import check_cache_folders
 from framework.errors import ConfigError
 
 
@@ -46,7 +46,7 @@ def compile_named(kernels: list[Kernel], parts: list[str]) -> str:
         )
     missing = [kernel for kernel in kernels if not kernel.is_compiled()]
     if missing:
-        check_storage(kernel.dispatcher._cache for kernel in missing)
+        check_cache_folders(kernel.dispatcher._cache for kernel in missing)
         started = time.perf_counter()
         compile_all(missing)
         return f"{len(missing)} of {len(kernels)} kernels compiled in {time.perf_counter() - started:.0f} s"

@@ -30,7 +30,7 @@ def main() -> None:
         "directory",
         metavar="DIR",
         type=Path,
-        help="output RGB-D folder; must be new, empty or of an interrupted import",
+        help="output RGB-D folder; must be new, empty or from an interrupted import",
     )
     width = f"image width before rotation, px; default: {LONGER_SIDE} px for the longer side"
     add("--width", metavar="PX", type=int, default=default.width, help=width)

@@ -6,17 +6,14 @@ import argparse
 import logging
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from framework.commands.command_line import arguments, one_line_errors
 from framework.errors import DataError
 from framework.files.atomic_write import path_exists
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum
-from framework.files.yaml_file import load_yaml
 from framework.queries.changes import Change, Kind, Visit, changes
 from framework.queries.labeled_surface import LabeledSurface
-from framework.runs.stored_runs import CONFIG, EDITED_FROM, EXTERNAL, METRICS, TRAJECTORY, read_metrics
+from framework.runs.stored_runs import EDITED_FROM, EXTERNAL, METRICS, TRAJECTORY, read_config, read_metrics
 
 log = logging.getLogger(__name__)
 
@@ -78,8 +75,8 @@ def in_world(run: Path, world: Path) -> bool:
     This is the case if `run` was localized in `world`, resumed it or is an edit of it, or if both used ground-truth
     poses. Imported maps are in the world frame of these poses.
     """
-    config = load_yaml(run / CONFIG) if path_exists(run / CONFIG) else None
-    worlds = [config.get(key) for key in ("localize_in", "resume_from")] if isinstance(config, DictConfig) else []
+    config = read_config(run)
+    worlds = [config.get(key) for key in ("localize_in", "resume_from")]
     metrics = [read_metrics(one) if path_exists(one / METRICS) else {} for one in (run, world)]
     worlds.append(metrics[0].get(EDITED_FROM))
     if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in worlds):

@@ -2,7 +2,7 @@
 
 The layout is that of `dataset=rgbd_folder`:
 
-    camera.json         as in an RGB-D folder; may appear after the start, but must not change then
+    camera.json         as in an RGB-D folder; may appear after the start, but must not change afterwards
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
     end                 an empty file, written after the last frame
@@ -143,8 +143,11 @@ def _check_unchanged(path: Path, stored: StoredCamera, found: StoredCamera) -> N
 
 
 def _read(number: int, images: StoredImages, timestamp: float, calibration: Calibration, sensor: SensorKind) -> Frame:
-    color = calibration.color(images.color(), images.color_name)
-    depth = calibration.depth(images.depth(), images.depth_name)
+    try:
+        color = calibration.color(images.color(), images.color_name)
+        depth = calibration.depth(images.depth(), images.depth_name)
+    except FrameError as error:  # without its cause, because `Arrivals` detects lost storage
+        raise FrameError(str(error)) from None
     name = images.image_name
     return Frame(number, timestamp, color, depth, calibration.camera, sensor=sensor, image_name=name)
 

@@ -74,15 +74,15 @@ class OutputFolder:
 
     def _rescued(self) -> Path:
         """Move the staged files to a new folder, and return it."""
-        reason: OSError | None = None
-        for wanted in (_beside(self.directory), self.directory / RESCUED):  # the first may be on another disk
+        reason: OSError | DataError | None = None
+        for wanted in (_next_to(self.directory), self.directory / RESCUED):  # the first may be on another disk
             try:
                 folder = Path(new_directory(str(wanted)))
                 folder.rmdir()  # Windows cannot replace a folder
                 self.path.rename(folder)
                 sync_folder(folder.parent)
                 return folder
-            except OSError as error:
+            except (OSError, DataError) as error:
                 reason = error
         raise DataError(f"{self.path}: expected a folder that can be moved, got an error ({reason})") from reason
 
@@ -105,17 +105,17 @@ def _identity(path: str) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def _beside(directory: Path) -> Path:
+def _next_to(directory: Path) -> Path:
     absolute = directory.absolute()
     return absolute.with_name(f"{absolute.name}_{RESCUED}")
 
 
 def _rescue_folder(directory: Path) -> Path:
     """Create a folder next to a directory or, if impossible, in the folder for temporary files."""
-    beside = _beside(directory)
+    preferred = _next_to(directory)
     with suppress(DataError):
-        return Path(new_directory(str(beside)))
-    return Path(new_directory(str(Path(tempfile.gettempdir()) / beside.name)))
+        return Path(new_directory(str(preferred)))
+    return Path(new_directory(str(Path(tempfile.gettempdir()) / preferred.name)))
 
 
 def _check_writable(directory: Path) -> None:

@@ -62,7 +62,6 @@ def restartable_folder(
                     path.unlink()
             with atomic_write(marker) as temporary:
                 temporary.write_text(f"{command}\n")
-            sync_folder(directory)
             try:
                 yield
             except BaseException:

@@ -18,7 +18,7 @@ import pytest
 from framework.commands.installation.compile import compile_named
 from framework.compilation import catalog, kernel_cache
 from framework.compilation.catalog import Kernel
-from framework.compilation.kernel_cache import CheckedFiles, KernelCache, check_storage, damaged_files
+from framework.compilation.kernel_cache import CheckedFiles, KernelCache, check_cache_folders, damaged_files
 from framework.errors import DataError
 from tests.support.recordings.damaged_files import EXAMPLES
 
@@ -133,11 +133,11 @@ def test_kernel_without_cache_folder_is_kept_in_memory(
 
 
 def test_check_storage_reports_folder_and_reason(twice: Any, tmp_path: Path) -> None:
-    check_storage([twice._cache])
+    check_cache_folders([twice._cache])
     (tmp_path / "file").touch()
     twice._cache._cache_path = str(tmp_path / "file" / "cache")
     with pytest.raises(DataError, match=r"got .*/file/cache \(Not a directory\); set NUMBA_CACHE_DIR=DIR"):
-        check_storage([twice._cache])
+        check_cache_folders([twice._cache])
 
 
 def test_cache_dir_not_writable_is_reported(

@@ -99,6 +99,21 @@ def test_verified_damaged_manifest_raises(key: str, directory: Path) -> None:
         read(directory / "config.yaml")
 
 
+def test_verified_unfinished_folder_raises(directory: Path) -> None:
+    (directory / ".unfinished").write_text("import-map\n")
+    with pytest.raises(DataError, match="expected complete data, got an unfinished import-map; repeat"):
+        read(directory / "config.yaml")
+
+
+@pytest.mark.parametrize("size", [0, 5, 40])
+@pytest.mark.parametrize("rest", [b"", bytes(64)])
+def test_verified_truncated_manifest_raises(size: int, rest: bytes, directory: Path) -> None:
+    path = directory / "manifest.json"
+    path.write_bytes(path.read_bytes()[:size] + rest)
+    with pytest.raises(DataError, match=r"manifest\.json: expected valid JSON"):
+        read(directory / "config.yaml")
+
+
 def test_verified_file_replaced_while_read_is_accepted(directory: Path) -> None:
     metrics = directory / "metrics.json"
     stored = Manifest.read(directory)

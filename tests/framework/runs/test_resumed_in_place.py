@@ -14,6 +14,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from framework.errors import DataError, PartialRunError
+from framework.files.folders import output_folder
+from framework.files.folders.directory_lock import new_directory
 from framework.files.folders.output_folder import reads_results_in
 from framework.files.manifest import Manifest, RunStatus
 from framework.files.tum_trajectory import read_tum
@@ -105,12 +107,13 @@ def test_paths_of_run_directory_are_recognized(run: Path, setting: Callable[[Pat
     assert not reads_results_in(run.parent, settings, OWN_FILES)
 
 
+def full_disk(path: Path, *_: object) -> None:
+    raise DataError(f"{path}: expected a writable file, got an error (No space left on device)")
+
+
 def test_failed_run_in_place_keeps_earlier_run(
     run: Path, room: CornerRoom, result: RunResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full_disk(path: Path, *_: object) -> None:
-        raise DataError(f"{path}: expected a writable file, got an error (No space left on device)")
-
     before = files_of(run)
     monkeypatch.setattr(run_directory, "write_mesh", full_disk)
     for name in ("run_rescued", "run_rescued_2"):
@@ -125,6 +128,22 @@ def test_failed_run_in_place_keeps_earlier_run(
         }
         assert Manifest.read(rescued).status is RunStatus.PARTIAL
         assert Manifest.read(rescued).changed_files(rescued) == []
+
+
+def test_failed_run_in_place_in_read_only_parent_is_kept(
+    run: Path, room: CornerRoom, result: RunResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def new_below_run(wanted: str) -> str:
+        if Path(wanted).parent != run:
+            raise DataError(f"{wanted}: expected a writable parent folder, got an error (Permission denied)")
+        return new_directory(wanted)
+
+    before = files_of(run)
+    monkeypatch.setattr(run_directory, "write_mesh", full_disk)
+    monkeypatch.setattr(output_folder, "new_directory", new_below_run)
+    assert begun(run, resume_from=str(run)).write(room, result).folder == run / "rescued"
+    assert (run / "rescued" / "map.npz").exists()
+    assert {name: (run / name).read_bytes() for name in before} == before
 
 
 def test_interrupted_run_in_place_replaces_earlier_run(run: Path, room: CornerRoom, result: RunResult) -> None:

@@ -11,11 +11,12 @@ import pytest
 from omegaconf import OmegaConf
 
 from framework.errors import DataError
+from framework.files.manifest import Manifest, RunStatus
 from framework.runs import stored_runs
 from framework.runs.inputs import inputs_sha256
 from framework.runs.plugin_code import plugin_code
 from framework.runs.provenance import config_hash
-from framework.runs.stored_runs import MAPPED, find_records, is_recorded, read_record
+from framework.runs.stored_runs import MAPPED, find_records, is_recorded, read_config, read_record
 
 CONFIG = {"seed": 3, "fuser": {"voxel_size": 0.02, "far": 1e-9, "storage": "EXACT", "none": None}, "on": [1, "2", True]}
 
@@ -29,6 +30,7 @@ def directory(tmp_path: Path) -> Path:
     write(directory, config_hash=config_hash(CONFIG))
     for name in MAPPED:
         (directory / name).touch()
+    (directory / "manifest.json").write_text("{}")
     return directory
 
 
@@ -143,6 +145,22 @@ def test_is_recorded_changed_plugin_code_is_false(directory: Path, caplog: pytes
         (directory / "metrics.json").write_text(json.dumps(metrics | code))
         assert is_recorded(directory, OmegaConf.create(config)) is is_complete
     assert f"repeating the run: the code changed since the run in {directory}: refiner: mean 0.1 3f ->" in caplog.text
+
+
+def test_read_config_of_other_run_raises(directory: Path) -> None:
+    assert read_config(directory) == CONFIG
+    Manifest(RunStatus.COMPLETE, {}, {}, {}).with_files(directory, ["config.yaml"]).write(directory)
+    (directory / "config.yaml").write_text("seed: 4\n")
+    with pytest.raises(DataError, match=r"config\.yaml: expected the SHA-256"):
+        read_config(directory)
+    (directory / "config.yaml").unlink()
+    assert read_config(directory) == {}
+
+
+def test_is_recorded_without_manifest_is_false(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (directory / "manifest.json").unlink()
+    assert not is_recorded(directory, OmegaConf.create(CONFIG))
+    assert f"repeating the run: {directory / 'manifest.json'}: expected a file, got none" in caplog.text
 
 
 def test_is_recorded_same_config_is_true(directory: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -108,7 +108,10 @@ READERS = {
 READ = {
     "evaluate": ("config.yaml", "metrics.json", "mesh.ply", "instances.json", "trajectory.txt"),
     "export": ("mesh.ply", "instances.json", "metrics.json"),
-    "report": ("config.yaml", "metrics.json", "mesh.ply", "instances.json", "trajectory.txt", "timings.csv"),
+    "report": (
+        *("config.yaml", "metrics.json", "mesh.ply", "instances.json", "trajectory.txt", "timings.csv"),
+        "overview.png",
+    ),
     "tables": ("config.yaml", "metrics.json"),
     "query": ("map.npz", "metrics.json"),
 }

@@ -26,6 +26,7 @@ from framework.datasets.cameras import folder_watch
 from framework.datasets.cameras.folder_watch import FolderWatch
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError, FrameError
+from framework.files.storage import check_storage
 from framework.interfaces import FrameReader, PoseTracker, SceneMap
 from framework.runtime.frame_stream import LiveFrames
 from framework.sensors.noise_models import SensorChoice, SensorKind
@@ -186,6 +187,17 @@ def test_folder_watch_continues_after_files_are_removed(folder: Path) -> None:
         path.unlink()
     write(folder, 2)
     assert watched.look() == [2]
+
+
+def test_folder_watch_frame_in_emptied_folder_is_skipped(folder: Path) -> None:
+    """The other program may delete all images while a frame waits. The storage is still available."""
+    write(folder, 0)
+    (reader,) = Watched(folder).readers()
+    for path in (folder / "color").iterdir():
+        path.unlink()
+    with pytest.raises(FrameError) as caught:
+        reader()
+    check_storage(caught.value)
 
 
 def test_folder_watch_raises_for_ambiguous_names_only(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
