@@ -68,10 +68,11 @@ def _whole(digits: str) -> int:
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return the pairs as a dictionary, and raise DataError for duplicate keys."""
-    found = dict(pairs)  # JSON does not define the meaning of duplicate keys
-    if len(found) < len(pairs):
-        twice = next(key for k, (key, _) in enumerate(pairs) if key in {before for before, _ in pairs[:k]})
-        raise DataError(f"expected unique keys, got {twice!r} twice")
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:  # JSON does not define the meaning of duplicate keys
+            raise DataError(f"expected unique keys, got {key!r} twice")
+        found[key] = value
     return found
 
 

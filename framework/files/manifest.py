@@ -109,7 +109,9 @@ class Manifest:
         if digest != _digest(content):
             raise DataError(f"{path}: expected the digest {_digest(content)[:12]}, got {digest!s:.12}; repeat the run")
         try:
-            files = {str(name): (int(one["bytes"]), str(one["sha256"])) for name, one in content["files"].items()}
+            files = {
+                _file_name(name): (int(one["bytes"]), str(one["sha256"])) for name, one in content["files"].items()
+            }
             texts = [{key: str(one) for key, one in content[name].items()} for name in ("inputs", "parameters")]
             return cls(RunStatus[content["status"]], files, *texts)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -178,6 +180,13 @@ def verified(path: Path) -> Iterator[None]:
     if change:
         fix = f"repeat the run, or accept an intended change with {VERIFY} {path.parent} --accept {path.name}"
         raise DataError(f"{change}; {fix}")
+
+
+def _file_name(name: str) -> str:
+    """Return the name of a file, or raise ValueError for a path: a run lists only files in its own directory."""
+    if name in ("", ".", "..") or not {"/", "\\", "\0"}.isdisjoint(name):
+        raise ValueError(f"expected a file name, got {name!r:.60}")
+    return name
 
 
 def _digest(content: Mapping[str, Any]) -> str:

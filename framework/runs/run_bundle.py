@@ -5,12 +5,13 @@ from __future__ import annotations
 import sys
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from framework.config.composition import add_config_dir
-from framework.errors import DataError
+from framework.errors import DataError, in_one_line
 from framework.files.atomic_write import atomic_write
 from framework.files.manifest import MANIFEST, Manifest
 from framework.runs.plugin_code import plugin_files, targets_of
@@ -41,7 +42,11 @@ def write_bundle(folder: Path, path: Path, with_maps: bool = False) -> int:
     records, _ = completed_runs(folder)
     targets = {pair for record in records for pair in targets_of(record.config)}
     sources = {(stage, target): files for stage, target in sorted(targets) if (files := plugin_files(target))}
-    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+    with (
+        atomic_write(path) as temporary,
+        # ZIP files have no times before 1980 and after 2107
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, strict_timestamps=False) as archive,
+    ):
         for record in records:
             manifest = Manifest.read(record.directory)
             if changed := manifest.changed_files(record.directory):
@@ -75,12 +80,10 @@ def opened_bundle(path: Path, trust_code: bool) -> Iterator[Path]:
         trust_code: Accept a bundle with plugin code.
 
     Raises:
-        DataError: The file is not a ZIP file, is too large, or contains plugin code without `trust_code`.
+        DataError: The file is no undamaged ZIP file, is too large, or contains plugin code without `trust_code`.
     """
-    try:
+    with _zip_errors(path):
         archive = zipfile.ZipFile(path)
-    except (OSError, zipfile.BadZipFile) as error:
-        raise DataError(f"{path}: expected a bundle, got an error ({error})") from error
     with archive, tempfile.TemporaryDirectory(prefix="instancemap_bundle_") as temporary:
         if (size := sum(one.file_size for one in archive.infolist())) > MAX_SIZE:
             raise DataError(f"{path}: expected at most {MAX_SIZE} bytes, got {size}")
@@ -90,7 +93,8 @@ def opened_bundle(path: Path, trust_code: bool) -> Iterator[Path]:
                 f"{path}: expected --trust-code for a bundle with plugin code, got none; inspect {PLUGINS}/ in the "
                 "file, then set --trust-code"
             )
-        archive.extractall(temporary)
+        with _zip_errors(path):
+            archive.extractall(temporary)
         folder = Path(temporary)
         if has_code:
             sys.path.insert(0, str(folder / PLUGINS))
@@ -100,3 +104,12 @@ def opened_bundle(path: Path, trust_code: bool) -> Iterator[Path]:
         finally:
             if has_code:
                 sys.path.remove(str(folder / PLUGINS))
+
+
+@contextmanager
+def _zip_errors(path: Path) -> Iterator[None]:
+    """Raise DataError for an error of a ZIP file in the `with` body."""
+    try:
+        yield
+    except (OSError, zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError) as error:
+        raise DataError(f"{path}: expected an undamaged bundle, got an error ({in_one_line(error)})") from error

@@ -6,7 +6,6 @@ shapes. The folder of a room contains 000000.jpg, 000000.png (16-bit instance id
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import shutil
 import tempfile
@@ -21,10 +20,11 @@ import numba
 import numpy as np
 from tqdm import tqdm
 
-from framework.data import Bool, Camera, Float64, UInt8
+from framework.data import Array, Bool, Camera, Float64, UInt8
 from framework.errors import DataError
+from framework.files.atomic_write import atomic_write, sync_folder
 from framework.files.image_files import read_color, read_uint16
-from framework.files.json_file import read_json
+from framework.files.json_file import read_json, write_json
 from framework.synthetic.layout import CELL
 from framework.synthetic.renderer import Renderer
 from framework.synthetic.rgbd_camera import noisy_color
@@ -80,16 +80,27 @@ def room_folder(folder: Path, number: int) -> Path:
 
 
 def render_room(folder: Path, views: int, number: int) -> None:
-    """Render the images of a room and write them to a new folder atomically."""
+    """Render the images of a room and write them to a new folder atomically.
+
+    Raises:
+        DataError: A file cannot be written.
+    """
     with tempfile.TemporaryDirectory(dir=folder, prefix=".room_") as unfinished:
         target = Path(unfinished) / "room"
         target.mkdir()
         for k, (color, ids, names) in enumerate(pictures(number, views)):
-            (target / "classes.json").write_text(json.dumps(names))
             bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
-            cv2.imwrite(str(target / f"{k:06d}.jpg"), bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-            cv2.imwrite(str(target / f"{k:06d}.png"), ids)
+            _write_image(target / f"{k:06d}.jpg", bgr, cv2.IMWRITE_JPEG_QUALITY, QUALITY)
+            _write_image(target / f"{k:06d}.png", ids)
+            write_json(target / "classes.json", names)
         shutil.move(target, room_folder(folder, number))
+    sync_folder(folder)
+
+
+def _write_image(path: Path, image: Array, *parameters: int) -> None:
+    _, data = cv2.imencode(path.suffix, image, parameters)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(data.tobytes())
 
 
 def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[int, str]]]:

@@ -22,6 +22,7 @@ from framework.commands.command_line import arguments, one_line_errors
 from framework.commands.installation.plugins import options_of
 from framework.data import Camera, Detections, Frame, Instance, PointClusters, Pose, SurfaceView
 from framework.errors import ConfigError, DataError
+from framework.files.atomic_write import atomic_write, make_folder, sync_folder
 from framework.registry import GROUPS
 
 TEMPLATES = Path(framework.__file__).with_name("templates")
@@ -120,9 +121,11 @@ def write_repository(stage: str, name: str, folder: Path) -> Path:
         with tempfile.TemporaryDirectory(prefix=".new-plugin-", dir=folder) as temporary:
             half = Path(temporary, "repository")
             for path, text in files_of(stage, name).items():
-                (half / path).parent.mkdir(parents=True, exist_ok=True)
-                (half / path).write_text(text, encoding="utf-8", newline="\n")
+                make_folder((half / path).parent)
+                with atomic_write(half / path) as file:
+                    file.write_text(text, encoding="utf-8", newline="\n")
             half.rename(place)
+            sync_folder(folder)
     except OSError as error:
         raise DataError(
             f"{place}: expected a writable folder, got an error ({error.strerror or error}); choose another "

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from framework.commands.command_line import EXIT_FAILED, arguments, one_line_errors, print_error
 from framework.errors import ConfigError, DataError
+from framework.files.folders.directory_lock import locked
 from framework.files.manifest import MANIFEST, RUN_FILES, Manifest
 from framework.runs.stored_runs import run_directories
 
@@ -57,11 +58,12 @@ def accept(directory: Path, names: Sequence[str]) -> None:
 
     Raises:
         ConfigError: A name is not that of a listed file.
-        DataError: The manifest is missing, damaged or not writable.
+        DataError: The manifest is missing, damaged or not writable, or the directory is in use.
     """
     manifest = Manifest.read(directory)
     listed = {*manifest.files, *RUN_FILES}
     if unlisted := [name for name in names if name not in listed]:
         expected = f"expected files listed in {directory / MANIFEST}"
         raise ConfigError(f"accept: {expected}, got {', '.join(unlisted)}; choose {', '.join(sorted(listed))}")
-    manifest.with_files(directory, names).write(directory)
+    with locked(directory):  # `evaluate` may replace the manifest at the same time
+        Manifest.read(directory).with_files(directory, names).write(directory)

@@ -40,8 +40,11 @@ class StagedFiles:
         staged = cls(directory)
         try:
             make_folder(directory)
-            if path_exists(staged.folder):
-                shutil.rmtree(staged.folder)
+            for path in (staged.folder, directory / REPLACING):  # the second only if it is no folder of this module
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
             staged.folder.mkdir()
         except OSError as error:
             raise _not_writable(directory, error) from error
@@ -106,13 +109,14 @@ def staged_files(directory: Path) -> Iterator[Path]:
 def finish_replacement(directory: Path) -> None:
     """Complete the replacement of files in a directory if it was interrupted.
 
-    Several processes may do this at the same time.
+    Several processes may do this at the same time. A symbolic link is ignored, because the files of its target are not
+    those of an interrupted replacement.
 
     Raises:
         DataError: The replacement cannot be completed, for example in a read-only folder.
     """
     replacing = directory / REPLACING
-    if not replacing.is_dir():
+    if replacing.is_symlink() or not replacing.is_dir():
         return
     try:
         sync_folder(directory)

@@ -10,22 +10,31 @@ from types import ModuleType
 import pytest
 from omegaconf import OmegaConf
 
+from framework.commands.installation import new_plugin
+from framework.commands.recordings import import_recording
 from framework.commands.results import (
     bundle,
     edit,
     evaluate,
     export,
+    figures,
     import_map,
+    raycast,
     report,
+    tables,
     verify,
 )
+from framework.commands.running.detect import write_detections
 from framework.commands.running.run import run
 from framework.files.folders.staged_files import REPLACING, STAGED, finish_replacement
 from framework.files.manifest import MANIFEST, Manifest, RunStatus
 from framework.runs.stored_runs import read_record
+from framework.training.room_pictures import render_room
 from tests.support import reported_run
 from tests.support.command_call import call_command
 from tests.support.power_cut import Lost, VolatileDisk
+from tests.support.recordings.phone_exports import room_frames, write_stray_scanner
+from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
 CONFIG = OmegaConf.create(reported_run.CONFIG | {"fuser": reported_run.CONFIG["fuser"] | {"voxel_size": 0.06}})
@@ -36,7 +45,12 @@ COMMANDS: dict[str, tuple[ModuleType, tuple[str, ...]]] = {
     "evaluate": (evaluate, ("run", "--label-space", "agnostic")),
     "export": (export, ("run", "--to", "glb", "ply", "obj", "--out", "exported")),
     "import-map": (import_map, ("run/mesh.ply", "imported")),
+    "figures": (figures, ("run", "figure.kind=stage_times")),
+    "import": (import_recording, ("phone", "recording")),
+    "new-plugin": (new_plugin, ("refiner", "my_refiner")),
+    "raycast": (raycast, ("run",)),
     "report": (report, ("run",)),
+    "tables": (tables, ("run", "table.columns=[fps]")),
     "verify": (verify, ("run", "--accept", "overview.png")),
 }
 
@@ -52,6 +66,7 @@ def folder(mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     """Return the working folder, with a copy of the run."""
     folder = tmp_path / "work"
     shutil.copytree(mapped, folder / "run")
+    write_stray_scanner(folder / "phone", room_frames(2))
     monkeypatch.chdir(folder)
     return folder
 
@@ -110,6 +125,21 @@ def test_command_after_power_cut_has_no_damaged_files(
 @pytest.mark.parametrize("directory", ["run", "new"])
 def test_run_after_power_cut_has_no_damaged_files(directory: str, folder: Path) -> None:
     assert cut_everywhere(folder, lambda: run(CONFIG, folder / directory, {})) >= 20
+
+
+def test_resumed_run_after_power_cut_has_no_damaged_files(folder: Path) -> None:
+    tracker = {"_target_": "plugins.trackers.ground_truth.GroundTruth"}
+    config = OmegaConf.create(reported_run.CONFIG | {"resume_from": str(folder / "run"), "tracker": tracker})
+    assert cut_everywhere(folder, lambda: run(config, folder / "run", {}), "run") >= 20
+
+
+def test_detections_after_power_cut_are_undamaged(folder: Path) -> None:
+    path = folder / "found.json"
+    assert cut_everywhere(folder, lambda: write_detections(path, SphereDetector(), CornerRoom(frames=2))) >= 2
+
+
+def test_rendered_room_after_power_cut_is_undamaged(folder: Path) -> None:
+    assert cut_everywhere(folder, lambda: render_room(folder, 1, 2)) >= 4
 
 
 def test_power_cut_without_sync_is_found(folder: Path) -> None:

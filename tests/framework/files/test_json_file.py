@@ -43,6 +43,12 @@ def test_json_invalid_raises_one_line_error_with_source(content: bytes, message:
     assert len(str(caught.value)) < 300
 
 
+def test_json_duplicate_of_many_keys_is_found() -> None:
+    keys = [*map(str, range(100_000)), "99999"]
+    with pytest.raises(DataError, match="expected unique keys, got '99999' twice"):
+        parse_json("results.json", "{" + ", ".join(f'"{key}": 0' for key in keys) + "}")
+
+
 def test_json_maximum_nesting_depth_is_read(tmp_path: Path) -> None:
     (tmp_path / "deep.json").write_text("[" * MAX_DEPTH + "]" * MAX_DEPTH)
     found = read_json(tmp_path / "deep.json")

@@ -56,6 +56,14 @@ def test_manifest_edited_raises(directory: Path, changes: dict[str, object], mes
         Manifest.read(directory)
 
 
+@pytest.mark.parametrize("name", ["../secret.txt", "/etc/hostname", "..", "", "a\\b", "a\0"])
+def test_manifest_with_path_of_other_folder_raises(name: str, directory: Path) -> None:
+    (directory.parent / "secret.txt").write_text("secret")
+    Manifest(RunStatus.COMPLETE, {name: (6, "0" * 64)}, {}, {}).write(directory)
+    with pytest.raises(DataError, match=r"manifest\.json: expected status, files, .*expected a file name, got "):
+        Manifest.read(directory)
+
+
 def test_manifest_without_object_raises(directory: Path) -> None:
     (directory / "manifest.json").write_text("[]")
     with pytest.raises(DataError, match="expected a JSON object, got list"):

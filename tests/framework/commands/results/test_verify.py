@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from framework.commands.results import evaluate, export, query, report, tables, verify
+from framework.files.folders.directory_lock import locked
 from framework.files.manifest import Manifest
 from tests.support import reported_run
 from tests.support.command_call import call_command
@@ -89,6 +90,15 @@ def test_verify_accepted_files_are_unchanged(stored: Path, command: Command) -> 
     assert "mesh.ply" not in Manifest.read(stored).files
     status, _, error = command(verify, stored, "--accept", "notes.txt")
     assert (status, "accept: expected files listed in " in error) == (1, True)
+
+
+def test_verify_accept_in_locked_directory_is_rejected(stored: Path, command: Command) -> None:
+    reported_run.rename_class(stored, "globe")
+    before = (stored / "manifest.json").read_bytes()
+    with locked(stored):  # as `evaluate` does
+        status, _, error = command(verify, stored, "--accept", "instances.json")
+    assert (status, "expected an unlocked directory" in error) == (1, True)
+    assert (stored / "manifest.json").read_bytes() == before
 
 
 @pytest.mark.parametrize("folder", ["", "empty"])

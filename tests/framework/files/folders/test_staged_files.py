@@ -94,6 +94,23 @@ def test_staged_files_replace_link_instead_of_target(old: Path, tmp_path_factory
     assert (target.read_text(), contents(old)) == ("other", NEW)
 
 
+@pytest.mark.parametrize("name", [STAGED, REPLACING])
+@pytest.mark.parametrize("kind", ["link", "dangling link", "file"])
+def test_staged_files_ignore_links_to_other_folders(
+    old: Path, name: str, kind: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    other = tmp_path_factory.mktemp("other")
+    (other / "a").write_text("other")
+    if kind == "file":
+        (old / name).touch()
+    else:
+        (old / name).symlink_to(other if kind == "link" else other / "missing")
+    finish_replacement(old)
+    assert (old / "a").read_text() == "old"
+    replace(old)
+    assert (contents(old), contents(other)) == (NEW, {"a": "other"})
+
+
 def test_finish_replacement_completes_interrupted_one(old: Path) -> None:
     (old / REPLACING).mkdir()
     (old / REPLACING / "a").write_text("new")
