@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from framework.errors import DataError
-from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
+from framework.files.atomic_write import path_exists, read_bytes
 from framework.files.folders.restartable_folder import check_finished
 from framework.files.folders.staged_files import finish_replacement
 from framework.files.hashing import path_hash
 from framework.files.json_file import parse_json, write_json
 
 MANIFEST = "manifest.json"
+MAX_SIZE = 2**24  # maximum size of a manifest, bytes; a usual one has 10 kB
 RUN_FILES = (
     "config.yaml",
     "metrics.json",
@@ -80,7 +81,7 @@ class Manifest:
         """
         finish_replacement(directory)
         path = directory / MANIFEST
-        return cls._parsed(path, read_bytes(path, MAX_TEXT))
+        return cls._parsed(path, read_bytes(path, MAX_SIZE))
 
     @classmethod
     def of_file(cls, path: Path) -> Manifest | None:
@@ -95,7 +96,7 @@ class Manifest:
         manifest = path.with_name(MANIFEST)
         if not path_exists(manifest):
             return None
-        content = read_bytes(manifest, MAX_TEXT)
+        content = read_bytes(manifest, MAX_SIZE)
         is_ours = b'"digest"' in content or b'"parameters"' in content  # also if one of the keys is damaged
         is_cut_off = _START.startswith(content[: len(_START)].rstrip(b"\0"))  # or empty
         return cls._parsed(manifest, content) if is_ours or is_cut_off else None

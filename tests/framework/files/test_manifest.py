@@ -64,6 +64,13 @@ def test_manifest_with_path_of_other_folder_raises(name: str, directory: Path) -
         Manifest.read(directory)
 
 
+def test_manifest_of_huge_size_raises(directory: Path) -> None:
+    path = directory / "manifest.json"
+    path.write_bytes(path.read_bytes() + b" " * 2**24)
+    with pytest.raises(DataError, match=r"manifest\.json: expected at most 16777216 bytes, got "):
+        Manifest.read(directory)
+
+
 def test_manifest_without_object_raises(directory: Path) -> None:
     (directory / "manifest.json").write_text("[]")
     with pytest.raises(DataError, match="expected a JSON object, got list"):
