@@ -435,6 +435,7 @@ def run(directory: Path | str, *overrides: str, **named: object) -> Path:
     config, choices = composed_with_choices(*words)
     settings = Settings.of(config)
     with locked(target), limited_threads(settings.threads):
+        check_new(target)  # another process may have finished a run
         settings.seed_generators()
         write_run(begin(config), config, target, choices).check()
     return target

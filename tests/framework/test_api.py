@@ -7,7 +7,8 @@ import pickle
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 import instancemap
+from framework import api
 from framework.api import Mapper, load_map
 from framework.config.composition import composed
 from framework.errors import ConfigError, DataError, InstanceMapError
@@ -53,6 +55,19 @@ def test_mapper_map_equals_pipeline_map(room: CornerRoom) -> None:
     np.testing.assert_array_equal(ours.vertices, of_run.vertices)
     np.testing.assert_array_equal(ours.instance_ids, of_run.instance_ids)
     assert list(mapper.instances()) == list(result.scene.instances()) != []
+
+
+def test_run_in_directory_of_finished_process_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextmanager
+    def locked_after_other_run(directory: Path) -> Iterator[None]:
+        directory.mkdir()
+        (directory / "metrics.json").write_text("{}")
+        yield
+
+    monkeypatch.setattr(api, "locked", locked_after_other_run)
+    with pytest.raises(DataError, match="expected a new or empty folder"):
+        instancemap.run(tmp_path / "run", "detector=none", dataset="desk")
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["metrics.json"]
 
 
 def test_mapper_detection_interval_detects_every_nth_frame(room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
