@@ -182,8 +182,9 @@ def run_command() -> None:
         word = "run"
     if word in PRINTING and hasattr(signal, "SIGPIPE"):  # not on Windows
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    from framework.runtime.signals import interruptible_imports
+    from framework.runtime.signals import interruptible_imports, raise_on_signals
 
+    raise_on_signals()
     try:
         with interruptible_imports():
             check_environment(word)

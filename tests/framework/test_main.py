@@ -157,7 +157,7 @@ def test_commands_ignore_matplotlib_backend_of_user(tmp_path: Path) -> None:
 LIBRARY = """
 import os, signal
 try:
-    os.kill(os.getpid(), signal.SIGINT)
+    os.kill(os.getpid(), signal.{name})
     import time; time.sleep(10)
 except KeyboardInterrupt:
     raise ImportError("expected a working library") from None
@@ -165,18 +165,21 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="requires signals of POSIX")
+@pytest.mark.parametrize(("name", "line"), [("SIGINT", "interrupted by Ctrl-C"), ("SIGUSR1", "ended by SIGUSR1")])
 @pytest.mark.parametrize(
     ("library", "arguments"),
     [("filelock", ["compile", "nothing"]), ("pycolmap", ["detector=simulated", "dataset=synthetic"])],
 )
-def test_command_ctrl_c_while_loading_is_one_line(tmp_path: Path, library: str, arguments: list[str]) -> None:
-    (tmp_path / f"{library}.py").write_text(LIBRARY)
+def test_command_signal_while_loading_is_one_line(
+    tmp_path: Path, library: str, arguments: list[str], name: str, line: str
+) -> None:
+    (tmp_path / f"{library}.py").write_text(LIBRARY.format(name=name))
     path = os.pathsep.join([str(tmp_path), str(CHECKOUT)])
     done = subprocess.run(
         [sys.executable, "-m", "framework", *arguments], cwd=tmp_path, env=environment() | {"PYTHONPATH": path},
         capture_output=True, text=True, check=False,
     )  # fmt: skip
-    assert (done.returncode, done.stderr) == (130, "interrupted by Ctrl-C\n")
+    assert (done.returncode, done.stderr) == (128 + signal.Signals[name], f"{line}\n")
 
 
 def test_run_log_not_writable_is_one_warning(tmp_path: Path) -> None:
