@@ -17,7 +17,7 @@ import pytest
 from framework.files.ply import read_ply
 from tests.support.forked_commands import CHECKOUT, completed
 
-pytestmark = pytest.mark.integration
+pytestmark = pytest.mark.acceptance  # several seconds each
 Inputs = Callable[[str], Path]
 FOLDER = "dataset=rgbd_folder dataset.root=CASE"
 GIVEN = "tracker=ground_truth detector=none"

@@ -340,7 +340,7 @@ def test_cache_read_only_writes_nothing(room: CornerRoom, tmp_path: Path) -> Non
 def test_cache_full_disk_disables_storing_with_warning(
     room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path) -> Any:
+    def full(path: Path, **_: object) -> Any:
         raise DataError(f"{path} could not be written: No space left on device")
 
     monkeypatch.setattr(cache, "atomic_write", full)
