@@ -48,8 +48,7 @@ def atomic_write(path: Path, sync_entry: bool = True) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem[:50]}.{os.getpid()}-{secrets.token_hex(4)}.partial{path.suffix}")
     try:
         yield temporary
-        with temporary.open("rb+") as file:  # Windows syncs only writable files
-            os.fsync(file.fileno())
+        sync_file(temporary)
         temporary.replace(path)
         if sync_entry:
             sync_folder(path.parent)
@@ -62,6 +61,16 @@ def atomic_write(path: Path, sync_entry: bool = True) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # the disk may be read-only
             temporary.unlink(missing_ok=True)
+
+
+def sync_file(path: Path) -> None:
+    """Write the contents of a file to disk.
+
+    Raises:
+        OSError: Writing fails.
+    """
+    with path.open("rb+") as file:  # Windows syncs only writable files
+        os.fsync(file.fileno())
 
 
 def sync_folder(folder: Path) -> None:

@@ -20,7 +20,7 @@ from PIL.PngImagePlugin import PngImageFile
 
 from framework.data import MAX_PIXELS, Array, UInt8, UInt16
 from framework.errors import DataError, FrameError, in_one_line
-from framework.files.atomic_write import read_bytes
+from framework.files.atomic_write import atomic_write, read_bytes
 
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -141,6 +141,24 @@ def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
     if image is None:
         raise FrameError(f"{name}: expected a decodable PNG, got corrupt data")
     return np.asarray(image)
+
+
+def write_image(path: Path, image: Array, *options: int) -> None:
+    """Write one of many images atomically. The format is that of the suffix.
+
+    The caller syncs the folder when all images are written (`atomic_write`).
+
+    Args:
+        path: The file.
+        image: Color image (H, W, 3), BGR, or single-channel image (H, W).
+        options: Options of `cv2.imencode`.
+
+    Raises:
+        DataError: The file cannot be written.
+    """
+    _, data = cv2.imencode(path.suffix, image, options)
+    with atomic_write(path, sync_entry=False) as temporary:
+        temporary.write_bytes(data.tobytes())
 
 
 def check_image(name: Path | str, data: bytes) -> None:

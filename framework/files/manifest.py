@@ -150,7 +150,7 @@ class Manifest:
         return [one for one in [*found, *(self.change(path, "") for path in added if path_exists(path))] if one]
 
     def change(self, path: Path, sha256: str) -> str:
-        """Return the difference between the SHA-256 (hex) of a file and the manifest, or "" if there is none."""
+        """Return a message if the SHA-256 (hex) of a file differs from the manifest, otherwise ""."""
         if path.name not in self.files:
             return f"{path}: expected no file in this run, got one" if path.name in RUN_FILES else ""
         expected = self.files[path.name][1]

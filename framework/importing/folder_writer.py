@@ -14,12 +14,12 @@ import numpy as np
 from tqdm import tqdm
 
 from framework.config.validation import require
-from framework.data import MAX_PIXELS, Array, Camera, Float64
+from framework.data import MAX_PIXELS, Camera, Float64
 from framework.datasets.calibration.camera_json import DISTORTION, SENSOR
 from framework.datasets.calibration.color_registration import ColorRegistration
 from framework.errors import DataError, errors_of
-from framework.files.atomic_write import atomic_write
 from framework.files.folders.restartable_folder import check_startable, restartable_folder
+from framework.files.image_files import write_image
 from framework.files.json_file import write_json
 from framework.files.number_lines import write_gravity, write_image_times
 from framework.files.storage import check_storage
@@ -124,8 +124,8 @@ def _write_files(
         depth = np.where(units < np.iinfo(np.uint16).max, units, 0).astype(np.uint16)
         has_depth |= bool(depth.any())
         bgr = cv2.cvtColor(turn.image(color), cv2.COLOR_RGB2BGR)
-        _write_image(directory / f"color/{number:06d}.jpg", bgr, cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
-        _write_image(directory / f"depth/{number:06d}.png", turn.image(depth), cv2.IMWRITE_PNG_COMPRESSION, 1)
+        write_image(directory / f"color/{number:06d}.jpg", bgr, cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
+        write_image(directory / f"depth/{number:06d}.png", turn.image(depth), cv2.IMWRITE_PNG_COMPRESSION, 1)
         written.timestamps.append(frame.timestamp)
         if frame.T_world_camera is not None:
             written.poses.append(turn.pose(frame.T_world_camera))
@@ -168,9 +168,3 @@ def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int
             written.errors.append(str(error))
         else:
             yield number, frame
-
-
-def _write_image(path: Path, image: Array, *parameters: int) -> None:
-    _, data = cv2.imencode(path.suffix, image, parameters)
-    with atomic_write(path, sync_entry=False) as temporary:
-        temporary.write_bytes(data.tobytes())

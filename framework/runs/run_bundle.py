@@ -80,7 +80,7 @@ def opened_bundle(path: Path, trust_code: bool) -> Iterator[Path]:
         trust_code: Accept a bundle with plugin code.
 
     Raises:
-        DataError: The file is no undamaged ZIP file, is too large, or contains plugin code without `trust_code`.
+        DataError: The file is not a ZIP file, is damaged or too large, or contains plugin code without `trust_code`.
     """
     with _zip_errors(path):
         archive = zipfile.ZipFile(path)

@@ -62,6 +62,7 @@ from framework.runs.stored_runs import (
     PARTIAL_METRICS,
     REPORT,
     TRAJECTORY,
+    has_metrics,
     read_metrics,
 )
 from framework.runtime.process_settings import frozen_garbage_collector
@@ -307,7 +308,7 @@ def origin_metrics(video: RGBDVideo) -> Metrics:
 
 def check_origin(video: RGBDVideo, resumed: Path) -> None:
     """Raise DataError if the map of a stored run has another origin than the poses of the video."""
-    if not video.has_poses() or not any((resumed / name).exists() for name in (METRICS, PARTIAL_METRICS)):
+    if not video.has_poses() or not has_metrics(resumed):
         return
     origin = np.array(stored_origin(read_metrics(resumed)) or (0.0, 0.0, 0.0))
     found = np.array(video.world_origin)

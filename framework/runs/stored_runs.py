@@ -53,8 +53,6 @@ MAPPED = (TRAJECTORY, "timings.csv", MAP, INSTANCES, MESH, "overview.png")
 
 DIGESTS = "digests.csv"  # digest of each stage for each frame, to locate differences between runs
 ENVIRONMENT = "environment.txt"  # versions of all installed packages, as constraints for pip
-RESULT_FILES = (CONFIG, *MAPPED, KEYFRAMES, DIGESTS, ENVIRONMENT)
-"""Files listed in manifest.json, in addition to the metrics."""
 
 EVALUATION = "evaluation."  # prefix of keys about the last re-evaluation
 GROUND_TRUTH = EVALUATION + "ground_truth"  # key of the last re-evaluated `dataset.ground_truth`; optional
@@ -335,7 +333,7 @@ def _with_text_keys(node: Any) -> Any:
 
 
 def read_config(directory: Path) -> dict[str, Any]:
-    """Read the config of a run without resolving interpolations, {} if there is none.
+    """Read the config of a run without resolving interpolations, {} without a config.
 
     Raises:
         DataError: The config is invalid or has changed since the run.

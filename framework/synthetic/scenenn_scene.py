@@ -13,11 +13,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from framework.data import Array, Box, Camera, Float32, Int32
+from framework.data import Box, Camera, Float32, Int32
 from framework.datasets.scenenn.scene_files import write_trajectory_log
 from framework.datasets.scenenn.scenenn_annotation import Annotated, write_annotation
 from framework.errors import ConfigError
 from framework.files.atomic_write import atomic_write
+from framework.files.image_files import write_image
 from framework.files.ply import write_ply
 from framework.geometry import transform
 from framework.synthetic.benchmark import SceneSpec, plan_scene
@@ -137,8 +138,8 @@ class SceneNNScene:
         exposed = blurred(picture.color, picture.depth, self.camera, T_world_camera, *ends)
         color = noisy_color(exposed, NOISE, rng)
         color_file, depth_file = frame_files(self.folder, index)
-        _write_png(depth_file, np.rint(1000 * depth).astype(np.uint16))
-        _write_png(color_file, cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
+        write_image(depth_file, np.rint(1000 * depth).astype(np.uint16), *PNG)
+        write_image(color_file, cv2.cvtColor(color, cv2.COLOR_RGB2BGR), *PNG)
 
     def write_truth(self) -> int:
         """Write the labeled mesh and its annotation, and return 0 as the number of frames."""
@@ -198,9 +199,3 @@ def frame_files(folder: Path, index: int) -> tuple[Path, Path]:
 def trajectory_file(folder: Path) -> Path:
     """Return the path of the trajectory of a scene."""
     return folder / "trajectory.log"
-
-
-def _write_png(path: Path, image: Array) -> None:
-    _, data = cv2.imencode(".png", image, PNG)
-    with atomic_write(path, sync_entry=False) as temporary:
-        temporary.write_bytes(data.tobytes())

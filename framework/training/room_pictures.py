@@ -20,10 +20,10 @@ import numba
 import numpy as np
 from tqdm import tqdm
 
-from framework.data import Array, Bool, Camera, Float64, UInt8
+from framework.data import Bool, Camera, Float64, UInt8
 from framework.errors import DataError
-from framework.files.atomic_write import atomic_write, sync_folder
-from framework.files.image_files import read_color, read_uint16
+from framework.files.atomic_write import sync_folder
+from framework.files.image_files import read_color, read_uint16, write_image
 from framework.files.json_file import read_json, write_json
 from framework.synthetic.layout import CELL
 from framework.synthetic.renderer import Renderer
@@ -90,17 +90,11 @@ def render_room(folder: Path, views: int, number: int) -> None:
         target.mkdir()
         for k, (color, ids, names) in enumerate(pictures(number, views)):
             bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
-            _write_image(target / f"{k:06d}.jpg", bgr, cv2.IMWRITE_JPEG_QUALITY, QUALITY)
-            _write_image(target / f"{k:06d}.png", ids)
-            write_json(target / "classes.json", names)
+            write_image(target / f"{k:06d}.jpg", bgr, cv2.IMWRITE_JPEG_QUALITY, QUALITY)
+            write_image(target / f"{k:06d}.png", ids)
+            write_json(target / "classes.json", names)  # also syncs the entries of the images
         shutil.move(target, room_folder(folder, number))
     sync_folder(folder)
-
-
-def _write_image(path: Path, image: Array, *parameters: int) -> None:
-    _, data = cv2.imencode(path.suffix, image, parameters)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(data.tobytes())
 
 
 def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[int, str]]]:

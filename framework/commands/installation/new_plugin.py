@@ -22,7 +22,7 @@ from framework.commands.command_line import arguments, one_line_errors
 from framework.commands.installation.plugins import options_of
 from framework.data import Camera, Detections, Frame, Instance, PointClusters, Pose, SurfaceView
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_write import make_folder, sync_folder
+from framework.files.atomic_write import make_folder, sync_file, sync_folder
 from framework.registry import GROUPS
 
 TEMPLATES = Path(framework.__file__).with_name("templates")
@@ -123,8 +123,7 @@ def write_repository(stage: str, name: str, folder: Path) -> Path:
             for path, text in files_of(stage, name).items():
                 make_folder((half / path).parent)
                 (half / path).write_text(text, encoding="utf-8", newline="\n")
-                with (half / path).open("rb+") as file:  # Windows syncs only writable files
-                    os.fsync(file.fileno())
+                sync_file(half / path)
                 sync_folder((half / path).parent)
             half.rename(place)
             sync_folder(folder)

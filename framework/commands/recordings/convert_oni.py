@@ -15,13 +15,12 @@ import cv2
 from tqdm import tqdm
 
 from framework.commands.command_line import arguments, one_line_errors
-from framework.data import Array
 from framework.datasets.scenenn.oni import read_frames
 from framework.datasets.scenenn.oni_records import OniContents, Stream, read_contents
 from framework.datasets.scenenn.scene_files import MICROSECONDS, write_timestamps
 from framework.errors import DataError
-from framework.files.atomic_write import atomic_write
 from framework.files.folders.restartable_folder import restartable_folder
+from framework.files.image_files import write_image
 
 COMMAND = "convert-oni"
 IMAGE, DEPTH, TIMESTAMP = "image", "depth", "timestamp.txt"
@@ -101,8 +100,9 @@ def write_frames(contents: OniContents, target: Path) -> tuple[int, DataError | 
         with closing(read_frames(contents, target)) as frames:
             bar = tqdm(frames, total=total, desc=contents.path.name, unit=" frames", disable=None)
             for number, frame in enumerate(bar, start=1):
-                _write_png(target / DEPTH / f"depth{number:05d}.png", frame.depth_mm)
-                _write_png(target / IMAGE / f"image{number:05d}.png", cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
+                write_image(target / DEPTH / f"depth{number:05d}.png", frame.depth_mm, *PNG)
+                bgr = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
+                write_image(target / IMAGE / f"image{number:05d}.png", bgr, *PNG)
                 color_times[number] = frame.color_time / MICROSECONDS
                 depth_times[number] = frame.depth_time / MICROSECONDS
     except DataError as error:
@@ -111,10 +111,3 @@ def write_frames(contents: OniContents, target: Path) -> tuple[int, DataError | 
         if depth_times:
             write_timestamps(target / TIMESTAMP, depth_times, color_times)
     return len(depth_times), found
-
-
-def _write_png(path: Path, image: Array) -> None:
-    """Write a depth image (H, W) in mm, or a BGR color image (H, W, 3)."""
-    _, data = cv2.imencode(".png", image, PNG)
-    with atomic_write(path, sync_entry=False) as temporary:
-        temporary.write_bytes(data.tobytes())

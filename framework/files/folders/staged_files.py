@@ -7,7 +7,6 @@ interrupted move with `finish_replacement`, and the next writer discards unfinis
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from framework.errors import DataError
-from framework.files.atomic_write import make_folder, path_exists, remove_left_over, sync_folder
+from framework.files.atomic_write import make_folder, path_exists, remove_left_over, sync_file, sync_folder
 
 STAGED, REPLACING = ".staged", ".replacing"
 REMOVED = ".removed"  # suffix of an empty file in the subfolder: the replacement removes the file of this name
@@ -76,8 +75,7 @@ class StagedFiles:
             for path in old:
                 (self.folder / f"{path.name}{REMOVED}").touch()
             for path in new:
-                with path.open("rb+") as file:  # Windows syncs only writable files
-                    os.fsync(file.fileno())
+                sync_file(path)
             sync_folder(self.folder)
             self.folder.rename(self.directory / REPLACING)
         except OSError as error:

@@ -23,7 +23,7 @@ from framework.evaluation.instances import PredictedInstances
 from framework.files.atomic_write import atomic_write
 from framework.files.hashing import path_hash
 from framework.files.json_file import write_json
-from framework.files.manifest import Manifest, RunStatus
+from framework.files.manifest import RUN_FILES, Manifest, RunStatus
 from framework.interfaces import RGBDVideo
 from framework.mapping.gravity import floor_height
 from framework.registry import STAGES, build, text_kind
@@ -35,7 +35,7 @@ from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import Metrics, class_name, evaluation_metrics
 from framework.runs.provenance import code_version, config_hash, parameters_of
 from framework.runs.run_directory import headline, likely_labels
-from framework.runs.stored_runs import CHOICE, CONFIG, EXTERNAL, INSTANCES, MESH, METRICS, RESULT_FILES
+from framework.runs.stored_runs import CHOICE, CONFIG, EXTERNAL, INSTANCES, MESH, METRICS
 from framework.vocabulary.label_spaces import label_space_of
 
 ImportOption = str | Path | float | None
@@ -139,7 +139,7 @@ def write_imported_run(
     write_json(directory / METRICS, found)
     parameters = parameters_of(config) | {key: str(value) for key, value in given.items()}
     manifest = Manifest(RunStatus.COMPLETE, {}, inputs, parameters)
-    manifest.with_files(directory, [*RESULT_FILES, METRICS]).write(directory)
+    manifest.with_files(directory, RUN_FILES).write(directory)
     return title
 
 

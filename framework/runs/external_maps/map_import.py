@@ -13,16 +13,15 @@ from framework.data import Float64
 from framework.errors import ConfigError
 from framework.evaluation.compared_classes import OF_DATASET
 from framework.files.folders.restartable_folder import check_startable, restartable_folder
-from framework.files.manifest import MANIFEST
+from framework.files.manifest import MANIFEST, RUN_FILES
 from framework.runs.external_maps.conversion import ConvertedMap, MapPlacement, read_transform
 from framework.runs.external_maps.imported_run import ImportOption, MappedData, write_imported_run
 from framework.runs.external_maps.map_formats import read_external_map
 from framework.runs.external_maps.ply_instances import LabelProperties
-from framework.runs.stored_runs import METRICS, RESULT_FILES
 from framework.vocabulary.label_spaces import ClassNames
 
 COMMAND = "import-map"
-OWN_FILES = re.compile("|".join(map(re.escape, (*RESULT_FILES, METRICS, MANIFEST))))
+OWN_FILES = re.compile("|".join(map(re.escape, (*RUN_FILES, MANIFEST))))
 
 
 @dataclass(frozen=True)

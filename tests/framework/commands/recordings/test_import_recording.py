@@ -177,13 +177,13 @@ def test_import_phone_recording_is_mappable(shared_data: Path, tmp_path: Path, m
 
 def write_slowly() -> None:
     """Make the command take 0.2 s for each image."""
-    write = folder_writer._write_image
+    write = folder_writer.write_image
 
     def slow(path: Path, image: Array, *parameters: int) -> None:
         write(path, image, *parameters)
         time.sleep(0.2)
 
-    folder_writer._write_image = slow
+    folder_writer.write_image = slow
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGXCPU])
