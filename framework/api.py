@@ -299,8 +299,7 @@ class Mapper(Map):
                 )
             self._camera, self._sensor = frame.camera, frame.sensor
             self._frames += 1
-            self._journal.timings.clear()  # unused here; the list would grow without limit for a live camera
-            self._journal.tracked.clear()
+            self._journal.forget_frames()  # they would grow without limit for a live camera
             before = self.scene.instance_ids()
             found = self._map(frame)
             if found.lost:
@@ -324,7 +323,7 @@ class Mapper(Map):
         pipeline, journal = self.pipeline, self._journal
         try:
             detections, times = pipeline.detect(frame, self._frames - 1)
-            journal.timings += times
+            journal.record(times)
             pose = pipeline.map_frame(frame, detections, journal)
         except FrameError as error:
             pipeline.viewer.skip(str(error))

@@ -101,12 +101,13 @@ class Pipeline:
                 return result
             raise result.stopped_by
 
-    def run_to_any_end(self, video: RGBDVideo, directory: Path = Path()) -> RunResult:
+    def run_to_any_end(self, video: RGBDVideo, directory: Path | None = None) -> RunResult:
         """Map a sequence or live video. After the first mapped frame, errors are returned in `stopped_by`.
 
         Args:
             video: The sequence or live video.
-            directory: Output folder of the viewer.
+            directory: Output folder of the viewer, and folder of an unnamed temporary file with the data of the frames;
+                None = the working directory, and the folder for temporary files.
         """
         check_not_forked()
         if not isinstance(cast(object, video), RGBDVideo):
@@ -121,9 +122,9 @@ class Pipeline:
         if isinstance(video, RGBDSequence):
             self.detector.check_sequence(video)
         self.color_to_depth = ColorToDepth(video.constant_color_delay())
-        journal = Journal(self.fuser.scene, frames_expected, self.tracker.pose_source)
+        journal = Journal(self.fuser.scene, frames_expected, self.tracker.pose_source, directory)
         with (
-            watched(self.viewer, self.fuser.scene, video.name, directory),
+            watched(self.viewer, self.fuser.scene, video.name, directory or Path()),
             journal,
             signals_deferred(signal.SIGINT) as interruption,
         ):
@@ -235,7 +236,7 @@ class Pipeline:
                         self.skip(outcome, journal)
                         continue
                     frame, detections, timings = outcome
-                    journal.timings += timings
+                    journal.record(timings)
                     yield frame, detections
         finally:
             for error in stream.unreported():

@@ -28,7 +28,7 @@ from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import TRUTH, is_evaluation
 from framework.runs.reevaluation import Reevaluation, Truth, classes_of
-from framework.runs.run_directory import headline, likely_labels
+from framework.runs.run_directory import caption, likely_labels
 from framework.runs.stored_runs import (
     EDITED_FROM,
     EVALUATION,
@@ -117,7 +117,7 @@ class EditedRun:
             self.scene.save(folder / MAP)
             self.write_preview(folder / PREVIEW)
             metrics = self._metrics(folder, len(found))
-            title = f"{headline(metrics)} | edited"
+            title = f"{caption(metrics)} | edited"
             write_overview(folder / OVERVIEW, mesh, likely_labels(found, self.scene.classes), self.poses, title)
             write_json(folder / METRICS, metrics)
             self.manifest.with_files(folder, [*copied, *REWRITTEN]).write(folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from array import array
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -60,8 +61,10 @@ def run_metrics(result: RunResult) -> Metrics:
     }
     if result.disagreeing is not None:
         metrics["frames_disagreeing"] = len(result.disagreeing)
-    for stage in dict.fromkeys([*STAGES, *(time.stage for time in result.timings)]):
-        milliseconds = [time.milliseconds for time in result.timings if time.stage == stage]
+    of_stages = {stage: array("d") for stage in STAGES}
+    for time in result.timings:
+        of_stages.setdefault(time.stage, array("d")).append(time.milliseconds)
+    for stage, milliseconds in of_stages.items():
         metrics[f"stage_ms.{stage}.median"] = float(np.median(milliseconds)) if milliseconds else None
         metrics[f"stage_ms.{stage}.p95"] = float(np.percentile(milliseconds, 95)) if milliseconds else None
     if result.color_delay is not None and result.color_delay.known:
@@ -216,8 +219,8 @@ def _scannet_metrics(compared: Compared, compared_classes: ComparedClasses) -> t
 def truth_sha256(truth: SceneTruth) -> str:
     """Return the SHA-256 (hex) of a ground truth."""
     digest = hashlib.sha256(repr((sorted(truth.class_names.items()), truth.classes)).encode())
-    for array in (truth.points_world, truth.instance_ids):
-        add_values(digest, array)
+    for values in (truth.points_world, truth.instance_ids):
+        add_values(digest, values)
     return digest.hexdigest()
 
 

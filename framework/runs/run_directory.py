@@ -149,9 +149,9 @@ class RunRecord:
             attempt((folder / name).unlink, missing_ok=True)
         if not (folder / CONFIG).exists():
             attempt(_write_config, folder / CONFIG, self.config)
-        trusted = [frame for frame in result.tracked if not frame.pose.lost]
-        poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
-        timestamps = np.array([frame.timestamp for frame in trusted])
+        trusted = [(one.timestamp, one.pose.T_world_camera) for one in result.tracked if not one.pose.lost]
+        timestamps = np.array([timestamp for timestamp, _ in trusted])
+        poses = np.array([T_world_camera for _, T_world_camera in trusted]).reshape(-1, 4, 4)
         comments = origin_comments(video.world_origin)
         attempt(write_tum, folder / TRAJECTORY, timestamps, poses, comments)
         attempt(write_timings, folder / "timings.csv", result)
@@ -175,10 +175,10 @@ class RunRecord:
                 classes = self.compared_classes
                 figures |= attempt(instance_metrics, video, *found, scene.classes, stored, classes) or {}
         figures |= attempt(trajectory_metrics, result) or {}
-        title = headline({"sequence": video.name, **figures})
+        shown = {"sequence": video.name, **figures}
         labels = {} if found is None else likely_labels(found[1], scene.classes)
         if found is not None:
-            attempt(write_overview, folder / "overview.png", found[0], labels, poses, title)
+            attempt(write_overview, folder / "overview.png", found[0], labels, poses, caption(shown))
         if attempt.error is None:
             attempt(write_json, folder / METRICS, self._metrics(video, figures))
         if attempt.error is None:
@@ -191,7 +191,7 @@ class RunRecord:
         if moved and self.in_place:
             moved += f", and the earlier run in {_from_here(self.directory)} is unchanged"
         written = WrittenRun(folder, attempt.error or error, moved)
-        self._announce(written, title, labels, figures)
+        self._announce(written, headline(shown), labels, figures)
         return written
 
     def _metrics(self, video: RGBDVideo, figures: Metrics) -> Metrics:
@@ -367,13 +367,20 @@ _DROPPED = {
     "frames_disagreeing": "disagree with the map",
 }
 _QUALITY = {"instances.ap50": "AP50", "instances.ap25": "AP25"}
+_TIMES = ("fps", "latency_ms")
+
+
+def caption(metrics: Mapping[str, Any]) -> str:
+    """Return the main metrics of a run without run times, which differ between runs with identical results."""
+    return headline({key: value for key, value in metrics.items() if key not in _TIMES})
 
 
 def headline(metrics: Mapping[str, Any]) -> str:
     """Return the main metrics of a run as one line of text."""
     parts = [str(metrics["sequence"])]
     if "frames" in metrics:
-        parts += [f"{metrics['frames']} frames at {metrics['fps']:.1f}/s"]
+        speed = f" at {metrics['fps']:.1f}/s" if "fps" in metrics else ""
+        parts += [f"{metrics['frames']} frames{speed}"]
     parts += [f"{metrics[key]} {word}" for key, word in _DROPPED.items() if metrics.get(key)]
     if metrics.get("latency_ms") is not None:
         parts.append(f"latency {metrics['latency_ms']:.0f} ms")
@@ -404,8 +411,9 @@ def write_timings(path: Path, result: RunResult) -> None:
 
 def write_digests(path: Path, result: RunResult) -> None:
     """Write the digest of each stage for each frame as CSV, in chronological order."""
-    lines = [f"{one.frame},{one.stage},{one.digest:08x}" for one in result.digests]
-    _write_text(path, "\n".join(["frame,stage,digest", *lines]) + "\n")
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write("frame,stage,digest\n")
+        file.writelines(f"{one.frame},{one.stage},{one.digest:08x}\n" for one in result.digests)
 
 
 def _write_text(path: Path, text: str) -> None:

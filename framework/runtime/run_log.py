@@ -6,10 +6,10 @@ import logging
 import math
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from itertools import takewhile
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -21,6 +21,7 @@ from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
 from framework.runtime.digests import StageDigest, digest_of
 from framework.runtime.frame_stream import steady_time
 from framework.runtime.progress import Progress
+from framework.runtime.spooled_list import Spool, SpooledList
 from framework.sensors.noise_models import SensorKind
 
 log = logging.getLogger(__name__)
@@ -63,13 +64,13 @@ class LiveFigures:
 
 @dataclass(frozen=True)
 class RunResult:
-    """The result of a run, in memory."""
+    """The result of a run. The data of the frames are in a temporary file if there are many."""
 
     scene: SceneMap
     frames: int  # number of mapped, lost and skipped frames
     frames_skipped: int  # number of frames that are unreadable, inconsistent or without a required pose
-    tracked: tuple[TrackedFrame, ...]  # including lost frames
-    timings: tuple[StageTime, ...]
+    tracked: Sequence[TrackedFrame]  # including lost frames
+    timings: Sequence[StageTime]
     seconds: float  # wall-clock time of the whole loop
     stopped_by: BaseException | None = None  # reason for an early end; None = completed
     intervals: tuple[float, ...] = ()  # wall-clock time between frames, s
@@ -77,7 +78,7 @@ class RunResult:
     live: LiveFigures | None = None  # None = a recording
     keyframes: Mapping[str, Array] = field(default_factory=dict)  # of the tracker
     color_delay: DelayEstimate | None = None  # None = given, not estimated
-    digests: tuple[StageDigest, ...] = ()  # of each stage and frame
+    digests: Sequence[StageDigest] = ()  # of each stage and frame
     disagreeing: tuple[int, ...] | None = None  # Frame.index of the frames that contradict the map; None = not compared
 
     @property
@@ -98,31 +99,40 @@ class RunResult:
 
 @dataclass
 class Journal:
-    """Journal and progress display of a run."""
+    """Journal and progress display of a run.
+
+    The data of the frames are in a temporary file, except for those of the last frames.
+    """
 
     scene: SceneMap
     frames_expected: int | None  # None = a live video
     pose_source: str
+    folder: Path | None = None  # folder of the temporary file, which has no name; None = the folder for temporary files
     frames: int = 0
     frames_skipped: int = 0
     without_pose: int = 0  # skipped frames without a pose
     first_without_pose: str = ""  # message of the first frame without a pose
-    tracked: list[TrackedFrame] = field(default_factory=list)
-    timings: list[StageTime] = field(default_factory=list)
-    digests: list[StageDigest] = field(default_factory=list)
     frames_in_map: int = 0  # number of frames that are at least partly fused
     stopped_by: BaseException | None = None
     last_index: int = -1  # Frame.index of the last tracked frame; -1 = none
     unordered: bool = False  # True once a timestamp did not increase
     last_time: float = -math.inf  # s, latest timestamp of the tracked frames
-    frames_began: list[float] = field(default_factory=list)  # start of each frame, s
     lost_for: int = 0  # number of consecutive lost frames
     frames_dropped: int = 0
-    latencies: list[float] = field(default_factory=list)  # s
     sensor: SensorKind | None = None  # of the last frame
     compared: int = 0  # number of frames whose depth is compared with the map at a given pose
     apart: int = 0  # number of compared frames in a row that see nothing of the map
-    disagreeing: list[int] = field(default_factory=list)  # Frame.index of those that contradict the map
+
+    def __post_init__(self) -> None:
+        spool = Spool(self.folder)
+        self.tracked: SpooledList[TrackedFrame] = SpooledList(spool)
+        self.timings: SpooledList[StageTime] = SpooledList(spool)
+        self.digests: SpooledList[StageDigest] = SpooledList(spool)
+        self.frames_began: SpooledList[float] = SpooledList(spool)  # start of each frame, s
+        self.latencies: SpooledList[float] = SpooledList(spool)  # s
+        self.disagreeing: SpooledList[int] = SpooledList(spool)  # Frame.index of those that contradict the map
+        self._stage_ms: dict[str, float] = {}  # stage times of the last timed frame, ms
+        self._timed = -1  # Frame.index of the last timed frame
 
     def __enter__(self) -> Journal:
         self._screen = ExitStack()
@@ -154,7 +164,7 @@ class Journal:
         """Record the run time of the `with` body as the time of a stage, unless the body raises."""
         started = time.perf_counter()
         yield
-        self.timings.append(StageTime(frame, stage, 1e3 * (time.perf_counter() - started)))
+        self.record([StageTime(frame, stage, 1e3 * (time.perf_counter() - started))])
 
     @contextmanager
     def fusing(self, frame: int) -> Iterator[StageTimer]:
@@ -174,16 +184,28 @@ class Journal:
         started = time.perf_counter()
         yield timer
         of_stages = seconds or {FUSION: time.perf_counter() - started}
-        self.timings += [StageTime(frame, stage, 1e3 * spent) for stage, spent in of_stages.items()]
+        self.record(StageTime(frame, stage, 1e3 * spent) for stage, spent in of_stages.items())
+
+    def record(self, times: Iterable[StageTime]) -> None:
+        """Record the run times of stages."""
+        for one in times:
+            if one.frame != self._timed:
+                self._timed, self._stage_ms = one.frame, {}
+            self._stage_ms[one.stage] = one.milliseconds
+            self.timings.append(one)
 
     def digest(self, frame: int, **results: object) -> None:
         """Record the digests of stage results for the frame with index `frame`."""
-        self.digests += [StageDigest(frame, stage, digest_of(result)) for stage, result in results.items()]
+        self.digests.extend(StageDigest(frame, stage, digest_of(result)) for stage, result in results.items())
 
     def stage_ms(self, frame: int) -> dict[str, float]:
         """Return the stage times of the last frame, ms, given its index."""
-        of_last = takewhile(lambda time: time.frame == frame, reversed(self.timings))
-        return {time.stage: time.milliseconds for time in of_last}
+        return dict(self._stage_ms) if frame == self._timed else {}
+
+    def forget_frames(self) -> None:
+        """Discard the data of the frames, which only the outputs of a run need."""
+        for rows in (self.tracked, self.timings, self.digests, self.latencies):
+            rows.clear()
 
     def frame_begins(self) -> None:
         """Count a frame of the sequence."""
@@ -244,7 +266,9 @@ class Journal:
             self.sensor = frame.sensor
             log.info("depth sensor: %s", frame.sensor)
         self.digest(frame.index, tracking=pose)
-        self.tracked.append(TrackedFrame(frame.index, self.frames - 1, frame.timestamp, pose, frame.T_world_camera))
+        # without the attributes of a subclass, which may not be picklable
+        plain = Pose(pose.T_world_camera, pose.lost, pose.reason, pose.covariance)
+        self.tracked.append(TrackedFrame(frame.index, self.frames - 1, frame.timestamp, plain, frame.T_world_camera))
         if pose.lost:
             if not self.lost_for:
                 log.warning("frame %d: lost: %s", frame.index, pose.reason or "no reason given by the tracker")
@@ -291,12 +315,12 @@ class Journal:
             scene=self.scene,
             frames=self.frames,
             frames_skipped=self.frames_skipped,
-            tracked=tuple(self.tracked),
-            timings=tuple(self.timings),
-            digests=tuple(self.digests),
+            tracked=self.tracked,
+            timings=self.timings,
+            digests=self.digests,
             seconds=self.seconds,
             stopped_by=self.stopped_by,
-            intervals=tuple(np.diff(self.frames_began).tolist()),
+            intervals=tuple(np.diff(list(self.frames_began)).tolist()),
             pose_source=self.pose_source,
             disagreeing=tuple(self.disagreeing) if self.compared else None,
             live=LiveFigures(self.frames_dropped, tuple(self.latencies)) if self.frames_expected is None else None,

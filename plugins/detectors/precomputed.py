@@ -153,7 +153,9 @@ class Precomputed(Detector):
         if self._matched or found:
             self._matched = True
             return
-        self._requested.add(frame.index)
+        in_doubt = len(self._requested) < FRAMES_IN_DOUBT
+        if in_doubt:
+            self._requested.add(frame.index)
         numbers = [one if isinstance(one, int) else one.number for one in self._images]
         known = [number for number in numbers if number is not None]
         if not known and not frame.image_name:
@@ -169,7 +171,7 @@ class Precomputed(Detector):
                     f"detector.path: expected detections of this sequence, got {has} and none for the frames "
                     f"requested so far, up to {frame.index}; check that the file belongs to this sequence"
                 )
-        if len(self._requested) == FRAMES_IN_DOUBT:
+        if in_doubt and len(self._requested) == FRAMES_IN_DOUBT:
             log.warning(
                 "detector.path: expected detections of this sequence, got %s and none for the first %d frames; "
                 "check that the file belongs to this sequence",

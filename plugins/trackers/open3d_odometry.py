@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING
@@ -15,6 +18,8 @@ from framework.interfaces import PoseTracker, SceneMap
 
 if TYPE_CHECKING:
     import open3d as o3d
+
+_THREAD_LIMIT = threading.Lock()  # held while Open3D's thread limit, which applies to the whole process, is changed
 
 
 class Method(Enum):
@@ -45,7 +50,7 @@ class Open3dOdometry(PoseTracker):
     """Multi-scale RGB-D odometry of Open3D, relative to a view of the map or to the previous frame.
 
     Use POINT_TO_PLANE with the map. Use HYBRID and INTENSITY with the previous frame, because the colors of the map are
-    blurred.
+    blurred. Poses are repeatable, because Open3D aligns frames with one thread.
     """
 
     method: Method = Method.POINT_TO_PLANE  # minimized error
@@ -105,10 +110,11 @@ class Open3dOdometry(PoseTracker):
         if readings == 0:
             return np.eye(4), "the frame has no depth"
         try:
-            result = odometry.rgbd_odometry_multi_scale(
-                image, reference, _tensor(frame.camera.K), _tensor(np.eye(4)), 1.0, self.max_depth, self._criteria,
-                self._method, self._loss,
-            )  # fmt: skip
+            with _one_thread():
+                result = odometry.rgbd_odometry_multi_scale(
+                    image, reference, _tensor(frame.camera.K), _tensor(np.eye(4)), 1.0, self.max_depth, self._criteria,
+                    self._method, self._loss,
+                )  # fmt: skip
         except RuntimeError as error:  # "Singular 6x6 linear system": no overlap
             return np.eye(4), f"Open3D did not align the frame: {str(error).strip().splitlines()[-1]}"
         T_last_camera = result.transformation.numpy()
@@ -122,6 +128,23 @@ class Open3dOdometry(PoseTracker):
         if step > self.max_translation or turn > self.max_rotation:
             return np.eye(4), f"implausible step of {step:.2f} m and {np.degrees(turn):.0f} deg"
         return T_last_camera, ""
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Limit Open3D to one thread in the `with` body.
+
+    With several threads, Open3D sums residuals in an order that depends on the timing of the threads.
+    """
+    import open3d as o3d
+
+    with _THREAD_LIMIT:
+        threads = o3d.utility.get_max_threads()
+        o3d.utility.set_max_threads(1)
+        try:
+            yield
+        finally:
+            o3d.utility.set_max_threads(threads)
 
 
 def _rgbd_image(color: UInt8, depth: Float32) -> o3d.t.geometry.RGBDImage:

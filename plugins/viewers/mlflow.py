@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from framework.interfaces import SceneMap, Viewer
 from framework.runs.logged_values import frame_values, parameter_values, run_values
 
 MAX_PARAMETERS = 100  # maximum number of parameters in a request to MLflow
+MAX_PENDING = 1000  # maximum number of frames that wait for MLflow
 
 
 @dataclass
@@ -39,7 +41,7 @@ class MLflowViewer(Viewer):
         from mlflow.entities import Param
 
         self._directory = directory
-        self._pending: list[Any] = []  # operations of MLflow's thread
+        self._pending: deque[Any] = deque()  # operations of MLflow's thread
         # parallel runs of a sweep would create the tables of the database at the same time
         lock = user_cache_path("instancemap", appauthor=False, ensure_exists=True) / "mlflow.lock"
         with FileLock(lock), self._named_errors():
@@ -56,6 +58,8 @@ class MLflowViewer(Viewer):
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
         entries = _entries(frame_values(pose, stage_ms, self._scene), frame.index)
         self._pending.append(self._client.log_batch(self._run, entries, synchronous=False))  # in a thread of MLflow
+        if len(self._pending) > MAX_PENDING:
+            self._pending.popleft().wait()
 
     def end_run(self, metrics: Mapping[str, Any], error: str) -> None:
         for pending in self._pending:

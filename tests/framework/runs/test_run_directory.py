@@ -381,6 +381,16 @@ def test_headline_contains_key_metrics() -> None:
     assert expected == "room0 | 9 frames at 3.2/s | 2 lost | given poses | 4 instances | AP50 0.50"
 
 
+def test_overview_does_not_depend_on_speed(tmp_path: Path, room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+    titles: list[str] = []
+    monkeypatch.setattr(run_directory, "write_overview", lambda *arguments: titles.append(arguments[-1]))
+    result = mapped(room)
+    for seconds in (1.0, 9.0):
+        RunRecord.begin(tmp_path / f"run_{seconds}", CONFIG, CHOICES).write(room, replace(result, seconds=seconds))
+    assert titles == 2 * [titles[0]]
+    assert titles[0].startswith(f"{room.name} | 6 frames | ")
+
+
 # Provenance
 
 

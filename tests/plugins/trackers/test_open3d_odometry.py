@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
+from threading import Event
 
 import numpy as np
+import open3d as o3d
 import pytest
 
 from framework.data import Frame, Pose
@@ -79,6 +84,45 @@ def test_open3d_odometry_resumes_after_uninformative_frames(
     assert "\n" not in poses[5].reason
     np.testing.assert_array_equal(poses[5].T_world_camera, poses[3].T_world_camera)
     assert_near(poses[-1], frames[7], meters)
+
+
+@contextmanager
+def open3d_threads(threads: int) -> Iterator[None]:
+    """Set Open3D's thread limit in the `with` body, 0 = no limit, while another thread uses Open3D."""
+    ended = Event()
+    points = np.random.default_rng(0).random((20_000, 3), np.float32)
+
+    def load() -> None:
+        while not ended.is_set():
+            o3d.t.geometry.PointCloud(o3d.core.Tensor(points)).estimate_normals(10)
+
+    o3d.utility.set_max_threads(threads)
+    with ThreadPoolExecutor(1) as pool:
+        loading = pool.submit(load)
+        try:
+            yield
+        finally:
+            ended.set()
+            loading.result()
+            o3d.utility.set_max_threads(0)
+
+
+@pytest.mark.parametrize(("parameters", "meters"), BEST)
+def test_open3d_odometry_is_independent_of_threads(frames: list[Frame], parameters: dict, meters: float) -> None:
+    alone = run(Open3dOdometry(**parameters), frames[:4])
+    for threads in (0, 1, 2):
+        with open3d_threads(threads):
+            loaded = run(Open3dOdometry(**parameters), frames[:4])
+        for pose, expected in zip(loaded, alone, strict=True):
+            np.testing.assert_array_equal(pose.T_world_camera, expected.T_world_camera)
+
+
+def test_open3d_odometry_restores_thread_limit(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[int] = []
+    monkeypatch.setattr(o3d.utility, "get_max_threads", lambda: 2)
+    monkeypatch.setattr(o3d.utility, "set_max_threads", limits.append)
+    run(Open3dOdometry(), frames[:2])
+    assert limits == [1, 2]
 
 
 def test_open3d_odometry_empty_map_is_lost_with_reason(frames: list[Frame]) -> None:
