@@ -36,7 +36,7 @@ from tests.support.power_cut import Lost, VolatileDisk
 from tests.support.recordings.phone_exports import room_frames, write_stray_scanner
 from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
-pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
+pytestmark = [pytest.mark.acceptance, pytest.mark.usefixtures("fakes_registered")]  # several seconds each
 CONFIG = OmegaConf.create(reported_run.CONFIG | {"fuser": reported_run.CONFIG["fuser"] | {"voxel_size": 0.06}})
 
 COMMANDS: dict[str, tuple[ModuleType, tuple[str, ...]]] = {

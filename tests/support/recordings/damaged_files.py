@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from framework.errors import DataError
 
-EXAMPLES = int(os.environ.get("INSTANCEMAP_FUZZ", "60"))
+EXAMPLES = int(os.environ.get("INSTANCEMAP_FUZZ", "30"))
 SLOWEST = 2.0  # s, maximum time to read a file of up to 100 KB on a busy machine
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?")
 ODD_NUMBERS = (b"0", b"-1", b"3", b"65536", b"2147483648", b"4294967295", b"1" * 20, b"1" * 5000, b"1e400", b"-0.5")
