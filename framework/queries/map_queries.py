@@ -10,11 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from framework.data import Camera, Float64, Instance, InstanceMesh, View
+from framework.data import Camera, Float32, Float64, Instance, InstanceMesh, View
 from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.gravity import floor_height
+from framework.mapping.instances.instance_list import bounds_of
 from framework.runtime.forked_process import ProcessLock
+
+TILE = 8  # px, side of an image tile; renderers cast rays at its corners at least, and interpolate between them
+TOLERANCE = 1e-6  # m, maximum rounding error of a bounding box
 
 
 class Map:
@@ -82,11 +86,7 @@ class Map:
         with self.lock:
             found = self.instances(class_)
             vertices = self.scene.mesh().vertices if found else np.zeros((0, 3), np.float32)
-
-            def distance(instance: Instance) -> float:
-                return float(np.linalg.norm(vertices[instance.vertices] - target, axis=1).min(initial=np.inf))
-
-            return min(found.values(), key=distance, default=None)
+            return _nearest(found, vertices, target)
 
     def view(self, camera: Camera, T_world_camera: Float64) -> View:
         """Return the view of the map from a pose.
@@ -124,8 +124,11 @@ class Map:
         """
         if not (0 <= u < camera.width and 0 <= v < camera.height):
             raise DataError(f"pixel: expected u, v in an image of {camera.width}x{camera.height} px, got ({u}, {v})")
+        left, top = TILE * (int(u) // TILE), TILE * (int(v) // TILE)
+        right, bottom = min(left + TILE + 1, camera.width), min(top + TILE + 1, camera.height)
         with self.lock:
-            return self.scene.instances().get(int(self.view(camera, T_world_camera).instance_ids[int(v), int(u)]))
+            tile = self.scene.render(camera.cropped(left, top, right, bottom), T_world_camera)
+            return self.scene.instances().get(int(tile.instance_ids[int(v) - top, int(u) - left]))
 
     def up(self) -> Float64 | None:
         """Return the up direction (3,), a unit vector in the world frame, or None if unknown.
@@ -177,3 +180,20 @@ class Map:
         """
         with self.lock:
             self.scene.save(path)
+
+
+def _nearest(found: Mapping[int, Instance], vertices: Float32, target: Float64) -> Instance | None:
+    """Return the object whose vertices are nearest to a point (3,), m. Ties go to the first object.
+
+    `vertices` (V, 3) are those of the map.
+    """
+    low, high = bounds_of(found)
+    # no vertex is nearer than the bounding box of its object
+    to_box = np.linalg.norm(np.maximum(np.maximum(low - target, target - high), 0), axis=1) - TOLERANCE
+    ids, best = [*found], (np.inf, 0)
+    for k in np.argsort(to_box):
+        if to_box[k] > best[0]:
+            break
+        own = vertices[found[ids[k]].vertices]
+        best = min(best, (float(np.linalg.norm(own - target, axis=1).min(initial=np.inf)), int(k)))
+    return found[ids[best[1]]] if found else None
