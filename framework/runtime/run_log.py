@@ -111,6 +111,7 @@ class Journal:
     timings: list[StageTime] = field(default_factory=list)
     digests: list[StageDigest] = field(default_factory=list)
     frames_in_map: int = 0  # number of frames that are at least partly fused
+    frames_masked: int = 0  # number of frames with masked objects
     stopped_by: BaseException | None = None
     last_index: int = -1  # Frame.index of the last tracked frame; -1 = none
     unordered: bool = False  # True once a timestamp did not increase
@@ -146,6 +147,8 @@ class Journal:
                 "estimate the poses with tracker=voxel_hashing_icp",
                 len(self.disagreeing), self.frames, frame_ranges(self.disagreeing),
             )  # fmt: skip
+        if self.frames_masked:
+            log.info("%d of %d frames with masked objects", self.frames_masked, self.frames)
         if self.frames_dropped:
             log.warning("%d frames dropped because newer frames replaced them or the run ended", self.frames_dropped)
 
@@ -229,9 +232,10 @@ class Journal:
                 f"got {frame.index}; number the frames in their order, and map another recording with resume_from"
             )
 
-    def frame_tracked(self, frame: Frame, pose: Pose) -> None:
-        """Record a pose. Log a change of the depth sensor, and the loss and recovery of tracking."""
+    def frame_tracked(self, frame: Frame, pose: Pose, is_masked: bool = False) -> None:
+        """Record a pose, and count a masked frame. Log a change of the depth sensor, and the loss and recovery of tracking."""
         self.last_index = int(frame.index)
+        self.frames_masked += is_masked
         if frame.timestamp <= self.last_time and not self.unordered:
             self.unordered = True
             log.warning(

@@ -1,0 +1,163 @@
+"""Masking of people, and of other objects that move by themselves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
+
+import cv2
+import numpy as np
+
+from framework.config.validation import check_bounds, require
+from framework.data import Bool, Detections, Float32, Frame, UInt8
+from framework.interfaces import FrameMasking
+
+GRID_WIDTH = 160  # maximum width of the coarse images, px
+HALF_EXTENT = 0.6  # m, maximum distance of the readings of a body from their median along z
+GAP, GAP_PER_DEPTH = 0.03, 0.02  # m and m per m, maximum depth difference of neighboring readings on one surface
+CAMERA_TURN = 1.0  # rad/s, maximum angular speed of the camera
+LONGEST_STEP = 0.5  # s, maximum time between two frames for which a body is followed
+NEVER = 255  # age of pixels without a body, frames
+FAR = np.float32(np.inf)
+
+Image = TypeVar("Image", Float32, UInt8)
+
+
+class Bodies(NamedTuple):
+    """The bodies in a frame."""
+
+    time: float  # s, of the depth image
+    depth: Float32  # (H, W) m, depth of the frame before masking
+    mask: Bool  # (H, W) masked pixels
+    body: Float32  # (H, W) m, depth of the bodies, 0 = none
+    age: UInt8  # (H, W) frames since the detection of the body, NEVER = no body
+
+
+@dataclass
+class People(FrameMasking):
+    """Masking of detected people, who are followed by their depth in frames without a detection.
+
+    A body consists of the depth readings of a detected mask near their median, and of readings of similar depth next to
+    them, which coarse masks omit. In the next frame, readings near the body belong to it at its pixels, and where they
+    are in front of all other surfaces that the frame before shows there. All detections of the masked classes are
+    removed.
+    """
+
+    classes: str = "person"  # names of the masked classes, separated by commas; unknown names are ignored
+    min_score: float = 0.3  # minimum score of a detection whose depth is masked, in [0, 1]
+    margin: int = 4  # width of the masked border around a body, px, in [0, 64]
+    completion: float = 0.1  # maximum distance of a body's readings from its detected mask, m, in [0, 1]
+    max_speed: float = 2.0  # maximum speed of a body, m/s, in [0, 10]
+    max_unseen: int = 10  # number of frames for which a body is followed after its last detection, in [0, 254]
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self, min_score=(0, 1), margin=(0, 64), completion=(0, 1), max_speed=(0, 10), max_unseen=(0, NEVER - 1)
+        )
+        self._names = frozenset(filter(None, map(str.strip, self.classes.split(","))))
+        require(bool(self._names), "masking.classes", repr(self.classes), "class names; choose masking=none for none")
+        self._last: Bodies | None = None
+
+    def mask(self, frame: Frame, detections: Detections) -> tuple[Frame, Detections]:
+        excluded = self._excluded(detections)
+        found = detections.masks[excluded & (detections.scores >= self.min_score)]
+        last, self._last = self._last, None
+        if len(found) or last is not None:
+            detected = self._completed(frame, detected_bodies(found, frame.depth))
+            followed, age = self._followed(frame, last)
+            followed &= ~connected(followed, detected > 0)  # a detection replaces the last shape of its body
+            age[detected > 0] = 0
+            body = np.where((detected > 0) | followed, frame.depth, np.float32(0))
+            mask = _dilated(body > 0, self.margin) | found.any(axis=0)
+            if (body > 0).any():
+                self._last = Bodies(frame.depth_time, frame.depth, mask, body, age)
+            if mask.any():
+                frame = replace(frame, depth=np.where(mask, np.float32(0), frame.depth))
+        return frame, chosen(detections, ~excluded) if excluded.any() else detections
+
+    def _excluded(self, detections: Detections) -> Bool:
+        """Return True for each detection (N,) whose most likely class is masked."""
+        masked = np.array([name in self._names for name in detections.classes], np.bool_)
+        if not len(detections) or not masked.any():
+            return np.zeros(len(detections), np.bool_)
+        return np.asarray(masked[detections.class_probabilities.argmax(axis=1)])
+
+    def _completed(self, frame: Frame, body: Float32) -> Float32:
+        """Return the depth (H, W) of detected bodies with the readings of similar depth next to them."""
+        if not body.any():
+            return body
+        radius = frame.camera.fx * self.completion / nearest(body)
+        return np.where((body > 0) | _is_near(frame.depth, body, radius, 0.0), frame.depth, np.float32(0))
+
+    def _followed(self, frame: Frame, last: Bodies | None) -> tuple[Bool, UInt8]:
+        """Return True on the bodies of the last frame, and the ages (H, W) of the bodies."""
+        shape = frame.depth.shape
+        step = np.inf if last is None else frame.depth_time - last.time
+        if last is None or last.depth.shape != shape or not 0 < step <= LONGEST_STEP:
+            return np.zeros(shape, np.bool_), np.full(shape, NEVER, np.uint8)
+        turn = frame.camera.fx * CAMERA_TURN * step
+        reach = self.max_speed * step
+        radius = turn + frame.camera.fx * reach / nearest(last.body)
+        static = np.where(last.mask | (last.depth == 0), FAR, last.depth)
+        appeared = frame.depth < _lowest(static, turn) - GAP - GAP_PER_DEPTH * frame.depth
+        kept = last.body > 0
+        age = cv2.add(np.where(kept, last.age, _lowest(last.age, radius)), 1)  # saturates at NEVER
+        followed = _is_near(frame.depth, last.body, radius, reach) & (kept | appeared) & (age <= self.max_unseen)
+        return followed, np.where(followed, age, np.uint8(NEVER))
+
+
+def detected_bodies(masks: Bool, depth: Float32) -> Float32:
+    """Return the depth (H, W) of the bodies in masks (N, H, W), 0 = none.
+
+    Readings far from the median of their mask are excluded, because masks extend beyond the outline of a body.
+    """
+    body = np.zeros_like(depth)
+    for mask in masks:
+        readings = depth[mask]
+        readings = readings[readings > 0]
+        if len(readings):
+            inside = mask & (np.abs(depth - np.median(readings)) < HALF_EXTENT) & (depth > 0)
+            body[inside] = depth[inside]
+    return body
+
+
+def chosen(detections: Detections, kept: Bool) -> Detections:
+    """Return the detections for which `kept` (N,) is True."""
+    rows = {name: getattr(detections, name)[kept] for name in ("masks", "boxes", "scores", "class_probabilities")}
+    embeddings = None if detections.embeddings is None else detections.embeddings[kept]
+    return replace(detections, **rows, embeddings=embeddings)
+
+
+def connected(mask: Bool, seeds: Bool) -> Bool:
+    """Return True on the components of `mask` | `seeds` (H, W) that contain a seed."""
+    _, labels = cv2.connectedComponents((mask | seeds).view(np.uint8))
+    return np.asarray(np.isin(labels, np.unique(labels[seeds])))
+
+
+def nearest(body: Float32) -> float:
+    """Return the minimum depth of a body (H, W), m."""
+    return float(body[body > 0].min())
+
+
+def _is_near(depth: Float32, body: Float32, radius: float, reach: float) -> Bool:
+    """Return True for readings (H, W) near a body, within `radius` px and `reach` m along z."""
+    tolerance = np.float32(GAP + reach) + np.float32(GAP_PER_DEPTH) * depth
+    low = _lowest(np.where(body > 0, body, FAR), radius)
+    high = -_lowest(np.where(body > 0, -body, FAR), radius)
+    return np.asarray((depth > 0) & (depth > low - tolerance) & (depth < high + tolerance))
+
+
+def _lowest(image: Image, radius: float) -> Image:
+    """Return the approximate minimum (H, W) of an image within a radius in px."""
+    height, width = image.shape
+    step = -(-width // GRID_WIDTH)
+    side = 2 * (int(radius / step) + 1) + 1
+    small = cv2.erode(np.ascontiguousarray(image[::step, ::step]), np.ones((side, side), np.uint8))
+    size = small.shape[1] * step, small.shape[0] * step
+    return cv2.resize(small, size, interpolation=cv2.INTER_NEAREST)[:height, :width]
+
+
+def _dilated(mask: Bool, radius: int) -> Bool:
+    """Return a mask (H, W) with a border of `radius` px."""
+    kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    return np.asarray(cv2.dilate(mask.view(np.uint8), kernel).view(np.bool_))
