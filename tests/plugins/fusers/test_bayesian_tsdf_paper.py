@@ -216,6 +216,7 @@ def roll_classes(scene: InstanceMap, shift: int) -> None:
     used = scene.labels.in_use()
     named = used.class_ids < len(scene.classes)
     used.class_ids[named] = (used.class_ids[named] + shift) % len(scene.classes)
+    scene.relabel()
 
 
 @pytest.mark.parametrize(("source", "changes"), [("VOXELS", True), ("DETECTIONS", False)])

@@ -69,6 +69,9 @@ def test_map_arrays_with_invalid_ids_raise(
         ("instance_ids", -1),
         ("instance", FAR),
         ("class_ids", 200),
+        ("states", 511),
+        ("instance_slots", 1000),
+        ("class_slots", 0),
         ("block_coords", FAR),
     ]:
         if name in arrays:
