@@ -41,7 +41,7 @@ from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 from framework.sensors.noise_models import SensorKind
 
-FORMAT = "object_volumes 4"  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = "object_volumes 5"  # format of the map file; increment it when the meaning of the contents changes
 OBJECT = "object_"  # prefix of the names of the arrays with the concatenated volumes of all objects
 
 Part = tuple[Float32, Int32, UInt8, Int32]
@@ -86,7 +86,8 @@ class ObjectMap(InstanceTableMap):
 
     def remove(self, instance_id: int) -> None:
         """Remove an object and its volume."""
-        del self.table.records[instance_id], self.volumes[instance_id]
+        self.table.remove(instance_id)
+        del self.volumes[instance_id]
         self.background.changed(NO_BLOCKS)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, masks: Mapping[int, Bool], band: float) -> None:

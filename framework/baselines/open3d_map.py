@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +27,7 @@ from framework.mapping.storage.map_file import (
 )
 from framework.sensors.noise_models import SensorKind
 
-FORMAT = "open3d_vbg 5"  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = "open3d_vbg 6"  # format of the map file; increment it when the meaning of the contents changes
 
 
 class Open3DMap(InstanceTableMap):
@@ -85,6 +86,15 @@ class Open3DMap(InstanceTableMap):
         self.table.merge(kept, dropped)
         instance = self.grid.flat("instance")
         instance[instance == dropped] = kept
+        self.changed()
+
+    def remove(self, instance_ids: Sequence[int]) -> None:
+        """Remove tentative instances and their votes. Their ids are used again."""
+        instance = self.grid.flat("instance")
+        removed = np.isin(instance, instance_ids)
+        instance[removed] = self.grid.flat("votes")[removed] = 0
+        for k in instance_ids:
+            self.table.release(k)
         self.changed()
 
     def changed(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -34,7 +35,7 @@ from framework.mapping.voxels.raycasting import render
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
-FORMAT = 8  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = 9  # format of the map file; increment it when the meaning of the contents changes
 LARGEST_SCALE = 2**40  # maximum score_scale of a map file (quantized class score for evidence of 1)
 
 
@@ -98,6 +99,13 @@ class InstanceMap(InstanceTableMap):
         """Merge instance `dropped` into instance `kept`."""
         self.table.merge(kept, dropped)
         self.labels.merge_instances(kept, dropped)
+        self.volume.changed(NO_BLOCKS)
+
+    def remove(self, instance_ids: Sequence[int]) -> None:
+        """Remove tentative instances and their evidence in the voxels. Their ids are used again."""
+        self.labels.remove_instances(instance_ids, self.table.last_id)
+        for k in instance_ids:
+            self.table.release(k)
         self.volume.changed(NO_BLOCKS)
 
     def add_class(self, name: str) -> None:

@@ -5,17 +5,18 @@ the measured surface or in a ray-cast view. The ray-cast view is our interpretat
 
 A cluster and an instance can match if their overlap is large enough. By default, the overlap is relative to the smaller
 of the two, so that a part of an object matches the whole. Matching is one to one, in order of decreasing IoU. An
-unmatched cluster creates a new instance.
+unmatched cluster creates a new instance. Most false detections create instances that are never confirmed. They are
+removed after some time, so that a map of a known place does not grow.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,9 @@ from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed_space
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
+
+if TYPE_CHECKING:
+    from framework.mapping.instances.instance_list import Confirmation
 
 VOTES_ACROSS = 320  # approximate number of voting pixels per image row; more take longer without improving the result
 
@@ -139,6 +143,7 @@ class LabeledMap(Protocol):
     """A map with an instance table and instance labels in its voxels."""
 
     table: InstanceTable
+    confirmation: Confirmation
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
         """Return the most likely instance at the measured surface at every stride-th pixel of a frame, 0 = none.
@@ -152,6 +157,9 @@ class LabeledMap(Protocol):
 
     def merge(self, kept: int, dropped: int) -> None:
         """Merge instance `dropped` into instance `kept`."""
+
+    def remove(self, instance_ids: Sequence[int]) -> None:
+        """Remove tentative instances and their evidence. Their ids are used again."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +185,7 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min
     """
     if not matches.clusters.detected:
         return
+    table.detected_frames += 1
     instance_ids, scores = matches.instance_ids, matches.clusters.scores
     embeddings = weighted_embeddings(matches.clusters)
     if any(instance_ids[k] for k in embeddings):
@@ -185,8 +194,7 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min
         score, embedding = float(scores[k]), embeddings.get(int(k))
         table.observe(int(instance_ids[k]), class_evidence[k], score, matches.frame_index, embedding)
     in_view = set(matches.overlaps.instance_ids[matches.overlaps.visible >= min_pixels].tolist())
-    for instance_id in in_view | set(instance_ids[instance_ids > 0].tolist()):
-        table.records[instance_id].in_view.add(matches.frame_index)
+    table.see(in_view | set(instance_ids[instance_ids > 0].tolist()), matches.frame_index)
 
 
 def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding]:
@@ -226,6 +234,9 @@ class Association:
     # minimum Bhattacharyya coefficient of the class distributions of two instances to merge them, in [0, 1]; 0 = any
     # classes are merged
     merge_agreement: float = 0.1
+    # number of frames with detections after which an instance that was never confirmed is removed if none of them
+    # detects it, >= 0; 0 = never
+    tentative_max_age: int = 300
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -237,6 +248,7 @@ class Association:
             merge_overlap=(0.0, 1.0),
             merge_frames=(1, 2**31),
             merge_agreement=(0.0, 1.0),
+            tentative_max_age=(0, 2**31),
         )
         self._merge_votes: Counter[tuple[int, int]] = Counter()  # votes by pair of instances; see merge_frames
 
@@ -289,6 +301,8 @@ class Association:
 
         The rule follows Voxblox++. At most one pair is merged per frame.
         """
+        if self.merge_overlap >= 1:
+            return
         matched = sorted(set(matches.instance_ids[matches.instance_ids > 0].tolist()))
         self._merge_votes.subtract(combinations(matched, 2))
         for k, row in enumerate(matches.overlaps.over_smaller(self.create_points)):
@@ -299,7 +313,7 @@ class Association:
                 self._merge_votes[pair] += 1
                 if self._merge_votes[pair] >= self.merge_frames and self._same_class(scene.table, *pair):
                     scene.merge(*pair)
-                    self._remove_votes(pair[1])
+                    self._remove_votes({pair[1]})
                     return  # the overlaps are now outdated; other pairs can be merged in later frames
 
     def _same_class(self, table: InstanceTable, a: int, b: int) -> bool:
@@ -307,8 +321,16 @@ class Association:
         known = [table.class_probabilities(table.records[k])[None] for k in (a, b)]
         return bool(class_agreement(*known)[0, 0] >= self.merge_agreement)
 
-    def _remove_votes(self, instance_id: int) -> None:
-        self._merge_votes = Counter({pair: n for pair, n in self._merge_votes.items() if instance_id not in pair})
+    def expire(self, scene: LabeledMap) -> None:
+        """Remove the tentative instances that have reached `tentative_max_age`."""
+        scene.table.confirmed(scene.confirmation)  # confirmed instances are no longer tentative
+        expired = scene.table.unseen(self.tentative_max_age) if self.tentative_max_age else []
+        if expired:
+            scene.remove(expired)
+            self._remove_votes(set(expired))
+
+    def _remove_votes(self, removed: set[int]) -> None:
+        self._merge_votes = Counter({pair: n for pair, n in self._merge_votes.items() if removed.isdisjoint(pair)})
 
 
 def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str, ...]:

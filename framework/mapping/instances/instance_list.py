@@ -63,8 +63,7 @@ class Confirmation:
     def counts(self, table: InstanceTable) -> Bool:
         """Return a Boolean array (last id + 1,), True for instances that meet all conditions but the minimum area."""
         counts = np.zeros(table.last_id + 1, np.bool_)
-        for record in table.records.values():
-            counts[record.id] = self.is_met(record)
+        counts[[*table.confirmed(self)]] = True
         return counts
 
     def min_vertices(self, voxel_size: float) -> int:
@@ -99,7 +98,7 @@ class InstanceTableMap(SceneMap):
         return zlib.crc32(repr(sorted(self.instance_ids())).encode(), super().digest())
 
     def instance_ids(self) -> frozenset[int]:
-        return frozenset(np.flatnonzero(self.confirmation.counts(self.table)).tolist())
+        return self.table.confirmed(self.confirmation)
 
     def most_likely_classes(self) -> Mapping[int, tuple[int, float]]:
         evidence = self.class_evidence()
@@ -107,8 +106,8 @@ class InstanceTableMap(SceneMap):
 
     def class_evidence(self) -> dict[int, Float64]:
         """Return the class evidence (C,) of each confirmed instance by id, from its detections."""
-        confirmed = filter(self.confirmation.is_met, self.table.records.values())
-        return {record.id: record.class_evidence for record in confirmed}
+        confirmed = self.table.confirmed(self.confirmation)
+        return {k: record.class_evidence for k, record in self.table.records.items() if k in confirmed}
 
     def begin(self, classes: tuple[str, ...]) -> None:
         """Set the label space of the map.

@@ -1,9 +1,15 @@
-"""Instance table: the class evidence, observations and confidence of each instance."""
+"""Instance table: the class evidence, observations and confidence of each instance.
+
+An instance is tentative until it is confirmed for the first time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from itertools import takewhile
+from typing import Protocol
 
 import numpy as np
 
@@ -12,35 +18,43 @@ from framework.mapping.instances.object_embedding import ObjectEmbedding, added
 from framework.mapping.labels.label_evidence import UNSEEN
 from framework.mapping.labels.label_evidence_kernels import Combine
 
+PAGE = 4096  # number of frames of a page of a FrameSet
+
 
 class FrameSet:
-    """A set of frame indices, stored as spans of consecutive frames."""
+    """A set of frame indices with one bit for each frame, stored in pages."""
 
-    def __init__(self, spans: Iterable[list[int]] = ()) -> None:
-        self.spans: list[list[int]] = []  # first and last frame of each span, ascending, with gaps between spans
-        self._count = 0
-        for first, last in sorted(spans):
-            self._append(first, last)
+    def __init__(self, pages: Mapping[int, int] | None = None) -> None:
+        self.pages = dict(pages or {})  # bits of the frames page * PAGE to page * PAGE + PAGE - 1, by page
+        self._count = sum(bits.bit_count() for bits in self.pages.values())
 
     def __len__(self) -> int:
         return self._count
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FrameSet) and self.pages == other.pages
+
     def __or__(self, other: FrameSet) -> FrameSet:
-        return FrameSet(self.spans + other.spans)
+        both = self.pages.keys() | other.pages.keys()
+        return FrameSet({page: self.pages.get(page, 0) | other.pages.get(page, 0) for page in both})
 
     def add(self, frame: int) -> None:
-        if self.spans and frame < self.spans[-1][0]:
-            merged = self | FrameSet([[frame, frame]])
-            self.spans, self._count = merged.spans, len(merged)
-        else:
-            self._append(frame, frame)
+        page, bit = divmod(frame, PAGE)
+        bits = self.pages.get(page, 0)
+        self._count += not bits >> bit & 1
+        self.pages[page] = bits | 1 << bit
 
-    def _append(self, first: int, last: int) -> None:
-        """Add a span that begins within or after the last span."""
-        if not self.spans or first > self.spans[-1][1] + 1:
-            self.spans.append([first, first - 1])
-        self._count += max(last - self.spans[-1][1], 0)
-        self.spans[-1][1] = max(last, self.spans[-1][1])
+    def last(self) -> int:
+        """Return the largest frame index, -1 if the set is empty."""
+        page = max(self.pages, default=-1)
+        return PAGE * page + self.pages[page].bit_length() - 1 if self.pages else -1
+
+
+class Condition(Protocol):
+    """Condition for an instance to be confirmed. Equal conditions give equal results."""
+
+    def is_met(self, record: InstanceRecord) -> bool:
+        """Return True if the condition is met."""
 
 
 @dataclass
@@ -54,7 +68,7 @@ class InstanceRecord:
     class_evidence: Float64
     first_frame: int = -1
     last_frame: int = -1
-    observed_in: set[int] = field(default_factory=set)  # frames with a detection
+    observed_in: FrameSet = field(default_factory=FrameSet)  # frames with a detection
     in_view: FrameSet = field(default_factory=FrameSet)  # frames in which the instance is in view
     score_sum: float = 0.0  # sum of the scores of its detections
     detections: int = 0  # number of detections
@@ -80,13 +94,21 @@ class InstanceRecord:
 class InstanceTable:
     """The instances of a map by id.
 
-    Ids start at 1 and are never reused. Class evidence is combined by the rule `combine`, as in the voxels. It consists
-    of log-likelihoods if `logarithmic` is True, and of votes otherwise.
+    Ids start at 1. The ids of tentative instances that are removed are used again, those of other instances never are.
+    Class evidence is combined by the rule `combine`, as in the voxels. It consists of log-likelihoods if `logarithmic`
+    is True, and of votes otherwise.
     """
 
     def __init__(self, combine: Combine = Combine.SUM, logarithmic: bool = True) -> None:
         self.records: dict[int, InstanceRecord] = {}
         self.last_id = 0
+        self.free_ids: list[int] = []  # heap of the ids that are used again
+        self.detected_frames = 0  # number of frames with detections since the map was created or loaded
+        # `detected_frames` at the last detection of each tentative instance by id, in ascending order
+        self.tentative: dict[int, int] = {}
+        self._confirmed: frozenset[int] = frozenset()
+        self._condition: Condition | None = None  # of `_confirmed`
+        self._changed: set[int] = set()  # ids whose entry in `_confirmed` may be outdated
         self._last_before = -1  # last frame of the previous sequences
         self._offset = 0  # offset of the frame indices of this sequence
         self.combine = combine
@@ -100,15 +122,51 @@ class InstanceTable:
             classes: The number of classes.
             frame_index: The frame in which the instance is created.
         """
-        self.last_id += 1
-        record = InstanceRecord(self.last_id, np.zeros(classes), first_frame=frame_index, last_frame=frame_index)
-        self.records[self.last_id] = record
+        instance_id = heappop(self.free_ids) if self.free_ids else self.last_id + 1
+        record = InstanceRecord(instance_id, np.zeros(classes), first_frame=frame_index, last_frame=frame_index)
+        self.add(record)
+        self.tentative[instance_id] = self.detected_frames
         return record
+
+    def add(self, record: InstanceRecord) -> None:
+        """Add an instance with a new id."""
+        self.records[record.id] = record
+        self.last_id = max(self.last_id, record.id)
+        self._changed.add(record.id)
+
+    def remove(self, instance_id: int) -> None:
+        """Remove an instance. Its id is not used again."""
+        del self.records[instance_id]
+        self.tentative.pop(instance_id, None)
+        self._changed.add(instance_id)
+
+    def release(self, instance_id: int) -> None:
+        """Remove a tentative instance without evidence in the voxels. Its id is used again."""
+        self.remove(instance_id)
+        heappush(self.free_ids, instance_id)
+
+    def unseen(self, frames: int) -> list[int]:
+        """Return the tentative instances without a detection in the last `frames` frames with detections."""
+        return [*takewhile(lambda k: self.detected_frames - self.tentative[k] >= frames, self.tentative)]
+
+    def confirmed(self, condition: Condition) -> frozenset[int]:
+        """Return the ids of the instances that meet the condition. Only changed instances are tested again."""
+        if condition != self._condition:
+            self._condition, self._changed = condition, {*self.records}
+            self._confirmed = frozenset()
+        if self._changed:
+            met = {k for k in self._changed if k in self.records and condition.is_met(self.records[k])}
+            for k in met:
+                self.tentative.pop(k, None)
+            if met != self._confirmed & self._changed:
+                self._confirmed = self._confirmed - self._changed | met
+            self._changed.clear()
+        return self._confirmed
 
     def begin_recording(self) -> None:
         """Prepare for the frames of another sequence, whose indices may repeat those of previous sequences."""
-        spans = [span[1] for record in self.records.values() for span in record.in_view.spans[-1:]]
-        self._last_before = max([*spans, *(record.last_frame for record in self.records.values())], default=-1)
+        last = (max(record.in_view.last(), record.last_frame) for record in self.records.values())
+        self._last_before = max(last, default=-1)
         self._offset = 0
 
     def number_of(self, frame_index: int) -> int:
@@ -141,10 +199,30 @@ class InstanceTable:
         record.score_sum += score
         record.detections += 1
         record.embedding = added(record.embedding, embedding)
+        self._changed.add(instance_id)
+        self._detected(instance_id)
+
+    def _detected(self, instance_id: int) -> None:
+        """Move an instance to the end of the tentative instances, if it is one of them."""
+        if self.tentative.pop(instance_id, None) is not None:
+            self.tentative[instance_id] = self.detected_frames
+
+    def see(self, instance_ids: Iterable[int], frame_index: int) -> None:
+        """Record that instances are in view in a frame."""
+        for k in instance_ids:
+            self.records[k].in_view.add(frame_index)
+            self._changed.add(k)
 
     def merge(self, kept: int, dropped: int) -> None:
-        """Add the history of instance `dropped` to `kept`, and remove `dropped`."""
-        a, b = self.records[kept], self.records.pop(dropped)
+        """Add the history of instance `dropped` to `kept`, and remove `dropped`. The caller moves its voxels."""
+        a, b = self.records[kept], self.records[dropped]
+        if dropped in self.tentative:
+            self.release(dropped)
+            self._detected(kept)
+        else:
+            self.remove(dropped)
+            self.tentative.pop(kept, None)
+        self._changed.add(kept)
         earlier, later = (a, b) if a.last_frame <= b.last_frame else (b, a)
         a.class_evidence = _combined(earlier.class_evidence, later.class_evidence, self.combine)
         a.observed_in |= b.observed_in

@@ -6,6 +6,7 @@ labeled when it is near the measured surface and its pixel is inside a mask.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from framework.mapping.labels.evidence_rows_kernels import (
     label_new,
     merge_instances,
     number_new,
+    remove_instances,
     sum_classes_of_instances,
     update_rows,
 )
@@ -169,6 +171,20 @@ class EvidenceRows:
         """Add the evidence for instance `dropped` to the evidence for `kept` in every voxel."""
         row_bits = self._row_bits[: self.row_count]
         merge_instances(self.evidence, row_bits, np.int32(kept), np.int32(dropped), int(self.combine))
+
+    def remove_instances(self, instance_ids: Sequence[int], last_id: int) -> None:
+        """Remove the evidence for instances in every voxel.
+
+        The class evidence of the voxels does not change, because it is not stored by instance.
+
+        Args:
+            instance_ids: The instances.
+            last_id: The largest id of all instances.
+        """
+        removed = np.zeros(last_id + 1, np.bool_)
+        removed[[*instance_ids]] = True
+        bits = np.bitwise_or.reduce(np.uint64(1) << np.array(instance_ids, np.uint64) % np.uint64(BITS))
+        remove_instances(self.evidence, self._row_bits[: self.row_count], removed, bits)
 
     def classes_of_instances(self, counts: Bool, classes: int) -> Float64:
         """Return the class evidence (ids + 1, classes) of the instances, summed over their voxels.

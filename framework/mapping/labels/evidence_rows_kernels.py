@@ -203,6 +203,39 @@ def merge_instances(evidence, row_bits, kept, dropped, combine):
                     _merge_voxel(evidence.instance_ids[voxel], evidence.instance_value[voxel], kept, dropped, combine)
 
 
+@device
+def _remove_from_voxel(ids, values, removed):
+    """Remove the evidence of a voxel for instances with `removed[id]` True, and return the set of its others."""
+    bits = np.uint64(0)
+    kept = 0
+    for s in range(len(ids)):
+        instance, value = ids[s], values[s]
+        if instance == 0:  # slots are filled from the front
+            break
+        ids[s], values[s] = 0, 0
+        if not removed[instance]:
+            ids[kept], values[kept] = instance, value
+            bits |= _instance_bit(instance)
+            kept += 1
+    best_first(ids, values, 0)
+    return bits
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def remove_instances(evidence, row_bits, removed, removed_bits):
+    """Remove the evidence for instances with `removed[id]` True in every voxel.
+
+    Only the rows whose instance set (R,) has one of `removed_bits` are visited. Their sets become exact.
+    """
+    for row in prange(row_bits.shape[0]):
+        if row_bits[row] & removed_bits:
+            bits = np.uint64(0)
+            for voxel in evidence.labeled[row]:
+                if voxel >= 0:
+                    bits |= _remove_from_voxel(evidence.instance_ids[voxel], evidence.instance_value[voxel], removed)
+            row_bits[row] = bits
+
+
 @njit(cache=True, nogil=True)
 def sum_classes_of_instances(evidence, counts, sums):
     """Add the class scores of every labeled voxel to the sums (ids + 1, C) of its instance.
