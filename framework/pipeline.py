@@ -14,6 +14,7 @@ from typing import cast
 
 from framework.data import Array, Detections, Float64, Frame, Pose
 from framework.detection.domain import warn_outside_domain
+from framework.detection.masks.mask_limit import MAX_MASK_AREA, fitting_masks, mask_area
 from framework.errors import ConfigError, DataError, FrameError, MapFullError, in_one_line
 from framework.files.storage import check_storage
 from framework.interfaces import (
@@ -278,11 +279,18 @@ class Pipeline:
         """Return the detections of a frame and the detection time.
 
         Both are empty for frames between two detections. `number` is the frame number, starting at 0.
+
+        Raises:
+            DataError: The detector does not return Detections.
         """
         if number % self.detection_interval:
             return Detections.none(frame.depth.shape, self.detector.classes, detected=False), []
         began = time.perf_counter()
         detections = self.detector.detect(frame)
+        if not isinstance(cast(object, detections), Detections):
+            raise DataError(
+                f"frame {frame.index}: expected Detections from the detector, got {type(detections).__name__}"
+            )
         return detections, [StageTime(frame.index, "detection", 1e3 * (time.perf_counter() - began))]
 
     def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> Pose:
@@ -313,7 +321,7 @@ class Pipeline:
         if pose.lost:
             return pose
         with journal.timed(frame.index, "lifting"):
-            lifted = lift(detections, frame, pose, color_pixels)
+            lifted = lift(self.limited(detections, frame, journal), frame, pose, color_pixels)
         with journal.timed(frame.index, "refinement"):
             clusters = refine(self.refiner, lifted, frame)
         journal.frames_in_map += 1
@@ -322,6 +330,22 @@ class Pipeline:
         journal.frame_fused(frame)
         journal.digest(frame.index, detection=detections, lifting=lifted, refinement=clusters, fusion=self.fuser.scene)
         return pose
+
+    def limited(self, detections: Detections, frame: Frame, journal: Journal) -> Detections:
+        """Return the detections whose masks fit into the limit of a frame.
+
+        Omitted masks are counted, and those of the first frame are logged.
+        """
+        fitting = fitting_masks(detections)
+        omitted = len(detections) - len(fitting)
+        if omitted and not journal.masks_omitted:
+            log.warning(
+                "frame %d: masks: expected at most %d times the pixels of the image, got %.1f times; %d of %d masks "
+                "with low scores are omitted, later ones are only counted; reduce detector.max_detections",
+                frame.index, MAX_MASK_AREA, mask_area(detections), omitted, len(detections),
+            )  # fmt: skip
+        journal.masks_omitted += omitted
+        return fitting
 
     def compare_with_map(self, frame: Frame, pose: Pose, journal: Journal) -> None:
         """Compare the depth of a frame with the map at its given pose, and record the result.

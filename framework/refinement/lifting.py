@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 import numpy as np
 
 from framework.data import Detections, Frame, Int32, PointClusters, Pose
@@ -24,10 +22,8 @@ def lift(detections: Detections, frame: Frame, pose: Pose, color_pixels: Int32 |
             have the same pixels. Ignored for exact masks of the depth image.
 
     Raises:
-        DataError: If `detections` is not a Detections object, or if the size of its masks differs from the frame.
+        DataError: If the size of the masks differs from the frame.
     """
-    if not isinstance(cast(object, detections), Detections):
-        raise DataError(f"frame {frame.index}: expected Detections from the detector, got {type(detections).__name__}")
     height, width = frame.depth.shape
     if detections.masks.shape[1:] != (height, width):
         raise DataError(

@@ -80,6 +80,7 @@ class RunResult:
     color_delay: DelayEstimate | None = None  # None = given, not estimated
     digests: Sequence[StageDigest] = ()  # of each stage and frame
     disagreeing: tuple[int, ...] | None = None  # Frame.index of the frames that contradict the map; None = not compared
+    masks_omitted: int = 0  # number of masks beyond the limit of a frame
 
     @property
     def frames_lost(self) -> int:
@@ -119,6 +120,7 @@ class Journal:
     last_time: float = -math.inf  # s, latest timestamp of the tracked frames
     lost_for: int = 0  # number of consecutive lost frames
     frames_dropped: int = 0
+    masks_omitted: int = 0  # number of masks beyond the limit of a frame
     sensor: SensorKind | None = None  # of the last frame
     compared: int = 0  # number of frames whose depth is compared with the map at a given pose
     apart: int = 0  # number of compared frames in a row that see nothing of the map
@@ -323,6 +325,7 @@ class Journal:
             intervals=tuple(np.diff(list(self.frames_began)).tolist()),
             pose_source=self.pose_source,
             disagreeing=tuple(self.disagreeing) if self.compared else None,
+            masks_omitted=self.masks_omitted,
             live=LiveFigures(self.frames_dropped, tuple(self.latencies)) if self.frames_expected is None else None,
         )
 

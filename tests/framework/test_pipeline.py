@@ -18,10 +18,12 @@ import pytest
 from tqdm import TMonitor
 
 from framework.data import Array, Detections, Frame, PointClusters, Pose
+from framework.detection.masks.mask_limit import MAX_MASK_AREA
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.interfaces import RGBDSequence, SceneMap, StageTimer, Viewer, untimed
 from framework.pipeline import Pipeline
 from framework.registry import assemble
+from framework.runs.metrics import run_metrics
 from framework.runtime.run_log import RunResult
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.support.scenes.corner_room import (
@@ -268,6 +270,41 @@ def test_pipeline_full_map_returns_partial_result(room: CornerRoom) -> None:
 
 
 @dataclass
+class _CoversImage(SphereDetector):
+    """Detector of 100 objects, each with a mask of the whole image."""
+
+    def detect(self, frame: Frame) -> Detections:
+        return Detections(
+            np.ones((100, *frame.depth.shape), np.bool_),
+            np.zeros((100, 4), np.float32),
+            np.linspace(0, 1, 100, dtype=np.float32),
+            np.tile(np.eye(len(self.classes), dtype=np.float32)[0], (100, 1)),
+            self.classes,
+        )
+
+
+class _NotesScores(KeepAll):
+    noted: tuple[float, ...] = ()
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        self.noted += tuple(clusters.scores.tolist())
+        return clusters
+
+
+def test_pipeline_limits_mask_pixels_of_frame(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+    refiner = _NotesScores()
+    result = pipeline(detector=_CoversImage(), refiner=refiner).run(room)
+    expected = np.linspace(0, 1, 100, dtype=np.float32)[-MAX_MASK_AREA:].tolist()
+    assert refiner.noted == tuple(len(room) * expected)
+    assert result.masks_omitted == run_metrics(result)["masks_omitted"] == len(room) * (100 - MAX_MASK_AREA)
+    logged = [record.getMessage() for record in caplog.records if "masks" in record.getMessage()]
+    assert len(logged) == 1
+    assert logged[0].startswith(
+        "frame 0: masks: expected at most 8 times the pixels of the image, got 100.0 times; 92 of"
+    )
+    assert "masks_omitted" not in run_metrics(pipeline().run(room))
+
+
 class _Fails(GridFuser):
     at: int = 3
 
