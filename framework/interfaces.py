@@ -274,14 +274,37 @@ class Gravity:
     source: str = ""  # "sensor" or "surfaces"; "" = unknown
 
 
+MAX_CLASSES = 10_000  # maximum number of classes of a map; LVIS has 1,203
+LONGEST_NAME = 200  # maximum length of a class name, characters
+
+
 class SceneMap(ABC):
     """The map of a fuser.
 
-    Implement `classes` and the six abstract members. Override the other seven members to provide more data or a faster
+    Implement `classes` and the six abstract members. Override the other eight members to provide more data or a faster
     implementation.
     """
 
     classes: tuple[str, ...]  # the label space; empty until the first frame is fused
+
+    def check_classes(self, classes: tuple[str, ...]) -> None:
+        """Check that the map supports a label space. Called before the first frame is read.
+
+        The default accepts MAX_CLASSES names of at most LONGEST_NAME characters.
+
+        Raises:
+            ConfigError: The map does not support the label space.
+        """
+        if len(classes) > MAX_CLASSES:
+            raise ConfigError(
+                f"detector: expected at most {MAX_CLASSES} classes, got {len(classes)}; remove the classes that the scene "
+                "cannot contain"
+            )
+        if long := next((name for name in classes if len(name) > LONGEST_NAME), None):
+            raise ConfigError(
+                f"detector: expected class names of at most {LONGEST_NAME} characters, got {len(long)} in {long!r:.60}; "
+                "shorten the name"
+            )
 
     @property
     @abstractmethod

@@ -53,6 +53,9 @@ class Pipeline:
     """The stages and the mapping loop.
 
     Example: `Pipeline(detector, tracker, refiner, fuser).run(video)`.
+
+    Raises:
+        ConfigError: A parameter is out of range, or the map does not support the classes of the detector.
     """
 
     detector: Detector
@@ -70,6 +73,7 @@ class Pipeline:
             )
         if self.prefetch < 0:
             raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}; set it to 0")
+        self.fuser.scene.check_classes(self.detector.classes)
         self.viewer = GuardedViewer(self.viewer)
         self.color_to_depth = ColorToDepth(delay=None)
         self.resumed = False  # True until a frame is compared with the map of `resume_from`

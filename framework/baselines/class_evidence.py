@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from framework.baselines.class_evidence_kernels import best_clusters, find_blocks_under_masks, update_classes
-from framework.data import Float32, Float64, Int32, PointClusters, UInt8, UInt16
+from framework.data import Float32, Float64, Int16, Int32, PointClusters, UInt8, UInt16
 from framework.errors import DataError
 from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS
 from framework.mapping.labels.label_evidence import named_classes
@@ -47,7 +47,7 @@ class ClassEvidence(NamedTuple):
     """
 
     unmasked: UInt16  # (B, 512) number of frames in which the voxel was outside all masks, for B blocks
-    class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
+    class_ids: Int16  # (R, 512, T), NO_CLASS = free slot
     log_ratio: Float32  # (R, 512, T) sum of log(P(class) / P(background)) over the frames counted by `masked`
     rest: Float32  # (R, 512) log_ratio of each unnamed class of the voxel
     masked: UInt16  # (R, 512) number of frames in which the voxel was under a mask
@@ -65,8 +65,8 @@ class MaskClasses(NamedTuple):
     cluster: Int32  # (H * W,) cluster with the highest score at each pixel, -1 = none
     log_ratio: Float32  # (N, C) log(P(class) / P(background))
     unnamed: Float32  # (N,) log(mean P(unnamed class) / P(background)) of each cluster
-    named_classes: UInt8  # (N, NEW_CLASSES) most likely classes of each cluster
-    named_bit: UInt8  # (N, NO_CLASS + 1) 2^m for the m-th named class of a cluster, 0 = unnamed
+    named_classes: Int16  # (N, NEW_CLASSES) most likely classes of each cluster
+    named_bit: UInt8  # (N, C + 1) column c + 1: 2^m if class c is the m-th named class of a cluster, 0 = unnamed
     frame: int  # index of the frame
 
 
@@ -114,13 +114,7 @@ class ClassRows:
         return sum(array.nbytes for array in self.saved().values())
 
     def begin(self, classes: int) -> None:
-        """Set the number of classes before the first update.
-
-        Raises:
-            DataError: If there are too many classes.
-        """
-        if classes > NO_CLASS:
-            raise DataError(f"detector: expected at most {NO_CLASS} classes, got {classes}")
+        """Set the number of classes before the first update."""
         self.evidence = _free_rows(min(classes, CLASS_SLOTS))
 
     def update(self, seen: SeenBlocks, masks: MaskClasses | None) -> None:
@@ -181,7 +175,7 @@ class ClassRows:
         self.row_count = needed
 
 
-def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: int) -> None:
+def _check_order(class_ids: Int16, log_ratio: Float32, rest: Float32, classes: int) -> None:
     """Raise DataError unless slot 0 has the most likely class, and all log ratios are in range."""
     named = class_ids != NO_CLASS
     ratios = np.where(named, log_ratio, np.float32(-np.inf))
@@ -203,7 +197,7 @@ def _free_rows(class_slots: int) -> ClassEvidence:
     voxels = (0, BLOCK_VOXELS)
     return ClassEvidence(
         unmasked=np.empty(voxels, np.uint16),
-        class_ids=np.empty((*voxels, class_slots), np.uint8),
+        class_ids=np.empty((*voxels, class_slots), np.int16),
         log_ratio=np.empty((*voxels, class_slots), np.float32),
         rest=np.empty(voxels, np.float32),
         masked=np.empty(voxels, np.uint16),

@@ -75,7 +75,7 @@ def observe_mask(evidence, row, n, masks, k):
         if labels[s] == NO_CLASS:
             break  # slots are filled from the front
         sums[s] += masks.log_ratio[k, labels[s]]
-        known |= masks.named_bit[k, labels[s]]
+        known |= masks.named_bit[k, labels[s] + 1]
     evicted = 0
     for m in range(NEW_CLASSES if known != ALL_NAMED else 0):
         label = masks.named_classes[k, m]

@@ -29,7 +29,7 @@ from framework.sensors.noise_models import SensorKind
 
 ABSENCE, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds
 SWEEPS = 20  # maximum number of sweeps of the regularization
-FORMAT = "semantic 4"  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = "semantic 5"  # format of the map file; increment it when the meaning of the contents changes
 
 
 class Elections(NamedTuple):
@@ -68,8 +68,10 @@ class SemanticMap(SceneMap):
         """Set the label space of the map.
 
         Raises:
-            DataError: If the map has a different label space, or if there are too many classes.
+            DataError: If the map has a different label space.
+            ConfigError: If the map does not support the label space.
         """
+        self.check_classes(classes)
         if not self.classes:
             self.labels.begin(len(classes))
         self.classes = agreed_classes(self.classes, classes)

@@ -51,7 +51,8 @@ class EditedMap:
         """Apply an edit, and return a description of its result.
 
         Raises:
-            DataError: An instance is unknown or cannot be split, or the map has too many classes for a new one.
+            DataError: An instance is unknown or cannot be split.
+            ConfigError: The map has too many classes for a new one.
         """
         match edit:
             case Merge(ids):
@@ -121,7 +122,7 @@ class EditedMap:
         classes = self.scene.classes
         k, evidence, voxels = classes.index(name), self.scene.labels.in_use(), self._voxels_of(key)
         self.scene.table.records[key].class_evidence = CERTAIN * np.eye(len(classes))[k]
-        slots = np.full(evidence.class_ids.shape[1], NO_CLASS, np.uint8)
+        slots = np.full(evidence.class_ids.shape[1], NO_CLASS, np.int16)
         score = MAX_SCORE
         if self.scene.labels.storage is Storage.EXACT:  # every class has a slot
             slots[1:] = np.delete(np.arange(len(slots)), k)

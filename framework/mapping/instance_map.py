@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View
-from framework.errors import DataError
+from framework.errors import ConfigError, DataError
 from framework.interfaces import Gravity, MapStatistics
 from framework.mapping.instances.association_kernels import look_up_instances
 from framework.mapping.instances.instance_list import Confirmation, InstanceClass, InstanceTableMap
@@ -18,6 +18,7 @@ from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
 from framework.mapping.labels.label_evidence import Evidence
 from framework.mapping.labels.vertex_labels_kernels import label_vertices
 from framework.mapping.storage.map_file import (
+    CLASS_EVIDENCE,
     check_known,
     check_like,
     check_numbers,
@@ -34,7 +35,8 @@ from framework.mapping.voxels.raycasting import render
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
-FORMAT = 8  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = 9  # format of the map file; increment it when the meaning of the contents changes
+MAX_EXACT_CLASSES = 255  # maximum number of classes in exact storage; a voxel takes 10 bytes per class
 LARGEST_SCALE = 2**40  # maximum score_scale of a map file (quantized class score for evidence of 1)
 
 
@@ -67,6 +69,14 @@ class InstanceMap(InstanceTableMap):
     @property
     def depth_range(self) -> tuple[float, float]:
         return self.volume.sensor.depth_range
+
+    def check_classes(self, classes: tuple[str, ...]) -> None:
+        super().check_classes(classes)
+        if self.labels.storage is Storage.EXACT and len(classes) > MAX_EXACT_CLASSES:
+            raise ConfigError(
+                f"fuser.storage: expected COMPACT for more than {MAX_EXACT_CLASSES} classes, got EXACT for {len(classes)}; "
+                "set fuser.storage=COMPACT"
+            )
 
     def begin(self, classes: tuple[str, ...]) -> None:
         if not self.classes:
@@ -104,10 +114,9 @@ class InstanceMap(InstanceTableMap):
         """Add a class to a map with classes. The class distributions of the instances do not change.
 
         Raises:
-            DataError: The map has the maximum number of classes.
+            ConfigError: The map has the maximum number of classes.
         """
-        if len(self.classes) == NO_CLASS:
-            raise DataError(f"expected one of the {NO_CLASS} classes of the map, which is the maximum, got {name!r}")
+        self.check_classes((*self.classes, name))
         self.classes += (name,)
         self.labels.add_class(self.table.logarithmic)
         self.table.add_class()
@@ -151,11 +160,11 @@ class InstanceMap(InstanceTableMap):
             "evicted": self.labels.evicted,
             "table": plain_table(self.table),
         }
-        write_map(path, header, arrays | self.labels.in_use()._asdict() | table_arrays(self.table))
+        write_map(path, header, arrays | self.labels.in_use()._asdict() | table_arrays(self.table, len(self.classes)))
 
     @classmethod
     def load(cls, path: Path | str) -> InstanceMap:
-        header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields))
+        header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields, CLASS_EVIDENCE))
         with map_file_errors(path):
             classes, storage = header.classes(), header.option("storage", Storage)
             table = table_of(header.part("table"), len(classes), arrays)

@@ -115,7 +115,9 @@ class InstanceTableMap(SceneMap):
 
         Raises:
             DataError: If the map has a different label space.
+            ConfigError: If the map does not support the label space.
         """
+        self.check_classes(classes)
         self.classes = agreed_classes(self.classes, classes)
 
     def instances(self) -> Mapping[int, Instance]:

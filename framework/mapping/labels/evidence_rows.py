@@ -1,6 +1,6 @@
 """Storage and update of the label evidence.
 
-In compact storage, the slots of a labeled voxel take 80 bytes, and a row of a block takes 2 KiB. A voxel becomes
+In compact storage, the slots of a labeled voxel take 96 bytes, and a row of a block takes 2 KiB. A voxel becomes
 labeled when it is near the measured surface and its pixel is inside a mask.
 """
 
@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from framework.data import Bool, Float64, Int32, UInt8
-from framework.errors import DataError
+from framework.data import Bool, Float64, Int16, Int32
 from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS
 from framework.mapping.labels.evidence_rows_kernels import (
     BITS,
@@ -113,13 +112,7 @@ class EvidenceRows:
             array[:, given.shape[1] :] = 0
 
     def begin(self, classes: int) -> None:
-        """Set the number of classes before the first update.
-
-        Raises:
-            DataError: If there are too many classes.
-        """
-        if classes > NO_CLASS:
-            raise DataError(f"detector: expected at most {NO_CLASS} classes, got {classes}")
+        """Set the number of classes before the first update."""
         if self.storage is Storage.EXACT:
             self._class_slots = max(classes, 1)
             self._free()
@@ -154,7 +147,7 @@ class EvidenceRows:
         if self.storage is Storage.COMPACT:
             return
         old = self.in_use()
-        new_id = np.full((len(old.class_ids), 1), self._class_slots, np.uint8)
+        new_id = np.full((len(old.class_ids), 1), self._class_slots, np.int16)
         unseen = old.class_value.max(axis=1, keepdims=True) - int(UNSEEN * self.score_scale) if logarithmic else 0
         new_value = np.broadcast_to(unseen, new_id.shape).astype(old.class_value.dtype)
         self._class_slots += 1
@@ -184,7 +177,7 @@ class EvidenceRows:
         self._row_bits = np.empty(len(self._labeled), np.uint64)  # bit k % BITS = a voxel may have instance k
         scores = np.int16 if self.storage is Storage.COMPACT else np.int64
         shapes = self._instance_slots, self._instance_slots, self._class_slots, self._class_slots
-        kinds = zip(SLOTS, (np.int32, np.float32, np.uint8, scores), shapes, strict=True)
+        kinds = zip(SLOTS, (np.int32, np.float32, np.int16, scores), shapes, strict=True)
         slots = np.dtype([(name, kind, (count,)) for name, kind, count in kinds], align=True)
         self._slots = reserved(RESERVED * self.voxels.max_blocks, lambda voxels: np.empty(voxels, slots))
         self._lay_out()
@@ -192,11 +185,11 @@ class EvidenceRows:
     def _lay_out(self) -> None:
         self.evidence = Evidence(self._labeled, **{name: self._slots[name] for name in SLOTS})
 
-    def _free_classes(self) -> UInt8:
+    def _free_classes(self) -> Int16:
         """Return the class ids (T,) in the slots of a new voxel."""
         # exact storage has a slot for every class
         named = np.arange(self._class_slots) if self.storage is Storage.EXACT else np.full(self._class_slots, NO_CLASS)
-        return named.astype(np.uint8)
+        return named.astype(np.int16)
 
     def _make_room(self, blocks: Int32, new: NewVoxels) -> None:
         """Reserve slots for new voxels and rows for new blocks, and fill new.rows and new.starts."""

@@ -159,7 +159,7 @@ def sum_classes(classes, scores, measurement, k):
         evicted += rejected
         if rejected:
             continue  # later classes have lower scores
-        score = cluster_scores[label] >> NEW_CLASSES
+        score = cluster_scores[label + 1] >> NEW_CLASSES
         slot = filled
         if filled < len(classes):
             filled += 1
@@ -211,7 +211,7 @@ def update_voxel(evidence, voxel, measurement, list_id):
                 label = measurement.named_classes[k, m]
                 if m > 0 and label == measurement.named_classes[k, 0]:
                     break
-                score = measurement.class_scores[k, label] >> NEW_CLASSES
+                score = measurement.class_scores[k, label + 1] >> NEW_CLASSES
                 evicted += add_evidence(classes, class_values, NO_CLASS, label, score, combine, measurement.max_score)
     if (named or absent) and ids[1] != 0:
         best_first(ids, id_values, 0)

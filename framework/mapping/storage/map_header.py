@@ -12,9 +12,8 @@ from enum import Enum
 from typing import Any, TypeVar
 
 from framework.errors import DataError
+from framework.interfaces import LONGEST_NAME, MAX_CLASSES
 
-MAX_CLASSES = 10_000  # maximum number of classes of a map; LVIS has 1,200
-LONGEST_NAME = 200  # maximum length of a class name, characters
 LARGEST_COUNT = 2**53  # maximum number of frames and evictions; JSON readers represent all integers up to it exactly
 
 Option = TypeVar("Option", bound=Enum)
