@@ -233,7 +233,7 @@ class Journal:
             )
 
     def frame_tracked(self, frame: Frame, pose: Pose, is_masked: bool = False) -> None:
-        """Record a pose, and count a masked frame. Log a change of the depth sensor, and the loss and recovery of tracking."""
+        """Record a pose and whether the frame is masked. Log a change of the depth sensor, and loss and recovery."""
         self.last_index = int(frame.index)
         self.frames_masked += is_masked
         if frame.timestamp <= self.last_time and not self.unordered:

@@ -66,7 +66,7 @@ class MovingObject:
         part = np.zeros(len(vectors), np.int32)
         part[self.surfaces.triangles] = self.surfaces.parts[:, None]
         T = self.poses(frame)[part]
-        return (np.einsum("vij,vj->vi", T[:, :3, :3], vectors) + w * T[:, :3, 3]).astype(np.float32)
+        return np.asarray(np.einsum("vij,vj->vi", T[:, :3, :3], vectors) + w * T[:, :3, 3], np.float32)
 
     def render(self, camera: Camera, T_world_camera: Float64, frame: float, brightness: float = 1.0) -> Rendering:
         """Return a view of the object alone, in diffuse light from above."""

@@ -92,7 +92,9 @@ class Renderer:
             smooth_edges(surfaces, view, u, v, *samples, triangle, depth, light)
         unread = np.empty(incidence.shape, np.float32)
         lose_readings(surfaces.materials, surfaces.table, triangle, incidence, unread)
-        return Rendering(to_srgb(light * np.float32(brightness)), depth, _ids_of(self.surfaces, triangle), incidence, unread)
+        return Rendering(
+            to_srgb(light * np.float32(brightness)), depth, _ids_of(self.surfaces, triangle), incidence, unread
+        )
 
     def depth_and_ids(self, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Int32]:
         """Return the exact depth (H, W), m along z, and the instance ids (H, W) of a view.

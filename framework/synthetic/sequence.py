@@ -105,7 +105,7 @@ class Synthetic(RGBDSequence):
         if self.dynamics is Dynamics.PERSON:
             instance = max(self.class_names) + 1
             self.moving = walking_person(instance, self.path, self.frames, rng)
-            self._frame_names = self.class_names | self.moving.surfaces.class_names
+            self._frame_names = self.class_names | dict(self.moving.surfaces.class_names)
 
     def _with_opening_door(self) -> tuple[Surfaces, MovingObject]:
         """Return the room without the leaf of its door, and the leaf."""

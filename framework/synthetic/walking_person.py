@@ -23,7 +23,8 @@ def person(rng: Rng) -> Furniture:
     Torso and head are in the frame of the body, which faces +y. A limb hangs from its joint at the origin.
     """
     body = Furniture("person", "person")
-    shirt = Material(Texture.CHECKS, paints.pick(rng, paints.CLOTHS), (0.90, 0.88, 0.84), 0.12, seed=paints.new_seed(rng))
+    color, white = paints.pick(rng, paints.CLOTHS), (0.90, 0.88, 0.84)
+    shirt = Material(Texture.CHECKS, color, white, 0.12, seed=paints.new_seed(rng))
     trousers, skin = paints.cloth(rng, (0.42, 0.46, 0.55)), paints.paint(rng, (0.86, 0.66, 0.54))
     torso = [(0.84, 0.10, 0.08), (0.88, 0.16, 0.11), (1.15, 0.15, 0.11), (1.40, 0.19, 0.12), (1.50, 0.06, 0.06)]
     body.add(loft([Section(*section) for section in torso]), shirt)

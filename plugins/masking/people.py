@@ -154,7 +154,7 @@ def _lowest(image: Image, radius: float) -> Image:
     side = 2 * (int(radius / step) + 1) + 1
     small = cv2.erode(np.ascontiguousarray(image[::step, ::step]), np.ones((side, side), np.uint8))
     size = small.shape[1] * step, small.shape[0] * step
-    return cv2.resize(small, size, interpolation=cv2.INTER_NEAREST)[:height, :width]
+    return np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_NEAREST)[:height, :width])
 
 
 def _dilated(mask: Bool, radius: int) -> Bool:
