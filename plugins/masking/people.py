@@ -16,6 +16,8 @@ GRID_WIDTH = 160  # maximum width of the coarse images, px
 HALF_EXTENT = 0.6  # m, maximum distance of the readings of a body from their median along z
 GAP, GAP_PER_DEPTH = 0.03, 0.02  # m and m per m, maximum depth difference of neighboring readings on one surface
 CAMERA_TURN = 1.0  # rad/s, maximum angular speed of the camera
+OVERLAP_STEP = 4  # px, step between the pixels of masks that are compared with a body
+MIN_COVERED = 0.25  # minimum fraction of the followed bodies in the mask of a detection that continues a body
 LONGEST_STEP = 0.5  # s, maximum time between two frames for which a body is followed
 NEVER = 255  # age of pixels without a body, frames
 FAR = np.float32(np.inf)
@@ -40,7 +42,7 @@ class People(FrameMasking):
     A body consists of the depth readings of a detected mask near their median, and of readings of similar depth next to
     them, which coarse masks omit. In the next frame, readings near the body belong to it at its pixels, and where they
     are in front of all other surfaces that the frame before shows there. All detections of the masked classes are
-    removed.
+    removed, and all whose masks cover a followed body, whatever their class.
     """
 
     classes: str = "person"  # names of the masked classes, separated by commas; unknown names are ignored
@@ -59,27 +61,30 @@ class People(FrameMasking):
         self._last: Bodies | None = None
 
     def mask(self, frame: Frame, detections: Detections) -> tuple[Frame, Detections]:
-        excluded = self._excluded(detections)
-        found = detections.masks[excluded & (detections.scores >= self.min_score)]
+        of_class = self._of_masked_class(detections)
+        starts = of_class & (detections.scores >= self.min_score)
         last, self._last = self._last, None
-        if len(found) or last is not None:
-            detected = self._completed(frame, detected_bodies(found, frame.depth))
-            followed, age = self._followed(frame, last)
-            followed &= ~connected(followed, detected > 0)  # a detection replaces the last shape of its body
-            age[detected > 0] = 0
-            body = np.where((detected > 0) | followed, frame.depth, np.float32(0))
-            mask = _dilated(body > 0, self.margin) | found.any(axis=0)
-            if (body > 0).any():
-                self._last = Bodies(frame.depth_time, frame.depth, mask, body, age)
-            if mask.any():
-                frame = replace(frame, depth=np.where(mask, np.float32(0), frame.depth))
-        return frame, chosen(detections, ~excluded) if excluded.any() else detections
+        if last is None and not starts.any():
+            return frame, chosen(detections, ~of_class)
+        followed, age = self._followed(frame, last)
+        continues = covering(detections.masks, followed)
+        found = detections.masks[starts | continues]
+        detected = self._completed(frame, detected_bodies(found, frame.depth))
+        followed &= ~connected(followed, detected > 0)  # a detection replaces the last shape of its body
+        age[detected > 0] = 0
+        body = np.where((detected > 0) | followed, frame.depth, np.float32(0))
+        mask = _dilated(body > 0, self.margin) | found.any(axis=0)
+        if body.any():
+            self._last = Bodies(frame.depth_time, frame.depth, mask, body, age)
+        if mask.any():
+            frame = replace(frame, depth=np.where(mask, np.float32(0), frame.depth))
+        return frame, chosen(detections, ~(of_class | continues))
 
-    def _excluded(self, detections: Detections) -> Bool:
+    def _of_masked_class(self, detections: Detections) -> Bool:
         """Return True for each detection (N,) whose most likely class is masked."""
         masked = np.array([name in self._names for name in detections.classes], np.bool_)
-        if not len(detections) or not masked.any():
-            return np.zeros(len(detections), np.bool_)
+        if not len(detections):
+            return np.zeros(0, np.bool_)
         return np.asarray(masked[detections.class_probabilities.argmax(axis=1)])
 
     def _completed(self, frame: Frame, body: Float32) -> Float32:
@@ -121,8 +126,19 @@ def detected_bodies(masks: Bool, depth: Float32) -> Float32:
     return body
 
 
+def covering(masks: Bool, body: Bool) -> Bool:
+    """Return True for each mask (N, H, W) that is mostly on a body (H, W) and covers a large part of it."""
+    body = body[::OVERLAP_STEP, ::OVERLAP_STEP]
+    masks = masks[:, ::OVERLAP_STEP, ::OVERLAP_STEP]
+    shared = np.count_nonzero(masks & body, axis=(1, 2))
+    large = shared > MIN_COVERED * np.count_nonzero(body)
+    return np.asarray(large & (2 * shared > np.count_nonzero(masks, axis=(1, 2))))
+
+
 def chosen(detections: Detections, kept: Bool) -> Detections:
     """Return the detections for which `kept` (N,) is True."""
+    if kept.all():
+        return detections
     rows = {name: getattr(detections, name)[kept] for name in ("masks", "boxes", "scores", "class_probabilities")}
     embeddings = None if detections.embeddings is None else detections.embeddings[kept]
     return replace(detections, **rows, embeddings=embeddings)

@@ -17,11 +17,13 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from tests.acceptance import recording_checks
+from tests.acceptance import changing_scenes, recording_checks
 from tests.acceptance.runner import CHECKOUT, Measured, measurement
 
 SHARED = CHECKOUT.parent / "shared" / "data"
 PIPELINE = ("framework", "plugins", "conf", "tests/acceptance")
+YOLO = SHARED.parent / "weights" / "yolo11n_seg" / "yolo11n_seg.onnx"
+MASKING_DETECTORS = (("detector=maskrcnn2go",), ("detector=onnx_segmentation", f"detector.weights={YOLO}"))
 CHECKS = ("framework/checking", "framework/datasets", "tests/acceptance", "tests/support/recordings/damaged.py")
 
 
@@ -104,6 +106,46 @@ def replica_floor2_ap50() -> Measured:
 @measurement("AP50 >= 0.6, given poses", *PIPELINE)
 def kitchen_ap50() -> Measured:
     return ap50(0.6, "redkitchen")
+
+
+@measurement("ATE <= 1.1 times that without the person, masked, detections on every and every fifth frame", *PIPELINE)
+def person_ate_ratio() -> Measured:
+    ratio = max(run.ate for run in changing_scenes.masked()) / changing_scenes.without_person().ate
+    return ratio, ratio <= 1.1
+
+
+@measurement("<= 0.1% of the vertices on the person, masked, detections on every and every fifth frame", *PIPELINE)
+def person_vertices() -> Measured:
+    percentage = 100 * max(run.vertices for run in changing_scenes.masked())
+    return percentage, percentage <= 0.1
+
+
+@measurement("0 likely instances of the person, masked, detections on every and every fifth frame", *PIPELINE)
+def person_instances() -> Measured:
+    count = max(run.instances for run in changing_scenes.masked())
+    return count, count == 0
+
+
+@measurement("ATE <= +2%, 0 additional lost frames, freiburg1_rpy with and without masking", *PIPELINE)
+def masking_freiburg1_rpy() -> Measured:
+    """Return the larger increase of the ATE with two networks, in percent."""
+    increases, lost = [], 0
+    for detector in MASKING_DETECTORS:
+        with_masking, without = (mapped(*RPY[:2], *detector, f"masking={name}") for name in ("people", "none"))
+        increases.append(100 * (with_masking["trajectory.ate_rmse_m"] / without["trajectory.ate_rmse_m"] - 1))
+        lost += max(0, with_masking["frames_lost"] - without["frames_lost"])
+    return max(increases), max(increases) <= 2 and lost == 0
+
+
+@measurement("0 lost frames, changing lights, opening door, camera that stops and starts", *PIPELINE)
+def changing_scene_lost_frames() -> Measured:
+    count = 0
+    for dynamics in ("LIGHTS", "DOOR", "PAUSE"):
+        kind = ("dataset.kind=KITCHEN",) if dynamics == "DOOR" else ()  # its door is in view
+        metrics = mapped("dataset=synthetic", f"dataset.dynamics={dynamics}", *kind, "detector=ground_truth")
+        print(dynamics, 1e3 * metrics["trajectory.ate_rmse_m"], "mm,", metrics["frames_lost"], "lost", flush=True)
+        count += metrics["frames_lost"]
+    return count, count == 0
 
 
 @measurement("0 wrong diagnoses, 75 recordings with one wrong convention, unit or delay", *CHECKS)

@@ -102,6 +102,29 @@ def test_people_body_missed_by_detector_is_followed() -> None:
     assert not depth_after(people, frame_of(21, 1), nothing(detected=True))[body_of(frame_of(21))].any()
 
 
+def test_people_detection_on_followed_body_continues_it() -> None:
+    """A network may report another class or a low score for some frames."""
+    people = People(max_unseen=1, margin=0, completion=0.0)
+    people.mask(frame_of(20), found(body_of(frame_of(20))))
+    for k in range(1, 6):
+        frame = frame_of(20, k)
+        masked, kept = people.mask(frame, found(body_of(frame), score=0.1, label="chair"))
+        np.testing.assert_array_equal(masked.depth == 0, body_of(frame))
+        assert len(kept) == 0
+
+
+def test_people_detection_replaces_last_shape_of_body() -> None:
+    """Otherwise, the mask would grow from frame to frame."""
+    people = People(margin=0, completion=0.0)
+    frame = frame_of(20)
+    people.mask(frame, found(body_of(frame)))
+    upper = body_of(frame)
+    upper[24:] = False
+    masked = depth_after(people, frame_of(20, 1), found(upper))
+    assert not masked[upper].any()
+    assert masked[25:].all()  # readings within 1 px complete the mask
+
+
 def test_people_following_ends_after_max_unseen_frames() -> None:
     people = People(max_unseen=3)
     people.mask(frame_of(20), found(body_of(frame_of(20))))
