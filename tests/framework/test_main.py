@@ -359,10 +359,10 @@ def test_run_ctrl_c_writes_partial_outputs(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("{}")  # of an earlier run in the same directory
     line = command(f"hydra.run.dir={tmp_path}", "dataset.frames=100000", "dataset.slow_s=0.02")
     with subprocess.Popen(line, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True) as process:
-        deadline = time.monotonic() + 60
-        while (tmp_path / "metrics.json").exists() and time.monotonic() < deadline:  # to be removed when mapping begins
+        deadline, logged = time.monotonic() + 60, tmp_path / "instancemap.log"
+        while not (logged.exists() and "depth sensor" in logged.read_text()) and time.monotonic() < deadline:  # tracked
             time.sleep(0.05)
-        time.sleep(3)  # a busy machine needs more than 1 s for the first frame
+        time.sleep(0.5)
         process.send_signal(signal.SIGINT)
         _, stderr = process.communicate(timeout=90)
     assert process.returncode == 130
