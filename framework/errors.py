@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 LONGEST_WORD = 200  # maximum number of characters of one word of a message, such as a name from the input
+LONGEST_REASON = 200  # maximum number of characters of a library's message in ours
 LONGEST_MESSAGE = 1000  # maximum number of characters of a message; a list of all options or labels has about 500
 
 _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
@@ -70,6 +71,11 @@ def _shortened(text: str, most: int) -> str:
 def in_one_line(message: object) -> str:
     """Return the message of an exception on one line, or the name of its class if the message is empty."""
     return " ".join(str(message).split()) or type(message).__name__
+
+
+def reason_of(error: BaseException) -> str:
+    """Return the message of a library's exception on one line, shortened, because it can quote a damaged file."""
+    return _shortened(in_one_line(error), LONGEST_REASON)
 
 
 def first_line(error: BaseException) -> str:

@@ -357,7 +357,7 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
         try:
             # a resolved value is not a reference
             schema[key] = without_interpolation(value) if isinstance(value, str) else value
-        except OmegaConfBaseException as error:
+        except (OmegaConfBaseException, OverflowError) as error:  # an integer beyond all floats overflows
             raise ConfigError(f"{where}: {key}: expected {values_of(fields[key][1])}, got {_shown(value)}") from error
     return schema, plugins
 

@@ -18,7 +18,7 @@ import numpy as np
 from PIL.TiffImagePlugin import TiffImageFile
 
 from framework.data import MAX_PIXELS, Array, Float32, UInt16
-from framework.errors import FrameError, import_optional, in_one_line
+from framework.errors import FrameError, import_optional, reason_of
 from framework.files.image_files import read_image_file, read_uint16
 from framework.files.number_lines import SHOWN
 
@@ -74,14 +74,14 @@ def _read_tiff(path: Path) -> Array:
             return np.asarray(decoded)
         raise FrameError(f"{path}: expected a TIFF image of uint16 or floats, got another type") from None
     except Exception as error:  # Pillow has no common base exception
-        raise FrameError(f"{path}: expected a TIFF image, got an error ({in_one_line(error)[:SHOWN]})") from error
+        raise FrameError(f"{path}: expected a TIFF image, got an error ({reason_of(error)})") from error
     try:
         pages, (width, height) = image.n_frames, image.size
         if pages > 1 or width * height > MAX_PIXELS:
             raise ValueError(f"{pages} pages of {width}x{height} px")
         return np.asarray(image)
     except Exception as error:  # Pillow has no common base exception
-        raise FrameError(f"{path}: expected a TIFF of one page, got an error ({in_one_line(error)[:SHOWN]})") from error
+        raise FrameError(f"{path}: expected a TIFF of one page, got an error ({reason_of(error)})") from error
 
 
 def _read_npy(path: Path) -> Array:
@@ -92,7 +92,7 @@ def _read_npy(path: Path) -> Array:
             values = np.frombuffer(data, dtype, math.prod(shape), stream.tell())
         return np.array(values.reshape(shape, order="F" if column_major else "C"))
     except (KeyError, ValueError, EOFError, MemoryError) as error:
-        raise FrameError(f"{path}: expected a NumPy array, got an error ({in_one_line(error)[:SHOWN]})") from error
+        raise FrameError(f"{path}: expected a NumPy array, got an error ({reason_of(error)})") from error
 
 
 def _read_exr(path: Path) -> Array:
@@ -109,7 +109,7 @@ def _read_exr(path: Path) -> Array:
     except FrameError:
         raise
     except Exception as error:  # OpenEXR has no common base exception
-        raise FrameError(f"{path}: expected an EXR file, got an error ({in_one_line(error)[:SHOWN]})") from error
+        raise FrameError(f"{path}: expected an EXR file, got an error ({reason_of(error)})") from error
 
 
 def _depth_channel(path: Path, names: list[str]) -> str:

@@ -17,6 +17,7 @@ from framework.config.validation import require
 from framework.data import MAX_PIXELS, Camera, Float64
 from framework.datasets.calibration.camera_json import DISTORTION, SENSOR
 from framework.datasets.calibration.color_registration import ColorRegistration
+from framework.datasets.calibration.undistortion import Undistortion
 from framework.errors import DataError, errors_of
 from framework.files.folders.restartable_folder import check_startable, restartable_folder
 from framework.files.image_files import write_image
@@ -85,7 +86,8 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
     Unusable frames are skipped. The files of an interrupted import in the same folder are replaced.
 
     Raises:
-        DataError: `directory` is not empty, no frame is usable, or a file cannot be written.
+        DataError: `directory` is not empty, no frame is usable, the lens does not fit the camera, or a file cannot be
+            written.
         StorageError: The storage of the recording is no longer available.
     """
     check_startable(directory, COMMAND)
@@ -97,6 +99,8 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
         raise DataError(f"{source.format}: expected usable frames, got none; {reason}")
     # the focal length of phones varies, so all frames are resampled to the camera of the first frame
     camera = writing.camera(first[1].camera)
+    if source.distortion:
+        Undistortion(writing.turned.camera(camera), writing.turned.lens(source.distortion))  # raises if it does not fit
     with restartable_folder(directory, COMMAND, OWN_FILES):
         _write_files(source, chain([first], frames), directory, writing, camera, written)
     return written

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from framework.config.composition import add_config_dir
-from framework.errors import DataError, in_one_line
+from framework.errors import DataError, reason_of
 from framework.files.atomic_write import atomic_write
 from framework.files.manifest import MANIFEST, Manifest
 from framework.runs.plugin_code import plugin_files, targets_of
@@ -112,4 +112,4 @@ def _zip_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError) as error:
-        raise DataError(f"{path}: expected an undamaged bundle, got an error ({in_one_line(error)})") from error
+        raise DataError(f"{path}: expected an undamaged bundle, got an error ({reason_of(error)})") from error

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from textwrap import shorten
 from typing import Any
 
 from filelock import FileLock
@@ -17,7 +16,7 @@ from platformdirs import user_cache_path
 
 from framework.config.validation import check_package
 from framework.data import Detections, Frame, Pose
-from framework.errors import ConfigError, in_one_line
+from framework.errors import ConfigError, reason_of
 from framework.interfaces import SceneMap, Viewer
 from framework.runs.logged_values import frame_values, parameter_values, run_values
 
@@ -84,7 +83,7 @@ class MLflowViewer(Viewer):
         except Exception as error:  # of MLflow, SQLAlchemy or an HTTP client
             raise ConfigError(
                 f"viewer.tracking_uri: expected a database or server of MLflow, got {self.tracking_uri!r} "
-                f"({shorten(in_one_line(error), 200)})"
+                f"({reason_of(error)})"
             ) from error
 
 

@@ -7,7 +7,7 @@ import pickle
 import pytest
 
 from framework.config.composition import one_line
-from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, printable
+from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, printable, reason_of
 
 
 def test_error_message_of_usual_text_is_unchanged() -> None:
@@ -34,6 +34,13 @@ def test_printable_long_word_is_shortened() -> None:
     assert "(5001 characters)" in message
     assert message.endswith("did you mean 'coco'?")
     assert message.count("x") <= 200
+
+
+def test_reason_of_quoted_file_is_short_line() -> None:
+    reason = reason_of(ValueError("header\n" + "b'x' " * 1000))
+    assert reason.startswith("header b'x'")
+    assert len(reason) < 250
+    assert reason_of(KeyError()) == "KeyError"
 
 
 def test_frame_error_pickle_round_trip_keeps_message() -> None:

@@ -156,6 +156,7 @@ def test_build_flattens_parameters_of_parts() -> None:
     ("parameters", "output"),
     [
         ({"threshold": "high"}, ["Probe", "threshold: expected a number, got 'high'"]),
+        ({"threshold": 10**400}, ["threshold: expected a number, got 1000"]),
         ({"limit": 2.5}, ["limit: expected an integer, got 2.5"]),
         ({"limit": None}, ["limit: expected an integer, got None"]),
         ({"storage": "exakt"}, ["storage: expected one of exact, compact, got 'exakt'"]),

@@ -252,7 +252,7 @@ def _check_length(path: Path, records: Records) -> None:
             if path.name == "rigs.bin" and items != 1:
                 raise DataError(f"{path}: expected one camera per rig, got {items}; export a model without rigs")
             end += struct.calcsize(records.counter) + items * records.item
-    except (struct.error, ValueError):  # beyond the end
+    except (struct.error, ValueError, OverflowError):  # beyond the end
         end = len(data) + 1
     _require_length(path, len(data), end)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from framework.data import Array, check_array
-from framework.errors import DataError, InstanceMapError, in_one_line
+from framework.errors import DataError, InstanceMapError, reason_of
 from framework.files.atomic_write import atomic_write, check_regular
 from framework.files.json_file import parse_json
 from framework.files.manifest import verified
@@ -107,9 +107,7 @@ def map_file_errors(path: Path | str) -> Iterator[None]:
     except InstanceMapError as error:
         raise DataError(f"{path}: {error}; map again") from error
     except Exception as error:  # zipfile and numpy raise many types for damaged archives
-        raise DataError(
-            f"{path}: expected a map file, got unreadable data ({in_one_line(error)}); map again"
-        ) from error
+        raise DataError(f"{path}: expected a map file, got unreadable data ({reason_of(error)}); map again") from error
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from framework.data import Int32
-from framework.errors import DataError, in_one_line
+from framework.errors import DataError, reason_of
 from framework.files.atomic_write import read_bytes, read_text
 
 LARGEST_FILE = 2**32  # bytes
@@ -28,7 +28,7 @@ def read_array(path: Path) -> Numbers:
     try:
         return np.lib.format.read_array(BytesIO(content), allow_pickle=False)
     except (ValueError, EOFError, MemoryError, OverflowError) as error:
-        raise DataError(f"{path}: expected an NPY file, got an error ({in_one_line(error)})") from error
+        raise DataError(f"{path}: expected an NPY file, got an error ({reason_of(error)})") from error
 
 
 def read_mask(path: Path, points: int) -> Int32:

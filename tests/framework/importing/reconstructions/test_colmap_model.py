@@ -116,6 +116,23 @@ def test_colmap_truncated_binary_file_raises(tmp_path: Path, name: str, kept: in
         open_source(tmp_path / "scene")
 
 
+def test_colmap_track_of_impossible_length_raises(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "scene", FRAMES, 1.0)
+    path = tmp_path / "scene/sparse/0/points3D.bin"
+    content = bytearray(path.read_bytes())
+    content[8 + 43 : 8 + 51] = b"\xff" * 8  # number of images of the first point
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"points3D.bin: expected complete records, got a file that ends after"):
+        open_source(tmp_path / "scene")
+
+
+def test_colmap_lens_that_does_not_fit_writes_no_folder(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "scene", FRAMES, 1.0, lens=(50.0, 0.0, 0.0, 0.0))
+    with pytest.raises(DataError, match="expected a shift of at most"):
+        imported(tmp_path / "scene", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
