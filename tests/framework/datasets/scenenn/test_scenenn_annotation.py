@@ -146,10 +146,10 @@ BOMB = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10 if k else "ha"}">' for k in 
 )
 def test_scenenn_annotation_entities_and_doctypes_raise(path, prologue):
     path.write_text(f'<?xml version="1.0"?>\n{prologue}\n<l><label id="1" text="&a11;"/></l>')
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(DataError, match=r"011.xml, line 2: expected XML without a document type or entities") as caught:
         read_annotation(path)
-    assert time.perf_counter() - began < 1
+    assert time.process_time() - began < 1
     assert "\n" not in str(caught.value)
 
 
