@@ -48,6 +48,8 @@ WIDEST = 10.0  # maximum ratio of lateral distance to depth: half of a field of 
 LONGEST_FOCAL_LENGTH = 1e6  # maximum focal length, px
 UNIT_TOLERANCE = 1e-3  # maximum | |v| - 1 | of a unit vector
 LONGEST_EMBEDDING = 65_536  # maximum number of dimensions; published networks have 500 to 4,000
+MAX_CLASSES = 2**16 - 1  # maximum number of classes of a label space; maps store class ids in two bytes; LVIS has 1,203
+LONGEST_CLASS_NAME = 200  # maximum number of characters of a class name
 LONGEST_SPACE = 300  # maximum number of characters of an embedding space name
 LARGEST_INDEX = 2**53  # limit of frame numbers; smaller numbers are exact in double precision and in JSON files
 LATEST = 1e19  # s, maximum absolute timestamp; stored timestamps in ns, of which `check` warns, have up to 2^63
@@ -351,6 +353,7 @@ class PointClusters:
     embeddings: Float32 | None = None  # (N, D), as in Detections
     embedding_space: str = ""  # as in Detections
     detected: bool = True  # as in Detections
+    omitted: int = 0  # number of detections that exceed the limit of points of a frame; their clusters are empty
 
     def __post_init__(self) -> None:
         check_array("PointClusters.points_world", self.points_world, (None, 3), np.float32)
@@ -515,6 +518,21 @@ def check_view(camera: Camera, T_world_camera: Float64) -> None:
     if not isinstance(cast(object, camera), Camera):
         raise DataError(f"camera: expected a Camera, got {type(camera).__name__}")
     check_rigid("T_world_camera", T_world_camera)
+
+
+def check_label_space(classes: tuple[str, ...]) -> None:
+    """Raise DataError unless a map can store the classes."""
+    if len(classes) > MAX_CLASSES:
+        raise DataError(
+            f"detector: expected at most {MAX_CLASSES} classes, got {len(classes)}; remove classes that the scene "
+            "cannot contain"
+        )
+    long = max(classes, key=len, default="")
+    if len(long) > LONGEST_CLASS_NAME:
+        raise DataError(
+            f"detector: expected class names of at most {LONGEST_CLASS_NAME} characters, got {len(long)}: "
+            f"{long!r:.60}; shorten the name"
+        )
 
 
 def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: npt.DTypeLike) -> None:

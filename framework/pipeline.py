@@ -12,7 +12,7 @@ from itertools import count
 from pathlib import Path
 from typing import cast
 
-from framework.data import Array, Detections, Float64, Frame, Pose
+from framework.data import Array, Detections, Float64, Frame, Pose, check_label_space
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError, in_one_line
 from framework.files.storage import check_storage
@@ -52,6 +52,10 @@ class Pipeline:
     """The stages and the mapping loop.
 
     Example: `Pipeline(detector, tracker, refiner, fuser).run(video)`.
+
+    Raises:
+        ConfigError: A parameter is out of range.
+        DataError: The detector has too many classes, or a class name is too long.
     """
 
     detector: Detector
@@ -69,6 +73,7 @@ class Pipeline:
             )
         if self.prefetch < 0:
             raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}; set it to 0")
+        check_label_space(self.detector.classes)
         self.viewer = GuardedViewer(self.viewer)
         self.color_to_depth = ColorToDepth(delay=None)
         self.resumed = False  # True until a frame is compared with the map of `resume_from`
@@ -314,6 +319,7 @@ class Pipeline:
             return pose
         with journal.timed(frame.index, "lifting"):
             lifted = lift(detections, frame, pose, color_pixels)
+        journal.count_omitted(frame, lifted)
         with journal.timed(frame.index, "refinement"):
             clusters = refine(self.refiner, lifted, frame)
         journal.frames_in_map += 1

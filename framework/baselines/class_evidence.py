@@ -29,7 +29,7 @@ import numpy.typing as npt
 from framework.baselines.class_evidence_kernels import best_clusters, find_blocks_under_masks, update_classes
 from framework.data import Float32, Float64, Int32, PointClusters, UInt8, UInt16
 from framework.errors import DataError
-from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS
+from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS, ClassIds, class_id_type
 from framework.mapping.labels.label_evidence import named_classes
 from framework.mapping.labels.pixel_lists import PixelLists
 from framework.mapping.storage.map_file import check_known, check_like
@@ -47,7 +47,7 @@ class ClassEvidence(NamedTuple):
     """
 
     unmasked: UInt16  # (B, 512) number of frames in which the voxel was outside all masks, for B blocks
-    class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
+    class_ids: ClassIds  # (R, 512, T) in [1, C], 0 = free slot
     log_ratio: Float32  # (R, 512, T) sum of log(P(class) / P(background)) over the frames counted by `masked`
     rest: Float32  # (R, 512) log_ratio of each unnamed class of the voxel
     masked: UInt16  # (R, 512) number of frames in which the voxel was under a mask
@@ -65,8 +65,8 @@ class MaskClasses(NamedTuple):
     cluster: Int32  # (H * W,) cluster with the highest score at each pixel, -1 = none
     log_ratio: Float32  # (N, C) log(P(class) / P(background))
     unnamed: Float32  # (N,) log(mean P(unnamed class) / P(background)) of each cluster
-    named_classes: UInt8  # (N, NEW_CLASSES) most likely classes of each cluster
-    named_bit: UInt8  # (N, NO_CLASS + 1) 2^m for the m-th named class of a cluster, 0 = unnamed
+    named_classes: UInt16  # (N, NEW_CLASSES) ids of the most likely classes of each cluster
+    named_bit: UInt8  # (N, C + 1) by class id, 2^m for the m-th named class of a cluster, 0 = unnamed
     frame: int  # index of the frame
 
 
@@ -114,14 +114,8 @@ class ClassRows:
         return sum(array.nbytes for array in self.saved().values())
 
     def begin(self, classes: int) -> None:
-        """Set the number of classes before the first update.
-
-        Raises:
-            DataError: If there are too many classes.
-        """
-        if classes > NO_CLASS:
-            raise DataError(f"detector: expected at most {NO_CLASS} classes, got {classes}")
-        self.evidence = _free_rows(min(classes, CLASS_SLOTS))
+        """Set the number of classes before the first update."""
+        self.evidence = _free_rows(classes)
 
     def update(self, seen: SeenBlocks, masks: MaskClasses | None) -> None:
         """Update the class evidence of the voxels near the measured surface.
@@ -160,7 +154,7 @@ class ClassRows:
         free = self.evidence._asdict()
         check_like(arrays, {"unmasked": free.pop("unmasked")}, self.voxels.block_count)
         check_like(arrays, free, len(arrays["rest"]))
-        check_known("class_ids", arrays["class_ids"], [*range(classes), NO_CLASS])
+        check_known("class_ids", arrays["class_ids"], [NO_CLASS, *range(1, classes + 1)])
         if len(arrays["rest"]) and not classes:
             raise DataError(f"rest: expected 0 rows in a map without classes, got {len(arrays['rest'])}")
         _check_order(arrays["class_ids"], arrays["log_ratio"], arrays["rest"], classes)
@@ -181,7 +175,7 @@ class ClassRows:
         self.row_count = needed
 
 
-def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: int) -> None:
+def _check_order(class_ids: ClassIds, log_ratio: Float32, rest: Float32, classes: int) -> None:
     """Raise DataError unless slot 0 has the most likely class, and all log ratios are in range."""
     named = class_ids != NO_CLASS
     ratios = np.where(named, log_ratio, np.float32(-np.inf))
@@ -199,11 +193,11 @@ def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: i
         )
 
 
-def _free_rows(class_slots: int) -> ClassEvidence:
-    voxels = (0, BLOCK_VOXELS)
+def _free_rows(classes: int) -> ClassEvidence:
+    voxels, class_slots = (0, BLOCK_VOXELS), min(classes, CLASS_SLOTS)
     return ClassEvidence(
         unmasked=np.empty(voxels, np.uint16),
-        class_ids=np.empty((*voxels, class_slots), np.uint8),
+        class_ids=np.empty((*voxels, class_slots), class_id_type(classes)),
         log_ratio=np.empty((*voxels, class_slots), np.float32),
         rest=np.empty(voxels, np.float32),
         masked=np.empty(voxels, np.uint16),

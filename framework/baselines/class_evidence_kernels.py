@@ -43,7 +43,7 @@ def best_class(grid, evidence, log_missed, block, n):
     if row < 0 or evidence.class_ids[row, n, 0] == NO_CLASS:
         return np.int32(-1)
     above = evidence.log_ratio[row, n, 0] + log_missed * np.float32(evidence.unmasked[block, n])
-    return np.int32(evidence.class_ids[row, n, 0]) if above > 0 else np.int32(-1)
+    return np.int32(evidence.class_ids[row, n, 0] - 1) if above > 0 else np.int32(-1)
 
 
 @device
@@ -74,7 +74,7 @@ def observe_mask(evidence, row, n, masks, k):
     for s in range(len(labels)):
         if labels[s] == NO_CLASS:
             break  # slots are filled from the front
-        sums[s] += masks.log_ratio[k, labels[s]]
+        sums[s] += masks.log_ratio[k, labels[s] - 1]
         known |= masks.named_bit[k, labels[s]]
     evicted = 0
     for m in range(NEW_CLASSES if known != ALL_NAMED else 0):
@@ -82,7 +82,7 @@ def observe_mask(evidence, row, n, masks, k):
         if m > 0 and label == masks.named_classes[k, 0]:
             break
         if not (known >> m) & 1:
-            evicted += _add_class(labels, sums, label, evidence.rest[row, n] + masks.log_ratio[k, label])
+            evicted += _add_class(labels, sums, label, evidence.rest[row, n] + masks.log_ratio[k, label - 1])
     evidence.rest[row, n] += masks.unnamed[k]
     best_first(labels, sums, NO_CLASS)
     if evidence.masked[row, n] < MAX_FRAMES:

@@ -26,6 +26,7 @@ from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.vertex_labels_kernels import color_vertices
 from framework.mapping.storage.map_file import (
+    CLASS_EVIDENCE,
     check_like,
     map_file_errors,
     plain_table,
@@ -41,7 +42,7 @@ from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 from framework.sensors.noise_models import SensorKind
 
-FORMAT = "object_volumes 4"  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = "object_volumes 5"  # format of the map file; increment it when the meaning of the contents changes
 OBJECT = "object_"  # prefix of the names of the arrays with the concatenated volumes of all objects
 
 Part = tuple[Float32, Int32, UInt8, Int32]
@@ -213,11 +214,13 @@ class ObjectMap(InstanceTableMap):
         }
         parts = [self._empty_volume().arrays(), *(volume.arrays() for volume in self.volumes.values())]
         arrays |= {OBJECT + name: np.concatenate([part[name] for part in parts]) for name in VOLUME_ARRAYS}
-        write_map(path, header, arrays | table_arrays(self.table))
+        write_map(path, header, arrays | table_arrays(self.table, len(self.classes)))
 
     @classmethod
     def load(cls, path: Path | str) -> ObjectMap:
-        header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *(OBJECT + name for name in VOLUME_ARRAYS)))
+        header, arrays = read_map(
+            path, FORMAT, (*BLOCK_ARRAYS, *(OBJECT + name for name in VOLUME_ARRAYS), CLASS_EVIDENCE)
+        )
         with map_file_errors(path):
             scene = cls(TsdfVolume.load(header, arrays, 0), Confirmation.of(header.part("confirmation")))
             scene.classes = header.classes()

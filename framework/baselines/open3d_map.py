@@ -16,6 +16,7 @@ from framework.mapping.gravity import GravityEstimator
 from framework.mapping.instances.instance_list import Confirmation, InstanceTableMap
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.storage.map_file import (
+    CLASS_EVIDENCE,
     check_known,
     map_file_errors,
     plain_table,
@@ -26,7 +27,7 @@ from framework.mapping.storage.map_file import (
 )
 from framework.sensors.noise_models import SensorKind
 
-FORMAT = "open3d_vbg 5"  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = "open3d_vbg 6"  # format of the map file; increment it when the meaning of the contents changes
 
 
 class Open3DMap(InstanceTableMap):
@@ -149,11 +150,11 @@ class Open3DMap(InstanceTableMap):
             **self.gravity_estimator.saved(),
             "table": plain_table(self.table),
         }
-        write_map(path, header, self.grid.arrays() | table_arrays(self.table))
+        write_map(path, header, self.grid.arrays() | table_arrays(self.table, len(self.classes)))
 
     @classmethod
     def load(cls, path: Path | str) -> Open3DMap:
-        header, arrays = read_map(path, FORMAT, ("block_coords", *ATTRIBUTES))
+        header, arrays = read_map(path, FORMAT, ("block_coords", *ATTRIBUTES, CLASS_EVIDENCE))
         with map_file_errors(path):
             settings = BlockGridSettings.of(header.part("settings"))
             scene = cls(settings, Confirmation.of(header.part("confirmation")))

@@ -29,7 +29,7 @@ from framework.sensors.noise_models import SensorKind
 
 ABSENCE, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds
 SWEEPS = 20  # maximum number of sweeps of the regularization
-FORMAT = "semantic 4"  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = "semantic 5"  # format of the map file; increment it when the meaning of the contents changes
 
 
 class Elections(NamedTuple):

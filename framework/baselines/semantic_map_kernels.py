@@ -70,7 +70,7 @@ def _log_ratio(grid, evidence, log_missed, block, n, label):
     if row < 0:
         return absent
     for s in range(evidence.class_ids.shape[2]):
-        if evidence.class_ids[row, n, s] == label:
+        if evidence.class_ids[row, n, s] == label + 1:
             return evidence.log_ratio[row, n, s] + absent
     return evidence.rest[row, n] + absent
 
@@ -169,7 +169,7 @@ def sum_components(grid, evidence, log_missed, voxels, instance_ids, found):
             total += np.exp(ratios[s] + absent - largest)
         unnamed_sums[k] += p_unnamed / total
         for s in range(named):
-            sums[k, labels[s]] += (np.exp(ratios[s] + absent - largest) - p_unnamed) / total
+            sums[k, labels[s] - 1] += (np.exp(ratios[s] + absent - largest) - p_unnamed) / total
         masked[k] = max(masked[k], evidence.masked[row, n])
         if evidence.masked[row, n] > 0:
             first = evidence.first_frame[row, n]

@@ -121,12 +121,12 @@ class EditedMap:
         classes = self.scene.classes
         k, evidence, voxels = classes.index(name), self.scene.labels.in_use(), self._voxels_of(key)
         self.scene.table.records[key].class_evidence = CERTAIN * np.eye(len(classes))[k]
-        slots = np.full(evidence.class_ids.shape[1], NO_CLASS, np.uint8)
+        slots = np.full(evidence.class_ids.shape[1], NO_CLASS, evidence.class_ids.dtype)
         score = MAX_SCORE
         if self.scene.labels.storage is Storage.EXACT:  # every class has a slot
-            slots[1:] = np.delete(np.arange(len(slots)), k)
+            slots[1:] = np.delete(np.arange(1, len(slots) + 1), k)
             score <<= EXACT_BITS
-        slots[0] = k
+        slots[0] = k + 1
         evidence.class_ids[voxels] = slots
         evidence.class_value[voxels] = np.where(np.arange(len(slots)) == 0, score, 0)
         self.scene.volume.changed(NO_BLOCKS)

@@ -14,7 +14,8 @@ import numpy.typing as npt
 from framework.data import Array, Float64, Int64
 from framework.errors import DataError
 
-LARGEST_HEADER = 2**16  # bytes; a header has tens of lines
+USUAL_HEADER = 2**16  # bytes; a header has tens of lines
+LARGEST_HEADER = 2**24  # bytes; a header may contain 65,535 class names
 LONGEST_LINE = 2**20  # bytes of a line in a text file; splitting a line takes tens of times as much memory
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
 TYPES = {
@@ -124,10 +125,11 @@ def _header_lines(path: Path, data: bytes) -> list[bytes]:
     """Return the lines of the header, up to `end_header`."""
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
         raise DataError(f"{path}, line 1: expected a PLY file, got {shown(data[:16].decode('latin-1'))}")
-    lines = data[:LARGEST_HEADER].splitlines(keepends=True)
-    for k, line in enumerate(lines):
-        if line.strip() == b"end_header":
-            return lines[: k + 1]
+    for size in (USUAL_HEADER, LARGEST_HEADER):  # splitting binary data into lines is slow
+        lines = data[:size].splitlines(keepends=True)
+        for k, line in enumerate(lines):
+            if line.strip() == b"end_header" and (line[-1:].isspace() or len(data) <= size):
+                return lines[: k + 1]
     searched = min(len(data), LARGEST_HEADER)
     expected = f"expected a line 'end_header' in the first {searched} bytes"
     raise DataError(f"{path}, line {len(lines)}: {expected}, got none")

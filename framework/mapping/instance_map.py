@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View
+from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View, check_label_space
 from framework.errors import DataError
 from framework.interfaces import Gravity, MapStatistics
 from framework.mapping.instances.association_kernels import look_up_instances
@@ -18,6 +18,7 @@ from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
 from framework.mapping.labels.label_evidence import Evidence
 from framework.mapping.labels.vertex_labels_kernels import label_vertices
 from framework.mapping.storage.map_file import (
+    CLASS_EVIDENCE,
     check_known,
     check_like,
     check_numbers,
@@ -34,7 +35,7 @@ from framework.mapping.voxels.raycasting import render
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
-FORMAT = 8  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = 9  # format of the map file; increment it when the meaning of the contents changes
 LARGEST_SCALE = 2**40  # maximum score_scale of a map file (quantized class score for evidence of 1)
 
 
@@ -106,10 +107,9 @@ class InstanceMap(InstanceTableMap):
         Raises:
             DataError: The map has the maximum number of classes.
         """
-        if len(self.classes) == NO_CLASS:
-            raise DataError(f"expected one of the {NO_CLASS} classes of the map, which is the maximum, got {name!r}")
+        check_label_space((*self.classes, name))
         self.classes += (name,)
-        self.labels.add_class(self.table.logarithmic)
+        self.labels.add_class(len(self.classes), self.table.logarithmic)
         self.table.add_class()
         self.volume.changed(NO_BLOCKS)
 
@@ -151,11 +151,11 @@ class InstanceMap(InstanceTableMap):
             "evicted": self.labels.evicted,
             "table": plain_table(self.table),
         }
-        write_map(path, header, arrays | self.labels.in_use()._asdict() | table_arrays(self.table))
+        write_map(path, header, arrays | self.labels.in_use()._asdict() | table_arrays(self.table, len(self.classes)))
 
     @classmethod
     def load(cls, path: Path | str) -> InstanceMap:
-        header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields))
+        header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields, CLASS_EVIDENCE))
         with map_file_errors(path):
             classes, storage = header.classes(), header.option("storage", Storage)
             table = table_of(header.part("table"), len(classes), arrays)
@@ -173,7 +173,7 @@ class InstanceMap(InstanceTableMap):
                     expected[name] = np.empty((0, slots), expected[name].dtype)
             check_like(arrays, expected, len(arrays["instance_ids"]))
             check_numbers("labeled", arrays["labeled"], len(arrays["instance_ids"]))
-            check_known("class_ids", arrays["class_ids"], [*range(len(classes)), NO_CLASS])
+            check_known("class_ids", arrays["class_ids"], [NO_CLASS, *range(1, len(classes) + 1)])
             check_known("instance_ids", arrays["instance_ids"], [0, *table.records])
             if count := int((arrays["class_ids"][:, 0] == NO_CLASS).sum()):
                 raise DataError(

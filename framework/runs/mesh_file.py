@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote, unquote
 
@@ -19,15 +19,17 @@ TYPES = {**dict.fromkeys(CHANNELS, np.uint8), "instance": np.int32, "class": np.
 """Types of the vertex properties other than the position."""
 
 SAFE = "".join(chr(code) for code in range(32, 127) if chr(code) not in ",%")  # not escaped in class names
-CLASSES = "classes "  # prefix of the comment with the class names
+CLASSES = "classes "  # prefix of the comments with the class names
+LONGEST_LIST = 1000  # maximum number of characters of the names in a comment; Open3D aborts for lines of 1,024 bytes
 
 
 def write_mesh(path: Path, mesh: InstanceMesh, comments: Sequence[str] = ()) -> None:
     """Write a mesh to a binary PLY file.
 
     Each vertex has a position in m, a color, an instance id and a class. The class is an index into the class names in
-    the header, where commas and characters outside of ASCII are escaped as in URLs. Vertices without an instance have
-    the id 0, and vertices without a class have the index -1. `comments` are added to the header.
+    the header, where commas and characters outside of ASCII are escaped as in URLs. Long lists of names are split into
+    several comments. Vertices without an instance have the id 0, and vertices without a class have the index -1.
+    `comments` are added to the header.
     """
     properties: dict[str, Array] = {
         **{channel: mesh.colors[:, k] for k, channel in enumerate(CHANNELS)},
@@ -37,7 +39,7 @@ def write_mesh(path: Path, mesh: InstanceMesh, comments: Sequence[str] = ()) -> 
     comments = (
         *comments,
         "InstanceMap; meters; instance 0 = none; class -1 = none, else an index into:",
-        f"{CLASSES}{','.join(quote(plain(name), SAFE) for name in mesh.classes)}",
+        *(CLASSES + names for names in _lists([quote(plain(name), SAFE) for name in mesh.classes])),
     )
     write_ply(path, mesh.vertices, mesh.triangles, properties, comments)
 
@@ -57,22 +59,32 @@ def read_mesh(path: Path) -> InstanceMesh:
                 f"{path}: expected {np.dtype(kind)} for the vertex property {name!r}, got {got}; "
                 "use the mesh.ply of a run"
             )
-    class_lists = listed_classes(ply.comments)
-    if len(class_lists) != 1:
-        raise DataError(
-            f"{path}: expected one line 'comment {CLASSES}...', got {len(class_lists)} lines; use the mesh.ply of a run"
-        )
+    classes = listed_classes(ply.comments)
+    if classes is None:
+        raise DataError(f"{path}: expected a line 'comment {CLASSES}...', got none; use the mesh.ply of a run")
     return InstanceMesh(
         vertices=ply.vertices,
         triangles=ply.triangles,
         colors=np.stack([ply.properties[channel] for channel in CHANNELS], axis=1).astype(np.uint8),
         instance_ids=ply.properties["instance"].astype(np.int32),
         class_ids=ply.properties["class"].astype(np.int32),
-        classes=class_lists[0],
+        classes=classes,
     )
 
 
-def listed_classes(comments: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the class names in each comment of `write_mesh` with classes. Control characters are escaped."""
+def listed_classes(comments: Sequence[str]) -> tuple[str, ...] | None:
+    """Return the class names in the comments of `write_mesh`, None = no comment. Control characters are escaped."""
     lists = [comment[len(CLASSES) :] for comment in comments if f"{comment} ".startswith(CLASSES)]
-    return [tuple(plain(unquote(name)) for name in names.split(",")) if names else () for names in lists]
+    names = ",".join(lists)
+    return (tuple(plain(unquote(name)) for name in names.split(",")) if names else ()) if lists else None
+
+
+def _lists(names: Sequence[str]) -> Iterator[str]:
+    """Yield names, separated by commas, in lists of at most LONGEST_LIST characters or one name."""
+    start = length = 0
+    for end, name in enumerate(names):
+        if end > start and length + len(name) > LONGEST_LIST:
+            yield ",".join(names[start:end])
+            start, length = end, 0
+        length += len(name) + 1
+    yield ",".join(names[start:])

@@ -48,7 +48,7 @@ ANNOTATED = "annotated_sha256"  # key of the hash of the names outside of COCO, 
 def run_metrics(result: RunResult) -> Metrics:
     """Return the frame counts, speed, pose source, stage times, map size and color delay of a run.
 
-    The dropped frames and the latency are included for live video.
+    The dropped frames and the latency are included for live video, and the omitted masks if there are any.
     """
     metrics: Metrics = {
         "frames": result.frames,
@@ -59,6 +59,8 @@ def run_metrics(result: RunResult) -> Metrics:
         "pose_source": result.pose_source,
         **{f"map.{name}": value for name, value in asdict(result.scene.statistics).items()},
     }
+    if result.masks_omitted:
+        metrics["masks_omitted"] = result.masks_omitted
     if result.disagreeing is not None:
         metrics["frames_disagreeing"] = len(result.disagreeing)
     of_stages = {stage: array("d") for stage in STAGES}

@@ -15,9 +15,10 @@ from typing import get_args
 import numpy as np
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from framework.data import Array, DelayEstimate, Float64, Frame, Pose
+from framework.data import Array, DelayEstimate, Float64, Frame, PointClusters, Pose
 from framework.errors import DataError, FrameError, NoPoseError
 from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
+from framework.refinement.lifting import MAX_COVERAGE
 from framework.runtime.digests import StageDigest, digest_of
 from framework.runtime.frame_stream import steady_time
 from framework.runtime.progress import Progress
@@ -80,6 +81,7 @@ class RunResult:
     color_delay: DelayEstimate | None = None  # None = given, not estimated
     digests: Sequence[StageDigest] = ()  # of each stage and frame
     disagreeing: tuple[int, ...] | None = None  # Frame.index of the frames that contradict the map; None = not compared
+    masks_omitted: int = 0  # number of masks that exceeded the limit of points of a frame
 
     @property
     def frames_lost(self) -> int:
@@ -119,6 +121,7 @@ class Journal:
     last_time: float = -math.inf  # s, latest timestamp of the tracked frames
     lost_for: int = 0  # number of consecutive lost frames
     frames_dropped: int = 0
+    masks_omitted: int = 0  # number of masks that exceeded the limit of points of a frame
     sensor: SensorKind | None = None  # of the last frame
     compared: int = 0  # number of frames whose depth is compared with the map at a given pose
     apart: int = 0  # number of compared frames in a row that see nothing of the map
@@ -156,6 +159,8 @@ class Journal:
                 "estimate the poses with tracker=voxel_hashing_icp",
                 len(self.disagreeing), self.frames, frame_ranges(self.disagreeing),
             )  # fmt: skip
+        if self.masks_omitted:
+            log.warning("%d masks omitted in total because their frames had too many points", self.masks_omitted)
         if self.frames_dropped:
             log.warning("%d frames dropped because newer frames replaced them or the run ended", self.frames_dropped)
 
@@ -185,6 +190,16 @@ class Journal:
         yield timer
         of_stages = seconds or {FUSION: time.perf_counter() - started}
         self.record(StageTime(frame, stage, 1e3 * spent) for stage, spent in of_stages.items())
+
+    def count_omitted(self, frame: Frame, clusters: PointClusters) -> None:
+        """Count the masks of a frame that exceed the limit of points, and log those of the first such frame."""
+        if clusters.omitted and not self.masks_omitted:
+            log.warning(
+                "frame %d: masks: expected at most %d points per pixel, got more in %d masks; %d masks with low scores "
+                "are omitted; reduce detector.max_detections",
+                frame.index, MAX_COVERAGE, len(clusters), clusters.omitted,
+            )  # fmt: skip
+        self.masks_omitted += clusters.omitted
 
     def record(self, times: Iterable[StageTime]) -> None:
         """Record the run times of stages."""
@@ -323,6 +338,7 @@ class Journal:
             intervals=tuple(np.diff(list(self.frames_began)).tolist()),
             pose_source=self.pose_source,
             disagreeing=tuple(self.disagreeing) if self.compared else None,
+            masks_omitted=self.masks_omitted,
             live=LiveFigures(self.frames_dropped, tuple(self.latencies)) if self.frames_expected is None else None,
         )
 

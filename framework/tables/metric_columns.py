@@ -61,6 +61,7 @@ DIRECTIONS = {
     **dict.fromkeys(("instances", "semantic", "coverage", "fps", "fps_median"), Direction.HIGHER),
     **dict.fromkeys(("trajectory", "stage_ms", "latency_ms", "map.bytes", "peak_rss_bytes"), Direction.LOWER),
     **dict.fromkeys(("frames_lost", "frames_skipped", "frames_dropped", "frames_disagreeing"), Direction.LOWER),
+    "masks_omitted": Direction.LOWER,
 }
 """Directions by prefix of the key. The longest prefix applies. Other metrics have no direction."""
 

@@ -17,14 +17,17 @@ import numpy as np
 import pytest
 from tqdm import TMonitor
 
-from framework.data import Array, Detections, Frame, PointClusters, Pose
+from framework.data import MAX_CLASSES, Array, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.interfaces import RGBDSequence, SceneMap, StageTimer, Viewer, untimed
 from framework.pipeline import Pipeline
+from framework.refinement.lifting import MAX_COVERAGE
 from framework.registry import assemble
+from framework.runs.metrics import run_metrics
 from framework.runtime.run_log import RunResult
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.support.scenes.corner_room import (
+    CAMERA,
     CornerRoom,
     FaultyDetector,
     GivenPose,
@@ -47,6 +50,20 @@ def pipeline(prefetch: int = 2, detection_interval: int = 1, **stages: object) -
 def mapped(result: RunResult) -> GridMap:
     assert isinstance(result.scene, GridMap)
     return result.scene
+
+
+@pytest.mark.parametrize(
+    ("classes", "expected"),
+    [
+        (tuple(map(str, range(MAX_CLASSES + 1))), "detector: expected at most 65535 classes, got 65536"),
+        (("chair", 201 * "x"), "detector: expected class names of at most 200 characters, got 201"),
+    ],
+)
+def test_pipeline_unsupported_label_space_raises(classes: tuple[str, ...], expected: str) -> None:
+    detector = SphereDetector()
+    detector.classes = classes
+    with pytest.raises(DataError, match=expected):
+        pipeline(detector=detector)
 
 
 @PREFETCH
@@ -265,6 +282,40 @@ def test_pipeline_full_map_returns_partial_result(room: CornerRoom) -> None:
     result = pipeline(fuser=GridFuser(capacity=4)).run(room)
     assert isinstance(result.stopped_by, MapFullError)
     assert (result.frames, len(mapped(result).vertices)) == (5, 4)
+
+
+class _CoversImage(SphereDetector):
+    """Detector of 100 objects, each with a mask of the whole image."""
+
+    def detect(self, frame: Frame) -> Detections:
+        return Detections(
+            np.ones((100, *frame.depth.shape), np.bool_),
+            np.zeros((100, 4), np.float32),
+            np.linspace(0, 1, 100, dtype=np.float32),
+            np.tile(np.eye(len(self.classes), dtype=np.float32)[0], (100, 1)),
+            self.classes,
+        )
+
+
+class _NotesCounts(KeepAll):
+    noted: tuple[list[int], ...] = ()
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        self.noted += (np.bincount(clusters.cluster, minlength=len(clusters)).tolist(),)
+        return clusters
+
+
+def test_pipeline_limits_points_of_frame(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+    refiner, readings = _NotesCounts(), [np.count_nonzero(frame.depth) for frame in room]
+    result = pipeline(detector=_CoversImage(), refiner=refiner).run(room)
+    fitting = [MAX_COVERAGE * CAMERA.width * CAMERA.height // count for count in readings]
+    assert refiner.noted == tuple([0] * (100 - n) + [count] * n for n, count in zip(fitting, readings, strict=True))
+    assert result.masks_omitted == run_metrics(result)["masks_omitted"] == sum(100 - n for n in fitting)
+    logged = [record.getMessage() for record in caplog.records if "masks" in record.getMessage()]
+    assert len(logged) == 2
+    assert logged[0].startswith("frame 0: masks: expected at most 8 points per pixel, got more in 100 masks; ")
+    assert logged[1].startswith(f"{result.masks_omitted} masks omitted in total")
+    assert "masks_omitted" not in run_metrics(pipeline().run(room))
 
 
 @dataclass

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS
+from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS, class_id_type
 from framework.mapping.labels.evidence_rows import INSTANCE_SLOTS
 from framework.mapping.labels.label_evidence import Evidence, Measurement, named_classes, pack_class_scores
 from framework.mapping.labels.label_evidence_kernels import Combine
@@ -12,13 +12,13 @@ SCORE_SCALE = 1 << 16  # the precision of exact storage
 BARE, COVERED = np.int32(0), np.int32(1)  # indices of the cluster lists: no cluster, all clusters
 
 
-def blank() -> Evidence:
-    """Return the evidence of one voxel with empty label slots."""
+def blank(classes: int = 255) -> Evidence:
+    """Return the evidence of one voxel with empty label slots in a map with the given number of classes."""
     return Evidence(
         np.zeros((1, 512), np.int32),
         np.zeros((1, INSTANCE_SLOTS), np.int32),
         np.zeros((1, INSTANCE_SLOTS), np.float32),
-        np.full((1, CLASS_SLOTS), NO_CLASS, np.uint8),
+        np.full((1, CLASS_SLOTS), NO_CLASS, class_id_type(classes)),
         np.zeros((1, CLASS_SLOTS), np.int64),
     )
 

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from framework.config.validation import check_bounds
-from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose, View
+from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose, View, check_label_space
 from framework.errors import DataError
 from framework.mapping.instances.association_kernels import count_votes, find_seen
 from framework.mapping.instances.instance_table import InstanceTable
@@ -319,9 +319,11 @@ def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str,
         found: The label space of the current frame.
 
     Raises:
-        DataError: If the two differ.
+        DataError: If the two differ, or if the map cannot store the label space.
     """
-    if known and known != found:
+    if not known:
+        check_label_space(found)
+    elif known != found:
         raise DataError(
             f"detector: expected the label space of the map (length {len(known)}), got a different label space "
             f"(length {len(found)}); use one detector, or map all detectors to one label space"

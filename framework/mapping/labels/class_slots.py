@@ -4,15 +4,20 @@ In compact storage, a voxel has sixteen class slots, which fit into one SIMD vec
 such short loops, the intrinsics in this module emit vector instructions. Exact storage uses ordinary loops with the
 same results.
 
-A quantized score is the evidence times a scale, rounded to an integer. An array of cluster scores (NO_CLASS + 1,) is
-indexed by class. It contains the quantized score, shifted left by NEW_CLASSES bits. Bit m is set for the m-th named
-class of the cluster.
+In voxels, class ids begin at 1 and 0 is a free slot, as for instance ids: id k is column k - 1 of class probabilities.
+The ids of a vocabulary of at most 255 classes take one byte, larger ones take two.
+
+A quantized score is the evidence times a scale, rounded to an integer. An array of cluster scores (C + 1,) is indexed
+by class id. It contains the quantized score, shifted left by NEW_CLASSES bits. Bit m is set for the m-th named class of
+the cluster. The entry of free slots is 0.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
@@ -21,11 +26,17 @@ from numba.extending import intrinsic, overload
 from framework.mapping.voxels.voxel_grid_kernels import device
 
 CLASS_SLOTS = 16  # number of class slots of a voxel in compact storage
-NO_CLASS = 255  # class id of a free slot; slots are filled from the front
+NO_CLASS = 0  # class id of a free slot; slots are filled from the front
 NEW_CLASSES = 8  # maximum number of named classes of a cluster; only these can be added to the slots of a voxel
 ALL_NAMED = (1 << NEW_CLASSES) - 1  # bits of all named classes
 
+ClassIds = npt.NDArray[np.unsignedinteger[Any]]  # of the type of class_id_type()
 _OPTIONS = {"forceinline": True, "error_model": "numpy", "_nrt": False}  # the options of `device`
+
+
+def class_id_type(classes: int) -> type[np.unsignedinteger[Any]]:
+    """Return the type of the class ids in the voxels of a map with the given number of classes."""
+    return np.uint8 if classes <= np.iinfo(np.uint8).max else np.uint16
 
 
 @device
@@ -38,7 +49,7 @@ def add_scores(classes, scores, cluster_scores, limit):
     Args:
         classes: The classes (T,) in the slots.
         scores: The scores (T,) of the slots, modified in place. They are at least -limit.
-        cluster_scores: The packed scores (NO_CLASS + 1,) of the cluster, indexed by class.
+        cluster_scores: The packed scores (C + 1,) of the cluster, indexed by class id.
         limit: The maximum score.
     """
     return _add_scores(classes, scores, cluster_scores, limit)
@@ -91,7 +102,7 @@ def _least_likely_slot(scores):
     return least
 
 
-_BIT, _BYTE, _INT16, _INT32 = (ir.IntType(bits) for bits in (1, 8, 16, 32))
+_BIT, _INT16, _INT32 = (ir.IntType(bits) for bits in (1, 16, 32))
 
 
 def _vector(number: Any) -> Any:
@@ -123,7 +134,7 @@ class _Slots:
         stored.align = 1
 
     def gather(self, table: Any, indices: Any) -> Any:
-        """Return the table entries selected by the 8-bit indices stored at address `indices`."""
+        """Return the table entries selected by the unsigned indices stored at address `indices`."""
         found = ir.Constant(_vector(table.type.pointee), ir.Undefined)
         for s in range(CLASS_SLOTS):
             index = self.builder.zext(self.builder.load(self.builder.gep(indices, [_INT32(s)])), _INT32)
@@ -161,7 +172,7 @@ def _add_scores_to_vector(_context: Any, classes: Any, scores: Any, cluster_scor
         new = builder.select(builder.icmp_signed(">", total, floor), total, floor)
         slots.store(builder.trunc(new, _vector(_INT16)), old)
         known = builder.and_(slots.reduce("or", packed), _INT32(ALL_NAMED))
-        named = slots.bits(builder.icmp_unsigned("!=", slots.load(ids), _all(NO_CLASS, _BYTE)))
+        named = slots.bits(builder.icmp_unsigned("!=", slots.load(ids), _all(NO_CLASS, ids.type.pointee)))
         filled = builder.zext(slots.call("ctpop", named), _INT32)
         excess = builder.add(slots.reduce("smax", new), lowest)
         return context.make_tuple(builder, signature.return_type, [known, filled, excess])
@@ -174,9 +185,9 @@ def _most_likely_of_vector(_context: Any, classes: Any, scores: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         slots = _Slots(context, builder)
         ids, values = (slots.load(slots.address(*pair)) for pair in zip(signature.args, arguments, strict=True))
-        above = builder.mul(builder.sext(values, _vector(_INT32)), _all(NO_CLASS + 1, _INT32))
+        above = builder.shl(builder.sext(values, _vector(_INT32)), _all(ids.type.element.width, _INT32))
         rank = builder.sub(above, builder.zext(ids, _vector(_INT32)))
-        free = builder.icmp_unsigned("==", ids, _all(NO_CLASS, _BYTE))
+        free = builder.icmp_unsigned("==", ids, _all(NO_CLASS, ids.type.element))
         rank = builder.select(free, _all(-(2**31), _INT32), rank)
         best = builder.icmp_signed("==", rank, slots.repeat(slots.reduce("smax", rank)))
         return builder.zext(slots.call("cttz", slots.bits(best), _BIT(1)), _INT32)
@@ -198,8 +209,8 @@ def _least_likely_of_vector(_context: Any, scores: Any) -> Any:
 
 def _are_compact(*arrays: Any) -> bool:
     """Return True if the arrays have the types of compact storage."""
-    kinds = (types.uint8, types.int16, types.int32)
-    return all(array.dtype == kind for array, kind in zip(arrays, kinds, strict=False))
+    kinds = ((types.uint8, types.uint16), (types.int16,), (types.int32,))
+    return all(array.dtype in kind for array, kind in zip(arrays, kinds, strict=False))
 
 
 @overload(_add_scores, jit_options=_OPTIONS)

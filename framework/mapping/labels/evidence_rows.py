@@ -1,7 +1,7 @@
 """Storage and update of the label evidence.
 
-In compact storage, the slots of a labeled voxel take 80 bytes, and a row of a block takes 2 KiB. A voxel becomes
-labeled when it is near the measured surface and its pixel is inside a mask.
+In compact storage, the slots of a labeled voxel take 80 bytes (96 for more than 255 classes), and a row of a block
+takes 2 KiB. A voxel becomes labeled when it is near the measured surface and its pixel is inside a mask.
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from framework.data import Bool, Float64, Int32, UInt8
-from framework.errors import DataError
-from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS
+from framework.data import Bool, Float64, Int32
+from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS, ClassIds, class_id_type
 from framework.mapping.labels.evidence_rows_kernels import (
     BITS,
     fewest_free,
@@ -73,6 +72,7 @@ class EvidenceRows:
         self.evicted = 0  # number of slots reassigned to another label
         self._instance_slots = INSTANCE_SLOTS
         self._class_slots = CLASS_SLOTS
+        self._class_id_type = class_id_type(0)
         self._free()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -113,16 +113,11 @@ class EvidenceRows:
             array[:, given.shape[1] :] = 0
 
     def begin(self, classes: int) -> None:
-        """Set the number of classes before the first update.
-
-        Raises:
-            DataError: If there are too many classes.
-        """
-        if classes > NO_CLASS:
-            raise DataError(f"detector: expected at most {NO_CLASS} classes, got {classes}")
+        """Set the number of classes before the first update."""
+        self._class_id_type = class_id_type(classes)
         if self.storage is Storage.EXACT:
             self._class_slots = max(classes, 1)
-            self._free()
+        self._free()
 
     def update(self, seen: SeenBlocks, measurement: Measurement) -> None:
         """Update the label evidence of the voxels near the measured surface.
@@ -145,25 +140,27 @@ class EvidenceRows:
         label_new(grid, seen, self.evidence, measurement, list_bits, self._row_bits, new, free_classes, evicted)
         self.evicted += int(evicted.sum())
 
-    def add_class(self, logarithmic: bool) -> None:
+    def add_class(self, classes: int, logarithmic: bool) -> None:
         """Add a class without evidence in any voxel. Compact storage has no slots for such classes.
 
         Args:
+            classes: The number of classes, including the new class.
             logarithmic: True if the evidence consists of log-likelihoods.
         """
-        if self.storage is Storage.COMPACT:
+        old, id_type = self.in_use(), class_id_type(classes)
+        if self.storage is Storage.COMPACT and id_type is self._class_id_type:
             return
-        old = self.in_use()
-        new_id = np.full((len(old.class_ids), 1), self._class_slots, np.uint8)
-        unseen = old.class_value.max(axis=1, keepdims=True) - int(UNSEEN * self.score_scale) if logarithmic else 0
-        new_value = np.broadcast_to(unseen, new_id.shape).astype(old.class_value.dtype)
-        self._class_slots += 1
-        self.fill(
-            old._replace(
+        self._class_id_type = id_type
+        if self.storage is Storage.EXACT:
+            new_id = np.full((len(old.class_ids), 1), classes, id_type)
+            unseen = old.class_value.max(axis=1, keepdims=True) - int(UNSEEN * self.score_scale) if logarithmic else 0
+            new_value = np.broadcast_to(unseen, new_id.shape).astype(old.class_value.dtype)
+            self._class_slots += 1
+            old = old._replace(
                 class_ids=np.concatenate([old.class_ids, new_id], axis=1),
                 class_value=np.concatenate([old.class_value, new_value], axis=1),
             )
-        )
+        self.fill(old)
 
     def merge_instances(self, kept: int, dropped: int) -> None:
         """Add the evidence for instance `dropped` to the evidence for `kept` in every voxel."""
@@ -184,7 +181,7 @@ class EvidenceRows:
         self._row_bits = np.empty(len(self._labeled), np.uint64)  # bit k % BITS = a voxel may have instance k
         scores = np.int16 if self.storage is Storage.COMPACT else np.int64
         shapes = self._instance_slots, self._instance_slots, self._class_slots, self._class_slots
-        kinds = zip(SLOTS, (np.int32, np.float32, np.uint8, scores), shapes, strict=True)
+        kinds = zip(SLOTS, (np.int32, np.float32, self._class_id_type, scores), shapes, strict=True)
         slots = np.dtype([(name, kind, (count,)) for name, kind, count in kinds], align=True)
         self._slots = reserved(RESERVED * self.voxels.max_blocks, lambda voxels: np.empty(voxels, slots))
         self._lay_out()
@@ -192,11 +189,12 @@ class EvidenceRows:
     def _lay_out(self) -> None:
         self.evidence = Evidence(self._labeled, **{name: self._slots[name] for name in SLOTS})
 
-    def _free_classes(self) -> UInt8:
+    def _free_classes(self) -> ClassIds:
         """Return the class ids (T,) in the slots of a new voxel."""
         # exact storage has a slot for every class
-        named = np.arange(self._class_slots) if self.storage is Storage.EXACT else np.full(self._class_slots, NO_CLASS)
-        return named.astype(np.uint8)
+        exact = self.storage is Storage.EXACT
+        named = np.arange(1, self._class_slots + 1) if exact else np.full(self._class_slots, NO_CLASS)
+        return named.astype(self._class_id_type)
 
     def _make_room(self, blocks: Int32, new: NewVoxels) -> None:
         """Reserve slots for new voxels and rows for new blocks, and fill new.rows and new.starts."""

@@ -215,4 +215,4 @@ def sum_classes_of_instances(evidence, counts, sums):
             label = evidence.class_ids[voxel, s]
             if label == NO_CLASS:  # slots are filled from the front
                 break
-            sums[instance, label] += evidence.class_value[voxel, s]
+            sums[instance, label - 1] += evidence.class_value[voxel, s]

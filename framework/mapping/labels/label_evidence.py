@@ -30,8 +30,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from framework.data import Bool, Float32, Float64, Int32, UInt8
-from framework.mapping.labels.class_slots import NEW_CLASSES, NO_CLASS
+from framework.data import Bool, Float32, Float64, Int32, UInt8, UInt16
+from framework.mapping.labels.class_slots import NEW_CLASSES, ClassIds
 
 Integers = npt.NDArray[Any]  # of int16, int32 or int64
 MAX_SCORE = 30_000  # maximum quantized class score in compact storage; the excess is subtracted from all scores
@@ -51,7 +51,7 @@ class Evidence(NamedTuple):
     labeled: Int32  # (R, 512) index of a voxel among the voxels with slots, -1 = no slots
     instance_ids: Int32  # (L, S), 0 = free slot; all slots are free if only unmatched clusters updated the voxel
     instance_value: Float32  # (L, S) log-odds over the unnamed instances
-    class_ids: UInt8  # (L, T), NO_CLASS = free slot
+    class_ids: ClassIds  # (L, T) in [1, C], 0 = free slot
     class_value: Integers  # (L, T) quantized scores over the unnamed classes; int16, in exact storage int64
 
 
@@ -65,13 +65,13 @@ class Measurement(NamedTuple):
     instance_log_odds: Float32  # (N,) log-odds of that instance over any other instance
     absence: np.float32  # log-odds, <= 0, of a matched instance in voxels outside its mask
     matched: Bool  # (ids + 1,) indexed by id, True where an instance was matched in this frame
-    class_scores: Integers  # (N, NO_CLASS + 1) quantized class scores with named bits; int32, in exact storage int64
-    named_classes: UInt8  # (N, NEW_CLASSES) most likely classes of each cluster
+    class_scores: Integers  # (N, C + 1) quantized scores by class id with named bits; int32, in exact storage int64
+    named_classes: UInt16  # (N, NEW_CLASSES) ids of the most likely classes of each cluster
     combine: int  # rule for combining new and old evidence, a value of Combine
     max_score: int  # maximum quantized score of a class in a voxel
 
 
-def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8, UInt8]:
+def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt16, UInt8]:
     """Return the class evidence relative to the unnamed classes, the named classes and their bits.
 
     With log-likelihoods, a cluster names its NEW_CLASSES most likely classes. Every unnamed class gets the mean
@@ -83,8 +83,8 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
 
     Returns:
         The relative evidence (N, C).
-        The named classes (N, NEW_CLASSES), padded with the first named class.
-        The bits (N, NO_CLASS + 1), 2^m for the m-th named class and 0 for unnamed classes.
+        The ids (N, NEW_CLASSES) of the named classes, padded with the first named class.
+        The bits (N, C + 1) by class id, 2^m for the m-th named class and 0 for unnamed classes.
     """
     c = evidence.shape[1]
     names = min(c, NEW_CLASSES) if logarithmic else min(c, 1)
@@ -98,14 +98,14 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
         else:  # all classes are named; a term common to all classes is not evidence
             mean = unnamed.min(axis=1, keepdims=True, initial=1.0)
         relative = evidence - np.log(np.maximum(mean, 1e-6))
-    bits = np.zeros((len(evidence), NO_CLASS + 1), np.uint8)
-    np.put_along_axis(bits, named, np.uint8(1) << np.arange(names, dtype=np.uint8)[None], axis=1)
+    bits = np.zeros((len(evidence), c + 1), np.uint8)
+    np.put_along_axis(bits, named + 1, np.uint8(1) << np.arange(names, dtype=np.uint8)[None], axis=1)
     again = np.repeat(named[:, :1], NEW_CLASSES - names, axis=1)
-    return relative, np.concatenate([named, again], axis=1).astype(np.uint8), bits
+    return relative, (np.concatenate([named, again], axis=1) + 1).astype(np.uint16), bits
 
 
 def pack_class_scores(relative: Float64, scale: int, named_bit: UInt8, kind: type[np.signedinteger[Any]]) -> Integers:
-    """Return the quantized class evidence (N, NO_CLASS + 1) of the clusters, packed with the named bits.
+    """Return the quantized class evidence (N, C + 1) of the clusters by class id, packed with the named bits.
 
     An entry contains the named bit in its lowest NEW_CLASSES bits, and the quantized evidence above. A single look-up
     then reads both.
@@ -113,9 +113,9 @@ def pack_class_scores(relative: Float64, scale: int, named_bit: UInt8, kind: typ
     Args:
         relative: The class evidence (N, C) relative to the unnamed classes.
         scale: The quantized score for evidence of 1.
-        named_bit: The bits (N, NO_CLASS + 1) of the named classes.
+        named_bit: The bits (N, C + 1) of the named classes.
         kind: The integer type of the result.
     """
     packed = named_bit.astype(np.int64)
-    packed[:, : relative.shape[1]] += np.rint(relative * scale).astype(np.int64) << NEW_CLASSES
+    packed[:, 1:] += np.rint(relative * scale).astype(np.int64) << NEW_CLASSES
     return packed.astype(kind)

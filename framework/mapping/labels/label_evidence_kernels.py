@@ -69,8 +69,8 @@ def best_counted_instance(evidence, voxel, counts):
 
 @device
 def best_class(evidence, voxel):
-    """Return the most likely class of a labeled voxel."""
-    return np.int32(evidence.class_ids[voxel, 0])
+    """Return the most likely class of a labeled voxel, as an index into the classes."""
+    return np.int32(evidence.class_ids[voxel, 0] - 1)
 
 
 @device

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from framework.data import Array, check_array
+from framework.data import Array, Float64, check_array
 from framework.errors import DataError, InstanceMapError, reason_of
 from framework.files.atomic_write import atomic_write, check_regular
 from framework.files.json_file import parse_json
@@ -28,6 +28,7 @@ from framework.mapping.voxels.voxel_grid_kernels import FARTHEST_BLOCK
 DEFLATE_LEVEL = 1  # zlib level; files are at most a tenth larger than at level 6, and writing takes half the time
 
 HEADER = "header"  # name of the array with the JSON header
+CLASS_EVIDENCE = "class_evidence"  # name of the array with the class evidence (I, C) of the I instances
 LARGEST_HEADER = 2**28  # maximum size of the header, bytes; an hour of mapping with thousands of instances takes 10 MB
 LARGEST_ID = 2**24  # maximum instance id
 MAX_EVIDENCE = 1e12  # maximum absolute evidence for a class
@@ -197,8 +198,9 @@ def check_blocks(coords: Any) -> None:
 
 
 def plain_table(table: InstanceTable) -> dict[str, Any]:
-    """Return an instance table as JSON values, without its embeddings."""
-    space = {SPACE: table.embedding_space} if table_arrays(table) else {}
+    """Return an instance table as JSON values, without its class evidence and its embeddings."""
+    embedded = any(record.embedding is not None for record in table.records.values())
+    space = {SPACE: table.embedding_space} if embedded else {}
     return {
         "combine": table.combine.name,
         "logarithmic": table.logarithmic,
@@ -211,21 +213,23 @@ def plain_table(table: InstanceTable) -> dict[str, Any]:
 def _plain_record(record: InstanceRecord) -> dict[str, Any]:
     plain = {
         **vars(record),
-        "class_evidence": record.class_evidence.tolist(),
         "observed_in": sorted(record.observed_in),
         "in_view": record.in_view.spans,
     }
-    del plain["embedding"]
+    del plain["class_evidence"], plain["embedding"]
     return plain
 
 
-def table_arrays(table: InstanceTable) -> dict[str, Array]:
-    """Return the arrays of the embeddings of an instance table.
+def table_arrays(table: InstanceTable, classes: int) -> dict[str, Array]:
+    """Return the arrays of an instance table: the class evidence, and the embeddings if there are any.
 
-    The result is empty if there are no embeddings.
+    Args:
+        table: The instance table.
+        classes: The number of classes.
     """
+    evidence = np.array([record.class_evidence for record in table.records.values()], np.float64)
     embeddings = {k: record.embedding for k, record in table.records.items() if record.embedding is not None}
-    return embedding_arrays(embeddings)
+    return {CLASS_EVIDENCE: evidence.reshape(len(table.records), classes), **embedding_arrays(embeddings)}
 
 
 def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> InstanceTable:
@@ -241,8 +245,17 @@ def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> Insta
     """
     table = InstanceTable(plain.option("combine", Combine), plain.flag("logarithmic"))
     table.last_id = plain.whole("last_id", 0, LARGEST_ID)
-    for entry in plain.parts("instances"):
-        record = _record(entry, table.last_id, classes)
+    entries, evidence = list(plain.parts("instances")), arrays[CLASS_EVIDENCE]
+    check_array(CLASS_EVIDENCE, evidence, (len(entries), classes), np.float64)
+    if len(entries) and not classes:
+        raise DataError(f"{CLASS_EVIDENCE}: expected at least 1 class for {len(entries)} instances, got 0")
+    if len(entries) and np.abs(evidence).max() > MAX_EVIDENCE:
+        raise DataError(
+            f"{CLASS_EVIDENCE}: expected numbers in [-{MAX_EVIDENCE:g}, {MAX_EVIDENCE:g}], got {evidence.min():g} to "
+            f"{evidence.max():g}"
+        )
+    for entry, of_classes in zip(entries, evidence, strict=True):
+        record = _record(entry, table.last_id, of_classes)
         if record.id in table.records:
             raise DataError(f"{entry.name}.id: expected a unique id, got {record.id} twice")
         table.records[record.id] = record
@@ -253,13 +266,10 @@ def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> Insta
     return table
 
 
-def _record(entry: MapHeader, last_id: int, classes: int) -> InstanceRecord:
-    evidence = entry.items("class_evidence")
-    if len(evidence) != classes or not classes or not all(type(value) in (int, float) for value in evidence):
-        raise DataError(f"{entry.name}.class_evidence: expected {classes} numbers, one per class, got {evidence!r:.60}")
-    record = InstanceRecord(
+def _record(entry: MapHeader, last_id: int, class_evidence: Float64) -> InstanceRecord:
+    return InstanceRecord(
         id=entry.whole("id", 1, last_id),
-        class_evidence=np.array(evidence, np.float64),
+        class_evidence=class_evidence.copy(),
         first_frame=entry.whole("first_frame", -LARGEST_COUNT),
         last_frame=entry.whole("last_frame", -LARGEST_COUNT),
         observed_in={whole(f"{entry.name}.observed_in", k, -LARGEST_COUNT) for k in entry.items("observed_in")},
@@ -267,12 +277,6 @@ def _record(entry: MapHeader, last_id: int, classes: int) -> InstanceRecord:
         score_sum=entry.number("score_sum", (0.0, float(entry.whole("detections")))),
         detections=entry.whole("detections"),
     )
-    if not np.abs(record.class_evidence).max() <= MAX_EVIDENCE:
-        raise DataError(
-            f"{entry.name}.class_evidence: expected numbers in [-{MAX_EVIDENCE:g}, {MAX_EVIDENCE:g}], got "
-            f"{evidence!r:.60}"
-        )
-    return record
 
 
 def _span(name: str, found: object) -> list[int]:

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, TypeVar
 
+from framework.data import LONGEST_CLASS_NAME, MAX_CLASSES
 from framework.errors import DataError
 
-MAX_CLASSES = 10_000  # maximum number of classes of a map; LVIS has 1,200
-LONGEST_NAME = 200  # maximum length of a class name, characters
 LARGEST_COUNT = 2**53  # maximum number of frames and evictions; JSON readers represent all integers up to it exactly
 
 Option = TypeVar("Option", bound=Enum)
@@ -83,9 +82,9 @@ class MapHeader:
     def classes(self) -> tuple[str, ...]:
         """Return the names of the classes."""
         found = self.items("classes")
-        names = [name for name in found if isinstance(name, str) and len(name) <= LONGEST_NAME]
+        names = [name for name in found if isinstance(name, str) and len(name) <= LONGEST_CLASS_NAME]
         if len(names) < len(found) or len(found) > MAX_CLASSES:
-            expected = f"at most {MAX_CLASSES} names of at most {LONGEST_NAME} characters each"
+            expected = f"at most {MAX_CLASSES} names of at most {LONGEST_CLASS_NAME} characters each"
             raise self._error("classes", expected, found)
         return tuple(names)
 

@@ -32,10 +32,10 @@ def read_external_map(
     names = None if label_space is None else ClassIdNames.of(label_space)
     if labels is not None and (labels.is_dir() or labels.suffix.lower() == ".txt"):
         return read_mask_predictions(mesh, surface, labels, names)
-    for in_header in listed_classes(surface.comments):  # a mesh.ply of InstanceMap
-        if in_header:
-            names = names or ClassIdNames(dict(enumerate(in_header)), str(mesh))
-        elif properties.class_ is None:
-            properties = replace(properties, class_="")
+    in_header = listed_classes(surface.comments)  # None = not a mesh.ply of InstanceMap
+    if in_header:
+        names = names or ClassIdNames(dict(enumerate(in_header)), str(mesh))
+    elif in_header == () and properties.class_ is None:
+        properties = replace(properties, class_="")
     by_id = None if labels is None else read_labels_by_id(labels, names)
     return read_ply_instances(mesh, surface, properties, names, by_id)

@@ -8,8 +8,7 @@ from numba import njit
 
 from framework.baselines.class_evidence import ClassEvidence, ClassRows, MaskClasses, mask_classes
 from framework.baselines.class_evidence_kernels import observe_mask
-from framework.data import PointClusters
-from framework.errors import DataError
+from framework.data import MAX_CLASSES, PointClusters
 from framework.mapping.labels.class_slots import CLASS_SLOTS, NEW_CLASSES, NO_CLASS
 from framework.mapping.labels.pixel_lists import list_points_by_pixel
 from framework.mapping.voxels.voxel_grid import VoxelGrid
@@ -48,7 +47,7 @@ def sums(evidence: ClassEvidence, classes: int) -> np.ndarray:
     found = np.full(classes, evidence.rest[0, 0], np.float64)
     for label, value in zip(evidence.class_ids[0, 0], evidence.log_ratio[0, 0], strict=True):
         if label != NO_CLASS:
-            found[label] = value
+            found[label - 1] = value
     return found
 
 
@@ -58,7 +57,7 @@ def test_class_evidence_few_classes_match_dense_recursion() -> None:
     masks, evidence = masks_of(log_ratios), one_voxel(5)
     assert sum(observe(evidence, masks, k) for k in range(30)) == 0
     np.testing.assert_allclose(sums(evidence, 5), log_ratios.sum(axis=0), atol=1e-4)
-    assert evidence.class_ids[0, 0, 0] == log_ratios.sum(axis=0).argmax()
+    assert evidence.class_ids[0, 0, 0] == 1 + log_ratios.sum(axis=0).argmax()
     assert evidence.masked[0, 0] == 30
 
 
@@ -80,8 +79,8 @@ def test_class_evidence_full_voxel_evicts_least_likely_classes() -> None:
     assert evidence.class_ids.shape[2] == CLASS_SLOTS
     assert [observe(evidence, masks, k) for k in range(3)] == [0, 0, 8]
     # summed log ratios: 1 - 5 - 5 for classes 0 to 7, -5 + 2 - 5 for 8 to 15, and -5 - 5 + 9 for 16 to 23
-    assert set(evidence.class_ids[0, 0].tolist()) == set(range(8, 24))
-    assert evidence.class_ids[0, 0, 0] == 16
+    assert set(evidence.class_ids[0, 0].tolist()) == set(range(9, 25))
+    assert evidence.class_ids[0, 0, 0] == 17
     assert evidence.log_ratio[0, 0, 0] == pytest.approx(-1)
 
 
@@ -106,8 +105,12 @@ def test_mask_classes_pixel_uses_highest_scoring_mask() -> None:
     assert masks.cluster.tolist() == [1, 1, -1, -1]
 
 
-def test_class_rows_more_than_255_classes_raise() -> None:
-    rows = ClassRows(VoxelGrid(0.01, 0.1, 8))
-    rows.begin(255)
-    with pytest.raises(DataError, match="255 classes"):
-        rows.begin(256)
+@pytest.mark.parametrize("classes", [255, 256, MAX_CLASSES])
+def test_class_evidence_of_last_class_is_stored(classes: int) -> None:
+    message = np.full((1, classes), -5.0)
+    message[0, -1] = 2.0
+    evidence = one_voxel(classes)
+    assert evidence.class_ids.itemsize == (1 if classes == 255 else 2)
+    observe(evidence, masks_of(message), 0)
+    assert evidence.class_ids[0, 0, 0] == classes
+    assert sums(evidence, classes)[-1] == 2

@@ -165,11 +165,22 @@ def test_instance_of_new_class_keeps_class_when_merged(scene: InstanceMap) -> No
     assert scene.instances()[COUCH].class_probabilities[2] > 0.99
 
 
-def test_new_class_of_full_map_is_error(scene: InstanceMap) -> None:
+def test_rename_to_256th_class_keeps_other_instances(scene: InstanceMap, tmp_path: Path) -> None:
     edited = EditedMap(scene)
+    classes = scene.mesh().class_ids.copy()
     for k in range(253):
         scene.add_class(f"class {k}")
-    with pytest.raises(DataError, match="expected one of the 255 classes of the map, which is the maximum"):
+    edited.apply(Rename(CHAIR, "forklift"))
+    scene.save(tmp_path / "map.npz")
+    for one in (scene, InstanceMap.load(tmp_path / "map.npz")):
+        assert one.instances()[CHAIR].class_probabilities.argmax() == 255
+        np.testing.assert_array_equal(one.mesh().class_ids, np.where(ids_of(one) == CHAIR, 255, classes))
+
+
+def test_new_class_of_full_map_is_error(scene: InstanceMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    edited = EditedMap(scene)
+    monkeypatch.setattr("framework.data.MAX_CLASSES", 2)
+    with pytest.raises(DataError, match="expected at most 2 classes, got 3"):
         edited.apply(Rename(CHAIR, "forklift"))
 
 

@@ -8,7 +8,7 @@ import pytest
 from framework.data import Detections, Frame, Pose
 from framework.errors import DataError
 from framework.geometry import inverse, project, transform
-from framework.refinement.lifting import lift
+from framework.refinement.lifting import MAX_COVERAGE, fitting_masks, lift
 from tests.support.scenes.corner_room import CornerRoom, pose_at
 
 
@@ -70,3 +70,40 @@ def test_lift_reads_masks_at_color_pixels(room: CornerRoom) -> None:
     found = np.zeros_like(masks)
     found[clusters.cluster, clusters.pixels[:, 1], clusters.pixels[:, 0]] = True
     np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("counts", "scores", "expected"),
+    [
+        ([4, 6], [0.1, 0.2], [True, True]),
+        ([4, 7], [0.1, 0.2], [False, True]),
+        ([9, 7, 3, 1], [0.9, 0.8, 0.7, 0.6], [True, False, False, True]),  # a smaller mask with a lower score fits
+        ([10, 10], [0.5, 0.5], [True, False]),
+        ([11, 0], [0.9, 0.1], [False, True]),
+        ([], [], []),
+    ],
+)
+def test_fitting_masks_prefers_high_scores(counts: list[int], scores: list[float], expected: list[bool]) -> None:
+    fits = fitting_masks(np.array(counts, np.int64), np.array(scores, np.float32), 10)
+    assert fits.tolist() == expected
+
+
+def test_lift_beyond_limit_empties_clusters_of_low_scores(room: CornerRoom) -> None:
+    """Each mask covers the image, and the last mask has a single row."""
+    frame, n = room[0], 2 * MAX_COVERAGE
+    masks = np.ones((n, *frame.depth.shape), np.bool_)
+    masks[-1, 1:] = False
+    scores = np.linspace(0.9, 0.1, n, dtype=np.float32)
+    detections = Detections(masks, np.zeros((n, 4), np.float32), scores, np.ones((n, 1), np.float32), ("a",))
+    lifted = lift(detections, frame, Pose(pose_at(0)))
+    counts = np.bincount(lifted.cluster, minlength=n)
+    readings = np.count_nonzero(frame.depth)
+    fitting = MAX_COVERAGE * frame.depth.size // readings
+    assert counts[:fitting].tolist() == [readings] * fitting
+    assert not counts[fitting:-1].any()
+    assert len(lifted) == n
+    assert lifted.omitted == np.count_nonzero(counts == 0)
+    single = Detections(masks[:1], detections.boxes[:1], scores[:1], np.ones((1, 1), np.float32), ("a",))
+    whole = lift(single, frame, Pose(pose_at(0)))
+    np.testing.assert_array_equal(lifted.points_world[lifted.cluster == 0], whole.points_world)
+    assert whole.omitted == 0

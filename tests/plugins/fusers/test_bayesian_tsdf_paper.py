@@ -10,6 +10,7 @@ from framework.data import Bool, Float64, Frame, Int32, PointClusters, Pose
 from framework.geometry import inverse
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instances.association import InstanceSource, Matches, OverlapRule
+from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.evidence_rows import Storage
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.refinement.lifting import lift
@@ -182,8 +183,8 @@ def test_paper_fuser_recursions_agree_with_slow_reference(
         classes, instances = expected
         values = np.zeros(2)
         for label, value in zip(evidence.class_ids[voxel], evidence.class_value[voxel], strict=True):
-            if label < 2:
-                values[label] = value / scale
+            if label:
+                values[label - 1] = value / scale
         assert values[0] - values[1] == pytest.approx(np.log(classes[0] / classes[1]), abs=4 * tolerance)
         stored = {
             int(i): float(value)
@@ -214,8 +215,8 @@ def test_paper_fuser_zero_instance_floor_splits_remainder(frames: list[Frame]) -
 def roll_classes(scene: InstanceMap, shift: int) -> None:
     """Shift the class evidence of every voxel by `shift` classes."""
     used = scene.labels.in_use()
-    named = used.class_ids < len(scene.classes)
-    used.class_ids[named] = (used.class_ids[named] + shift) % len(scene.classes)
+    named = used.class_ids != NO_CLASS
+    used.class_ids[named] = (used.class_ids[named] - 1 + shift) % len(scene.classes) + 1
 
 
 @pytest.mark.parametrize(("source", "changes"), [("VOXELS", True), ("DETECTIONS", False)])
@@ -242,8 +243,8 @@ def test_paper_fuser_instance_class_is_sum_over_its_voxels(frames: list[Frame], 
         best = max(ids, key=lambda i: (values[used.instance_ids[voxel].tolist().index(i)], -i), default=0)
         if best and values[used.instance_ids[voxel].tolist().index(best)] > 0:
             for label, value in zip(used.class_ids[voxel], used.class_value[voxel], strict=True):
-                if label < 2:
-                    sums[best, label] += value / scene.labels.score_scale
+                if label:
+                    sums[best, label - 1] += value / scene.labels.score_scale
     scene.save(tmp_path / "map.npz")
     for of in (scene, InstanceMap.load(tmp_path / "map.npz")):
         evidence = of.class_evidence()

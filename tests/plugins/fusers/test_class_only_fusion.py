@@ -154,8 +154,8 @@ def test_class_only_voxel_evidence_matches_reference(mapped: SemanticMap, frames
         row = grid.label_row[block]
         held = np.zeros(2)
         for label, ratio in zip(evidence.class_ids[row, n], evidence.log_ratio[row, n], strict=True):
-            if label < 2:
-                held[label] = ratio
+            if label:
+                held[label - 1] = ratio
         held += np.log(fuser.absence_likelihood_ratio) * evidence.unmasked[block, n]
         seen += masked > 0
         same = (evidence.masked[row, n], evidence.unmasked[block, n]) == (masked, unmasked)
@@ -179,8 +179,8 @@ def test_class_only_instance_attributes_match_voxel_reference(mapped: SemanticMa
                 continue
             log = np.array([evidence.rest[row, n]] * 2 + [0.0])
             for label, ratio in zip(evidence.class_ids[row, n], evidence.log_ratio[row, n], strict=True):
-                if label < 2:
-                    log[label] = ratio
+                if label:
+                    log[label - 1] = ratio
             log[:2] += np.log(mapped.elections.absence_likelihood_ratio) * evidence.unmasked[block, n]
             posteriors.append((np.exp(log) / np.exp(log).sum())[:2])
             counts.append(evidence.masked[row, n])
@@ -263,7 +263,7 @@ def test_class_only_loaded_map_can_be_extended(frames: list[Frame], tmp_path: Pa
 
 def test_class_only_loading_of_instance_map_raises(tmp_path: Path) -> None:
     BayesianTsdf().scene.save(tmp_path / "map.npz")
-    with pytest.raises(DataError, match=f"expected map format semantic 4, got {FORMAT}"):
+    with pytest.raises(DataError, match=f"expected map format semantic 5, got {FORMAT}"):
         SemanticMap.load(tmp_path / "map.npz")
 
 
@@ -312,8 +312,8 @@ def slowly_smoothed(scene: SemanticMap, smoothness: float) -> Int32:
             absent = np.log(scene.elections.absence_likelihood_ratio) * evidence.unmasked[block, n]
             log = [absent + (evidence.rest[row, n] if row >= 0 else 0)] * 2 + [0.0]  # two classes, background
             for label, ratio in zip(evidence.class_ids[row, n], evidence.log_ratio[row, n], strict=True):
-                if row >= 0 and label < 2:
-                    log[label] = ratio + absent
+                if row >= 0 and label:
+                    log[label - 1] = ratio + absent
             values = [
                 value + smoothness * sum(class_ids[w] == c for w in neighbors[v])
                 for c, value in zip((0, 1, -1), log, strict=True)

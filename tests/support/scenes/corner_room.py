@@ -123,14 +123,17 @@ class SphereDetector(Detector):
 
     concurrent = True
     broken_at: int = -1  # index of the frame that raises FrameError; -1 = none
+    unused_classes: int = 0  # number of classes without objects, before the classes of the spheres
 
     def __post_init__(self) -> None:
-        self.classes = CLASSES
+        self.classes = (*(f"unused {k}" for k in range(self.unused_classes)), *CLASSES)
 
     def detect(self, frame: Frame) -> Detections:
         if frame.index == self.broken_at:
             raise FrameError(f"frame {frame.index}: expected a usable frame, got an unusable one")
-        return spheres_in(frame)
+        found = spheres_in(frame)
+        padded = np.pad(found.class_probabilities, ((0, 0), (self.unused_classes, 0)))
+        return replace(found, class_probabilities=padded, classes=self.classes)
 
 
 @dataclass

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from framework.data import Int32
-from framework.errors import DataError
+from framework.data import MAX_CLASSES, Int32
 from framework.mapping.labels import evidence_rows
 from framework.mapping.labels.evidence_rows import SLOTS, EvidenceRows, Storage
 from framework.mapping.labels.evidence_rows_kernels import _merge_voxel
@@ -69,11 +68,6 @@ def test_evidence_merge_updates_all_labeled_voxels(count: int) -> None:
     value = np.tile(np.float32([7, 5, 0, 0]), (count + 100, 1))
     value[known] = [12, 0, 0, 0]
     np.testing.assert_array_equal(evidence.instance_value[: count + 100], value)
-
-
-def test_evidence_rows_with_256_classes_raise() -> None:
-    with pytest.raises(DataError, match="at most 255 classes, got 256"):
-        EvidenceRows(VoxelGrid(0.01, 0.05, 10)).begin(256)
 
 
 def at_pixel(block: int, *voxels: int) -> SeenBlocks:
@@ -182,23 +176,61 @@ def test_evidence_rows_count_evictions_of_new_voxel() -> None:
     assert rows.evicted == expected == 2
 
 
-def test_evidence_rows_exact_storage_keeps_all_evidence() -> None:
+@pytest.mark.parametrize(("classes", "size"), [(255, 80), (256, 96), (MAX_CLASSES, 96)])
+@pytest.mark.parametrize("storage", Storage)
+def test_evidence_rows_store_last_class(classes: int, size: int, storage: Storage) -> None:
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=storage)
+    rows.begin(classes)
+    rows.voxels.allocate(np.zeros((1, 3), np.int32))
+    measurement = voted([1], [1.0], [classes - 1], Combine.SUM, classes)
+    if storage is Storage.COMPACT:
+        measurement = measurement._replace(class_scores=measurement.class_scores.astype(np.int32), max_score=MAX_SCORE)
+    before = rows.byte_count
+    rows.update(at_pixel(0, 5), measurement)
+    assert best_class(rows.evidence, 0) == classes - 1
+    counts = np.array([False, True])
+    expected = np.zeros((2, classes))
+    expected[1, -1] = 100 / rows.score_scale
+    np.testing.assert_array_equal(rows.classes_of_instances(counts, classes), expected)
+    of_row = 4 * 512 + 8
+    if storage is Storage.COMPACT:
+        assert rows.byte_count - before == of_row + size
+
+
+@pytest.mark.parametrize("storage", Storage)
+def test_evidence_rows_256th_class_keeps_evidence(storage: Storage) -> None:
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=storage)
+    rows.begin(255)
+    rows.voxels.allocate(np.zeros((1, 3), np.int32))
+    rows.update(at_pixel(0, 5), voted([1], [1.0], [254], Combine.SUM, 255))
+    before = rows.in_use()
+    rows.add_class(256, logarithmic=False)
+    after = rows.in_use()
+    assert (before.class_ids.dtype, after.class_ids.dtype) == (np.uint8, np.uint16)
+    for name in SLOTS:
+        kept = getattr(after, name)[:, : getattr(before, name).shape[1]]
+        np.testing.assert_array_equal(kept, getattr(before, name), err_msg=name)
+    assert after.class_ids.shape[1] == before.class_ids.shape[1] + (storage is Storage.EXACT)
+
+
+@pytest.mark.parametrize("classes", [30, 300])
+def test_evidence_rows_exact_storage_keeps_all_evidence(classes: int) -> None:
     """There are more instances and classes than slots in compact storage."""
     rng = np.random.default_rng(0)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=Storage.EXACT)
-    rows.begin(30)
+    rows.begin(classes)
     rows.voxels.allocate(np.zeros((1, 3), np.int32))
-    class_log, instance_log = np.zeros(30), np.zeros(21)
+    class_log, instance_log = np.zeros(classes), np.zeros(21)
     for _ in range(100):
         ids = rng.choice(np.arange(1, 21), 3, replace=False)
-        p = np.array([distribution(rng, 30) for _ in ids])
+        p = np.array([distribution(rng, classes) for _ in ids])
         rows.update(at_pixel(0, 5), measured(ids.tolist(), [0.9] * 3, p, 1.0, 20))
         assert rows.evicted == 0
         class_log += np.log(p).sum(axis=0)
         instance_log[ids] += np.log(0.9 / FLOOR)
     labels, values = rows.evidence.class_ids[0], rows.evidence.class_value[0] / SCORE_SCALE
-    assert sorted(labels.tolist()) == list(range(30))
-    assert np.allclose(values - values[0], class_log[labels] - class_log[labels[0]], atol=1e-2)
+    assert sorted(labels.tolist()) == list(range(1, classes + 1))
+    assert np.allclose(values - values[0], class_log[labels - 1] - class_log[labels[0] - 1], atol=1e-2)
     named = rows.evidence.instance_ids[0] > 0
     assert np.allclose(rows.evidence.instance_value[0][named], instance_log[rows.evidence.instance_ids[0][named]])
     assert named.sum() == 20

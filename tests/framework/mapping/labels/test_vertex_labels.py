@@ -64,7 +64,7 @@ def slow_vote(fuser: BayesianTsdf, counts: np.ndarray, vertex: np.ndarray) -> tu
         best, most, label, row = 0, 0.0, -1, int(grid.label_row[block])
         labeled = int(evidence.labeled[row, n]) if row >= 0 else -1
         if labeled >= 0:
-            label = int(evidence.class_ids[labeled, 0])
+            label = int(evidence.class_ids[labeled, 0]) - 1
             for instance, value in zip(evidence.instance_ids[labeled], evidence.instance_value[labeled], strict=True):
                 if instance > 0 and counts[instance] and value > most:
                     best, most = int(instance), float(value)
