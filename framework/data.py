@@ -22,7 +22,7 @@ import copy
 import math
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from typing import cast
 
@@ -123,6 +123,10 @@ class Camera:
         width, height = round(self.width * factor), round(self.height * factor)
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
+
+    def cropped(self, u0: int, v0: int, u1: int, v1: int) -> Camera:
+        """Return the camera of the part of the image from pixel (u0, v0) to (u1, v1), exclusive."""
+        return replace(self, width=u1 - u0, height=v1 - v0, cx=self.cx - u0, cy=self.cy - v0)
 
 
 @dataclass(frozen=True)
@@ -439,15 +443,27 @@ class InstanceMesh:
 
     def of(self, instance: Instance) -> InstanceMesh:
         """Return the mesh of an instance: its vertices, in order, and the triangles between them."""
-        new_index = np.full(len(self.vertices), -1, np.int32)
-        new_index[instance.vertices] = np.arange(len(instance.vertices), dtype=np.int32)
-        triangles = new_index[self.triangles]
+        own = np.zeros(len(self.vertices), np.bool_)
+        own[instance.vertices] = True
+        triangles = self.triangles[own[self.triangles[:, 0]]]
+        triangles = triangles[own[triangles].all(axis=1)]
+        return self.part(instance.vertices, triangles)
+
+    def part(self, vertices: Int32, triangles: Int32) -> InstanceMesh:
+        """Return a part of the mesh.
+
+        Args:
+            vertices: The indices (M,) of the vertices of the part, in order.
+            triangles: The triangles (N, 3) of the part, as indices of vertices in this mesh.
+        """
+        new_index = np.empty(len(self.vertices), np.int32)
+        new_index[vertices] = np.arange(len(vertices), dtype=np.int32)
         return InstanceMesh(
-            self.vertices[instance.vertices],
-            triangles[(triangles >= 0).all(axis=1)],
-            self.colors[instance.vertices],
-            self.instance_ids[instance.vertices],
-            self.class_ids[instance.vertices],
+            self.vertices[vertices],
+            new_index[triangles],
+            self.colors[vertices],
+            self.instance_ids[vertices],
+            self.class_ids[vertices],
             self.classes,
         )
 

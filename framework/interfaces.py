@@ -328,6 +328,13 @@ class SceneMap(ABC):
         Raises DataError if T_world_camera is not a rigid transform.
         """
 
+    def instance_at(self, u: int, v: int, camera: Camera, T_world_camera: Float64) -> int:
+        """Return the instance at a pixel of the view from `camera` at T_world_camera (4, 4), 0 = none.
+
+        The implementation may render only a part of the view.
+        """
+        return int(self.render(camera, T_world_camera).instance_ids[v, u])
+
     def render_near(
         self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
     ) -> SurfaceView:

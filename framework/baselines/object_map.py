@@ -11,17 +11,17 @@ detected.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
-from framework.baselines.object_volume import FOREGROUND, VOLUME_ARRAYS, ObjectVolume, boxes_in_view
+from framework.baselines.object_volume import FOREGROUND, OBJECT_ARRAYS, ObjectVolume, boxes_in_view
 from framework.baselines.object_volume_kernels import look_up_object
 from framework.data import Bool, Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, UInt8, View
 from framework.errors import DataError, MapFullError
 from framework.interfaces import Gravity, MapStatistics
-from framework.mapping.instances.instance_list import Confirmation, InstanceTableMap
+from framework.mapping.instances.instance_list import Confirmation, InstanceTableMap, ListedInstances
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.vertex_labels_kernels import color_vertices
@@ -37,7 +37,8 @@ from framework.mapping.storage.map_file import (
 )
 from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
-from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
+from framework.mapping.voxels.packed_voxels import STORED_VOXELS
+from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VOLUME_ARRAYS, TsdfVolume
 from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 from framework.sensors.noise_models import SensorKind
@@ -61,6 +62,7 @@ class ObjectMap(InstanceTableMap):
         self.confirmation = confirmation
         self.table = InstanceTable(Combine.SUM, logarithmic=False)
         self.volumes: dict[int, ObjectVolume] = {}
+        self.listed = ListedInstances()
 
     @property
     def block_count(self) -> int:
@@ -213,14 +215,13 @@ class ObjectMap(InstanceTableMap):
             "table": plain_table(self.table),
         }
         parts = [self._empty_volume().arrays(), *(volume.arrays() for volume in self.volumes.values())]
-        arrays |= {OBJECT + name: np.concatenate([part[name] for part in parts]) for name in VOLUME_ARRAYS}
-        write_map(path, header, arrays | table_arrays(self.table, len(self.classes)))
+        arrays |= {OBJECT + name: np.concatenate([part[name] for part in parts]) for name in OBJECT_ARRAYS}
+        write_map(path, header, arrays | table_arrays(self.table, len(self.classes)), stored=STORED_VOXELS)
 
     @classmethod
     def load(cls, path: Path | str) -> ObjectMap:
-        header, arrays = read_map(
-            path, FORMAT, (*BLOCK_ARRAYS, *(OBJECT + name for name in VOLUME_ARRAYS), CLASS_EVIDENCE)
-        )
+        of_objects = (OBJECT + name for name in OBJECT_ARRAYS)
+        header, arrays = read_map(path, FORMAT, (*VOLUME_ARRAYS, *of_objects, CLASS_EVIDENCE))
         with map_file_errors(path):
             scene = cls(TsdfVolume.load(header, arrays, 0), Confirmation.of(header.part("confirmation")))
             scene.classes = header.classes()
@@ -242,7 +243,7 @@ class ObjectMap(InstanceTableMap):
             start = 0
             for key, blocks in counts.items():
                 volume = scene.volumes[key] = scene._empty_volume()
-                volume.fill({name: arrays[OBJECT + name][start : start + blocks] for name in VOLUME_ARRAYS})
+                volume.fill({name: arrays[OBJECT + name][start : start + blocks] for name in OBJECT_ARRAYS})
                 start += blocks
         return scene
 
@@ -266,8 +267,7 @@ def _part(surface: UnlabeledMesh, voxels: VoxelGrid, chosen: Bool, instance_ids:
 
 def _cropped(frame: Frame, u0: int, v0: int, u1: int, v1: int) -> Frame:
     """Return the part of a frame from (u0, v0) to (u1, v1), exclusive."""
-    camera = frame.camera
-    part = replace(camera, width=u1 - u0, height=v1 - v0, cx=camera.cx - u0, cy=camera.cy - v0)
+    part = frame.camera.cropped(u0, v0, u1, v1)
     return Frame(
         frame.index, frame.timestamp, frame.color[v0:v1, u0:u1], frame.depth[v0:v1, u0:u1], part, sensor=frame.sensor
     )

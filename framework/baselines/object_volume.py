@@ -24,7 +24,7 @@ from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, BLOCK_VOXELS
 
 FOREGROUND = 0.5  # minimum foreground probability of the surface of the object, exclusive
 
-VOLUME_ARRAYS = (*(name for name in BLOCK_ARRAYS if name != "label_row"), *MaskCounts._fields)  # saved arrays
+OBJECT_ARRAYS = (*(name for name in BLOCK_ARRAYS if name != "label_row"), *MaskCounts._fields)  # saved arrays
 
 
 class ObjectVolume:
@@ -93,8 +93,8 @@ class ObjectVolume:
 
     def arrays(self) -> dict[str, Array]:
         """Return the arrays for a map file."""
-        arrays = self.volume.saved()[1] | {n: counts[: self.block_count] for n, counts in self.counts._asdict().items()}
-        return {name: arrays[name] for name in VOLUME_ARRAYS}
+        arrays = self.volume.arrays() | {n: counts[: self.block_count] for n, counts in self.counts._asdict().items()}
+        return {name: arrays[name] for name in OBJECT_ARRAYS}
 
     def fill(self, arrays: dict[str, Any]) -> None:
         """Copy the arrays of a map file into this empty volume."""

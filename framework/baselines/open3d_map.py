@@ -13,7 +13,7 @@ from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32,
 from framework.geometry import back_project, transform
 from framework.interfaces import Gravity, MapStatistics
 from framework.mapping.gravity import GravityEstimator
-from framework.mapping.instances.instance_list import Confirmation, InstanceTableMap
+from framework.mapping.instances.instance_list import Confirmation, InstanceTableMap, ListedInstances
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.storage.map_file import (
     CLASS_EVIDENCE,
@@ -42,6 +42,7 @@ class Open3DMap(InstanceTableMap):
         self.confirmation = confirmation
         self.grid = BlockGrid(settings)
         self.gravity_estimator = GravityEstimator()
+        self.listed = ListedInstances()
 
     @property
     def statistics(self) -> MapStatistics:

@@ -20,11 +20,19 @@ from framework.baselines.semantic_map_kernels import (
 from framework.data import Camera, Float32, Float64, Instance, InstanceMesh, Int32, SurfaceView, View
 from framework.interfaces import Gravity, MapStatistics, SceneMap
 from framework.mapping.instances.association import agreed_classes
-from framework.mapping.instances.instance_list import aligned_box, box_around, vertices_by_id, vertices_of_area
+from framework.mapping.instances.instance_list import (
+    InstanceList,
+    ListedInstances,
+    aligned_box,
+    box_around,
+    vertices_by_id,
+    vertices_of_area,
+)
 from framework.mapping.storage.map_file import map_file_errors, read_map, write_map
 from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
-from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
+from framework.mapping.voxels.packed_voxels import STORED_VOXELS
+from framework.mapping.voxels.tsdf_volume import VOLUME_ARRAYS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
 ABSENCE, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds
@@ -63,6 +71,7 @@ class SemanticMap(SceneMap):
         self.volume = volume
         self.elections = elections
         self.labels = ClassRows(volume.voxels)
+        self.listed = ListedInstances()
 
     def begin(self, classes: tuple[str, ...]) -> None:
         """Set the label space of the map.
@@ -139,13 +148,21 @@ class SemanticMap(SceneMap):
         The confidence is the mean probability of the class of the instance before this normalization. The number of
         observations is the maximum, over these voxels, of the number of frames under a mask.
         """
-        mesh, up, instances = self.mesh(), self.gravity().up, {}
+        return self.listed.of(self.mesh(), self._list)
+
+    def _list(self, mesh: InstanceMesh) -> InstanceList:
+        up = self.gravity().up
         found = self._sum_components(self.volume.surface().voxels, mesh.instance_ids)
-        for k, vertices in vertices_by_id(mesh.instance_ids).items():
-            sums, points = found.probability_sums[k], mesh.vertices[vertices]
-            instances[k] = Instance(
+
+        vertices_of = vertices_by_id(mesh.instance_ids)
+        sums_of = {k: found.probability_sums[k] for k in vertices_of}
+        distributions = {k: (sums / sums.sum()).astype(np.float32) for k, sums in sums_of.items()}
+
+        def create(k: int, vertices: Int32) -> Instance:
+            sums, points = sums_of[k], mesh.vertices[vertices]
+            return Instance(
                 id=k,
-                class_probabilities=(sums / sums.sum()).astype(np.float32),
+                class_probabilities=distributions[k],
                 confidence=float(sums[mesh.class_ids[vertices[0]]] / len(vertices)),
                 observations=int(found.masked[k]),
                 first_frame=int(found.first_frame[k]),
@@ -154,7 +171,9 @@ class SemanticMap(SceneMap):
                 aabb=aligned_box(points),
                 obb=box_around(points, up),
             )
-        return instances
+
+        class_ids = {k: int(distribution.argmax()) for k, distribution in distributions.items()}
+        return InstanceList(mesh, vertices_of, class_ids, create)
 
     def _sum_components(self, voxels: Int32, instance_ids: Int32) -> ComponentStatistics:
         entries = 1 + int(instance_ids.max(initial=0))
@@ -175,11 +194,11 @@ class SemanticMap(SceneMap):
             "classes": self.classes,
             "evicted": self.labels.evicted,
         }
-        write_map(path, header, arrays | self.labels.saved())
+        write_map(path, header, arrays | self.labels.saved(), stored=STORED_VOXELS)
 
     @classmethod
     def load(cls, path: Path | str) -> SemanticMap:
-        header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *ClassEvidence._fields))
+        header, arrays = read_map(path, FORMAT, (*VOLUME_ARRAYS, *ClassEvidence._fields))
         with map_file_errors(path):
             volume = TsdfVolume.load(header, arrays, len(arrays["rest"]))
             bounds = {"absence_likelihood_ratio": ABSENCE, "min_area": AREA, "smoothness": SMOOTHNESS}

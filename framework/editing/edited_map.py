@@ -20,7 +20,6 @@ from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.evidence_rows import Storage
 from framework.mapping.labels.label_evidence import MAX_SCORE, Evidence
 from framework.mapping.labels.label_rule import EXACT_BITS
-from framework.mapping.voxels.tsdf_volume import NO_BLOCKS
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE
 from framework.vocabulary.label_spaces import with_similar
 
@@ -45,7 +44,7 @@ class EditedMap:
         self._keep_most_likely(kept)
         scene.table.records = {key: scene.table.records[key] for key in kept}
         scene.confirmation = Confirmation(min_observations=1, min_confidence=0.0, min_area=0.0)
-        scene.volume.changed(NO_BLOCKS)
+        scene.relabel()
 
     def apply(self, edit: Edit) -> str:
         """Apply an edit, and return a description of its result.
@@ -112,7 +111,7 @@ class EditedMap:
         evidence.instance_ids[voxels, 0] = key
         if key == 0:
             evidence.instance_value[voxels, 0] = 0
-        self.scene.volume.changed(NO_BLOCKS)
+        self.scene.relabel()
 
     def _rename(self, key: int, name: str) -> None:
         if name not in self.scene.classes:
@@ -129,7 +128,7 @@ class EditedMap:
         slots[0] = k + 1
         evidence.class_ids[voxels] = slots
         evidence.class_value[voxels] = np.where(np.arange(len(slots)) == 0, score, 0)
-        self.scene.volume.changed(NO_BLOCKS)
+        self.scene.relabel()
 
     def _split(self, edit: Split) -> list[int]:
         """Split an instance, and return the ids of the new instances."""

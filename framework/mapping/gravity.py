@@ -30,6 +30,7 @@ FACING_UP = 2.0  # weight of horizontal surfaces that face up; 1 = all axes of a
 MIN_FRACTION = 0.15  # minimum fraction of the surface area that is horizontal or vertical; a heap of objects has less
 LEVEL = np.cos(np.radians(18.0))  # minimum dot product of up and the normal of a floor
 STEP = 0.05  # bin size of heights, m
+FLOOR_SAMPLED = 100_000  # approximate number of triangles sampled for the height of the floor
 FLOOR_FRACTION = 0.05  # minimum area of the floor, as a fraction of the area of all horizontal surfaces
 BELOW_FLOOR = 0.02  # maximum fraction of the surface area below the floor; caused by noise, windows and mirrors
 
@@ -123,8 +124,7 @@ class GravityEstimator:
         length = float(np.linalg.norm(self.camera_up))
         if length < 10.0**-DIGITS or not len(triangles):
             return None
-        chosen = triangles[:: max(1, len(triangles) // SAMPLED)]
-        normals, areas, _ = faces(vertices, chosen)
+        normals, areas, _ = faces(vertices, _sampled(triangles, SAMPLED))
         camera_up = self.camera_up / length
         directions = half_sphere(DIRECTIONS)
         directions *= np.where(directions @ camera_up < 0, -1.0, 1.0)[:, None]
@@ -144,6 +144,11 @@ def _vector(header: MapHeader, key: str) -> Float64:
             f"got {saved!r:.60}"
         )
     return np.array(numbers)
+
+
+def _sampled(triangles: Int32, count: int) -> Int32:
+    """Return at least `count` evenly spaced triangles, or all if there are fewer."""
+    return triangles[:: max(1, len(triangles) // count)]
 
 
 def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float64]:
@@ -210,7 +215,7 @@ def floor_height(vertices: Float32, triangles: Int32, up: Float64) -> float | No
         triangles: The triangles (F, 3).
         up: The up direction (3,), a unit vector in the world frame.
     """
-    normals, areas, centers = faces(vertices, triangles)
+    normals, areas, centers = faces(vertices, _sampled(triangles, FLOOR_SAMPLED))
     heights = centers @ up
     level = normals @ up > LEVEL
     if not level.any():

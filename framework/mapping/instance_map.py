@@ -8,20 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View, check_label_space
-from framework.errors import DataError
 from framework.interfaces import Gravity, MapStatistics
 from framework.mapping.instances.association_kernels import look_up_instances
-from framework.mapping.instances.instance_list import Confirmation, InstanceClass, InstanceTableMap
+from framework.mapping.instances.instance_list import Confirmation, InstanceClass, InstanceTableMap, ListedInstances
 from framework.mapping.instances.instance_table import InstanceTable
-from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
-from framework.mapping.labels.label_evidence import Evidence
-from framework.mapping.labels.vertex_labels_kernels import label_vertices
+from framework.mapping.labels.packed_evidence import STORED_EVIDENCE, PackedEvidence, checked_evidence, pack_evidence
+from framework.mapping.labels.vertex_labels import VertexLabels
 from framework.mapping.storage.map_file import (
     CLASS_EVIDENCE,
     check_known,
-    check_like,
-    check_numbers,
+    check_memory,
     map_file_errors,
     plain_table,
     read_map,
@@ -31,11 +28,13 @@ from framework.mapping.storage.map_file import (
 )
 from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
-from framework.mapping.voxels.raycasting import render
-from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
+from framework.mapping.voxels.packed_voxels import STORED_VOXELS
+from framework.mapping.voxels.raycasting import render, tiles_around
+from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VOLUME_ARRAYS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
 FORMAT = 9  # format of the map file; increment it when the meaning of the contents changes
+SAVED_ARRAYS = (*VOLUME_ARRAYS, *PackedEvidence._fields, CLASS_EVIDENCE)
 LARGEST_SCALE = 2**40  # maximum score_scale of a map file (quantized class score for evidence of 1)
 
 
@@ -59,6 +58,9 @@ class InstanceMap(InstanceTableMap):
         self.table = InstanceTable(labels.combine, logarithmic)
         self.confirmation = confirmation
         self.instance_class = instance_class
+        self.listed = ListedInstances()
+        self.vertex_labels = VertexLabels()
+        self._merged: set[int] = set()  # instances that were merged into others since the last mesh
 
     @property
     def statistics(self) -> MapStatistics:
@@ -99,6 +101,7 @@ class InstanceMap(InstanceTableMap):
         """Merge instance `dropped` into instance `kept`."""
         self.table.merge(kept, dropped)
         self.labels.merge_instances(kept, dropped)
+        self._merged.add(dropped)
         self.volume.changed(NO_BLOCKS)
 
     def add_class(self, name: str) -> None:
@@ -117,6 +120,10 @@ class InstanceMap(InstanceTableMap):
         volume = self.volume
         return render(volume.voxels, self.labels.evidence, volume.sensor, camera, T_world_camera)
 
+    def instance_at(self, u: int, v: int, camera: Camera, T_world_camera: Float64) -> int:
+        part, u, v = tiles_around(camera, u, v)
+        return int(self.render(part, T_world_camera).instance_ids[v, u])
+
     def render_near(
         self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
     ) -> SurfaceView:
@@ -125,15 +132,22 @@ class InstanceMap(InstanceTableMap):
     def mesh(self) -> InstanceMesh:
         return self.volume.mesh(self._labeled)
 
+    def relabel(self) -> None:
+        """Discard the labels of the mesh after a change to the label evidence of any voxel."""
+        self.vertex_labels = VertexLabels()
+        self.volume.changed(NO_BLOCKS)
+
     def _labeled(self, surface: UnlabeledMesh) -> InstanceMesh:
         grid, counts = self.volume.voxels.grid, self.confirmation.counts(self.table)
-        colors = np.empty((len(surface.voxels), 3), np.uint8)
-        instance_ids, class_ids = np.empty((2, len(surface.voxels)), np.int32)
-        label_vertices(grid, self.labels.evidence, counts, surface, colors, instance_ids, class_ids)
-        too_small = self.confirmation.too_small(instance_ids, self.volume.voxel_size)
-        instance_ids[too_small] = 0
-        class_ids[too_small] = -1
-        return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
+        starts, changed = self.volume.nets.take_changed()
+        relabeled = self._merged | self.vertex_labels.changed_ids(counts)
+        changed[self.labels.blocks_with(relabeled)] = True
+        self._merged = set()
+        labels = self.vertex_labels.update(grid, self.labels.evidence, counts, surface, starts, changed)
+        too_small = self.confirmation.too_small(labels.instance_ids, self.volume.voxel_size)
+        instance_ids = np.where(too_small, np.int32(0), labels.instance_ids)
+        class_ids = np.where(too_small, np.int32(-1), labels.class_ids)
+        return InstanceMesh(surface.vertices, surface.triangles, labels.colors, instance_ids, class_ids, self.classes)
 
     def gravity(self) -> Gravity:
         return self.volume.gravity()
@@ -151,11 +165,13 @@ class InstanceMap(InstanceTableMap):
             "evicted": self.labels.evicted,
             "table": plain_table(self.table),
         }
-        write_map(path, header, arrays | self.labels.in_use()._asdict() | table_arrays(self.table, len(self.classes)))
+        labels = pack_evidence(self.labels.in_use())._asdict()
+        labels |= table_arrays(self.table, len(self.classes))
+        write_map(path, header, arrays | labels, stored=(*STORED_VOXELS, *STORED_EVIDENCE))
 
     @classmethod
     def load(cls, path: Path | str) -> InstanceMap:
-        header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields, CLASS_EVIDENCE))
+        header, arrays = read_map(path, FORMAT, SAVED_ARRAYS)
         with map_file_errors(path):
             classes, storage = header.classes(), header.option("storage", Storage)
             table = table_of(header.part("table"), len(classes), arrays)
@@ -165,21 +181,11 @@ class InstanceMap(InstanceTableMap):
             instance_class = header.option("instance_class", InstanceClass)
             scene = cls(volume, labels, table.logarithmic, confirmation, instance_class)
             scene.begin(classes)
-            expected = scene.labels.evidence._asdict()
-            check_like(arrays, {"labeled": expected.pop("labeled")}, len(arrays["labeled"]))
-            if storage is Storage.EXACT and arrays["instance_ids"].ndim:
-                slots = max(arrays["instance_ids"].shape[-1], 1)  # the number of slots that the map needed
-                for name in ("instance_ids", "instance_value"):
-                    expected[name] = np.empty((0, slots), expected[name].dtype)
-            check_like(arrays, expected, len(arrays["instance_ids"]))
-            check_numbers("labeled", arrays["labeled"], len(arrays["instance_ids"]))
-            check_known("class_ids", arrays["class_ids"], [NO_CLASS, *range(1, len(classes) + 1)])
-            check_known("instance_ids", arrays["instance_ids"], [0, *table.records])
-            if count := int((arrays["class_ids"][:, 0] == NO_CLASS).sum()):
-                raise DataError(
-                    f"class_ids: expected a class in slot 0 of each labeled voxel, got a free slot 0 in {count} voxels"
-                )
-            scene.labels.fill(Evidence(**{name: arrays[name] for name in Evidence._fields}))
+            packed = checked_evidence(arrays, scene.labels.evidence, scene.labels.max_instance_slots)
+            check_known("class_ids", packed.class_ids, range(1, len(classes) + 1))
+            check_known("instance_ids", packed.instance_ids, [0, *table.records])
+            check_memory(volume.voxels.byte_count + scene.labels.unpacked_bytes(packed))
+            scene.labels.unpack(packed)
             scene.labels.evicted = header.whole("evicted")
             scene.table = table
         return scene

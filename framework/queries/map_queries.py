@@ -10,15 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from framework.data import Camera, Float64, Instance, InstanceMesh, View
+from framework.data import Camera, Float32, Float64, Instance, InstanceMesh, View
 from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.gravity import floor_height
+from framework.mapping.instances.instance_list import InstanceList, bounds_of
 from framework.runtime.forked_process import ProcessLock
+
+TOLERANCE = 1e-6  # m, maximum rounding error of a bounding box
 
 
 class Map:
-    """Thread-safe queries of a map, independent of the fuser."""
+    """Thread-safe queries of a map, independent of the fuser.
+
+    Mapping waits only while a query reads the map. The results do not change with the map.
+    """
 
     scene: SceneMap
     lock: ProcessLock  # held during a query and while a frame is mapped
@@ -26,10 +32,11 @@ class Map:
     def __init__(self, scene: SceneMap) -> None:
         self.scene = scene
         self.lock = ProcessLock()
+        self._floor: tuple[InstanceMesh, float | None] | None = None  # height of the floor in the last mesh
 
     def __getstate__(self) -> dict[str, Any]:
         with self.lock:
-            return {name: value for name, value in vars(self).items() if name != "lock"}
+            return {name: value for name, value in vars(self).items() if name != "lock"} | {"_floor": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, lock=ProcessLock())
@@ -49,14 +56,8 @@ class Map:
             DataError: The class is unknown.
         """
         with self.lock:
-            found = self.scene.instances()
-            if class_ is None:
-                return found
-            if class_ not in self.classes:
-                close = get_close_matches(class_, self.classes, n=1)
-                hint = f"; did you mean {close[0]!r}?" if close else ""
-                raise DataError(f"class: expected a class of this map, got {class_!r}{hint}")
-            return {key: instance for key, instance in found.items() if self.name(instance) == class_}
+            found, classes = self.scene.instances(), self.classes
+        return found if class_ is None else _of_class(found, class_, classes)
 
     def name(self, instance: Instance) -> str:
         """Return the most likely class of an object, or "object" in a map without classes."""
@@ -80,13 +81,9 @@ class Map:
         if target.shape != (3,) or not np.isfinite(target).all():
             raise DataError(f"point: expected 3 finite coordinates in the world frame, m, got {point!r:.60}")
         with self.lock:
-            found = self.instances(class_)
+            found, classes = self.scene.instances(), self.classes
             vertices = self.scene.mesh().vertices if found else np.zeros((0, 3), np.float32)
-
-            def distance(instance: Instance) -> float:
-                return float(np.linalg.norm(vertices[instance.vertices] - target, axis=1).min(initial=np.inf))
-
-            return min(found.values(), key=distance, default=None)
+        return _nearest(found if class_ is None else _of_class(found, class_, classes), vertices, target)
 
     def view(self, camera: Camera, T_world_camera: Float64) -> View:
         """Return the view of the map from a pose.
@@ -100,7 +97,8 @@ class Map:
         """
         with self.lock:
             view = self.scene.render(camera, T_world_camera)
-            unknown = ~np.isin(view.instance_ids, [0, *self.scene.instances()])
+            found = self.scene.instances()
+        unknown = ~np.isin(view.instance_ids, [0, *found])
         return replace(
             view,
             instance_ids=np.where(unknown, np.int32(0), view.instance_ids),
@@ -125,7 +123,9 @@ class Map:
         if not (0 <= u < camera.width and 0 <= v < camera.height):
             raise DataError(f"pixel: expected u, v in an image of {camera.width}x{camera.height} px, got ({u}, {v})")
         with self.lock:
-            return self.scene.instances().get(int(self.view(camera, T_world_camera).instance_ids[int(v), int(u)]))
+            key = self.scene.instance_at(int(u), int(v), camera, T_world_camera)
+            found = self.scene.instances() if key else {}
+        return found.get(key)
 
     def up(self) -> Float64 | None:
         """Return the up direction (3,), a unit vector in the world frame, or None if unknown.
@@ -148,7 +148,10 @@ class Map:
         """
         with self.lock:
             up, mesh = self.scene.gravity().up, self.scene.mesh()
-            return None if up is None else floor_height(mesh.vertices, mesh.triangles, up)
+        known = self._floor
+        if known is None or known[0] is not mesh:
+            known = self._floor = mesh, None if up is None else floor_height(mesh.vertices, mesh.triangles, up)
+        return known[1]
 
     def mesh(self, instance: Instance | int | None = None) -> InstanceMesh:
         """Return the surface of the map or of one object.
@@ -163,11 +166,11 @@ class Map:
             whole = self.scene.mesh()
             if instance is None:
                 return whole
-            key = instance.id if isinstance(instance, Instance) else instance
-            found = self.scene.instances().get(key)
-            if found is None:
-                raise DataError(f"instance: expected an id of this map, got {key!r}")
-            return whole.of(found)
+            instances = self.scene.instances()
+        key = instance.id if isinstance(instance, Instance) else instance
+        if key not in instances:
+            raise DataError(f"instance: expected an id of this map, got {key!r}")
+        return instances.mesh_of(key) if isinstance(instances, InstanceList) else whole.of(instances[key])
 
     def save(self, path: Path | str) -> None:
         """Write the map to one file, atomically. Read it with `load_map`.
@@ -177,3 +180,36 @@ class Map:
         """
         with self.lock:
             self.scene.save(path)
+
+
+def _of_class(found: Mapping[int, Instance], class_: str, classes: tuple[str, ...]) -> Mapping[int, Instance]:
+    """Return the objects whose most likely class is `class_`.
+
+    Raises:
+        DataError: The class is unknown.
+    """
+    if class_ not in classes:
+        close = get_close_matches(class_, classes, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise DataError(f"class: expected a class of this map, got {class_!r}{hint}")
+    index = classes.index(class_)
+    if isinstance(found, InstanceList):  # without creating the instances
+        return found.of_class(index)
+    return {key: instance for key, instance in found.items() if instance.class_probabilities.argmax() == index}
+
+
+def _nearest(found: Mapping[int, Instance], vertices: Float32, target: Float64) -> Instance | None:
+    """Return the object whose vertices are nearest to a point (3,), m. Ties go to the first object.
+
+    `vertices` (V, 3) are those of the map.
+    """
+    low, high = bounds_of(found)
+    # no vertex is nearer than the bounding box of its object
+    to_box = np.linalg.norm(np.maximum(np.maximum(low - target, target - high), 0), axis=1) - TOLERANCE
+    ids, best = [*found], (np.inf, 0)
+    for k in np.argsort(to_box):
+        if to_box[k] > best[0]:
+            break
+        own = vertices[found[ids[k]].vertices]
+        best = min(best, (float(np.linalg.norm(own - target, axis=1).min(initial=np.inf)), int(k)))
+    return found[ids[best[1]]] if found else None

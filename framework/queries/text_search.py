@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -115,11 +115,12 @@ def by_embedding(scene: Map, text: Float32) -> list[Match]:
         DataError: The embeddings of the map have another length.
     """
     with scene.lock:
-        known = {k: i.embedding for k, i in scene.instances().items() if i.embedding is not None}
-        lengths = {len(embedding) for embedding in known.values()}
-        if lengths - {len(text)}:
-            raise DataError(f"map: expected embeddings of length {len(text)}, got {max(lengths - {len(text)})}")
-        return _found(scene, {k: float(embedding @ text) for k, embedding in known.items()})
+        instances, mesh = scene.instances(), scene.mesh()
+    known = {k: i.embedding for k, i in instances.items() if i.embedding is not None}
+    lengths = {len(embedding) for embedding in known.values()}
+    if lengths - {len(text)}:
+        raise DataError(f"map: expected embeddings of length {len(text)}, got {max(lengths - {len(text)})}")
+    return _found(scene, instances, mesh, {k: float(embedding @ text) for k, embedding in known.items()})
 
 
 def by_names(scene: Map, query: str) -> list[Match]:
@@ -131,22 +132,22 @@ def by_names(scene: Map, query: str) -> list[Match]:
         DataError: A word is unknown, or the query has neither a class nor a color.
     """
     with scene.lock:
-        words = object_words(query, scene.classes)
-        if words.unknown or not (words.classes or words.colors):
-            unknown = ", ".join(map(repr, words.unknown or [query]))
-            there = ", ".join(sorted({scene.name(instance) for instance in scene.instances().values()}))
-            raise DataError(
-                f"query: expected classes of this map or colors, got {unknown}; use the classes of its objects "
-                f"({there or 'none'}) or the colors {', '.join(COLOR_NAMES)}"
-            )
-        columns = [scene.classes.index(name) for name in words.classes]
-        mesh, matches = scene.mesh(), {}
-        for k, instance in scene.instances().items():
-            of_class = float(instance.class_probabilities[columns].sum()) if columns else 1.0
-            match = of_class * (color_fit(mesh, instance, words.colors) if words.colors else 1.0)
-            if match >= MIN_MATCH:
-                matches[k] = round(match, 2)  # finer differences are not significant
-        return _found(scene, matches)
+        instances, mesh, classes = scene.instances(), scene.mesh(), scene.classes
+    words = object_words(query, classes)
+    if words.unknown or not (words.classes or words.colors):
+        unknown = ", ".join(map(repr, words.unknown or [query]))
+        there = ", ".join(sorted({scene.name(instance) for instance in instances.values()}))
+        raise DataError(
+            f"query: expected classes of this map or colors, got {unknown}; use the classes of its objects "
+            f"({there or 'none'}) or the colors {', '.join(COLOR_NAMES)}"
+        )
+    columns, matches = [classes.index(name) for name in words.classes], {}
+    for k, instance in instances.items():
+        of_class = float(instance.class_probabilities[columns].sum()) if columns else 1.0
+        match = of_class * (color_fit(mesh, instance, words.colors) if words.colors else 1.0)
+        if match >= MIN_MATCH:
+            matches[k] = round(match, 2)  # finer differences are not significant
+    return _found(scene, instances, mesh, matches)
 
 
 def color_fit(mesh: InstanceMesh, instance: Instance, colors: Sequence[str]) -> float:
@@ -160,9 +161,10 @@ def _colors(mesh: InstanceMesh, instance: Instance) -> Float32:
     return np.asarray(mesh.colors[instance.vertices].astype(np.float32) / np.float32(255), np.float32)
 
 
-def _found(scene: Map, similarities: dict[int, float]) -> list[Match]:
+def _found(
+    scene: Map, instances: Mapping[int, Instance], mesh: InstanceMesh, similarities: dict[int, float]
+) -> list[Match]:
     """Return the matches of objects with known similarities, best first."""
-    instances, mesh = scene.instances(), scene.mesh()
     return [
         Match(
             instance=instances[k],

@@ -18,6 +18,7 @@ from typing import Any
 from unittest import mock
 
 from tests.acceptance import recording_checks
+from tests.acceptance.large_map import measure_large_map
 from tests.acceptance.runner import CHECKOUT, Measured, measurement
 
 SHARED = CHECKOUT.parent / "shared" / "data"
@@ -159,6 +160,24 @@ def hashing_cost() -> Measured:
                 ratios.append(verified / seconds())
     cost = 100 * (statistics.median(ratios) - 1)
     return cost, cost <= 5
+
+
+@measurement("slowest query <= 10 ms, unchanged map of 20 rooms, 1 cm", *PIPELINE)
+def large_map_query() -> Measured:
+    value = measure_large_map(SHARED / "redkitchen").query_ms
+    return value, value <= 10
+
+
+@measurement("saving <= 3 s, 20 rooms, 1 cm", *PIPELINE)
+def large_map_saving() -> Measured:
+    value = measure_large_map(SHARED / "redkitchen").saving
+    return value, value <= 3
+
+
+@measurement("loading <= 3 s, 20 rooms, 1 cm", *PIPELINE)
+def large_map_loading() -> Measured:
+    value = measure_large_map(SHARED / "redkitchen").loading
+    return value, value <= 3
 
 
 @measurement("exit status 0, 30 kills", *PIPELINE, "tests/framework/commands/running")

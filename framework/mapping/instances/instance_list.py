@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
 
 from framework.config.validation import check_bounds
-from framework.data import Bool, Box, Float32, Float64, Instance, Int32
+from framework.data import Bool, Box, Float32, Float64, Instance, InstanceMesh, Int32
 from framework.interfaces import SceneMap
 from framework.mapping.instances.association import agreed_classes
 from framework.mapping.instances.instance_table import InstanceRecord, InstanceTable
@@ -90,6 +91,7 @@ class InstanceTableMap(SceneMap):
 
     table: InstanceTable
     confirmation: Confirmation
+    listed: ListedInstances  # the instances of the current mesh
 
     @property
     def embedding_space(self) -> str:
@@ -123,24 +125,131 @@ class InstanceTableMap(SceneMap):
 
         Oriented boxes are upright if the gravity direction is known.
         """
-        mesh, up, instances = self.mesh(), self.gravity().up, {}
-        class_evidence = self.class_evidence()
-        for k, vertices in vertices_by_id(mesh.instance_ids).items():
-            record, points = self.table.records[k], mesh.vertices[vertices]
-            instances[k] = Instance(
+        return self.listed.of(self.mesh(), self._list)
+
+    def _list(self, mesh: InstanceMesh) -> InstanceList:
+        up, known, class_ids = self.gravity().up, {}, {}
+        for k, evidence in self.class_evidence().items():
+            record, distribution = self.table.records[k], self.table.distribution(evidence)
+            class_ids[k] = int(distribution.argmax())
+            known[k] = partial(
+                Instance,
                 id=k,
-                class_probabilities=self.table.distribution(class_evidence[k]),
+                class_probabilities=distribution,
                 confidence=record.confidence,
                 observations=record.observations,
                 first_frame=record.first_frame,
                 last_frame=record.last_frame,
-                vertices=vertices,
-                aabb=aligned_box(points),
-                obb=box_around(points, up),
                 embedding=None if record.embedding is None else record.embedding.mean,
                 embedding_spread=None if record.embedding is None else record.embedding.spread,
             )
-        return instances
+
+        def create(k: int, vertices: Int32) -> Instance:
+            points = mesh.vertices[vertices]
+            return known[k](vertices=vertices, aabb=aligned_box(points), obb=box_around(points, up))
+
+        return InstanceList(mesh, vertices_by_id(mesh.instance_ids), class_ids, create)
+
+
+class InstanceList(Mapping[int, Instance]):
+    """The instances of a mesh by id, in ascending order. Each is created when it is first accessed.
+
+    Later changes to the map have no effect.
+    """
+
+    def __init__(
+        self,
+        mesh: InstanceMesh,
+        vertices: Mapping[int, Int32],
+        class_ids: Mapping[int, int],
+        create: Callable[[int, Int32], Instance],
+    ) -> None:
+        """List instances of a mesh.
+
+        Args:
+            mesh: The mesh.
+            vertices: The ascending vertex indices (M,) of each instance by id.
+            class_ids: The most likely class of each instance by id.
+            create: Function that returns an instance, given its id and its vertices (M,). It must not read the map,
+                which may have changed.
+        """
+        self._mesh, self._vertices, self._class_ids, self._create = mesh, vertices, class_ids, create
+        self._created: dict[int, Instance] = {}
+
+    def __getitem__(self, key: int) -> Instance:
+        if key not in self._created:
+            created = self._create(key, self._vertices[key])
+            self._created.setdefault(key, created)  # another thread may have created it
+        return self._created[key]
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._vertices
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._vertices)
+
+    def __len__(self) -> int:
+        return len(self._vertices)
+
+    def __reduce__(self) -> tuple[type, tuple[dict[int, Instance]]]:
+        return dict, (dict(self),)
+
+    def of_class(self, class_id: int) -> InstanceList:
+        """Return the instances with the given most likely class."""
+        chosen = {key: vertices for key, vertices in self._vertices.items() if self._class_ids[key] == class_id}
+        return InstanceList(self._mesh, chosen, self._class_ids, lambda key, _: self[key])
+
+    def mesh_of(self, key: int) -> InstanceMesh:
+        """Return the mesh of an instance: its vertices, in order, and the triangles between them."""
+        triangles = self._triangles.get(key, np.zeros(0, np.int32))
+        return self._mesh.part(self._vertices[key], self._mesh.triangles[triangles])
+
+    @cached_property
+    def _triangles(self) -> dict[int, Int32]:
+        """Ascending indices of the triangles of each instance."""
+        a, b, c = (self._mesh.instance_ids[self._mesh.triangles[:, k]] for k in range(3))
+        return vertices_by_id(np.where((a == b) & (b == c), a, np.int32(0)))
+
+    @cached_property
+    def bounds(self) -> tuple[Float64, Float64]:
+        """Minimum and maximum coordinates (N, 3) of the vertices of each instance in the world frame, m."""
+        if not self._vertices:
+            return np.zeros((0, 3)), np.zeros((0, 3))
+        vertices = list(self._vertices.values())
+        points = self._mesh.vertices[np.concatenate(vertices)].astype(np.float64)
+        starts = np.cumsum([0, *map(len, vertices[:-1])])
+        return np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
+
+
+def bounds_of(instances: Mapping[int, Instance]) -> tuple[Float64, Float64]:
+    """Return the minimum and maximum coordinates (N, 3) of each instance in the world frame, m."""
+    if isinstance(instances, InstanceList):  # without creating the instances
+        return instances.bounds
+    centers, extents = (
+        np.array([getattr(one.aabb, side) for one in instances.values()], np.float64).reshape(-1, 3)
+        for side in ("center", "extent")
+    )
+    return centers - extents / 2, centers + extents / 2
+
+
+class ListedInstances:
+    """The instances of a map, listed again when the map has another mesh.
+
+    A map has another mesh after each change to its labels, its instances or its surface.
+    """
+
+    def __init__(self) -> None:
+        self._mesh: InstanceMesh | None = None
+        self._instances: Mapping[int, Instance] = {}
+
+    def __reduce__(self) -> tuple[type[ListedInstances], tuple[()]]:
+        return ListedInstances, ()
+
+    def of(self, mesh: InstanceMesh, list_: Callable[[InstanceMesh], Mapping[int, Instance]]) -> Mapping[int, Instance]:
+        """Return the instances of the current mesh, which `list_` returns for a mesh."""
+        if mesh is not self._mesh:
+            self._instances, self._mesh = list_(mesh), mesh
+        return self._instances
 
 
 def vertices_of_area(area: float, voxel_size: float) -> int:
@@ -160,9 +269,13 @@ def vertices_by_id(instance_ids: Int32) -> dict[int, Int32]:
 
     Id 0 is omitted.
     """
-    order = np.argsort(instance_ids, kind="stable").astype(np.int32)
-    ids, starts = np.unique(instance_ids[order], return_index=True)
-    return {int(k): vertices for k, vertices in zip(ids, np.split(order, starts[1:]), strict=False) if k > 0}
+    labeled = np.flatnonzero(instance_ids > 0).astype(np.int32)
+    ids = instance_ids[labeled]
+    # NumPy uses the faster radix sort for 16-bit keys
+    order = np.argsort(ids.astype(np.uint16) if ids.max(initial=0) < 2**16 else ids, kind="stable")
+    ids, vertices = ids[order], labeled[order]
+    starts = np.flatnonzero(np.diff(ids, prepend=0))
+    return dict(zip(ids[starts].tolist(), np.split(vertices, starts[1:]), strict=False))
 
 
 def aligned_box(points: Float32) -> Box:

@@ -6,12 +6,13 @@ takes 2 KiB. A voxel becomes labeled when it is near the measured surface and it
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from enum import Enum
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from framework.data import Bool, Float64, Int32
+from framework.data import Bool, Float64, Int32, Int64
 from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS, ClassIds, class_id_type
 from framework.mapping.labels.evidence_rows_kernels import (
     BITS,
@@ -25,11 +26,13 @@ from framework.mapping.labels.evidence_rows_kernels import (
 )
 from framework.mapping.labels.label_evidence import UNSEEN, Evidence, Measurement
 from framework.mapping.labels.label_evidence_kernels import Combine
+from framework.mapping.labels.packed_evidence import PackedEvidence, unpack_evidence
 from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
 INSTANCE_SLOTS = 4  # number of instance slots of a voxel in compact storage
+MAX_SLOTS = 2**16 - 1  # maximum number of instance slots of a voxel in a map file
 RESERVED = 128  # initial capacity for labeled voxels per block of `max_blocks`; most blocks need fewer
 ANY_INSTANCE = np.uint64(2**BITS - 1)  # instance set with every bit set
 SLOTS = Evidence._fields[1:]  # fields with one row per labeled voxel
@@ -112,6 +115,24 @@ class EvidenceRows:
             array[:, : given.shape[1]] = given
             array[:, given.shape[1] :] = 0
 
+    @property
+    def max_instance_slots(self) -> int:
+        """Maximum number of instance slots of a voxel."""
+        return INSTANCE_SLOTS if self.storage is Storage.COMPACT else MAX_SLOTS
+
+    def unpacked_bytes(self, saved: PackedEvidence) -> int:
+        """Return the size of the evidence of a map file in memory."""
+        slots = max(self._instance_slots, int(saved.instance_slots.max(initial=0)))
+        row = self._labeled.itemsize * BLOCK_VOXELS + self._row_bits.itemsize
+        return row * len(saved.labeled) + self._slot_type(slots).itemsize * len(saved.states)
+
+    def unpack(self, saved: PackedEvidence) -> None:
+        """Replace the evidence with the evidence of a map file."""
+        self._instance_slots = max(self._instance_slots, int(saved.instance_slots.max(initial=0)))
+        self._free()
+        self._reserve(len(saved.labeled), len(saved.states))
+        unpack_evidence(saved, self._free_classes(), self.in_use(), self._row_bits[: self.row_count])
+
     def begin(self, classes: int) -> None:
         """Set the number of classes before the first update."""
         self._class_id_type = class_id_type(classes)
@@ -167,6 +188,15 @@ class EvidenceRows:
         row_bits = self._row_bits[: self.row_count]
         merge_instances(self.evidence, row_bits, np.int32(kept), np.int32(dropped), int(self.combine))
 
+    def blocks_with(self, instance_ids: Collection[int]) -> Int64:
+        """Return the blocks that may have evidence for any of the instances, which are more than those that do."""
+        if not instance_ids or not self.row_count:
+            return np.zeros(0, np.int64)
+        bits = np.bitwise_or.reduce(np.uint64(1) << np.array([*instance_ids], np.uint64) % np.uint64(BITS))
+        label_row = self.voxels.grid.label_row[: self.voxels.block_count]
+        found = (self._row_bits[: self.row_count] & bits) != 0
+        return np.flatnonzero((label_row >= 0) & found[label_row])
+
     def classes_of_instances(self, counts: Bool, classes: int) -> Float64:
         """Return the class evidence (ids + 1, classes) of the instances, summed over their voxels.
 
@@ -179,12 +209,16 @@ class EvidenceRows:
     def _free(self) -> None:
         self._labeled = reserved(self.voxels.max_blocks, lambda rows: np.empty((rows, BLOCK_VOXELS), np.int32))
         self._row_bits = np.empty(len(self._labeled), np.uint64)  # bit k % BITS = a voxel may have instance k
-        scores = np.int16 if self.storage is Storage.COMPACT else np.int64
-        shapes = self._instance_slots, self._instance_slots, self._class_slots, self._class_slots
-        kinds = zip(SLOTS, (np.int32, np.float32, self._class_id_type, scores), shapes, strict=True)
-        slots = np.dtype([(name, kind, (count,)) for name, kind, count in kinds], align=True)
+        slots = self._slot_type(self._instance_slots)
         self._slots = reserved(RESERVED * self.voxels.max_blocks, lambda voxels: np.empty(voxels, slots))
         self._lay_out()
+
+    def _slot_type(self, instance_slots: int) -> np.dtype[Any]:
+        """Return the type of the slots of a voxel."""
+        scores = np.int16 if self.storage is Storage.COMPACT else np.int64
+        shapes = instance_slots, instance_slots, self._class_slots, self._class_slots
+        kinds = zip(SLOTS, (np.int32, np.float32, self._class_id_type, scores), shapes, strict=True)
+        return np.dtype([(name, kind, (count,)) for name, kind, count in kinds], align=True)
 
     def _lay_out(self) -> None:
         self.evidence = Evidence(self._labeled, **{name: self._slots[name] for name in SLOTS})

@@ -50,7 +50,8 @@ def _prefetch_slots(evidence, voxel):
 
 
 @device
-def _instance_bit(instance):
+def instance_bit(instance):
+    """Return the instance set with one instance."""
     return ONE << (np.uint64(instance) % np.uint64(BITS))
 
 
@@ -60,7 +61,7 @@ def find_list_bits(offsets, clusters, instance_id, list_bits):
     for i in range(list_bits.shape[0]):
         list_bits[i] = 0
         for entry in range(offsets[i], offsets[i + 1]):
-            list_bits[i] |= _instance_bit(instance_id[clusters[entry]])
+            list_bits[i] |= instance_bit(instance_id[clusters[entry]])
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -196,8 +197,8 @@ def merge_instances(evidence, row_bits, kept, dropped, combine):
     Only the rows whose instance set (R,) may contain `dropped` are visited.
     """
     for row in prange(row_bits.shape[0]):
-        if row_bits[row] & _instance_bit(dropped):
-            row_bits[row] |= _instance_bit(kept)
+        if row_bits[row] & instance_bit(dropped):
+            row_bits[row] |= instance_bit(kept)
             for voxel in evidence.labeled[row]:
                 if voxel >= 0:
                     _merge_voxel(evidence.instance_ids[voxel], evidence.instance_value[voxel], kept, dropped, combine)

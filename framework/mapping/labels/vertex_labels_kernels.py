@@ -141,3 +141,39 @@ def label_vertices(grid, evidence, counts, surface, colors, instance_ids, class_
                 instance, label = _elect(grid, evidence, counts, blocks, voxels, weights, ids)
             instance_ids[v] = instance
             class_ids[v] = label
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def mark_around(grid, blocks, marked):
+    """Set `marked` (B,) to True for the given blocks (A,) and all blocks next to them."""
+    for a in prange(len(blocks)):
+        key, region = NO_LOOK_UP
+        bx, by, bz = grid.block_coords[blocks[a], 0], grid.block_coords[blocks[a], 1], grid.block_coords[blocks[a], 2]
+        for o in range(27):
+            x, y, z = bx + o % 3 - 1, by + o // 3 % 3 - 1, bz + o // 9 - 1
+            block, key, region = find_block(grid, x, y, z, key, region)
+            if block >= 0:
+                marked[block] = True
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def carry_over(outdated, starts, old_starts, old, new):
+    """Copy the labels of all blocks that are not outdated from an earlier mesh.
+
+    Args:
+        outdated: A Boolean array (B,), True for blocks whose labels are not copied.
+        starts: The first vertex (B + 1,) of each block, and the number of vertices.
+        old_starts: The same numbers in the earlier mesh.
+        old: The labels of the earlier mesh.
+        new: The output.
+    """
+    colors, instance_ids, class_ids = new.colors, new.instance_ids, new.class_ids
+    for block in prange(len(outdated)):
+        if not outdated[block]:
+            source = old_starts[block]
+            for v in range(starts[block], starts[block + 1]):
+                for c in range(3):
+                    colors[v, c] = old.colors[source, c]
+                instance_ids[v] = old.instance_ids[source]
+                class_ids[v] = old.class_ids[source]
+                source += 1

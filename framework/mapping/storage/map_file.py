@@ -6,7 +6,7 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from framework.files.search_paths import usable_path
 from framework.mapping.instances.instance_table import FrameSet, InstanceRecord, InstanceTable
 from framework.mapping.instances.object_embedding import ARRAYS, SPACE, embedding_arrays, read_embeddings
 from framework.mapping.labels.label_evidence_kernels import Combine
+from framework.mapping.storage.map_file_kernels import find_unknown
 from framework.mapping.storage.map_header import LARGEST_COUNT, MapHeader, whole
 from framework.mapping.voxels.voxel_grid_kernels import FARTHEST_BLOCK
 
@@ -40,10 +41,19 @@ class _TooLargeError(DataError):
     """Error for a map file that exceeds the memory limit."""
 
 
-def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+def write_map(
+    path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array], stored: Collection[str] = ()
+) -> None:
     """Write a header and arrays to a map file.
 
     The file has no timestamps and can be read by np.load.
+
+    Args:
+        path: The file.
+        header: The header.
+        arrays: The arrays by name.
+        stored: The names of arrays with little redundancy. They are not compressed, because it would take seconds for
+            a large map.
     """
     target = usable_path("map file", path)
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -52,14 +62,17 @@ def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, 
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=DEFLATE_LEVEL) as archive,
     ):
         for name, array in {HEADER: encoded, **arrays}.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+            member_name = f"{name}.npy"
+            info = zipfile.ZipInfo(member_name) if name in stored else member_name  # a ZipInfo is not compressed
+            with archive.open(info, "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
 
 
 def read_map(path: Path | str, expected_format: object, names: Sequence[str]) -> tuple[MapHeader, dict[str, Any]]:
     """Return the header, the named arrays and any embeddings of a map file.
 
-    Array sizes are checked against the file and the available memory before allocation.
+    Array sizes are checked against the file and the available memory before allocation. The checksum of each array is
+    checked while it is read.
 
     Raises:
         DataError: If the file is not a map file, has another format or is damaged.
@@ -69,9 +82,6 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
         found = header.values.get("format")
         if found != expected_format:
             raise DataError(f"expected map format {expected_format}, got {found!r:.60}")
-        damaged = archive.testzip()
-        if damaged is not None:
-            raise DataError(f"{damaged}: expected the stored CRC-32 checksum, got a different checksum")
         there = set(archive.namelist())
         optional = [name for name in ARRAYS if f"{name}.npy" in there]
         return header, {name: _array(archive, name) for name in dict.fromkeys((*names, *optional))}
@@ -115,14 +125,18 @@ def map_file_errors(path: Path | str) -> Iterator[None]:
 def _opened(path: Path | str) -> Iterator[zipfile.ZipFile]:
     check_regular(usable_path("map file", path))  # its errors contain the path
     with map_file_errors(path), zipfile.ZipFile(path) as archive:
-        unpacked = sum(info.file_size for info in archive.infolist())
-        limit = MAX_MEMORY_FRACTION * machine_memory()
-        if unpacked > limit:
-            raise _TooLargeError(
-                f"expected at most {limit:.0f} unpacked bytes (half of this machine's memory), got {unpacked}; open it "
-                "on a machine with more memory, or map again with a larger fuser.voxel_size"
-            )
+        check_memory(sum(info.file_size for info in archive.infolist()))
         yield archive
+
+
+def check_memory(size: int) -> None:
+    """Raise DataError if a map with `size` unpacked bytes exceeds the memory limit."""
+    limit = MAX_MEMORY_FRACTION * machine_memory()
+    if size > limit:
+        raise _TooLargeError(
+            f"expected at most {limit:.0f} unpacked bytes (half of this machine's memory), got {size}; open it "
+            "on a machine with more memory, or map again with a larger fuser.voxel_size"
+        )
 
 
 def _header(archive: zipfile.ZipFile) -> MapHeader:
@@ -147,7 +161,9 @@ def _array(archive: zipfile.ZipFile, name: str) -> Array:
             f"{name}: expected {claimed} bytes for shape {shape} and dtype {dtype}, got {info.file_size} bytes"
         )
     with archive.open(info) as member:
-        return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
+        array = np.asarray(np.lib.format.read_array(member, allow_pickle=False))
+        member.read()  # at the end of the data, zipfile compares the checksum
+    return array
 
 
 def machine_memory() -> int:
@@ -167,11 +183,13 @@ def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], lengt
         check_array(prefix + name, arrays[prefix + name], (length, *like.shape[1:]), like.dtype)
 
 
-def check_known(name: str, array: Array, known: Iterable[int]) -> None:
+def check_known(name: str, array: Array, known: Collection[int]) -> None:
     """Raise DataError unless all values of the array are in `known`."""
-    unknown = array[~np.isin(array, list(known))]  # kernels would use them as indices
-    if unknown.size:
-        raise DataError(f"{name}: expected ids in the map, got {unknown[0]}")
+    is_known = np.zeros(max(known, default=-1) + 1, np.bool_)
+    is_known[[*known]] = True
+    unknown = find_unknown(array.ravel(), is_known)  # kernels would use it as an index
+    if unknown >= 0:
+        raise DataError(f"{name}: expected ids in the map, got {array.flat[unknown]}")
 
 
 def check_numbers(name: str, numbers: Array, count: int) -> None:
@@ -193,7 +211,9 @@ def check_blocks(coords: Any) -> None:
             f"block_coords: expected values in [{1 - FARTHEST_BLOCK}, {FARTHEST_BLOCK - 1}], got {coords.min()} to "
             f"{coords.max()}"
         )
-    if len(np.unique(coords, axis=0)) < len(coords):
+    offset = np.asarray(coords, np.int64) + FARTHEST_BLOCK
+    keys = (offset[:, 0] * 2 * FARTHEST_BLOCK + offset[:, 1]) * 2 * FARTHEST_BLOCK + offset[:, 2]
+    if len(np.unique(keys)) < len(coords):
         raise DataError("block_coords: expected unique blocks, got duplicates")
 
 

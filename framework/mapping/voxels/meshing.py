@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from framework.data import Float32, Int32
+from framework.data import Bool, Float32, Int32
 from framework.mapping.voxels.meshing_kernels import (
     count_quads,
     find_cells,
@@ -53,7 +53,8 @@ class SurfaceNets:
         self._seen = np.zeros((1, BLOCK_SIDE), np.uint64)
         self._cells = np.zeros((1, BLOCK_SIDE), np.uint64)
         self._starts = np.zeros((0, BLOCK_SIDE), np.int32)  # index of the first vertex of each slice
-        self._changed = np.zeros(0, np.bool_)  # (B,)
+        self._changed = np.zeros(0, np.bool_)  # (B,) since the last extraction
+        self._not_taken = np.zeros(0, np.bool_)  # (B,) changed since the last call of `take_changed`
         self._surface = UnlabeledMesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.int32))
 
     def changed(self, blocks: Int32) -> None:
@@ -62,7 +63,17 @@ class SurfaceNets:
         New blocks need not be marked.
         """
         known = blocks[blocks < len(self._changed)]
-        self._changed[known] = True
+        self._changed[known] = self._not_taken[known] = True
+
+    def take_changed(self) -> tuple[Int32, Bool]:
+        """Return the first vertex (B + 1,) of each block of the last surface, and the changed blocks.
+
+        The first vertex is followed by the number of vertices. The Boolean array (B,) is True for blocks whose voxels
+        have changed since the last call.
+        """
+        starts = np.append(self._starts[:, 0], np.int32(len(self._surface.vertices)))
+        changed, self._not_taken = self._not_taken, np.zeros_like(self._not_taken)
+        return starts, changed
 
     def extract(self) -> UnlabeledMesh:
         """Return the current surface.
@@ -98,7 +109,8 @@ class SurfaceNets:
 
     def _grow(self, count: int) -> None:
         """Grow the arrays to the blocks of the grid, and mark the new blocks."""
-        self._changed = np.concatenate([self._changed, np.ones(count - len(self._changed), np.bool_)])
+        new = np.ones(count - len(self._changed), np.bool_)
+        self._changed, self._not_taken = np.append(self._changed, new), np.append(self._not_taken, new)
         if count + 1 > len(self._inside):
             capacity = len(self.voxels.grid.block_coords) + 1
             self._inside, self._seen, self._cells = (

@@ -34,7 +34,7 @@ from framework.mapping.voxels.raycasting_kernels import (
 from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.sensors.noise_models import SensorKind
 
-MAX_STRIDE = 8  # maximum distance between coarse rays, px
+MAX_STRIDE = TILE  # maximum distance between coarse rays, px
 
 
 def tile_bounds(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float32]:
@@ -92,6 +92,14 @@ def _stride(camera: Camera, voxel_size: float, max_depth: float) -> int:
     # resolves the details of the map at any depth
     resolved = DETAIL * voxel_size * min(camera.fx, camera.fy) / max_depth
     return 1 << int(np.log2(min(max(resolved, 1.0), MAX_STRIDE)))
+
+
+def tiles_around(camera: Camera, u: int, v: int) -> tuple[Camera, int, int]:
+    """Return the camera of the image tiles that determine pixel (u, v), and the pixel in its image."""
+    left, top = TILE * (u // TILE), TILE * (v // TILE)
+    # pixels are interpolated between rays at the corners of their tile, which belong to the next tiles
+    right, bottom = min(left + 2 * TILE, camera.width), min(top + 2 * TILE, camera.height)
+    return camera.cropped(left, top, right, bottom), u - left, v - top
 
 
 def render(voxels: VoxelGrid, evidence: Evidence, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> View:

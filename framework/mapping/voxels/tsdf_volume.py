@@ -12,17 +12,20 @@ from framework.config.validation import check_bounds
 from framework.data import Array, Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView
 from framework.interfaces import Gravity
 from framework.mapping.gravity import GravityEstimator
-from framework.mapping.storage.map_file import check_blocks, check_like, check_numbers
+from framework.mapping.storage.map_file import check_blocks, check_like, check_memory, check_numbers
 from framework.mapping.storage.map_header import MapHeader
 from framework.mapping.voxels.integration import Integrator, SeenBlocks
 from framework.mapping.voxels.integration_parameters import BOUNDS, Sensor
 from framework.mapping.voxels.meshing import SurfaceNets, UnlabeledMesh
+from framework.mapping.voxels.packed_voxels import PackedVoxels, checked_voxels, pack_voxels, unpack_voxels
 from framework.mapping.voxels.raycasting import render_surface
 from framework.mapping.voxels.voxel_grid import MAX_BLOCKS, VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, find_solid_blocks, mark_outdated
 from framework.sensors.noise_models import SensorKind
 
-BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # saved arrays of the grid
+BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # arrays of the grid
+VOLUME_ARRAYS = ("block_coords", "label_row", *PackedVoxels._fields)  # arrays of a map file
+BLOCK_BYTES = 8 * BLOCK_VOXELS + 64  # size of a block of the grid, approximately
 NO_BLOCKS = np.zeros(0, np.int32)
 
 
@@ -79,10 +82,15 @@ class TsdfVolume:
         elif self._nets is not None:
             self._nets.changed(blocks)
 
+    @property
+    def nets(self) -> SurfaceNets:
+        """The surface nets of the voxels."""
+        self._nets = self._nets or SurfaceNets(self.voxels)
+        return self._nets
+
     def surface(self) -> UnlabeledMesh:
         """Return the current surface without labels."""
-        self._nets = self._nets or SurfaceNets(self.voxels)
-        return self._nets.extract()
+        return self.nets.extract()
 
     def gravity(self) -> Gravity:
         """Return the gravity direction, cached until the volume changes."""
@@ -107,7 +115,6 @@ class TsdfVolume:
 
     def saved(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Return the header entries and the arrays for a map file."""
-        b = self.voxels.block_count
         header = {
             "voxel_size": self.voxel_size,
             "sensor": {name: float(value) for name, value in self.sensor._asdict().items()},
@@ -115,7 +122,12 @@ class TsdfVolume:
             "frames": self.integrator.frames,
             **self.gravity_estimator.saved(),
         }
-        return header, {name: getattr(self.voxels.grid, name)[:b] for name in BLOCK_ARRAYS}
+        blocks = {name: array for name, array in self.arrays().items() if name in VOLUME_ARRAYS}
+        return header, blocks | pack_voxels(self.voxels)._asdict()
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the arrays of the grid without unused capacity."""
+        return {name: getattr(self.voxels.grid, name)[: self.voxels.block_count] for name in BLOCK_ARRAYS}
 
     @classmethod
     def load(cls, header: MapHeader, arrays: dict[str, Any], rows: int) -> TsdfVolume:
@@ -135,23 +147,31 @@ class TsdfVolume:
         volume = cls(header.number("voxel_size", BOUNDS["voxel_size"]), sensor, max_blocks)
         volume.integrator.frames = header.whole("frames")  # determines the rounding of the next frame
         volume.gravity_estimator = GravityEstimator.of(header)
-        check_like(arrays, volume.saved()[1], len(arrays["block_coords"]))
+        blocks = {name: volume.arrays()[name] for name in ("block_coords", "label_row")}
+        check_like(arrays, blocks, len(arrays["block_coords"]))
         check_numbers("label_row", arrays["label_row"], rows)
-        volume.fill(arrays)
+        packed = checked_voxels(arrays)
+        check_memory(BLOCK_BYTES * len(packed.observed))
+        volume._allocate(arrays["block_coords"])
+        volume.voxels.grid.label_row[: volume.voxels.block_count] = arrays["label_row"]
+        unpack_voxels(packed, volume.voxels)
+        find_solid_blocks(volume.voxels.grid, volume.voxels.block_count)
         return volume
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Copy the arrays of a map file into this empty volume.
+        """Copy the arrays of another volume into this empty volume.
 
         The caller must check their types and shapes.
         """
-        coords = arrays["block_coords"]
-        check_blocks(coords)
-        self.voxels.allocate(coords)
+        self._allocate(arrays["block_coords"])
         b = self.voxels.block_count
         for name in arrays.keys() & set(BLOCK_ARRAYS):
             getattr(self.voxels.grid, name)[:b] = arrays[name]
         find_solid_blocks(self.voxels.grid, b)
+
+    def _allocate(self, coords: Int32) -> None:
+        check_blocks(coords)
+        self.voxels.allocate(coords)
 
 
 @dataclass

@@ -1,19 +1,22 @@
 """Tests for a map with instances: mesh, instances, saving and loading."""
 
 import json
+import pickle
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from framework.data import Detections, Frame, Pose
+from framework.data import Detections, Frame, Instance, Pose
 from framework.errors import DataError
 from framework.mapping.instance_map import FORMAT, InstanceMap
 from framework.mapping.instances.instance_list import oriented_box
 from framework.refinement.lifting import lift
 from framework.registry import assemble
+from framework.testing.contracts import same
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.support.scenes.analytic_scene import Scene, room, walk
 
@@ -165,6 +168,67 @@ def test_instance_map_excludes_instances_below_threshold(
     assert loaded.render(room().frame(T).camera, T).instance_ids.any(), (
         "expected unconfirmed instances in the view, because association uses them"
     )
+
+
+def assert_current(scene: InstanceMap) -> None:
+    """Compare the mesh and the instances with those of a copy without derived data."""
+    copy: InstanceMap = pickle.loads(pickle.dumps(scene))
+    assert same(scene.mesh(), copy.mesh())
+    assert_same_instances(scene.instances(), copy.instances())
+
+
+def assert_same_instances(found: Mapping[int, Instance], expected: Mapping[int, Instance]) -> None:
+    assert [*found] == [*expected]
+    assert all(same(found[key], expected[key]) for key in expected)
+
+
+def test_instance_map_after_each_frame_equals_rebuilt_map() -> None:
+    """Instances are confirmed in the third frame, and merged later."""
+    fuser = mapped(room(), 2)
+    assert_current(fuser.scene)
+    for k, T in enumerate(walk(12)[2:8], 2):
+        fused(fuser, room(), k, T)
+        if k == 5:
+            first, second, *_ = fuser.scene.instance_ids()
+            fuser.scene.merge(first, second)
+        assert_current(fuser.scene)
+    assert 0 < len(fuser.scene.instances()) < 3
+
+
+@pytest.mark.parametrize("change", ["frame", "merge", "relabel", "add_class", "confirmation", "colors"])
+def test_instance_map_lists_instances_again_after_change(change: str) -> None:
+    fuser = mapped(room(), 4)
+    scene, T = fuser.scene, walk(12)[5]
+    before = scene.instances()
+    first, second, *_ = before
+    assert scene.instances() is before
+    match change:
+        case "frame":
+            fused(fuser, room(), 4, T)
+        case "merge":
+            scene.merge(first, second)
+        case "relabel":
+            evidence = scene.labels.in_use()
+            evidence.instance_ids[evidence.instance_ids == second] = first
+            scene.relabel()
+        case "add_class":
+            scene.add_class("table")
+        case "confirmation":  # as of a resumed run
+            fuser.voxels.confirmation = replace(fuser.voxels.confirmation, min_observations=5)
+            fuser.resume(scene)
+        case "colors":
+            fuser.renew_colors()
+            fused(fuser, room(), 4, T)
+    assert scene.instances() is not before
+    assert_current(scene)
+
+
+def test_instance_map_list_keeps_state_after_later_frames() -> None:
+    fuser = mapped(room(), 4)
+    listed, expected = fuser.scene.instances(), pickle.loads(pickle.dumps(fuser.scene)).instances()
+    fused(fuser, room(), 4, walk(12)[5])
+    fuser.scene.merge(*[*listed][:2])
+    assert_same_instances(listed, expected)
 
 
 @pytest.mark.parametrize("points", [1, 2, 3])

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,6 +16,8 @@ from framework.api import Map, Mapper, load_map
 from framework.data import Camera
 from framework.datasets.tum_rgbd import TumRgbd
 from framework.errors import ConfigError, DataError
+from framework.mapping.instances.instance_list import InstanceList
+from framework.queries import map_queries
 from tests.support.scenes.corner_room import CornerRoom
 
 pytestmark = pytest.mark.integration
@@ -88,6 +93,80 @@ def test_map_at_pixel_matches_view(asked: Map) -> None:
     assert asked.at_pixel(int(u), int(v), frame.camera, frame.T_world_camera) is None
     with pytest.raises(DataError, match=r"pixel: expected u, v in an image of .*, got \(-1, 0\)"):
         asked.at_pixel(-1, 0, frame.camera, frame.T_world_camera)
+
+
+@pytest.mark.parametrize("fuser", ["bayesian_tsdf", "object_volumes", "open3d_vbg", "class_only_fusion"])
+def test_map_queries_equal_slow_reference(fuser: str) -> None:
+    """Compare `at_pixel` with the whole view, and `nearest` with a search of all vertices."""
+    mapper = Mapper(*STAGES[:-1], f"fuser={fuser}", "fuser.voxel_size=0.04")
+    rng = np.random.default_rng(0)
+    for frame in CornerRoom():
+        mapper.add(frame)
+        assert frame.T_world_camera is not None
+        camera = replace(frame.camera, width=frame.camera.width - 3, cx=frame.camera.cx - 0.3)  # no whole tiles
+        view = mapper.view(camera, frame.T_world_camera)
+        for v in (*range(0, camera.height, 7), camera.height - 1):
+            for u in (*range(0, camera.width, 9), camera.width - 1):
+                found = mapper.at_pixel(u, v, camera, frame.T_world_camera)
+                assert (found.id if found else 0) == view.instance_ids[v, u]
+        instances, vertices = mapper.instances(), mapper.mesh().vertices
+        for class_ in (None, *{mapper.name(instance) for instance in instances.values()}):
+            for point in rng.uniform(-3, 3, (10, 3)):
+                nearest = mapper.nearest(point, class_)
+                distances = {
+                    key: np.linalg.norm(vertices[instance.vertices] - point, axis=1).min()
+                    for key, instance in instances.items()
+                    if class_ is None or mapper.name(instance) == class_
+                }
+                assert (nearest.id if nearest else 0) == min(distances, key=distances.__getitem__, default=0)
+    assert len(mapper.instances()) >= 2
+
+
+def test_map_queries_repeated_do_not_list_instances_again(mapper: Mapper) -> None:
+    instances, floor = mapper.instances(), mapper.floor()
+    with mock.patch.object(map_queries, "floor_height", side_effect=AssertionError):
+        assert mapper.floor() == floor
+    assert mapper.instances() is instances
+    key = next(iter(instances))
+    assert mapper.instances()[key] is instances[key]
+    assert pickle.loads(pickle.dumps(instances)).keys() == instances.keys()
+
+
+def test_map_nearest_leaves_far_instances_out(mapper: Mapper) -> None:
+    """The vertices of an object are read only if its box is nearer than the nearest vertex."""
+    copy: Map = pickle.loads(pickle.dumps(Map(mapper.scene)))
+    instances = copy.instances()
+    assert isinstance(instances, InstanceList)
+    key = next(iter(instances))
+    found = copy.nearest(mapper.mesh().vertices[mapper.instances()[key].vertices[0]])
+    assert found is not None
+    assert found.id == key
+    assert [*instances._created] == [key]
+
+
+@pytest.mark.parametrize("fuser", ["bayesian_tsdf", "object_volumes", "open3d_vbg", "class_only_fusion"])
+def test_map_objects_of_class_are_not_created(fuser: str) -> None:
+    mapper = Mapper(*STAGES[:-1], f"fuser={fuser}", "fuser.voxel_size=0.04")
+    for frame in CornerRoom():
+        mapper.add(frame)
+    everything = mapper.instances()
+    assert isinstance(everything, InstanceList)
+    for class_ in mapper.classes:
+        found = mapper.instances(class_)
+        assert isinstance(found, InstanceList)
+        assert not found._created
+        assert [*found] == [key for key, instance in everything.items() if mapper.name(instance) == class_]
+        assert all(found[key] is everything[key] for key in found)
+
+
+def test_map_mesh_of_object_contains_its_triangles(mapper: Mapper) -> None:
+    whole = mapper.mesh()
+    for key, instance in mapper.instances().items():
+        part = mapper.mesh(key)
+        inside = np.isin(whole.triangles, instance.vertices).all(axis=1)
+        np.testing.assert_array_equal(instance.vertices[part.triangles], whole.triangles[inside])
+        np.testing.assert_array_equal(part.vertices, whole.vertices[instance.vertices])
+        assert (part.instance_ids == key).all()
 
 
 def test_map_view_hides_unconfirmed_instances() -> None:

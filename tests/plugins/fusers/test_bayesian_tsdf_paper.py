@@ -217,6 +217,7 @@ def roll_classes(scene: InstanceMap, shift: int) -> None:
     used = scene.labels.in_use()
     named = used.class_ids != NO_CLASS
     used.class_ids[named] = (used.class_ids[named] - 1 + shift) % len(scene.classes) + 1
+    scene.relabel()
 
 
 @pytest.mark.parametrize(("source", "changes"), [("VOXELS", True), ("DETECTIONS", False)])

@@ -70,6 +70,9 @@ def test_map_arrays_with_invalid_ids_raise(
         ("instance", FAR),
         ("class_ids", 200),
         ("class_evidence", 1e13),
+        ("states", 511),
+        ("instance_slots", 1000),
+        ("class_slots", 0),
         ("block_coords", FAR),
     ]:
         if name in arrays:

@@ -22,11 +22,12 @@ ARRAYS = {
     "flags": np.array([True, False]),
     "empty": np.zeros((0, 512), np.uint8),
 }
+STORED = ("noise", "strided", "empty")
 
 
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
-    write_map(tmp_path / "map.npz", HEADER, ARRAYS)
+    write_map(tmp_path / "map.npz", HEADER, ARRAYS, stored=STORED)
     return tmp_path / "map.npz"
 
 
@@ -42,7 +43,7 @@ def test_map_file_round_trip_keeps_header_and_arrays(saved: Path) -> None:
 
 
 def test_map_file_is_reproducible(saved: Path, tmp_path: Path) -> None:
-    write_map(tmp_path / "again.npz", HEADER, {name: array.copy() for name, array in ARRAYS.items()})
+    write_map(tmp_path / "again.npz", HEADER, {name: array.copy() for name, array in ARRAYS.items()}, STORED)
     assert (tmp_path / "again.npz").read_bytes() == saved.read_bytes()
     with zipfile.ZipFile(saved) as archive:
         assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}, (
@@ -60,9 +61,19 @@ def test_map_file_is_compressed_at_level_1(saved: Path) -> None:
     assert sizes["few.npy"] == len(by_zlib.compress(few) + by_zlib.flush())
 
 
-def test_map_file_changed_byte_raises(saved: Path) -> None:
+def test_map_file_stored_arrays_are_not_compressed(saved: Path) -> None:
+    with zipfile.ZipFile(saved) as archive:
+        stored = {info.filename for info in archive.infolist() if info.compress_type == zipfile.ZIP_STORED}
+    assert stored == {f"{name}.npy" for name in STORED}
+
+
+@pytest.mark.parametrize("name", ["header", "noise", "few", "strided"])
+def test_map_file_changed_byte_raises(saved: Path, name: str) -> None:
     content = bytearray(saved.read_bytes())
-    content[len(content) // 3] ^= 0x10
+    with zipfile.ZipFile(saved) as archive:
+        info = archive.getinfo(f"{name}.npy")
+    data = info.header_offset + 30 + len(info.filename) + 20  # after the header with 64-bit sizes
+    content[data + info.compress_size // 2] ^= 0x10
     saved.write_bytes(content)
     with pytest.raises(DataError, match=r"map\.npz"):
         read_map(saved, 7, list(ARRAYS))
