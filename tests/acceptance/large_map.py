@@ -16,6 +16,7 @@ import numpy as np
 
 from framework.api import Mapper, load_map
 from framework.data import Frame
+from framework.datasets.frames.sequence_reader import FRAME_RATE
 from framework.datasets.rgbd_folder import RgbdFolder
 
 ROOMS = 20
@@ -46,8 +47,8 @@ def measure_large_map(source: Path) -> LargeMap:
         mapper = Mapper("tracker=ground_truth", **cache)
         copies = (_moved(frame, number * SPACING) for number in range(ROOMS) for frame in room)
         for k, frame in enumerate(copies):
-            mapper.add(replace(frame, index=k))
-        query_ms = _slowest_query(mapper, replace(frame, index=k))
+            mapper.add(replace(frame, index=k, timestamp=k / FRAME_RATE))
+        query_ms = _slowest_query(mapper, replace(frame, index=k, timestamp=k / FRAME_RATE))
         path = Path(folder, "map.npz")
         saving = _seconds(lambda: mapper.save(path))
         loading = _seconds(lambda: load_map(path))
@@ -93,7 +94,7 @@ def _slowest_query(mapper: Mapper, frame: Frame) -> float:
     for query, ask in queries.items():
         after_change = []
         for _ in range(CHANGES):
-            frame = replace(frame, index=frame.index + 1)
+            frame = replace(frame, index=frame.index + 1, timestamp=frame.timestamp + 1 / FRAME_RATE)
             mapper.add(frame)
             after_change.append(_seconds(ask, 1))
         unchanged = _seconds(ask, CALLS)

@@ -175,6 +175,7 @@ class InstanceList(Mapping[int, Instance]):
         """
         self._mesh, self._vertices, self._class_ids, self._create = mesh, vertices, class_ids, create
         self._created: dict[int, Instance] = {}
+        self._of_class: dict[int, InstanceList] = {}
 
     def __getitem__(self, key: int) -> Instance:
         if key not in self._created:
@@ -196,8 +197,10 @@ class InstanceList(Mapping[int, Instance]):
 
     def of_class(self, class_id: int) -> InstanceList:
         """Return the instances with the given most likely class."""
-        chosen = {key: vertices for key, vertices in self._vertices.items() if self._class_ids[key] == class_id}
-        return InstanceList(self._mesh, chosen, self._class_ids, lambda key, _: self[key])
+        if class_id not in self._of_class:
+            chosen = {key: vertices for key, vertices in self._vertices.items() if self._class_ids[key] == class_id}
+            self._of_class[class_id] = InstanceList(self._mesh, chosen, self._class_ids, lambda key, _: self[key])
+        return self._of_class[class_id]
 
     def mesh_of(self, key: int) -> InstanceMesh:
         """Return the mesh of an instance: its vertices, in order, and the triangles between them."""

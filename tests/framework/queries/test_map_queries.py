@@ -154,6 +154,7 @@ def test_map_objects_of_class_are_not_created(fuser: str) -> None:
     for class_ in mapper.classes:
         found = mapper.instances(class_)
         assert isinstance(found, InstanceList)
+        assert found is mapper.instances(class_)
         assert not found._created
         assert [*found] == [key for key, instance in everything.items() if mapper.name(instance) == class_]
         assert all(found[key] is everything[key] for key in found)
