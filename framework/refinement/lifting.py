@@ -6,13 +6,9 @@ from typing import cast
 
 import numpy as np
 
-from framework.data import Bool, Detections, Float32, Frame, Int32, Int64, PointClusters, Pose
+from framework.data import MAX_COVERAGE, Bool, Detections, Float32, Frame, Int32, Int64, PointClusters, Pose
 from framework.errors import DataError
 from framework.refinement.lifting_kernels import count_readings, gather_readings, move_masks
-
-# maximum number of points of a frame, relative to the pixels of the image; the masks of three networks in six real
-# scenes have at most 2.8; the default refiner and fuser need 80 bytes and 0.2 us per point
-MAX_COVERAGE = 8
 
 
 def lift(detections: Detections, frame: Frame, pose: Pose, color_pixels: Int32 | None = None) -> PointClusters:

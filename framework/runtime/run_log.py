@@ -15,10 +15,9 @@ from typing import get_args
 import numpy as np
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from framework.data import Array, DelayEstimate, Float64, Frame, PointClusters, Pose
+from framework.data import MAX_COVERAGE, Array, DelayEstimate, Float64, Frame, PointClusters, Pose
 from framework.errors import DataError, FrameError, NoPoseError
 from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
-from framework.refinement.lifting import MAX_COVERAGE
 from framework.runtime.digests import StageDigest, digest_of
 from framework.runtime.frame_stream import steady_time
 from framework.runtime.progress import Progress

@@ -17,11 +17,10 @@ import numpy as np
 import pytest
 from tqdm import TMonitor
 
-from framework.data import MAX_CLASSES, Array, Detections, Frame, PointClusters, Pose
+from framework.data import MAX_CLASSES, MAX_COVERAGE, Array, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.interfaces import RGBDSequence, SceneMap, StageTimer, Viewer, untimed
 from framework.pipeline import Pipeline
-from framework.refinement.lifting import MAX_COVERAGE
 from framework.registry import assemble
 from framework.runs.metrics import run_metrics
 from framework.runtime.run_log import RunResult

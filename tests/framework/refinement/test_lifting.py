@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from framework.data import Detections, Frame, Pose
+from framework.data import MAX_COVERAGE, Detections, Frame, Pose
 from framework.errors import DataError
 from framework.geometry import inverse, project, transform
-from framework.refinement.lifting import MAX_COVERAGE, fitting_masks, lift
+from framework.refinement.lifting import fitting_masks, lift
 from tests.support.scenes.corner_room import CornerRoom, pose_at
 
 
