@@ -306,6 +306,8 @@ class Mapper(Map):
                 return FrameResult(found.T_world_camera, lost=True, reason=found.reason)
             self._T_world_color = self.pipeline.T_world_color
             now = self.scene.instance_ids()
+        if now is before:  # usual case
+            return FrameResult(found.T_world_camera)
         return FrameResult(found.T_world_camera, new=tuple(sorted(now - before)), removed=tuple(sorted(before - now)))
 
     def _warn_of_ignored_pose(self) -> None:

@@ -89,7 +89,8 @@ class ObjectMap(InstanceTableMap):
 
     def remove(self, instance_id: int) -> None:
         """Remove an object and its volume."""
-        del self.table.records[instance_id], self.volumes[instance_id]
+        self.table.remove(instance_id)
+        del self.volumes[instance_id]
         self.background.changed(NO_BLOCKS)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, masks: Mapping[int, Bool], band: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -87,6 +88,15 @@ class Open3DMap(InstanceTableMap):
         self.table.merge(kept, dropped)
         instance = self.grid.flat("instance")
         instance[instance == dropped] = kept
+        self.changed()
+
+    def remove(self, instance_ids: Sequence[int]) -> None:
+        """Remove instances and their votes."""
+        for k in instance_ids:
+            self.table.remove(k)
+        instance = self.grid.flat("instance")
+        removed = np.isin(instance, instance_ids)
+        instance[removed] = self.grid.flat("votes")[removed] = 0
         self.changed()
 
     def changed(self) -> None:

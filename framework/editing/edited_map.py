@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from copy import deepcopy
+from copy import copy
 from dataclasses import replace
 from itertools import count
 
@@ -42,7 +42,8 @@ class EditedMap:
         kept = [*scene.instances()]
         self._used = set(kept)  # ids that a new instance cannot have
         self._keep_most_likely(kept)
-        scene.table.records = {key: scene.table.records[key] for key in kept}
+        for key in scene.table.records.keys() - set(kept):
+            scene.table.remove(key)
         scene.confirmation = Confirmation(min_observations=1, min_confidence=0.0, min_area=0.0)
         scene.relabel()
 
@@ -71,7 +72,7 @@ class EditedMap:
                 self._check_ids(ids)
                 for key in ids:
                     self._assign(self._voxels_of(key), 0)
-                    del self.scene.table.records[key]
+                    self.scene.table.remove(key)
                 return f"delete {_listed(ids)}"
 
     def _check_ids(self, ids: tuple[int, ...] | list[int]) -> None:
@@ -143,8 +144,8 @@ class EditedMap:
         for number in range(1, int(part_ids.max()) + 1):
             key = next(one for one in count(1) if one not in self._used)
             self._used.add(key)
-            table.records[key] = replace(deepcopy(table.records[edit.id]), id=key)
-            table.last_id = max(table.last_id, key)
+            record = table.records[edit.id]
+            table.add(replace(record, id=key, observed_in=copy(record.observed_in), in_view=copy(record.in_view)))
             self._assign(voxels[voxel_parts == number], key)
             new.append(key)
         return new

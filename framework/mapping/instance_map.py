@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -103,6 +104,15 @@ class InstanceMap(InstanceTableMap):
         self.labels.merge_instances(kept, dropped)
         self._merged.add(dropped)
         self.volume.changed(NO_BLOCKS)
+
+    def remove(self, instance_ids: Sequence[int]) -> None:
+        """Remove instances and their evidence in the voxels."""
+        relabeled = self._merged | {k for k in instance_ids if self.vertex_labels.shows(k)}
+        self.volume.changed(self.labels.blocks_with(relabeled))  # not known after the removal
+        self._merged = set()
+        for k in instance_ids:
+            self.table.remove(k)
+        self.labels.remove_instances(instance_ids)
 
     def add_class(self, name: str) -> None:
         """Add a class to a map with classes. The class distributions of the instances do not change.

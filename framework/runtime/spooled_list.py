@@ -30,6 +30,9 @@ class Spool:
         self._end = 0  # size of the complete chunks, bytes
         self._failed = False
 
+    def __reduce__(self) -> tuple[type[Spool], tuple[Path | None]]:
+        return Spool, (self._folder,)  # a copy is empty
+
     def write(self, content: bytes) -> int | None:
         """Append the content, and return its position; None = it cannot be written."""
         if self._failed:
@@ -68,6 +71,9 @@ class SpooledList(Sequence[Item]):
     def __init__(self, spool: Spool) -> None:
         self._spool = spool
         self.clear()
+
+    def __reduce__(self) -> tuple[type[SpooledList[Item]], tuple[Spool], None, Iterator[Item]]:
+        return SpooledList, (self._spool,), None, iter(self)
 
     def clear(self) -> None:
         """Remove all items. Their space in the file is not reused."""

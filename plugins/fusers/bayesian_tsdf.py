@@ -59,6 +59,7 @@ class BayesianTsdf(MapFuser):
             self.association.observe(self.scene.table, matches, evidence.classes)
         with timer("association"):
             self.association.merge(self.scene, matches)
+            self.association.expire(self.scene)
 
     def evidence(self, clusters: PointClusters, instances: int) -> DetectionEvidence:
         """Return the log-likelihoods of the clusters.

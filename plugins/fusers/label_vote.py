@@ -66,3 +66,4 @@ class LabelVote(MapFuser):
             self.association.observe(self.scene.table, matches, evidence.classes)
         with timer("association"):
             self.association.merge(self.scene, matches)
+            self.association.expire(self.scene)

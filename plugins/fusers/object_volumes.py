@@ -74,7 +74,7 @@ class ObjectVolumes(MapFuser):
         with timer("update"):
             self._remove_empty(matches.instance_ids)
             observe(self.scene.table, matches, clusters.class_probabilities.astype(np.float64), self.create_points)
-            self._remove_unlikely()
+            self._remove_unlikely(matches)
 
     def _look_up(self, frame: Frame, T_world_camera: Float64, clusters: PointClusters) -> Overlaps:
         """Return the overlaps of the clusters with the objects at the measured surface."""
@@ -110,10 +110,13 @@ class ObjectVolumes(MapFuser):
                 self.scene.remove(instance_id)
                 instance_ids[instance_ids == instance_id] = 0
 
-    def _remove_unlikely(self) -> None:
-        for record in list(self.scene.table.records.values()):
-            if existence(record) < self.min_existence:
-                self.scene.remove(record.id)
+    def _remove_unlikely(self, matches: Matches) -> None:
+        """Remove unlikely objects. A frame changes the existence probability of visible and matched objects only."""
+        records = self.scene.table.records
+        changed = {*matches.overlaps.instance_ids.tolist(), *matches.instance_ids.tolist()} & records.keys()
+        for instance_id in sorted(changed):
+            if existence(records[instance_id]) < self.min_existence:
+                self.scene.remove(instance_id)
 
 
 def _masks(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> dict[int, Bool]:

@@ -65,6 +65,7 @@ class Open3DVoxelBlockGrid(MapFuser):
             self.association.observe(self.scene.table, matches, class_evidence)
         with timer("association"):
             self.association.merge(self.scene, matches)
+            self.association.expire(self.scene)
 
 
 def _paint(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> Int32:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from tests.acceptance import recording_checks
+from tests.acceptance import long_run, recording_checks
 from tests.acceptance.large_map import measure_large_map
 from tests.acceptance.runner import CHECKOUT, Measured, measurement
 
@@ -127,6 +127,23 @@ def speed_ratio() -> Measured:
         info = json.loads(report.read_text())["benchmarks"][0]["extra_info"]
     ours, theirs = info["whole loop, ms (ours, Open3D)"]
     return theirs / ours, theirs / ours >= 6
+
+
+@functools.cache
+def grown() -> long_run.Growth:
+    return long_run.measure()
+
+
+@measurement("< 50 bytes per frame, 20,000 frames of a known room", *PIPELINE)
+def long_run_growth() -> Measured:
+    value = grown().bytes_per_frame
+    return value, value < 50
+
+
+@measurement("last quarter <= 1.05 times the processor time per frame of the first, 20,000 frames", *PIPELINE)
+def long_run_slowdown() -> Measured:
+    value = grown().time_ratio
+    return value, value <= 1.05
 
 
 @measurement("exit status 0, 2,000 cases a test", *PIPELINE, "tests")

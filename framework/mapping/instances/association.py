@@ -5,17 +5,18 @@ the measured surface or in a ray-cast view. The ray-cast view is our interpretat
 
 A cluster and an instance can match if their overlap is large enough. By default, the overlap is relative to the smaller
 of the two, so that a part of an object matches the whole. Matching is one to one, in order of decreasing IoU. An
-unmatched cluster creates a new instance.
+unmatched cluster creates a new instance. Most instances of false detections stay tentative. They are removed after some
+time, so that the map of a known place does not grow.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,13 +24,17 @@ import numpy.typing as npt
 from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose, View, check_label_space
 from framework.errors import DataError
-from framework.mapping.instances.association_kernels import count_votes, find_seen
+from framework.mapping.instances.association_kernels import count_votes
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed_space
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
+if TYPE_CHECKING:
+    from framework.mapping.instances.instance_list import Confirmation
+
 VOTES_ACROSS = 320  # approximate number of voting pixels per image row; more take longer without improving the result
+MIN_PAIRS = 1024  # number of pairs with votes up to which those of removed instances are kept
 
 
 class InstanceSource(Enum):
@@ -86,16 +91,14 @@ def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> 
         instance_ids: The instance (h, w) at every stride-th pixel of every stride-th row, 0 = none.
         stride: The distance between the samples, px. Each sample counts as stride^2 pixels.
     """
-    is_seen = np.zeros(instance_ids.max() + 1, np.bool_)
-    find_seen(instance_ids, is_seen)
-    seen = np.flatnonzero(is_seen)
-    column = np.full(len(is_seen), len(seen), np.int32)  # column of each id in `votes`; the last column = no instance
-    column[seen] = np.arange(len(seen), dtype=np.int32)
+    flat = instance_ids.ravel()
+    seen = np.unique(flat[np.flatnonzero(np.diff(flat, prepend=0))])  # only the starts of runs, for speed
+    seen = seen[seen > 0]
     by_chunk = np.zeros((CHUNKS, points.cluster_count + 1, len(seen) + 1), np.int32)
-    count_votes(points, instance_ids, stride, column, by_chunk)
+    count_votes(points, instance_ids, stride, seen, by_chunk)
     votes = by_chunk.sum(axis=0, dtype=np.int32) * np.int32(stride**2)
     return Overlaps(
-        instance_ids=seen.astype(np.int32),
+        instance_ids=seen,
         visible=votes[-1, :-1],
         sizes=votes[:-1].sum(axis=1, dtype=np.int32),
         votes=votes[:-1, :-1],
@@ -139,6 +142,7 @@ class LabeledMap(Protocol):
     """A map with an instance table and instance labels in its voxels."""
 
     table: InstanceTable
+    confirmation: Confirmation
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
         """Return the most likely instance at the measured surface at every stride-th pixel of a frame, 0 = none.
@@ -152,6 +156,9 @@ class LabeledMap(Protocol):
 
     def merge(self, kept: int, dropped: int) -> None:
         """Merge instance `dropped` into instance `kept`."""
+
+    def remove(self, instance_ids: Sequence[int]) -> None:
+        """Remove instances and their evidence."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +184,7 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min
     """
     if not matches.clusters.detected:
         return
+    table.frames_detected += 1
     instance_ids, scores = matches.instance_ids, matches.clusters.scores
     embeddings = weighted_embeddings(matches.clusters)
     if any(instance_ids[k] for k in embeddings):
@@ -185,8 +193,7 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min
         score, embedding = float(scores[k]), embeddings.get(int(k))
         table.observe(int(instance_ids[k]), class_evidence[k], score, matches.frame_index, embedding)
     in_view = set(matches.overlaps.instance_ids[matches.overlaps.visible >= min_pixels].tolist())
-    for instance_id in in_view | set(instance_ids[instance_ids > 0].tolist()):
-        table.records[instance_id].in_view.add(matches.frame_index)
+    table.see(in_view | set(instance_ids[instance_ids > 0].tolist()), matches.frame_index)
 
 
 def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding]:
@@ -226,6 +233,9 @@ class Association:
     # minimum Bhattacharyya coefficient of the class distributions of two instances to merge them, in [0, 1]; 0 = any
     # classes are merged
     merge_agreement: float = 0.1
+    # number of frames with detections after which a tentative instance is removed if none of them detects it, >= 0;
+    # 0 = never
+    tentative_max_age: int = 300
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -237,8 +247,10 @@ class Association:
             merge_overlap=(0.0, 1.0),
             merge_frames=(1, 2**31),
             merge_agreement=(0.0, 1.0),
+            tentative_max_age=(0, 2**31),
         )
         self._merge_votes: Counter[tuple[int, int]] = Counter()  # votes by pair of instances; see merge_frames
+        self._max_pairs = MIN_PAIRS
 
     def match(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> tuple[PixelLists, Matches]:
         """Return the clusters at each pixel, and their matches with existing and new instances."""
@@ -289,6 +301,8 @@ class Association:
 
         The rule follows Voxblox++. At most one pair is merged per frame.
         """
+        if self.merge_overlap >= 1:
+            return
         matched = sorted(set(matches.instance_ids[matches.instance_ids > 0].tolist()))
         self._merge_votes.subtract(combinations(matched, 2))
         for k, row in enumerate(matches.overlaps.over_smaller(self.create_points)):
@@ -299,16 +313,28 @@ class Association:
                 self._merge_votes[pair] += 1
                 if self._merge_votes[pair] >= self.merge_frames and self._same_class(scene.table, *pair):
                     scene.merge(*pair)
-                    self._remove_votes(pair[1])
+                    del self._merge_votes[pair]
                     return  # the overlaps are now outdated; other pairs can be merged in later frames
+        self._forget_removed(scene.table)
+
+    def _forget_removed(self, table: InstanceTable) -> None:
+        """Discard the votes of removed instances, when the number of pairs has doubled."""
+        if len(self._merge_votes) > self._max_pairs:
+            known = table.records.keys()
+            self._merge_votes = Counter({pair: n for pair, n in self._merge_votes.items() if known >= {*pair}})
+            self._max_pairs = max(2 * len(self._merge_votes), MIN_PAIRS)
 
     def _same_class(self, table: InstanceTable, a: int, b: int) -> bool:
         """Return True if the class distributions of two instances allow a merge."""
         known = [table.class_probabilities(table.records[k])[None] for k in (a, b)]
         return bool(class_agreement(*known)[0, 0] >= self.merge_agreement)
 
-    def _remove_votes(self, instance_id: int) -> None:
-        self._merge_votes = Counter({pair: n for pair, n in self._merge_votes.items() if instance_id not in pair})
+    def expire(self, scene: LabeledMap) -> None:
+        """Remove the tentative instances that have reached `tentative_max_age`."""
+        scene.table.confirmed(scene.confirmation)  # updates the tentative instances
+        expired = scene.table.undetected(self.tentative_max_age) if self.tentative_max_age else []
+        if expired:
+            scene.remove(expired)
 
 
 def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str, ...]:

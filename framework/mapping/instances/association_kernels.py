@@ -54,31 +54,24 @@ def look_up_instances(
             instance_ids[row, column] = best_instance(evidence, voxel) if voxel >= 0 else np.int32(0)
 
 
-@njit(cache=True, nogil=True)
-def find_seen(instance_ids, seen):
-    """Set seen[id] to True for each instance in `instance_ids`."""
-    for instance in instance_ids.flat:
-        if instance > 0:
-            seen[instance] = True
-
-
 @device
-def _add_run(count, list_id, label, offsets, clusters, column, votes):
+def _add_run(count, list_id, label, offsets, clusters, seen, votes):
     """Add `count` pixels with the same cluster list and the same instance to the votes (N + 1, M + 1)."""
-    votes[votes.shape[0] - 1, column[label]] += count
+    column = np.searchsorted(seen, label) if label > 0 else seen.shape[0]
+    votes[votes.shape[0] - 1, column] += count
     for entry in range(offsets[list_id], offsets[list_id + 1]):
-        votes[clusters[entry], column[label]] += count
+        votes[clusters[entry], column] += count
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def count_votes(points, instance_ids, stride, column, votes):
+def count_votes(points, instance_ids, stride, seen, votes):
     """Count the pixels of each cluster on each instance.
 
     Args:
         points: The lists of clusters at the pixels.
         instance_ids: The instance (h, w) at every stride-th pixel of every stride-th row, 0 = none.
         stride: The distance between the samples, px.
-        column: The column of each instance in `votes`.
+        seen: The instances (M,) in `instance_ids`, ascending.
         votes: The counts (CHUNKS, N + 1, M + 1), modified in place. The last row counts all pixels, and the last column
             is for pixels without an instance.
     """
@@ -91,7 +84,7 @@ def count_votes(points, instance_ids, stride, column, votes):
             for sample in range(instance_ids.shape[1]):
                 i, found = list_ids[row * stride, sample * stride], instance_ids[row, sample]
                 if i != list_id or found != label:
-                    _add_run(count, list_id, label, offsets, clusters, column, votes[chunk])
+                    _add_run(count, list_id, label, offsets, clusters, seen, votes[chunk])
                     list_id, label, count = i, found, np.int32(0)
                 count += np.int32(1)
-        _add_run(count, list_id, label, offsets, clusters, column, votes[chunk])
+        _add_run(count, list_id, label, offsets, clusters, seen, votes[chunk])

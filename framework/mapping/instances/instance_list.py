@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import cv2
 import numpy as np
@@ -64,8 +64,7 @@ class Confirmation:
     def counts(self, table: InstanceTable) -> Bool:
         """Return a Boolean array (last id + 1,), True for instances that meet all conditions but the minimum area."""
         counts = np.zeros(table.last_id + 1, np.bool_)
-        for record in table.records.values():
-            counts[record.id] = self.is_met(record)
+        counts[[*table.confirmed(self)]] = True
         return counts
 
     def min_vertices(self, voxel_size: float) -> int:
@@ -98,10 +97,10 @@ class InstanceTableMap(SceneMap):
         return self.table.embedding_space
 
     def digest(self) -> int:
-        return zlib.crc32(repr(sorted(self.instance_ids())).encode(), super().digest())
+        return zlib.crc32(_checksum(self.instance_ids()).to_bytes(4, "little"), super().digest())
 
     def instance_ids(self) -> frozenset[int]:
-        return frozenset(np.flatnonzero(self.confirmation.counts(self.table)).tolist())
+        return self.table.confirmed(self.confirmation)
 
     def most_likely_classes(self) -> Mapping[int, tuple[int, float]]:
         evidence = self.class_evidence()
@@ -109,8 +108,8 @@ class InstanceTableMap(SceneMap):
 
     def class_evidence(self) -> dict[int, Float64]:
         """Return the class evidence (C,) of each confirmed instance by id, from its detections."""
-        confirmed = filter(self.confirmation.is_met, self.table.records.values())
-        return {record.id: record.class_evidence for record in confirmed}
+        confirmed = self.table.confirmed(self.confirmation)
+        return {k: record.class_evidence for k, record in self.table.records.items() if k in confirmed}
 
     def begin(self, classes: tuple[str, ...]) -> None:
         """Set the label space of the map.
@@ -253,6 +252,12 @@ class ListedInstances:
         if mesh is not self._mesh:
             self._instances, self._mesh = list_(mesh), mesh
         return self._instances
+
+
+@lru_cache(maxsize=16)
+def _checksum(instance_ids: frozenset[int]) -> int:
+    """Return a CRC-32 of ids. It is cached, because they change in few frames."""
+    return zlib.crc32(repr(sorted(instance_ids)).encode())
 
 
 def vertices_of_area(area: float, voxel_size: float) -> int:

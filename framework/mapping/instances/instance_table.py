@@ -2,45 +2,107 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import takewhile
+from struct import Struct
+from typing import Protocol
 
 import numpy as np
 
-from framework.data import Float32, Float64, Int32
+from framework.data import Bool, Float32, Float64, Int32
 from framework.mapping.instances.object_embedding import ObjectEmbedding, added
 from framework.mapping.labels.label_evidence import UNSEEN
 from framework.mapping.labels.label_evidence_kernels import Combine
+from framework.runtime.spooled_list import Spool
+
+PAGE = 1024  # number of frames of a page of a FrameSet
+STORED = Struct(f"<qq{PAGE // 8}s")  # a page in the file: position of the page before it (-1 = none), number, bits
+
+
+@dataclass(frozen=True)
+class _Page:
+    """A page of a FrameSet that cannot be written to the file."""
+
+    before: int | _Page
+    number: int
+    bits: int
 
 
 class FrameSet:
-    """A set of frame indices, stored as spans of consecutive frames."""
+    """A set of frame indices with one bit for each frame, in pages.
 
-    def __init__(self, spans: Iterable[list[int]] = ()) -> None:
-        self.spans: list[list[int]] = []  # first and last frame of each span, ascending, with gaps between spans
-        self._count = 0
-        for first, last in sorted(spans):
-            self._append(first, last)
+    Only the page of the latest frames is in memory. Earlier pages are in a temporary file.
+    """
+
+    def __init__(self, spool: Spool, pages: Mapping[int, int] | None = None) -> None:
+        """Create a set.
+
+        Args:
+            spool: The temporary file, which sets can share.
+            pages: The bits of the frames k * PAGE to k * PAGE + PAGE - 1, by page number k. None = no frames.
+        """
+        self._spool = spool
+        self._count = self._number = self._bits = 0  # number of frames; number and bits of the latest page
+        self._before: int | _Page = -1  # the page before the latest one: position in the file, -1 = none, or in memory
+        for number, bits in sorted((pages or {}).items()):
+            self._begin(number)
+            self._bits = bits
+            self._count += bits.bit_count()
+
+    def __reduce__(self) -> tuple[type[FrameSet], tuple[Spool, dict[int, int]]]:
+        return FrameSet, (self._spool, self.pages())
 
     def __len__(self) -> int:
         return self._count
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FrameSet) and self.pages() == other.pages()
+
     def __or__(self, other: FrameSet) -> FrameSet:
-        return FrameSet(self.spans + other.spans)
+        ours, theirs = self.pages(), other.pages()
+        return FrameSet(self._spool, {k: ours.get(k, 0) | theirs.get(k, 0) for k in ours.keys() | theirs.keys()})
 
     def add(self, frame: int) -> None:
-        if self.spans and frame < self.spans[-1][0]:
-            merged = self | FrameSet([[frame, frame]])
-            self.spans, self._count = merged.spans, len(merged)
-        else:
-            self._append(frame, frame)
+        number, bit = divmod(frame, PAGE)
+        if self._count and number < self._number:  # frames are usually in ascending order
+            vars(self).update(vars(self | FrameSet(self._spool, {number: 1 << bit})))
+            return
+        if number != self._number:
+            self._begin(number)
+        self._count += not self._bits >> bit & 1
+        self._bits |= 1 << bit
 
-    def _append(self, first: int, last: int) -> None:
-        """Add a span that begins within or after the last span."""
-        if not self.spans or first > self.spans[-1][1] + 1:
-            self.spans.append([first, first - 1])
-        self._count += max(last - self.spans[-1][1], 0)
-        self.spans[-1][1] = max(last, self.spans[-1][1])
+    def last(self) -> int:
+        """Return the largest frame index, -1 if the set is empty."""
+        return PAGE * self._number + self._bits.bit_length() - 1
+
+    def pages(self) -> dict[int, int]:
+        """Return the bits of each page that is not empty, by number, in descending order."""
+        pages = {self._number: self._bits} if self._bits else {}
+        page = self._before
+        while isinstance(page, _Page) or page >= 0:
+            if isinstance(page, _Page):
+                pages[page.number], page = page.bits, page.before
+            else:
+                page, number, bits = STORED.unpack(self._spool.opened(page).read(STORED.size))
+                pages[number] = int.from_bytes(bits, "little")
+        return pages
+
+    def _begin(self, number: int) -> None:
+        """Begin a page after the latest one."""
+        if self._bits:
+            before, content = self._before, self._bits.to_bytes(PAGE // 8, "little")
+            start = self._spool.write(STORED.pack(before, self._number, content)) if isinstance(before, int) else None
+            self._before = _Page(before, self._number, self._bits) if start is None else start
+        self._number, self._bits = number, 0
+
+
+class Condition(Protocol):
+    """Condition for an instance to be confirmed. Equal conditions give equal results."""
+
+    def is_met(self, record: InstanceRecord) -> bool:
+        """Return True if the condition is met."""
 
 
 @dataclass
@@ -52,10 +114,10 @@ class InstanceRecord:
 
     id: int
     class_evidence: Float64
-    first_frame: int = -1
-    last_frame: int = -1
-    observed_in: set[int] = field(default_factory=set)  # frames with a detection
-    in_view: FrameSet = field(default_factory=FrameSet)  # frames in which the instance is in view
+    first_frame: int
+    last_frame: int
+    observed_in: FrameSet  # frames with a detection
+    in_view: FrameSet  # frames in which the instance is in view
     score_sum: float = 0.0  # sum of the scores of its detections
     detections: int = 0  # number of detections
     embedding: ObjectEmbedding | None = None  # sum of the embeddings of its detections, None = no embedding
@@ -87,6 +149,15 @@ class InstanceTable:
     def __init__(self, combine: Combine = Combine.SUM, logarithmic: bool = True) -> None:
         self.records: dict[int, InstanceRecord] = {}
         self.last_id = 0
+        self.frames_detected = 0  # number of frames with detections since the map was created or loaded
+        # `frames_detected` when a tentative instance was last detected or became tentative, by id, in ascending order
+        self.tentative: dict[int, int] = {}
+        self._confirmed: frozenset[int] = frozenset()
+        self._condition: Condition | None = None  # of `_confirmed`
+        self._changed: set[int] = set()  # ids whose entries in `_confirmed` and `tentative` may be outdated
+        self._flags = np.zeros(1, np.bool_)
+        self._flagged = np.zeros(0, np.int32)
+        self._spool = Spool()  # earlier pages of the frame sets
         self._last_before = -1  # last frame of the previous sequences
         self._offset = 0  # offset of the frame indices of this sequence
         self.combine = combine
@@ -100,15 +171,62 @@ class InstanceTable:
             classes: The number of classes.
             frame_index: The frame in which the instance is created.
         """
-        self.last_id += 1
-        record = InstanceRecord(self.last_id, np.zeros(classes), first_frame=frame_index, last_frame=frame_index)
-        self.records[self.last_id] = record
+        evidence, observed_in, in_view = np.zeros(classes), self.frame_set(), self.frame_set()
+        record = InstanceRecord(self.last_id + 1, evidence, frame_index, frame_index, observed_in, in_view)
+        self.add(record)
         return record
+
+    def frame_set(self, pages: Mapping[int, int] | None = None) -> FrameSet:
+        """Return a set of frames, given the bits of its pages."""
+        return FrameSet(self._spool, pages)
+
+    def add(self, record: InstanceRecord) -> None:
+        """Add an instance with a new id."""
+        self.records[record.id] = record
+        self.last_id = max(self.last_id, record.id)
+        self._changed.add(record.id)
+
+    def remove(self, instance_id: int) -> None:
+        """Remove an instance. The caller removes it from the voxels."""
+        del self.records[instance_id]
+        self.tentative.pop(instance_id, None)
+        self._changed.add(instance_id)
+
+    def confirmed(self, condition: Condition) -> frozenset[int]:
+        """Return the ids of the instances that meet the condition. All others are tentative.
+
+        Only instances that changed since the last call are tested again.
+        """
+        if condition != self._condition:
+            self._condition, self._confirmed, self._changed = condition, frozenset(), {*self.records}
+        if self._changed:
+            met = {k for k in self._changed if k in self.records and condition.is_met(self.records[k])}
+            for k in met:
+                self.tentative.pop(k, None)
+            for k in sorted((self._changed & self.records.keys()) - met):
+                self.tentative.setdefault(k, self.frames_detected)
+            if met != self._confirmed & self._changed:
+                self._confirmed = self._confirmed - self._changed | met
+            self._changed.clear()
+        return self._confirmed
+
+    def undetected(self, frames: int) -> list[int]:
+        """Return the instances that were tentative and undetected in the last `frames` frames with detections."""
+        return [*takewhile(lambda k: self.frames_detected - self.tentative[k] >= frames, self.tentative)]
+
+    def flags(self, instance_ids: Int32) -> Bool:
+        """Return a Boolean array (last id + 1 or more,), True for these instances, valid until the next call."""
+        self._flags[self._flagged] = False
+        if len(self._flags) <= self.last_id:
+            self._flags = np.zeros(2 * (self.last_id + 1), np.bool_)  # rarely, so that a frame takes constant time
+        self._flags[instance_ids] = True
+        self._flagged = instance_ids.copy()
+        return self._flags
 
     def begin_recording(self) -> None:
         """Prepare for the frames of another sequence, whose indices may repeat those of previous sequences."""
-        spans = [span[1] for record in self.records.values() for span in record.in_view.spans[-1:]]
-        self._last_before = max([*spans, *(record.last_frame for record in self.records.values())], default=-1)
+        last = (max(record.in_view.last(), record.last_frame) for record in self.records.values())
+        self._last_before = max(last, default=-1)
         self._offset = 0
 
     def number_of(self, frame_index: int) -> int:
@@ -141,10 +259,24 @@ class InstanceTable:
         record.score_sum += score
         record.detections += 1
         record.embedding = added(record.embedding, embedding)
+        self._detected(instance_id)
+
+    def _detected(self, instance_id: int) -> None:
+        """Move an instance to the end of the tentative instances."""
+        self.tentative.pop(instance_id, None)
+        self._changed.add(instance_id)
+
+    def see(self, instance_ids: Iterable[int], frame_index: int) -> None:
+        """Record that instances are in view in a frame."""
+        for k in instance_ids:
+            self.records[k].in_view.add(frame_index)
+            self._changed.add(k)
 
     def merge(self, kept: int, dropped: int) -> None:
-        """Add the history of instance `dropped` to `kept`, and remove `dropped`."""
-        a, b = self.records[kept], self.records.pop(dropped)
+        """Add the history of instance `dropped` to `kept`, and remove `dropped`. The caller moves its voxels."""
+        a, b = self.records[kept], self.records[dropped]
+        self.remove(dropped)
+        self._detected(kept)
         earlier, later = (a, b) if a.last_frame <= b.last_frame else (b, a)
         a.class_evidence = _combined(earlier.class_evidence, later.class_evidence, self.combine)
         a.observed_in |= b.observed_in

@@ -6,13 +6,13 @@ takes 2 KiB. A voxel becomes labeled when it is near the measured surface and it
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from enum import Enum
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from framework.data import Bool, Float64, Int32, Int64
+from framework.data import Bool, Float64, Int32
 from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS, ClassIds, class_id_type
 from framework.mapping.labels.evidence_rows_kernels import (
     BITS,
@@ -21,6 +21,7 @@ from framework.mapping.labels.evidence_rows_kernels import (
     label_new,
     merge_instances,
     number_new,
+    remove_instances,
     sum_classes_of_instances,
     update_rows,
 )
@@ -188,14 +189,21 @@ class EvidenceRows:
         row_bits = self._row_bits[: self.row_count]
         merge_instances(self.evidence, row_bits, np.int32(kept), np.int32(dropped), int(self.combine))
 
-    def blocks_with(self, instance_ids: Collection[int]) -> Int64:
+    def remove_instances(self, instance_ids: Sequence[int]) -> None:
+        """Remove the evidence for instances in every voxel.
+
+        The class evidence of the voxels does not change, because it is not stored by instance.
+        """
+        remove_instances(self.evidence, self._row_bits[: self.row_count], np.array(sorted(instance_ids), np.int32))
+
+    def blocks_with(self, instance_ids: Collection[int]) -> Int32:
         """Return the blocks that may have evidence for any of the instances, which are more than those that do."""
         if not instance_ids or not self.row_count:
-            return np.zeros(0, np.int64)
+            return np.zeros(0, np.int32)
         bits = np.bitwise_or.reduce(np.uint64(1) << np.array([*instance_ids], np.uint64) % np.uint64(BITS))
         label_row = self.voxels.grid.label_row[: self.voxels.block_count]
         found = (self._row_bits[: self.row_count] & bits) != 0
-        return np.flatnonzero((label_row >= 0) & found[label_row])
+        return np.flatnonzero((label_row >= 0) & found[label_row]).astype(np.int32)
 
     def classes_of_instances(self, counts: Bool, classes: int) -> Float64:
         """Return the class evidence (ids + 1, classes) of the instances, summed over their voxels.

@@ -204,6 +204,43 @@ def merge_instances(evidence, row_bits, kept, dropped, combine):
                     _merge_voxel(evidence.instance_ids[voxel], evidence.instance_value[voxel], kept, dropped, combine)
 
 
+@device
+def _remove_from_voxel(ids, values, removed):
+    """Remove the evidence of a voxel for the instances in `removed`, and return the set of its other instances."""
+    bits = np.uint64(0)
+    kept = 0
+    for s in range(len(ids)):
+        instance, value = ids[s], values[s]
+        if instance == 0:  # slots are filled from the front
+            break
+        k = np.searchsorted(removed, instance)
+        ids[s], values[s] = 0, 0
+        if k == removed.shape[0] or removed[k] != instance:
+            ids[kept], values[kept] = instance, value
+            bits |= instance_bit(instance)
+            kept += 1
+    best_first(ids, values, 0)
+    return bits
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def remove_instances(evidence, row_bits, removed):
+    """Remove the evidence for the instances in `removed`, which are ascending, in every voxel.
+
+    Only the rows whose instance set (R,) may contain one of them are visited. Their sets become exact.
+    """
+    removed_bits = np.uint64(0)
+    for instance in removed:
+        removed_bits |= instance_bit(instance)
+    for row in prange(row_bits.shape[0]):
+        if row_bits[row] & removed_bits:
+            bits = np.uint64(0)
+            for voxel in evidence.labeled[row]:
+                if voxel >= 0:
+                    bits |= _remove_from_voxel(evidence.instance_ids[voxel], evidence.instance_value[voxel], removed)
+            row_bits[row] = bits
+
+
 @njit(cache=True, nogil=True)
 def sum_classes_of_instances(evidence, counts, sums):
     """Add the class scores of every labeled voxel to the sums (ids + 1, C) of its instance.

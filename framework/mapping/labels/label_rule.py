@@ -149,9 +149,8 @@ class LabeledVoxels:
         points = keep_on_top(points, updating, self.occlusion_area_ratio)
         supported = self.supported_instances(table, matches)
         if supported.any():
-            points = remove_supports(points, supported, matches.overlaps.seen, matches.overlaps.stride)
-        matched = np.zeros(table.last_id + 1, np.bool_)
-        matched[matches.instance_ids] = True
+            overlaps = matches.overlaps
+            points = remove_supports(points, supported, overlaps.instance_ids, overlaps.seen, overlaps.stride)
         relative, named, bits = named_classes(evidence.classes, rule.logarithmic)
         compact = self.storage is Storage.COMPACT
         scale = rule.quantization(self.storage)
@@ -164,7 +163,7 @@ class LabeledVoxels:
             instance_id=matches.instance_ids,
             instance_log_odds=evidence.instances,
             absence=np.float32(evidence.absence),
-            matched=matched,
+            matched=table.flags(matches.instance_ids),
             class_scores=pack_class_scores(relative, scale, bits, np.int32 if compact else np.int64),
             named_classes=named,
             combine=int(rule.combine),
@@ -172,24 +171,22 @@ class LabeledVoxels:
         )
 
     def supported_instances(self, table: InstanceTable, matches: Matches) -> Bool:
-        """Return a Boolean array (N, ids + 1), True where the object of a cluster supports an instance.
+        """Return a Boolean array (N, M), True where the object of a cluster supports a visible instance.
 
         For example, a table supports a book. The mask of the table may cover the book, but is not evidence for its
         voxels. The supported instance is confirmed, has another class, is much smaller and is mostly inside the mask.
         """
         overlaps, clusters = matches.overlaps, matches.clusters
-        supported = np.zeros((len(clusters), table.last_id + 1), np.bool_)
         if self.support_overlap >= 1 or not len(overlaps.instance_ids):
-            return supported
+            return np.zeros(overlaps.votes.shape, np.bool_)
         covered = overlaps.votes >= self.support_overlap * np.maximum(overlaps.visible, 1)
         small = 2 * overlaps.visible <= overlaps.sizes[:, None]
         other = matches.instance_ids[:, None] != overlaps.instance_ids
         under = covered & small & other
         if not under.any():  # usual case
-            return supported
+            return np.asarray(under)
         records = [table.records[int(k)] for k in overlaps.instance_ids]
         counts = np.array([self.confirmation.is_met(record) for record in records])
         known = np.stack([table.class_probabilities(record) for record in records])
         other_class = class_agreement(clusters.class_probabilities, known) < OTHER_CLASS
-        supported[:, overlaps.instance_ids] = counts & other_class & under
-        return supported
+        return np.asarray(counts & other_class & under)

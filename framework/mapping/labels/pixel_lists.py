@@ -96,25 +96,25 @@ def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> P
     return points._replace(offsets=offsets, clusters=kept[: offsets[-1]])
 
 
-def remove_supports(points: PixelLists, supported: Bool, seen: Int32, stride: int) -> PixelLists:
+def remove_supports(points: PixelLists, supported: Bool, instance_ids: Int32, seen: Int32, stride: int) -> PixelLists:
     """Remove each cluster from the pixels of the instances that its object supports.
 
     Args:
         points: The lists of clusters at the pixels.
-        supported: A Boolean array (N, ids + 1), True where the object of a cluster supports an instance.
+        supported: A Boolean array (N, M), True where the object of a cluster supports an instance.
+        instance_ids: The instances (M,), ascending.
         seen: The instance of the map at every stride-th pixel of every stride-th row, 0 = none.
         stride: The distance between the samples in `seen`, px.
     """
-    instances = np.flatnonzero(supported.any(axis=0))
-    column = np.zeros(supported.shape[1], np.int32)
-    column[instances] = np.arange(1, len(instances) + 1)
+    is_supported = supported.any(axis=0)
+    supported, instances = np.ascontiguousarray(supported[:, is_supported]), instance_ids[is_supported]
     lists = len(points.pixel_counts)
     replacement = np.empty((lists, 1 + len(instances)), np.int32)
     origin, ends = np.empty((2, lists * len(instances)), np.int32)
     kept = np.empty(len(points.clusters) * len(instances), np.int32)
-    new, length = lists_without(points.offsets, points.clusters, supported, instances, replacement, origin, ends, kept)
+    new, length = lists_without(points.offsets, points.clusters, supported, replacement, origin, ends, kept)
     list_ids, moved = np.empty_like(points.list_ids), np.zeros((CHUNKS, lists + new), np.int32)
-    relabel(points.list_ids, seen, stride, column, replacement, list_ids, moved)
+    relabel(points.list_ids, seen, stride, instances, replacement, list_ids, moved)
     pixel_counts = moved.sum(axis=0, dtype=np.int32)
     pixel_counts[:lists] = points.pixel_counts
     np.subtract.at(pixel_counts, origin[:new], pixel_counts[lists:])

@@ -107,15 +107,22 @@ def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kep
     kept_offsets[pixel_counts.shape[0]] = n
 
 
+@device
+def _column(instances, instance):
+    """Return 1 plus the position of an instance in `instances`, which are ascending, 0 = none."""
+    k = np.searchsorted(instances, instance)
+    return k + 1 if k < instances.shape[0] and instances[k] == instance else 0
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
+def relabel(list_ids, seen, stride, instances, replacement, new_ids, moved):
     """Replace the list of each pixel, depending on the instance of the map at this pixel.
 
     Args:
         list_ids: The list (H, W) of each pixel.
         seen: The instance at every stride-th pixel of every stride-th row, 0 = none.
         stride: The distance between the samples in `seen`, px.
-        column: The column of each instance in `replacement`, 0 = no replacement.
+        instances: The instances (J,) with a replacement, ascending.
         replacement: The new list (L, 1 + J) for each list and instance.
         new_ids: The output (H, W).
         moved: The number of pixels (CHUNKS, lists) that get each new list, modified in place.
@@ -125,8 +132,11 @@ def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
         for v in range(chunk * height // CHUNKS, (chunk + 1) * height // CHUNKS):
             row, old_row, new_row = seen[v // stride], list_ids[v], new_ids[v]
             new_row[:] = old_row
+            instance, k = np.int32(0), 0
             for sample in range(row.shape[0]):
-                k = column[row[sample]]
+                if row[sample] != instance:
+                    instance = row[sample]
+                    k = _column(instances, instance)
                 for u in range(sample * stride, min((sample + 1) * stride, width) if k > 0 else 0):
                     old = old_row[u]
                     new = replacement[old, k]
@@ -136,7 +146,7 @@ def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
 
 
 @njit(cache=True, nogil=True)
-def lists_without(offsets, clusters, supported, instances, replacement, origin, ends, kept):
+def lists_without(offsets, clusters, supported, replacement, origin, ends, kept):
     """Create the lists that replace others at the pixels of supported instances.
 
     Returns the number of new lists and the number of their clusters.
@@ -144,8 +154,7 @@ def lists_without(offsets, clusters, supported, instances, replacement, origin, 
     Args:
         offsets: The start (L + 1,) of each list in `clusters`.
         clusters: The clusters of the lists.
-        supported: A Boolean array (N, ids + 1), True where the object of a cluster supports an instance.
-        instances: The supported instances (J,).
+        supported: A Boolean array (N, J), True where the object of a cluster supports an instance.
         replacement: The output (L, 1 + J), the new list for each list and instance. Column 0 is for other pixels.
         origin: The output, the list that each new list replaces.
         ends: The output, the end of each new list in `kept`.
@@ -155,11 +164,11 @@ def lists_without(offsets, clusters, supported, instances, replacement, origin, 
     new = length = 0
     for i in range(lists):
         replacement[i, 0] = i
-    for j in range(instances.shape[0]):
+    for j in range(supported.shape[1]):
         for i in range(lists):
             before = length
             for entry in range(offsets[i], offsets[i + 1]):
-                if not supported[clusters[entry], instances[j]]:
+                if not supported[clusters[entry], j]:
                     kept[length] = clusters[entry]
                     length += 1
             if length - before == offsets[i + 1] - offsets[i]:

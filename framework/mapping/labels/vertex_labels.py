@@ -32,6 +32,10 @@ class VertexLabels:
     def __reduce__(self) -> tuple[type[VertexLabels], tuple[()]]:
         return VertexLabels, ()
 
+    def shows(self, instance_id: int) -> bool:
+        """Return True if the instance could be assigned in the last update."""
+        return instance_id < len(self.counts) and bool(self.counts[instance_id])
+
     def changed_ids(self, counts: Bool) -> set[int]:
         """Return the instance ids that can be assigned by either `counts` or the last update, but not by both."""
         last, now = np.zeros((2, max(len(counts), len(self.counts))), np.bool_)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import zipfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ from framework.files.atomic_write import atomic_write, check_regular
 from framework.files.json_file import parse_json
 from framework.files.manifest import verified
 from framework.files.search_paths import usable_path
-from framework.mapping.instances.instance_table import FrameSet, InstanceRecord, InstanceTable
+from framework.mapping.instances.instance_table import PAGE, FrameSet, InstanceRecord, InstanceTable
 from framework.mapping.instances.object_embedding import ARRAYS, SPACE, embedding_arrays, read_embeddings
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.storage.map_file_kernels import find_unknown
@@ -33,6 +34,7 @@ CLASS_EVIDENCE = "class_evidence"  # name of the array with the class evidence (
 LARGEST_HEADER = 2**28  # maximum size of the header, bytes; an hour of mapping with thousands of instances takes 10 MB
 LARGEST_ID = 2**24  # maximum instance id
 MAX_EVIDENCE = 1e12  # maximum absolute evidence for a class
+PAGE_NUMBER, PAGE_BITS = re.compile("0|-?[1-9][0-9]{0,12}"), re.compile(f"[1-9a-f][0-9a-f]{{0,{PAGE // 4 - 1}}}")
 MAX_ARRAYS = 100  # maximum number of arrays listed in the header of a file
 MAX_MEMORY_FRACTION = 0.5  # maximum size of a loaded map, as a fraction of the memory
 
@@ -225,6 +227,7 @@ def plain_table(table: InstanceTable) -> dict[str, Any]:
         "combine": table.combine.name,
         "logarithmic": table.logarithmic,
         "last_id": table.last_id,
+        "tentative": [[k, table.frames_detected - frame] for k, frame in table.tentative.items()],
         **space,
         "instances": [_plain_record(record) for record in table.records.values()],
     }
@@ -233,11 +236,16 @@ def plain_table(table: InstanceTable) -> dict[str, Any]:
 def _plain_record(record: InstanceRecord) -> dict[str, Any]:
     plain = {
         **vars(record),
-        "observed_in": sorted(record.observed_in),
-        "in_view": record.in_view.spans,
+        "observed_in": _plain_frames(record.observed_in),
+        "in_view": _plain_frames(record.in_view),
     }
     del plain["class_evidence"], plain["embedding"]
     return plain
+
+
+def _plain_frames(frames: FrameSet) -> dict[str, str]:
+    """Return the bits of each page, hexadecimal."""
+    return {str(number): f"{bits:x}" for number, bits in sorted(frames.pages().items())}
 
 
 def table_arrays(table: InstanceTable, classes: int) -> dict[str, Array]:
@@ -275,10 +283,11 @@ def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> Insta
             f"{evidence.max():g}"
         )
     for entry, of_classes in zip(entries, evidence, strict=True):
-        record = _record(entry, table.last_id, of_classes)
+        record = _record(entry, table, of_classes)
         if record.id in table.records:
             raise DataError(f"{entry.name}.id: expected a unique id, got {record.id} twice")
-        table.records[record.id] = record
+        table.add(record)
+    _read_tentative(table, plain)
     table.embedding_space, embeddings = read_embeddings(plain, arrays)
     check_known("embedding_ids", np.array(list(embeddings), np.int32), table.records)
     for k, embedding in embeddings.items():
@@ -286,21 +295,36 @@ def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> Insta
     return table
 
 
-def _record(entry: MapHeader, last_id: int, class_evidence: Float64) -> InstanceRecord:
+def _read_tentative(table: InstanceTable, plain: MapHeader) -> None:
+    """Read the age of each tentative instance."""
+    where, oldest = f"{plain.name}.tentative", LARGEST_COUNT
+    for entry in plain.items("tentative"):
+        k, age = entry if isinstance(entry, list) and len(entry) == 2 else (entry, None)
+        if whole(where, k, 1, table.last_id) not in table.records or k in table.tentative:
+            raise DataError(f"{where}: expected each instance at most once, got {k}")
+        oldest = whole(where, age, 0, oldest)
+        table.tentative[k] = -oldest
+
+
+def _record(entry: MapHeader, table: InstanceTable, class_evidence: Float64) -> InstanceRecord:
     return InstanceRecord(
-        id=entry.whole("id", 1, last_id),
+        id=entry.whole("id", 1, table.last_id),
         class_evidence=class_evidence.copy(),
         first_frame=entry.whole("first_frame", -LARGEST_COUNT),
         last_frame=entry.whole("last_frame", -LARGEST_COUNT),
-        observed_in={whole(f"{entry.name}.observed_in", k, -LARGEST_COUNT) for k in entry.items("observed_in")},
-        in_view=FrameSet(_span(f"{entry.name}.in_view", found) for found in entry.items("in_view")),
+        observed_in=table.frame_set(_pages(entry.part("observed_in"))),
+        in_view=table.frame_set(_pages(entry.part("in_view"))),
         score_sum=entry.number("score_sum", (0.0, float(entry.whole("detections")))),
         detections=entry.whole("detections"),
     )
 
 
-def _span(name: str, found: object) -> list[int]:
-    if not isinstance(found, list) or len(found) != 2:
-        raise DataError(f"{name}: expected a list [first frame, last frame], got {found!r:.60}")
-    first = whole(name, found[0], -LARGEST_COUNT)
-    return [first, whole(name, found[1], first)]
+def _pages(entry: MapHeader) -> dict[int, int]:
+    pages = {}
+    for number, bits in entry.values.items():
+        if not PAGE_NUMBER.fullmatch(number) or not isinstance(bits, str) or not PAGE_BITS.fullmatch(bits):
+            raise DataError(
+                f"{entry.name}: expected the bits of {PAGE} frames by page number, got {number!r:.20}: {bits!r:.60}"
+            )
+        pages[int(number)] = int(bits, 16)
+    return pages

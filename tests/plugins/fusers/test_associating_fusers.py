@@ -1,16 +1,21 @@
 """Tests for association and the instance table in all fusers that use them."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from framework.data import Detections, Frame, Pose
+from framework.data import Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError
 from framework.interfaces import MapFuser
-from framework.mapping.instances.association import OverlapRule
+from framework.mapping.instance_map import InstanceMap
+from framework.mapping.instances.association import MIN_PAIRS, Association, Matches, OverlapRule, Overlaps
+from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.labels.label_rule import floored_log
 from framework.refinement.lifting import lift
 from framework.registry import assemble
@@ -169,6 +174,73 @@ def test_fuser_confidence_decreases_without_detections(new_fuser: NewFuser, fram
     assert record.observations == 5
     assert record.visible == 10
     assert record.confidence == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("confirmed", [False, True])
+def test_fuser_only_tentative_instances_expire(new_fuser: NewFuser, frames: list[Frame], confirmed: bool) -> None:
+    """Frames without a run of the detector do not count. The second instance is detected again before it expires."""
+    fuser = new_fuser(tentative_max_age=3, min_observations=2 if confirmed else 4)
+    first, second, _ = masks_of(frames[0])
+    numbered = (dataclasses.replace(frames[0], index=k) for k in itertools.count())
+    for _ in range(2):
+        fuse_masks(fuser, next(numbered), [first, second], [0.9, 0.9])
+    for _ in range(2):
+        fuse_masks(fuser, next(numbered), [], [])
+    fuse_masks(fuser, next(numbered), [second], [0.9])
+    kept = {1, 2} if confirmed else {2}
+    table = fuser.scene.table
+    assert table.records.keys() == kept
+    assert set(np.unique(fuser.scene.instances_seen(frames[0], frames[0].T_world_camera, 1))) == {0, *kept}
+    fuse_masks(fuser, next(numbered), [first], [0.9])
+    assert table.records.keys() == ({1, 2} if confirmed else {2, 3}), "expected a new id"
+
+
+def test_fuser_without_maximum_age_keeps_instances(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    fuser = new_fuser(tentative_max_age=0)
+    fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [0.9])
+    for frame in frames[1:]:
+        fuse_masks(fuser, frame, [], [])
+    assert len(fuser.scene.table.records) == 1
+
+
+def test_fuser_resumed_map_expires_like_single_run(frames: list[Frame], tmp_path: Path) -> None:
+    def new() -> MapFuser:
+        return assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0, tentative_max_age=4)
+
+    def fuse(fuser: MapFuser, k: int) -> list[int]:
+        masks = [masks_of(frames[k])[i] for i, frame in enumerate((0, 2, 5)) if k == frame]
+        fuse_masks(fuser, frames[k], masks, [0.9] * len(masks))
+        return [*fuser.scene.table.records]
+
+    single, resumed = new(), new()
+    whole = [fuse(single, k) for k in range(10)]
+    parts = [fuse(resumed, k) for k in range(3)]
+    resumed.scene.save(tmp_path / "map.npz")
+    resumed = new()
+    resumed.resume(InstanceMap.load(tmp_path / "map.npz"))
+    assert parts + [fuse(resumed, k) for k in range(3, 10)] == whole
+    assert whole[4:] == [[2], [2, 3], [3], [3], [3], []]
+    for fuser, name in ((single, "single.npz"), (resumed, "resumed.npz")):
+        fuser.scene.save(tmp_path / name)
+    first, second = (InstanceMap.load(tmp_path / name) for name in ("single.npz", "resumed.npz"))
+    np.testing.assert_array_equal(first.labels.in_use().instance_ids, second.labels.in_use().instance_ids)
+
+
+def test_association_votes_of_removed_instances_are_bounded() -> None:
+    """Each frame detects two instances that are then removed."""
+    association, table = Association(merge_overlap=0.5), InstanceTable()
+    scene = SimpleNamespace(table=table)
+    nothing = np.zeros((0, 1), np.float32)
+    clusters = PointClusters(
+        np.zeros((0, 3), np.float32), np.zeros((0, 2), np.int32), np.int32([]), nothing, nothing[:, 0], ("a",)
+    )
+    overlaps = Overlaps(*np.zeros((3, 0), np.int32), np.zeros((0, 0), np.int32), np.zeros((1, 1), np.int32), 1)
+    for k in range(5 * MIN_PAIRS):
+        ids = [table.create(1, k).id for _ in range(2)]
+        association.merge(scene, Matches(k, clusters, overlaps, np.int32(ids)))
+        for instance_id in ids:
+            table.remove(instance_id)
+    assert len(association._merge_votes) <= MIN_PAIRS + 1
 
 
 def test_fuser_class_posterior_is_product_of_measurements(new_fuser: NewFuser, frames: list[Frame]) -> None:

@@ -240,15 +240,18 @@ def test_remove_supports_matches_reference(seed: int) -> None:
     clusters = clusters_of([rng.random(SHAPE) < filled for filled in rng.random(4)], [1] * 4)
     points = list_points_by_pixel(clusters, SHAPE)
     stride = 1 + seed % 2
-    seen = rng.integers(0, 3, tuple(-(-side // stride) for side in SHAPE)).astype(np.int32)
-    lying = rng.random((4, 3)) < 0.4
+    instance_ids = np.int32([2, 5, 2**20])
+    column = rng.integers(-1, 3, tuple(-(-side // stride) for side in SHAPE))
+    seen = np.append(instance_ids, np.int32(0))[column]
+    supported = rng.random((4, 3)) < 0.4
     expected = []
     for pixel, at_pixel in enumerate(clusters_at(points)):
         v, u = divmod(pixel, SHAPE[1])
-        expected.append([k for k in at_pixel if not lying[k, seen[v // stride, u // stride]]])
-    assert clusters_at(remove_supports(points, lying, seen, stride)) == expected
+        m = column[v // stride, u // stride]
+        expected.append([k for k in at_pixel if m < 0 or not supported[k, m]])
+    assert clusters_at(remove_supports(points, supported, instance_ids, seen, stride)) == expected
     on_top = keep_on_top(points, np.int32([3, 0, 1, 2]), 0.8)
     both = [[k for k in left if k in top] for left, top in zip(expected, clusters_at(on_top), strict=True)]
-    assert clusters_at(remove_supports(on_top, lying, seen, stride)) == both
-    unchanged = remove_supports(points, lying & False, seen, stride)
+    assert clusters_at(remove_supports(on_top, supported, instance_ids, seen, stride)) == both
+    unchanged = remove_supports(points, supported & False, instance_ids, seen, stride)
     assert clusters_at(unchanged) == clusters_at(points), "expected unchanged input lists"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from framework.mapping.instances.instance_list import MIN_VERTICES, Confirmation
-from framework.mapping.instances.instance_table import FrameSet, InstanceTable
+from framework.mapping.instances.instance_table import InstanceTable
 
 
 def test_confirmation_requires_observations_and_confidence() -> None:
@@ -13,7 +13,8 @@ def test_confirmation_requires_observations_and_confidence() -> None:
         record = table.create(1, 0)
         for frame, score in enumerate(scores):
             table.observe(record.id, np.zeros(1), score, frame)
-    table.records[4].in_view = FrameSet([[0, 5]])  # visible in 6 frames, detected in 3
+    for frame in range(6):  # visible in 6 frames, detected in 3
+        table.see([4], frame)
     assert Confirmation(3, 0.26, 0).counts(table).tolist() == [False, False, True, False, False]
     assert Confirmation(3, 0.25, 0).counts(table).tolist() == [False, False, True, False, True]
     assert Confirmation(1, 0, 0).counts(InstanceTable()).tolist() == [False]

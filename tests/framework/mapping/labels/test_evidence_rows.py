@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from framework.data import MAX_CLASSES, Int32
+from framework.data import MAX_CLASSES, Float32, Int32
 from framework.mapping.labels import evidence_rows
 from framework.mapping.labels.evidence_rows import SLOTS, EvidenceRows, Storage
 from framework.mapping.labels.evidence_rows_kernels import _merge_voxel
@@ -68,6 +68,41 @@ def test_evidence_merge_updates_all_labeled_voxels(count: int) -> None:
     value = np.tile(np.float32([7, 5, 0, 0]), (count + 100, 1))
     value[known] = [12, 0, 0, 0]
     np.testing.assert_array_equal(evidence.instance_value[: count + 100], value)
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_evidence_removal_matches_reference(stored: bool) -> None:
+    """Each voxel has a random number of instances. The rows are those of a stored map, or have exact instance sets."""
+
+    def removed() -> tuple[Int32, Float32]:
+        rng = np.random.default_rng(5)
+        rows = with_voxels(9 * 512)
+        evidence = rows.in_use()
+        for voxel in range(rows.voxel_count):
+            ids = rng.choice(np.arange(1, 200), rng.integers(0, 5), replace=False)
+            evidence.instance_ids[voxel, : len(ids)] = ids
+            evidence.instance_value[voxel, : len(ids)] = np.sort(rng.normal(size=len(ids)))[::-1]
+        if not stored:
+            rows.remove_instances([150])
+            sets = [set(evidence.instance_ids[labeled].ravel().tolist()) - {0} for labeled in evidence.labeled]
+            bits = [sum(1 << k for k in {k % 64 for k in ids}) for ids in sets]
+            assert rows._row_bits[: rows.row_count].tolist() == bits
+        before, values = evidence.instance_ids.copy(), evidence.instance_value.copy()
+        gone = [7, 71, 150, 3, 200]
+        rows.remove_instances(gone)
+        for voxel in range(rows.voxel_count):
+            kept = [k for k in range(4) if before[voxel, k] and before[voxel, k] not in gone]
+            kept.sort(key=lambda k: (-values[voxel, k], before[voxel, k]))
+            found = dict(zip(evidence.instance_ids[voxel], evidence.instance_value[voxel], strict=True))
+            assert evidence.instance_ids[voxel, 0] == (before[voxel, kept[0]] if kept else 0)
+            assert (evidence.instance_ids[voxel, : len(kept)] > 0).all()
+            assert not evidence.instance_ids[voxel, len(kept) :].any()
+            assert not evidence.instance_value[voxel, len(kept) :].any()
+            assert {k: v for k, v in found.items() if k} == {before[voxel, k]: values[voxel, k] for k in kept}
+        return evidence.instance_ids.copy(), evidence.instance_value.copy()
+
+    for one, other in zip(*by_one_thread_and_two(removed), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def at_pixel(block: int, *voxels: int) -> SeenBlocks:

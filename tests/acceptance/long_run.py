@@ -1,0 +1,122 @@
+"""Growth of memory and time over a long run in a known place: `python -m tests.acceptance.long_run`.
+
+A synthetic room is played forward and backward. The errors of the detector differ in each frame. Python allocates small
+objects with malloc (PYTHONMALLOC=malloc), so that the heap contains all objects.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from framework.api import Mapper
+from framework.data import Float64, Frame
+from framework.mapping.instances.instance_list import InstanceTableMap
+from framework.synthetic.room import RoomKind
+from framework.synthetic.sequence import Synthetic
+from framework.synthetic.walk import FRAME_RATE
+from tests.acceptance.runner import CHECKOUT
+
+FRAMES = 20_000
+VIEWS = 100  # number of views of the room
+INTERVAL = 2 * VIEWS  # number of frames forward and backward; values are compared at equal positions
+OVERRIDES = ("detector=simulated_maskrcnn2go", "fuser.voxel_size=0.03")
+REFERENCE_INTERVAL = 10  # number of frames between two timings of the reference
+
+
+class _Mallinfo2(ctypes.Structure):
+    """Statistics of glibc's malloc, see mallinfo2(3)."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in (
+            "arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
+        )
+    ]  # fmt: skip
+
+
+class Growth(NamedTuple):
+    """Growth between the first and the last quarter of the frames."""
+
+    bytes_per_frame: float  # difference of the median sizes, per frame between the centers of the quarters
+    time_ratio: float  # ratio of the median processor times of a frame, each relative to the reference
+
+
+def measure() -> Growth:
+    """Map the long run in another process, and return its growth."""
+    command = [sys.executable, "-m", "tests.acceptance.long_run"]
+    environment = os.environ | {"PYTHONMALLOC": "malloc", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=CHECKOUT, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    return Growth(*json.loads(done.stdout.splitlines()[-1]))
+
+
+def growth_of(size: Float64, relative_ms: Float64) -> Growth:
+    """Return the growth, given the memory (n,) in bytes and the relative time (n,) of a frame at equal intervals."""
+    quarter = len(size) // 4
+    (first, last), (early, late) = (
+        (np.median(values[:quarter]), np.median(values[-quarter:])) for values in (size, relative_ms)
+    )
+    return Growth(float(last - first) / (0.75 * FRAMES), float(late / early))
+
+
+def heap_size() -> int:
+    """Return the size of all objects in the heap of this process after garbage collection, bytes."""
+    gc.collect()
+    mallinfo2 = ctypes.CDLL(None).mallinfo2
+    mallinfo2.restype = _Mallinfo2
+    found = mallinfo2()
+    return int(found.uordblks + found.hblkhd)
+
+
+def reference_ms(mapper: Mapper, frame: Frame) -> float:
+    """Return the processor time of a computation of constant cost, ms. Other programs slow it down like mapping."""
+    began = time.process_time()
+    mapper.scene.render(frame.camera, np.eye(4))
+    return 1e3 * (time.process_time() - began)
+
+
+def main() -> None:
+    room = Synthetic(seed=3, kind=RoomKind.LIVING_ROOM, frames=VIEWS, width=160, height=120)
+    views = [room[k] for k in range(VIEWS)]
+    mapper, reference = Mapper(*OVERRIDES), Mapper("detector=none")
+    scene = mapper.scene
+    assert isinstance(scene, InstanceTableMap)
+    reference.add(views[0])
+    milliseconds, constant = np.full((2, FRAMES), np.nan)
+    size = np.empty(FRAMES // INTERVAL)
+    lost = 0
+    for number in range(FRAMES):
+        position = number % INTERVAL
+        view = views[min(position, INTERVAL - 1 - position)]
+        began = time.process_time()
+        lost += mapper.add(replace(view, index=number, timestamp=number / FRAME_RATE)).lost
+        milliseconds[number] = 1e3 * (time.process_time() - began)
+        if number % REFERENCE_INTERVAL == 0:
+            constant[number] = reference_ms(reference, view)
+        if position == INTERVAL - 1:
+            visit = number // INTERVAL
+            used = scene.statistics.bytes
+            size[visit] = heap_size() + used  # the heap contains the reserved memory of the map
+            if visit % 10 == 9:
+                print(
+                    f"frame {number + 1}: {size[visit]:.0f} bytes, {used} in the map; {scene.table.last_id} instances, "
+                    f"{len(scene.table.records)} not removed, {len(scene.instance_ids())} confirmed; "
+                    f"{np.nanmedian(milliseconds):.1f} ms, {lost} frames lost",
+                    flush=True,
+                )
+    by_block = np.nanmedian(milliseconds.reshape(-1, INTERVAL), axis=1)
+    found = growth_of(size, by_block / np.nanmedian(constant.reshape(-1, INTERVAL), axis=1))
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
