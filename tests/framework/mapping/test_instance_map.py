@@ -195,7 +195,9 @@ def test_instance_map_after_each_frame_equals_rebuilt_map() -> None:
     assert 0 < len(fuser.scene.instances()) < 3
 
 
-@pytest.mark.parametrize("change", ["frame", "merge", "relabel", "add_class", "confirmation", "colors"])
+@pytest.mark.parametrize(
+    "change", ["frame", "merge", "remove", "merge_and_remove", "relabel", "add_class", "confirmation", "colors"]
+)
 def test_instance_map_lists_instances_again_after_change(change: str) -> None:
     fuser = mapped(room(), 4)
     scene, T = fuser.scene, walk(12)[5]
@@ -207,6 +209,11 @@ def test_instance_map_lists_instances_again_after_change(change: str) -> None:
             fused(fuser, room(), 4, T)
         case "merge":
             scene.merge(first, second)
+        case "remove":
+            scene.remove([second])
+        case "merge_and_remove":
+            scene.merge(first, second)
+            scene.remove([first])
         case "relabel":
             evidence = scene.labels.in_use()
             evidence.instance_ids[evidence.instance_ids == second] = first
