@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -29,9 +29,6 @@ from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed_space
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
-
-if TYPE_CHECKING:
-    from framework.mapping.instances.instance_list import Confirmation
 
 VOTES_ACROSS = 320  # approximate number of voting pixels per image row; more take longer without improving the result
 MIN_PAIRS = 1024  # number of pairs with votes up to which those of removed instances are kept
@@ -142,7 +139,9 @@ class LabeledMap(Protocol):
     """A map with an instance table and instance labels in its voxels."""
 
     table: InstanceTable
-    confirmation: Confirmation
+
+    def instance_ids(self) -> frozenset[int]:
+        """Return the confirmed instances."""
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
         """Return the most likely instance at the measured surface at every stride-th pixel of a frame, 0 = none.
@@ -331,7 +330,7 @@ class Association:
 
     def expire(self, scene: LabeledMap) -> None:
         """Remove the tentative instances that have reached `tentative_max_age`."""
-        scene.table.confirmed(scene.confirmation)  # updates the tentative instances
+        scene.instance_ids()  # updates the tentative instances
         expired = scene.table.undetected(self.tentative_max_age) if self.tentative_max_age else []
         if expired:
             scene.remove(expired)
