@@ -44,6 +44,7 @@ from framework.geometry import camera_of, pose_of
 from framework.interfaces import (
     ClusterRefiner,
     Detector,
+    FrameMasking,
     Gravity,
     LiveVideo,
     MapFuser,
@@ -81,6 +82,7 @@ __all__ = [
     "Detector",
     "Frame",
     "FrameError",
+    "FrameMasking",
     "FrameResult",
     "Gravity",
     "Instance",
@@ -138,7 +140,7 @@ def begin(config: DictConfig) -> Pipeline:
     """
     fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
     tracker = build(PoseTracker, config.get("tracker"))
-    viewer = build(Viewer, config.get("viewer"))
+    masking, viewer = build(FrameMasking, config.get("masking")), build(Viewer, config.get("viewer"))
     classes: tuple[str, ...] = ()
     resumed = False
     chosen = {key: config.get(key) for key in ("resume_from", "localize_in") if config.get(key) is not None}
@@ -156,7 +158,7 @@ def begin(config: DictConfig) -> Pipeline:
     detector = build(Detector, config.get("detector"))  # last, because loading a network is slow
     detector = with_cache(with_classes_of_map(detector, classes), config)
     compile_for_run()
-    pipeline = Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval)
+    pipeline = Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval, masking)
     pipeline.resumed = resumed
     return pipeline
 
@@ -326,12 +328,10 @@ class Mapper(Map):
         try:
             detections, times = pipeline.detect(frame, self._frames - 1)
             journal.record(times)
-            pose = pipeline.map_frame(frame, detections, journal)
+            return pipeline.map_frame(frame, detections, journal)
         except FrameError as error:
             pipeline.viewer.skip(str(error))
             raise
-        pipeline.viewer.show(frame, detections, pose, journal.stage_ms(frame.index))
-        return pose
 
     def at_pixel(
         self, u: int, v: int, camera: Camera | None = None, T_world_camera: Float64 | None = None

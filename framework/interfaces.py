@@ -1,9 +1,8 @@
 """The interfaces between the pipeline and its plugins.
 
-    frame --> Detector --> lift to 3D --> ClusterRefiner --> MapFuser --> SceneMap
-      '-----> PoseTracker ----'                                 |
-                  ^                                             |
-                  '------------- view of the map ---------------'
+    frame --> Detector --> FrameMasking --> lift to 3D --> ClusterRefiner --> MapFuser --> SceneMap
+                               |                ^                                |
+                               '-------> PoseTracker <----- view of the map -----'
 
 A plugin is a dataclass that implements one of these interfaces. Its fields are its parameters, of type bool, int,
 float, str, Path, Enum or list[str]. Document the unit and bounds next to each default. Validate the values in
@@ -158,6 +157,21 @@ class Detector(ABC):
         Raises:
             DataError: The detector does not fit, for example because its detections belong to another sequence.
         """
+
+
+class FrameMasking:
+    """Masking of moving objects, such as people, in frames.
+
+    This class masks nothing.
+    """
+
+    def mask(self, frame: Frame, detections: Detections) -> tuple[Frame, Detections]:
+        """Return `frame` without the depth of moving objects, and `detections` without these objects.
+
+        Called once per frame, in order, before tracking. Depth without a reading is 0. Return `frame` itself if nothing
+        is masked. If `detections.detected` is false, the detector did not run.
+        """
+        return frame, detections
 
 
 class PoseTracker(ABC):

@@ -1,4 +1,4 @@
-"""The mapping loop: detection, tracking, lifting, refinement and fusion."""
+"""The mapping loop: detection, masking, tracking, lifting, refinement and fusion."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from itertools import count
 from pathlib import Path
 from typing import cast
 
-from framework.data import Array, Detections, Float64, Frame, Pose, check_label_space
+from framework.data import Array, Detections, Float64, Frame, Int32, Pose, check_label_space
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError, in_one_line
 from framework.files.storage import check_storage
 from framework.interfaces import (
     ClusterRefiner,
     Detector,
+    FrameMasking,
     LiveVideo,
     MapFuser,
     PoseTracker,
@@ -65,6 +66,7 @@ class Pipeline:
     prefetch: int = 2  # number of frames prefetched by other threads, >= 0 (live video: at most 1); 0 = none
     viewer: Viewer = field(default_factory=Viewer)
     detection_interval: int = 1  # interval between detections, in frames, >= 1; all frames are tracked and mapped
+    masking: FrameMasking = field(default_factory=FrameMasking)
 
     def __post_init__(self) -> None:
         if self.detection_interval < 1:
@@ -195,17 +197,11 @@ class Pipeline:
         with closing(self.detect_prefetched(video, journal, interruption, budget, prefetch)) as detected:
             for frame, detections in detected:
                 with budget.mapping():
-                    self.map_and_show(frame, detections, journal)
+                    try:
+                        self.map_frame(frame, detections, journal)
+                    except FrameError as error:
+                        self.skip(error, journal)
                 interruption.check()
-
-    def map_and_show(self, frame: Frame, detections: Detections, journal: Journal) -> None:
-        """Map one frame and show it in the viewer."""
-        try:
-            pose = self.map_frame(frame, detections, journal)
-        except FrameError as error:
-            self.skip(error, journal)
-        else:
-            self.viewer.show(frame, detections, pose, journal.stage_ms(frame.index))
 
     def skip(self, error: FrameError, journal: Journal) -> None:
         journal.frame_skipped(error)
@@ -291,9 +287,9 @@ class Pipeline:
         return detections, [StageTime(frame.index, "detection", 1e3 * (time.perf_counter() - began))]
 
     def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> Pose:
-        """Track a frame, and lift, refine and fuse its detections. Return the pose.
+        """Mask and track a frame, lift, refine and fuse its detections, and show it. Return the pose.
 
-        A lost frame is only tracked.
+        A lost frame is only masked, tracked and shown.
 
         Raises:
             FrameError: The frame is unusable.
@@ -301,22 +297,33 @@ class Pipeline:
         """
         journal.check_order(frame)
         with journal.timed(frame.index, "tracking"):
-            pose = self.tracker.track(self.color_to_depth.predicted(frame), self.fuser.scene)
+            masked, detections = self.masking.mask(frame, detections)
+            pose = self.tracker.track(self.color_to_depth.predicted(masked), self.fuser.scene)
             if not isinstance(cast(object, pose), Pose):
                 raise DataError(
                     f"frame {frame.index}: expected a Pose from the tracker, got {type(pose).__name__}; return a Pose "
                     "from track()"
                 )
-            check_distance(frame, pose)
-            frame, self.T_world_color, color_pixels = self.color_to_depth.tracked(frame, pose)
+            check_distance(masked, pose)
+            registered, self.T_world_color, color_pixels = self.color_to_depth.tracked(masked, pose)
             if self.color_to_depth.displaced_before:
                 self.tracker.renew_colors()
                 self.fuser.renew_colors()
             if self.tracker.poses_given and not pose.lost and self.fuser.scene.statistics.voxels:
-                self.compare_with_map(frame, pose, journal)
-        journal.frame_tracked(frame, pose)
-        if pose.lost:
-            return pose
+                self.compare_with_map(registered, pose, journal)
+        journal.frame_tracked(masked, pose, is_masked=masked is not frame)
+        if not pose.lost:
+            self.fuse_frame(registered, pose, detections, color_pixels, journal)
+        self.viewer.show(masked, detections, pose, journal.stage_ms(frame.index))
+        return pose
+
+    def fuse_frame(
+        self, frame: Frame, pose: Pose, detections: Detections, color_pixels: Int32 | None, journal: Journal
+    ) -> None:
+        """Lift, refine and fuse the detections of a tracked frame, whose color is registered to depth.
+
+        `color_pixels` is explained at `lift`.
+        """
         with journal.timed(frame.index, "lifting"):
             lifted = lift(detections, frame, pose, color_pixels)
         journal.count_omitted(frame, lifted)
@@ -327,7 +334,6 @@ class Pipeline:
             self.fuser.fuse(frame, pose, clusters, timer)
         journal.frame_fused(frame)
         journal.digest(frame.index, detection=detections, lifting=lifted, refinement=clusters, fusion=self.fuser.scene)
-        return pose
 
     def compare_with_map(self, frame: Frame, pose: Pose, journal: Journal) -> None:
         """Compare the depth of a frame with the map at its given pose, and record the result.

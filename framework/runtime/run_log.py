@@ -114,6 +114,7 @@ class Journal:
     without_pose: int = 0  # skipped frames without a pose
     first_without_pose: str = ""  # message of the first frame without a pose
     frames_in_map: int = 0  # number of frames that are at least partly fused
+    frames_masked: int = 0  # number of frames with masked objects
     stopped_by: BaseException | None = None
     last_index: int = -1  # Frame.index of the last tracked frame; -1 = none
     unordered: bool = False  # True once a timestamp did not increase
@@ -160,6 +161,8 @@ class Journal:
             )  # fmt: skip
         if self.masks_omitted:
             log.warning("%d masks omitted in total because their frames had too many points", self.masks_omitted)
+        if self.frames_masked:
+            log.info("%d of %d frames with masked objects", self.frames_masked, self.frames)
         if self.frames_dropped:
             log.warning("%d frames dropped because newer frames replaced them or the run ended", self.frames_dropped)
 
@@ -265,9 +268,10 @@ class Journal:
                 f"got {frame.index}; number the frames in their order, and map another recording with resume_from"
             )
 
-    def frame_tracked(self, frame: Frame, pose: Pose) -> None:
-        """Record a pose. Log a change of the depth sensor, and the loss and recovery of tracking."""
+    def frame_tracked(self, frame: Frame, pose: Pose, is_masked: bool = False) -> None:
+        """Record a pose and whether the frame is masked. Log a change of the depth sensor, and loss and recovery."""
         self.last_index = int(frame.index)
+        self.frames_masked += is_masked
         if frame.timestamp <= self.last_time and not self.unordered:
             self.unordered = True
             log.warning(

@@ -61,13 +61,20 @@ class Renderer:
         )
         self._rasterizer = Rasterizer(surfaces.vertices, surfaces.triangles)
 
-    def render(self, camera: Camera, T_world_camera: Float64, material_table: Float32 | None = None) -> Rendering:
+    def render(
+        self,
+        camera: Camera,
+        T_world_camera: Float64,
+        material_table: Float32 | None = None,
+        brightness: float = 1.0,
+    ) -> Rendering:
         """Render a view of the room.
 
         Args:
             camera: The camera.
             T_world_camera: The pose (4, 4).
             material_table: Other materials (M, 14) for the surfaces, with unchanged light; None = those of the room.
+            brightness: The brightness of all lights, relative to the computed light.
         """
         surfaces = self._lit if material_table is None else self._lit._replace(table=material_table)
         buffer = self._rasterizer.draw(camera, T_world_camera)
@@ -85,7 +92,9 @@ class Renderer:
             smooth_edges(surfaces, view, u, v, *samples, triangle, depth, light)
         unread = np.empty(incidence.shape, np.float32)
         lose_readings(surfaces.materials, surfaces.table, triangle, incidence, unread)
-        return Rendering(to_srgb(light), depth, _ids_of(self.surfaces, triangle), incidence, unread)
+        return Rendering(
+            to_srgb(light * np.float32(brightness)), depth, _ids_of(self.surfaces, triangle), incidence, unread
+        )
 
     def depth_and_ids(self, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Int32]:
         """Return the exact depth (H, W), m along z, and the instance ids (H, W) of a view.

@@ -17,9 +17,11 @@ from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import ConfigError
 from framework.interfaces import RGBDSequence
 from framework.sensors.noise_models import SensorChoice, SensorKind
-from framework.synthetic.renderer import Renderer, cast_ids
+from framework.synthetic.dynamics import Dynamics, MovingObject, in_front, opening_door, walking_person
+from framework.synthetic.renderer import Renderer, Rendering, cast_ids
 from framework.synthetic.rgbd_camera import DepthSensor, noisy_color
 from framework.synthetic.room import RoomKind, furnish
+from framework.synthetic.surfaces import Surfaces, assemble
 from framework.synthetic.walk import FRAME_RATE, plan_path
 
 MAX_FRAMES = 10**6  # nine hours at 30 Hz
@@ -45,6 +47,8 @@ class Synthetic(RGBDSequence):
     sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = KINECT_V1, or EXACT without noise
     noise: float = 1.0  # scale of the sensor noise, >= 0; 0 = none, 1 = noise model of the sensor
     max_depth: float = 6.0  # maximum depth of the sensor, m, > 0
+    # change during the sequence: a walking person, a door that opens, lights that change, or a camera that stops
+    dynamics: Dynamics = Dynamics.NONE
     # simulated delay of color relative to depth at equal timestamps, s, in [-0.2, 0.2]; positive = color captured later
     simulated_color_delay: float = 0.0
     # delay of color relative to depth assumed by the pipeline, s, in [-0.2, 0.2]; positive = color captured later; AUTO
@@ -81,7 +85,11 @@ class Synthetic(RGBDSequence):
         rng = np.random.default_rng([self.seed, self._stream])
         self.room = furnish(self.kind, rng)
         self.class_names = dict(self.room.surfaces.class_names)
-        self._renderer = Renderer(self.room.surfaces, list(self.room.lamps))
+        self.moving: MovingObject | None = None  # object that moves; None = none
+        static = self.room.surfaces
+        if self.dynamics is Dynamics.DOOR:
+            static, self.moving = self._with_opening_door()
+        self._renderer = Renderer(static, list(self.room.lamps))
         self.sensor_kind = self.sensor.kind(SensorKind.KINECT_V1 if self.noise else SensorKind.EXACT)
         self._sensor = DepthSensor(self.noise, self.max_depth, self.sensor_kind)
         wanted = {i for i, name in self.class_names.items() if name is not None}
@@ -89,10 +97,21 @@ class Synthetic(RGBDSequence):
         self.path = plan_path(
             self.room.layout,
             self.frames,
-            lambda T_world_camera: cast_ids(self.room.surfaces, self._renderer.caster, small, T_world_camera),
+            lambda T_world_camera: cast_ids(static, self._renderer.caster, small, T_world_camera),
             wanted,
             rng,
         )
+        self._frame_names = self.class_names
+        if self.dynamics is Dynamics.PERSON:
+            instance = max(self.class_names) + 1
+            self.moving = walking_person(instance, self.path, self.frames, rng)
+            self._frame_names = self.class_names | dict(self.moving.surfaces.class_names)
+
+    def _with_opening_door(self) -> tuple[Surfaces, MovingObject]:
+        """Return the room without the leaf of its door, and the leaf."""
+        instance, door = next((i, piece) for i, piece in self.room.objects if piece.kind == "door")
+        frame, leaf = opening_door(instance, door)
+        return assemble((i, frame if i == instance else piece) for i, piece in self.room.objects), leaf
 
     def __len__(self) -> int:
         return len(self._chosen)
@@ -102,10 +121,9 @@ class Synthetic(RGBDSequence):
 
     def __getitem__(self, k: int) -> Frame:
         index = self._chosen[k]
-        T_world_camera = self.path.pose(index)
-        picture = seen = self._renderer.render(self.camera, T_world_camera)
+        picture = seen = self._rendering(index)
         if self.simulated_color_delay:
-            seen = self._renderer.render(self.camera, self.path.pose(index + self.simulated_color_delay * FRAME_RATE))
+            seen = self._rendering(index + self.simulated_color_delay * FRAME_RATE)
         rng = np.random.default_rng([self.seed, self._stream, index])
         depth = self._sensor.measure(picture.depth, picture.incidence, self.camera, rng)
         return Frame(
@@ -114,13 +132,25 @@ class Synthetic(RGBDSequence):
             color=noisy_color(seen.color, self.noise, rng),
             depth=depth,
             camera=self.camera,
-            T_world_camera=T_world_camera,
-            truth=FrameTruth(seen.instance_ids, self.class_names),
+            T_world_camera=self._pose(index),
+            truth=FrameTruth(seen.instance_ids, self._frame_names),
             sensor=self.sensor_kind,
         )
 
+    def _pose(self, frame: float) -> Float64:
+        """Return the camera pose T_world_camera (4, 4) at a frame."""
+        return self.path.pose(self.dynamics.camera_frame(frame))
+
+    def _rendering(self, frame: float) -> Rendering:
+        """Return the images at a frame, without noise."""
+        T_world_camera, brightness = self._pose(frame), self.dynamics.brightness(frame)
+        room = self._renderer.render(self.camera, T_world_camera, brightness=brightness)
+        if self.moving is None:
+            return room
+        return in_front(self.moving.render(self.camera, T_world_camera, frame, brightness), room)
+
     def exact_view(self, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Return the exact depth (H, W), m along z, and the instance ids (H, W) of a view.
+        """Return the exact depth (H, W), m along z, and the instance ids (H, W) of a view, without moving objects.
 
         Both are 0 for pixels without a surface.
         """
@@ -133,7 +163,7 @@ class Synthetic(RGBDSequence):
         return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.ground_truth_spacing)
 
     def _exact(self, index: int) -> LabeledDepth:
-        T_world_camera = self.path.pose(index)
+        T_world_camera = self._pose(index)
         depth, ids = self.exact_view(T_world_camera)
         depth[depth > self.max_depth] = 0
         return LabeledDepth(depth, ids, self.camera, T_world_camera)

@@ -22,7 +22,7 @@ from framework.config.composition import composed
 from framework.data import Detections, Float64, Frame, FrameTruth, PointClusters, Pose
 from framework.errors import DataError
 from framework.geometry import exp_se3
-from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
+from framework.interfaces import ClusterRefiner, Detector, FrameMasking, MapFuser, PoseTracker, RGBDSequence
 from framework.refinement.lifting import lift
 from framework.registry import GROUPS, build, find_class, parameters
 from framework.runtime.run_log import FUSION_STAGES
@@ -176,6 +176,38 @@ def assert_valid(found: Detections, detector: Detector, frame: Frame) -> None:
             assert u.max() <= x2 + slack
             assert v.min() >= y1 - slack
             assert v.max() <= y2 + slack
+
+
+class MaskingContract:
+    """Tests of the masking of frames."""
+
+    stage = "masking"
+
+    def plugin(self) -> FrameMasking:
+        raise NotImplementedError(
+            "MaskingContract.plugin: expected an override, got none; return the masking under test from plugin()"
+        )
+
+    def test_masking_only_removes_depth_and_detections(self) -> None:
+        masking = self.plugin()
+        for k in range(4):
+            frame, found = frame_at(k), spheres_in(frame_at(k))
+            masked, kept = masking.mask(frame, found)
+            assert (np.isin(masked.depth, 0) | (masked.depth == frame.depth)).all()
+            assert same(replace(masked, depth=frame.depth), frame)
+            assert set(kept.scores) <= set(found.scores)
+            assert kept.classes == found.classes
+            assert same(frame, frame_at(k)), "the frame was changed"
+            assert same(found, spheres_in(frame_at(k))), "the detections were changed"
+
+    def test_masking_does_not_depend_on_ground_truth(self) -> None:
+        masking, misled = self.plugin(), self.plugin()
+        for k in range(4):
+            frame, found = frame_at(k), spheres_in(frame_at(k))
+            masked, kept = masking.mask(frame, found)
+            masked_too, kept_too = misled.mask(misleading(frame), found)
+            assert np.array_equal(masked.depth, masked_too.depth)
+            assert same(kept, kept_too)
 
 
 class TrackerContract:

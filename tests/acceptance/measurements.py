@@ -17,12 +17,15 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from tests.acceptance import long_run, recording_checks
+from framework.tables.statistics import bootstrap_interval
+from tests.acceptance import changing_scenes, long_run, recording_checks
 from tests.acceptance.large_map import measure_large_map
 from tests.acceptance.runner import CHECKOUT, Measured, measurement
 
 SHARED = CHECKOUT.parent / "shared" / "data"
 PIPELINE = ("framework", "plugins", "conf", "tests/acceptance")
+YOLO = SHARED.parent / "weights" / "yolo11n_seg" / "yolo11n_seg.onnx"
+MASKING_DETECTORS = (("detector=maskrcnn2go",), ("detector=onnx_segmentation", f"detector.weights={YOLO}"))
 CHECKS = ("framework/checking", "framework/datasets", "tests/acceptance", "tests/support/recordings/damaged.py")
 
 
@@ -59,7 +62,8 @@ def folder(scene: str) -> tuple[str, str]:
     return "dataset=rgbd_folder", f"dataset.root={SHARED / scene}"
 
 
-RPY = ("dataset=tum_rgbd", f"dataset.root={SHARED / 'tum_fr1_rpy_a' / 'rgbd_dataset_freiburg1_rpy'}", "detector=none")
+RPY_ROOT = SHARED / "tum_fr1_rpy_a" / "rgbd_dataset_freiburg1_rpy"
+RPY = ("dataset=tum_rgbd", f"dataset.root={RPY_ROOT}", "detector=none")
 
 
 def ate_mm(bound: float, *overrides: str) -> Measured:
@@ -105,6 +109,37 @@ def replica_floor2_ap50() -> Measured:
 @measurement("AP50 >= 0.6, given poses", *PIPELINE)
 def kitchen_ap50() -> Measured:
     return ap50(0.6, "redkitchen")
+
+
+@measurement("ATE <= 1.1 times that without the person, masked, detections on every and every fifth frame", *PIPELINE)
+def person_ate_ratio() -> Measured:
+    ratio = max(run.ate for run in changing_scenes.masked()) / changing_scenes.without_person().ate
+    return ratio, ratio <= 1.1
+
+
+@measurement("<= 0.1% of the vertices on the person, masked, detections on every and every fifth frame", *PIPELINE)
+def person_vertices() -> Measured:
+    percentage = 100 * max(run.vertices for run in changing_scenes.masked())
+    return percentage, percentage <= 0.1
+
+
+@measurement("0 likely instances of the person, masked, detections on every and every fifth frame", *PIPELINE)
+def person_instances() -> Measured:
+    count = max(run.instances for run in changing_scenes.masked())
+    return count, count == 0
+
+
+@measurement("mean ATE of 10 parts <= +2%, 0 additional lost frames, freiburg1_rpy, masked, two networks", *PIPELINE)
+def masking_freiburg1_rpy() -> Measured:
+    """Return the larger mean change of the ATE with two networks, in percent."""
+    means, lost = [], 0
+    for detector in MASKING_DETECTORS:
+        effect = changing_scenes.MaskingEffect.on(RPY_ROOT, *detector)
+        changes = 100 * effect.ate_changes
+        print(detector[0], changes, changes.mean(), bootstrap_interval(changes), effect.additional_lost, flush=True)
+        means.append(float(changes.mean()))
+        lost += max(0, effect.additional_lost)
+    return max(means), max(means) <= 2 and lost == 0
 
 
 @measurement("0 wrong diagnoses, 75 recordings with one wrong convention, unit or delay", *CHECKS)

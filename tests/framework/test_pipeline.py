@@ -17,16 +17,18 @@ import numpy as np
 import pytest
 from tqdm import TMonitor
 
-from framework.data import MAX_CLASSES, MAX_COVERAGE, Array, Detections, Frame, PointClusters, Pose
+from framework.data import MAX_CLASSES, MAX_COVERAGE, Array, Detections, Frame, InstanceMesh, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
-from framework.interfaces import RGBDSequence, SceneMap, StageTimer, Viewer, untimed
+from framework.interfaces import FrameMasking, RGBDSequence, SceneMap, StageTimer, Viewer, untimed
 from framework.pipeline import Pipeline
 from framework.registry import assemble
 from framework.runs.metrics import run_metrics
 from framework.runtime.run_log import RunResult
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from plugins.masking.people import People
 from tests.support.scenes.corner_room import (
     CAMERA,
+    CLASSES,
     CornerRoom,
     FaultyDetector,
     GivenPose,
@@ -118,6 +120,57 @@ def test_pipeline_map_is_independent_of_prefetch(room: CornerRoom) -> None:
     for mesh in meshes[1:]:
         for name in ("vertices", "triangles", "colors", "instance_ids"):
             np.testing.assert_array_equal(getattr(mesh, name), getattr(meshes[0], name))
+
+
+class _HiddenLeftHalf(FrameMasking):
+    """Masking that removes the left half of the depth image, and the first detection."""
+
+    def mask(self, frame: Frame, detections: Detections) -> tuple[Frame, Detections]:
+        depth = frame.depth.copy()
+        depth[:, : frame.camera.width // 2] = 0
+        rows = {name: getattr(detections, name)[1:] for name in ("masks", "boxes", "scores", "class_probabilities")}
+        return replace(frame, depth=depth), replace(detections, **rows)
+
+
+def test_pipeline_tracks_and_fuses_masked_frames(room: CornerRoom) -> None:
+    @dataclass
+    class Keeps(GivenPose):
+        def track(self, frame: Frame, scene: SceneMap) -> Pose:
+            tracked.append(frame)
+            return super().track(frame, scene)
+
+    @dataclass
+    class Shows(Viewer):
+        def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
+            shown.append((frame, len(detections)))
+
+    tracked: list[Frame] = []
+    shown: list[tuple[Frame, int]] = []
+    scene = mapped(pipeline(tracker=Keeps(), viewer=Shows(), masking=_HiddenLeftHalf()).run(room))
+    assert len(tracked) == len(shown) == 6
+    for frame, (seen, detections) in zip(tracked, shown, strict=True):
+        assert not frame.depth[:, : frame.camera.width // 2].any()
+        assert frame.depth[:, frame.camera.width // 2 :].any()
+        np.testing.assert_array_equal(seen.depth, frame.depth)
+        assert detections == 1
+    assert set(scene.instances()) == {1}
+
+
+def test_pipeline_map_without_people_ignores_masking(room: CornerRoom) -> None:
+    plain, masked = (mapped(pipeline(**stages).run(room)).mesh() for stages in ({}, {"masking": People()}))
+    for name in ("vertices", "triangles", "colors", "instance_ids"):
+        np.testing.assert_array_equal(getattr(masked, name), getattr(plain, name))
+
+
+@PREFETCH
+def test_pipeline_masked_map_is_independent_of_prefetch(prefetch: int) -> None:
+    def mesh(prefetch: int) -> InstanceMesh:
+        stages = {"masking": People(classes=CLASSES[0], min_score=0.0), "detection_interval": 3}
+        return mapped(pipeline(prefetch, **stages).run(CornerRoom(frames=8))).mesh()  # type: ignore[arg-type]
+
+    one, other = mesh(0), mesh(prefetch)
+    for name in ("vertices", "triangles", "colors", "instance_ids"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 class _OfOtherSequence(SphereDetector):

@@ -19,6 +19,7 @@ from framework.interfaces import LiveVideo, RGBDSequence
 from framework.testing.contracts import (
     DetectorContract,
     FuserContract,
+    MaskingContract,
     RefinerContract,
     SequenceContract,
     TrackerContract,
@@ -42,6 +43,12 @@ class TestDetectors(DetectorContract):
     @pytest.fixture(autouse=True, params=registered.names("detector"))
     def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
         self.plugin = lambda: ready("detector", request.param)
+
+
+class TestMaskings(MaskingContract):
+    @pytest.fixture(autouse=True, params=registered.names("masking"))
+    def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
+        self.plugin = lambda: ready("masking", request.param)
 
 
 class TestTrackers(TrackerContract):

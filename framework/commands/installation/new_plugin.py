@@ -43,6 +43,7 @@ SMALL = "dataset=synthetic dataset.frames=30 dataset.width=320 dataset.height=24
 FIRST = "hydra.sweep.dir=outputs/first_sweep"
 TRIES = {  # by stage: command that compares the new plugin with an existing plugin (viewer: a single run)
     "detector": f"instancemap -m detector=mask_rcnn_rooms,$name {SMALL} {FIRST}",
+    "masking": f"instancemap -m masking=none,$name detector=simulated {SMALL} {FIRST}",
     "tracker": f"instancemap -m tracker=voxel_hashing_icp,$name detector=simulated {SMALL} {FIRST}",
     "refiner": f"instancemap -m refiner=gmm_em,$name detector=simulated {SMALL} {FIRST}",
     "fuser": f"instancemap -m fuser=bayesian_tsdf,$name detector=simulated {SMALL} {FIRST}",
@@ -57,6 +58,7 @@ maps thirty frames of a synthetic scene with it: `outputs/first_run/frames.jsonl
 `instancemap dataset=desk viewer=$name` maps a real sequence."""
 DATA: dict[str, tuple[type, ...]] = {  # by stage: data types of its arguments and results, shown in the README
     "detector": (Frame, Camera, Detections),
+    "masking": (Frame, Camera, Detections),
     "tracker": (Frame, Camera, SurfaceView, Pose),
     "refiner": (PointClusters, Frame, Camera),
     "fuser": (Frame, Camera, Pose, PointClusters, Instance),
@@ -65,6 +67,7 @@ DATA: dict[str, tuple[type, ...]] = {  # by stage: data types of its arguments a
 }
 VARIANTS = {  # by stage: changed parameter of the example variant in the README
     "detector": "tolerance: 30",
+    "masking": "min_score: 0.6",
     "tracker": "max_distance: 0.2",
     "refiner": "reach: 0.6",
     "fuser": "least: 0.3",

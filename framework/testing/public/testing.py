@@ -15,6 +15,7 @@ pytest.register_assert_rewrite("framework.testing")  # shows the values of faile
 from framework.testing.contracts import (
     DetectorContract,
     FuserContract,
+    MaskingContract,
     OptionContract,
     RefinerContract,
     SequenceContract,
@@ -50,6 +51,7 @@ __all__ = [
     "STAGE_MS",
     "DetectorContract",
     "FuserContract",
+    "MaskingContract",
     "OptionContract",
     "RefinerContract",
     "RoomMap",
