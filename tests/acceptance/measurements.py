@@ -169,7 +169,7 @@ def grown() -> long_run.Growth:
     return long_run.measure()
 
 
-@measurement("< 50 bytes per frame, 20,000 frames of a known room", *PIPELINE)
+@measurement("< 50 bytes of heap per frame, 20,000 frames of a known room", *PIPELINE)
 def long_run_growth() -> Measured:
     value = grown().bytes_per_frame
     return value, value < 50

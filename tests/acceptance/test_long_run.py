@@ -1,0 +1,22 @@
+"""Tests for the growth of a long run."""
+
+import numpy as np
+import pytest
+
+from tests.acceptance.long_run import FRAMES, Growth, growth_of, heap_size
+
+
+def test_growth_with_outliers_is_exact() -> None:
+    frames = np.arange(100) * FRAMES / 100
+    size, relative_ms = 1e9 + 42 * frames, np.full(100, 3.0)
+    relative_ms[75:] = 3.3
+    relative_ms[::9] = 50
+    found = growth_of(size, relative_ms)
+    assert found == pytest.approx(Growth(42.0, 1.1))
+
+
+def test_heap_size_counts_arrays() -> None:
+    before = heap_size()
+    array = np.ones(10**6)
+    assert 8e6 <= heap_size() - before < 9e6
+    del array
