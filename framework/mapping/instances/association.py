@@ -234,7 +234,7 @@ class Association:
     merge_agreement: float = 0.1
     # number of frames with detections after which a tentative instance is removed if none of them detects it, >= 0;
     # 0 = never
-    tentative_max_age: int = 300
+    tentative_max_age: int = 1000
 
     def __post_init__(self) -> None:
         check_bounds(
