@@ -286,5 +286,7 @@ def _kth(override: str, k: int) -> str:
     value = override.split("=")[1]
     if value.startswith("interval("):
         return value.removeprefix("interval(").split(",")[0]
+    if value.startswith("'"):
+        return value
     values = value.split(",")
     return values[k % len(values)]

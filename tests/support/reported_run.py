@@ -24,6 +24,7 @@ CONFIG: dict[str, Any] = {
     "detection_cache": "off",
     "dataset": {"_target_": "tests.support.scenes.corner_room.CornerRoom", "frames": 6},
     "detector": {"_target_": "tests.support.scenes.corner_room.SphereDetector"},
+    "masking": {"_target_": "plugins.masking.none.NoMasking"},
     "tracker": {"_target_": "tests.support.scenes.corner_room.GivenPose"},
     "refiner": {"_target_": "tests.support.scenes.corner_room.KeepAll"},
     "fuser": {"_target_": "plugins.fusers.bayesian_tsdf.BayesianTsdf", "voxel_size": 0.03, "min_observations": 2},

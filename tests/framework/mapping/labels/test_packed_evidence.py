@@ -39,7 +39,7 @@ def evidence_of(storage: Storage) -> Evidence:
     values = np.where(used, rng.choice([-1.5, -0.0, 0.0, 2.5], used.shape), 0)
     slots = like.class_ids.shape[1]
     filled = np.arange(slots) < (rng.integers(1, 4, (count, 1)) if storage is Storage.COMPACT else slots)
-    classes = np.where(filled, np.arange(slots) + rng.integers(0, 2, (count, 1)) % CLASSES, NO_CLASS)
+    classes = np.where(filled, 1 + (np.arange(slots) + rng.integers(0, 2, (count, 1))) % CLASSES, NO_CLASS)
     scores = np.where(filled, rng.integers(-2, 3, (count, 1)), 0)
     arrays = zip(SLOTS, (ids, values, classes, scores), strict=True)
     return Evidence(labeled, **{name: array.astype(getattr(like, name).dtype) for name, array in arrays})
