@@ -6,7 +6,7 @@ the measured surface or in a ray-cast view. The ray-cast view is our interpretat
 A cluster and an instance can match if their overlap is large enough. By default, the overlap is relative to the smaller
 of the two, so that a part of an object matches the whole. Matching is one to one, in order of decreasing IoU. An
 unmatched cluster creates a new instance. Most instances of false detections stay tentative. They are removed after some
-time, so that the map of a known place does not grow.
+time, so that their number does not grow in a known place.
 """
 
 from __future__ import annotations
