@@ -25,7 +25,7 @@ from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose, View, check_label_space
 from framework.errors import DataError
 from framework.mapping.instances.association_kernels import count_votes
-from framework.mapping.instances.instance_table import InstanceTable
+from framework.mapping.instances.instance_table import Condition, InstanceTable
 from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed_space
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
@@ -140,8 +140,9 @@ class LabeledMap(Protocol):
 
     table: InstanceTable
 
-    def instance_ids(self) -> frozenset[int]:
-        """Return the confirmed instances."""
+    @property
+    def confirmation(self) -> Condition:
+        """The condition for an instance to be confirmed."""
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
         """Return the most likely instance at the measured surface at every stride-th pixel of a frame, 0 = none.
@@ -330,10 +331,10 @@ class Association:
 
     def expire(self, scene: LabeledMap) -> None:
         """Remove the tentative instances that have reached `tentative_max_age`."""
-        scene.instance_ids()  # updates the tentative instances
-        expired = scene.table.undetected(self.tentative_max_age) if self.tentative_max_age else []
-        if expired:
-            scene.remove(expired)
+        if self.tentative_max_age:
+            expired = scene.table.undetected(scene.confirmation, self.tentative_max_age)
+            if expired:
+                scene.remove(expired)
 
 
 def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str, ...]:

@@ -210,8 +210,14 @@ class InstanceTable:
             self._changed.clear()
         return self._confirmed
 
-    def undetected(self, frames: int) -> list[int]:
-        """Return the instances that were tentative and undetected in the last `frames` frames with detections."""
+    def undetected(self, condition: Condition, frames: int) -> list[int]:
+        """Return the instances that were tentative and undetected in the last `frames` frames with detections.
+
+        Args:
+            condition: The condition for an instance to be confirmed. All other instances are tentative.
+            frames: The number of frames.
+        """
+        self.confirmed(condition)  # updates the tentative instances
         return [*takewhile(lambda k: self.frames_detected - self.tentative[k] >= frames, self.tentative)]
 
     def flags(self, instance_ids: Int32) -> Bool:

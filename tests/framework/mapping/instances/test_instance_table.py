@@ -123,7 +123,7 @@ def test_instance_table_random_operations_match_reference(seed: int) -> None:
         assert table.confirmed(condition) == table.records.keys() - tentative
         assert {k: table.frames_detected - n for k, n in table.tentative.items()} == age
         expired = {k for k in tentative if age[k] >= 20}
-        assert set(table.undetected(20)) == expired
+        assert set(table.undetected(condition, 20)) == expired
         for k in expired:
             table.remove(k)
             del age[k]
