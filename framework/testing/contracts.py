@@ -78,15 +78,19 @@ class OptionContract:
         assert given == default
 
 
+def _plugin_missing(tests: object, tested: str) -> NotImplementedError:
+    return NotImplementedError(
+        f"{type(tests).__name__}.plugin: expected an override, got none; return the {tested} under test from plugin()"
+    )
+
+
 class SequenceContract:
     """Tests of a sequence with poses."""
 
     stage = "dataset"
 
     def plugin(self) -> RGBDSequence:
-        raise NotImplementedError(
-            "SequenceContract.plugin: expected an override, got none; return the sequence under test from plugin()"
-        )
+        raise _plugin_missing(self, "sequence")
 
     def test_dataset_returns_frames_of_its_camera(self) -> None:
         sequence = self.plugin()
@@ -110,9 +114,7 @@ class DetectorContract:
     stage = "detector"
 
     def plugin(self) -> Detector:
-        raise NotImplementedError(
-            "DetectorContract.plugin: expected an override, got none; return the detector under test from plugin()"
-        )
+        raise _plugin_missing(self, "detector")
 
     def test_detector_returns_valid_detections(self) -> None:
         detector = self.plugin()
@@ -184,9 +186,7 @@ class MaskingContract:
     stage = "masking"
 
     def plugin(self) -> FrameMasking:
-        raise NotImplementedError(
-            "MaskingContract.plugin: expected an override, got none; return the masking under test from plugin()"
-        )
+        raise _plugin_missing(self, "masking")
 
     def test_masking_only_removes_depth_and_detections(self) -> None:
         masking = self.plugin()
@@ -216,9 +216,7 @@ class TrackerContract:
     stage = "tracker"
 
     def plugin(self) -> PoseTracker:
-        raise NotImplementedError(
-            "TrackerContract.plugin: expected an override, got none; return the tracker under test from plugin()"
-        )
+        raise _plugin_missing(self, "tracker")
 
     def test_tracker_returns_poses_without_changing_map(self) -> None:
         tracker = self.plugin()
@@ -292,9 +290,7 @@ class RefinerContract:
     stage = "refiner"
 
     def plugin(self) -> ClusterRefiner:
-        raise NotImplementedError(
-            "RefinerContract.plugin: expected an override, got none; return the refiner under test from plugin()"
-        )
+        raise _plugin_missing(self, "refiner")
 
     def test_refiner_returns_only_measured_points(self) -> None:
         frame = frame_at(1)
@@ -367,9 +363,7 @@ class FuserContract:
     stage = "fuser"
 
     def plugin(self) -> MapFuser:
-        raise NotImplementedError(
-            "FuserContract.plugin: expected an override, got none; return the fuser under test from plugin()"
-        )
+        raise _plugin_missing(self, "fuser")
 
     def test_fuser_starts_with_empty_map(self) -> None:
         scene = self.plugin().scene
