@@ -47,6 +47,10 @@ test: check ## run make check and the integration tests
 acceptance: $(INSTALLED_DEV) ## run the missing and outdated acceptance measurements; MEASUREMENT=NAME runs one
 	$(BIN)/python -m tests.acceptance $(MEASUREMENT)
 
+.PHONY: endurance
+endurance: $(INSTALLED_DEV) ## map 10,000 frames and fail if memory, time, instances or errors grow
+	$(BIN)/python -m tests.endurance
+
 .PHONY: docs
 docs: $(INSTALLED_DEV) ## build the documentation into outputs/docs
 	@$(BIN)/python -m sphinx -W --keep-going -n -q -d outputs/docs/.doctrees docs outputs/docs

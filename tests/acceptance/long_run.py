@@ -7,8 +7,6 @@ reserved memory, which the heap contains from the start. The surface of the room
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import json
 import os
 import subprocess
@@ -20,12 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.api import Mapper
-from framework.data import Float64, Frame
+from framework.data import Float64
 from framework.mapping.instances.instance_list import InstanceTableMap
 from framework.synthetic.room import RoomKind
 from framework.synthetic.sequence import Synthetic
 from framework.synthetic.walk import FRAME_RATE
 from tests.acceptance.runner import CHECKOUT
+from tests.support.process_memory import ALLOCATOR, memory
+from tests.support.reference_time import Reference
 
 FRAMES = 20_000
 VIEWS = 100  # number of views of the room
@@ -33,17 +33,6 @@ INTERVAL = 2 * VIEWS  # number of frames forward and backward; values are compar
 # 120 new instances for each 900 frames; in a real kitchen, 36
 OVERRIDES = ("detector=simulated_maskrcnn2go", "detector.false_positives=0.8", "fuser.voxel_size=0.03")
 REFERENCE_INTERVAL = 10  # number of frames between two timings of the reference
-
-
-class _Mallinfo2(ctypes.Structure):
-    """Statistics of glibc's malloc, see mallinfo2(3)."""
-
-    _fields_ = [
-        (name, ctypes.c_size_t)
-        for name in (
-            "arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
-        )
-    ]  # fmt: skip
 
 
 class Growth(NamedTuple):
@@ -56,7 +45,7 @@ class Growth(NamedTuple):
 def measure() -> Growth:
     """Map the long run in another process, and return its growth."""
     command = [sys.executable, "-m", "tests.acceptance.long_run"]
-    environment = os.environ | {"PYTHONMALLOC": "malloc", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {ALLOCATOR: "malloc", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=CHECKOUT, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return Growth(*json.loads(done.stdout.splitlines()[-1]))
 
@@ -70,29 +59,12 @@ def growth_of(size: Float64, relative_ms: Float64) -> Growth:
     return Growth(float(last - first) / (0.75 * FRAMES), float(late / early))
 
 
-def heap_size() -> int:
-    """Return the size of all objects in the heap of this process after garbage collection, bytes."""
-    gc.collect()
-    mallinfo2 = ctypes.CDLL(None).mallinfo2
-    mallinfo2.restype = _Mallinfo2
-    found = mallinfo2()
-    return int(found.uordblks + found.hblkhd)
-
-
-def reference_ms(mapper: Mapper, frame: Frame) -> float:
-    """Return the processor time of a computation of constant cost, ms. Other programs slow it down like mapping."""
-    began = time.process_time()
-    mapper.scene.render(frame.camera, np.eye(4))
-    return 1e3 * (time.process_time() - began)
-
-
 def main() -> None:
     room = Synthetic(seed=3, kind=RoomKind.LIVING_ROOM, frames=VIEWS, width=160, height=120)
     views = [room[k] for k in range(VIEWS)]
-    mapper, reference = Mapper(*OVERRIDES), Mapper("detector=none")
+    mapper, reference = Mapper(*OVERRIDES), Reference(views[0])
     scene = mapper.scene
     assert isinstance(scene, InstanceTableMap)
-    reference.add(views[0])
     milliseconds, constant = np.full((2, FRAMES), np.nan)
     size = np.empty(FRAMES // INTERVAL)
     lost = 0
@@ -103,10 +75,10 @@ def main() -> None:
         lost += mapper.add(replace(view, index=number, timestamp=number / FRAME_RATE)).lost
         milliseconds[number] = 1e3 * (time.process_time() - began)
         if number % REFERENCE_INTERVAL == 0:
-            constant[number] = reference_ms(reference, view)
+            constant[number] = reference.milliseconds()
         if position == INTERVAL - 1:
             visit = number // INTERVAL
-            size[visit] = heap_size()
+            size[visit] = memory().heap
             if visit % 10 == 9:
                 print(
                     f"frame {number + 1}: heap {size[visit]:.0f} bytes, map {scene.statistics.bytes} bytes; "

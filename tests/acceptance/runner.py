@@ -70,12 +70,12 @@ def is_current(row: Sequence[str], paths: Sequence[str]) -> bool:
 
 def measure(chosen: Measurement) -> list[str]:
     """Run a measurement and return its row for the page."""
-    commit = _git("rev-parse", "--short", "HEAD") + "+" * bool(_git("status", "--porcelain", "--", *chosen.paths))
+    commit = commit_of(chosen.paths)
     begin = time.monotonic()
     value, met = chosen.measure()
     minutes = (time.monotonic() - begin) / 60
     shown = f"{value:.6g}" if met else f"{value:.6g} (missed)"
-    return [chosen.name, shown, chosen.bound, str(date.today()), commit, _machine(), f"{minutes:.1f}"]
+    return [chosen.name, shown, chosen.bound, str(date.today()), commit, machine(), f"{minutes:.1f}"]
 
 
 def run(names: Sequence[str]) -> bool:
@@ -92,11 +92,17 @@ def run(names: Sequence[str]) -> bool:
     return not any("(missed)" in rows[name][1] for name in names or rows)
 
 
+def commit_of(paths: Sequence[str]) -> str:
+    """Return the abbreviated commit, followed by + if the code at `paths` has uncommitted changes."""
+    return _git("rev-parse", "--short", "HEAD") + "+" * bool(_git("status", "--porcelain", "--", *paths))
+
+
 def _git(*arguments: str, missing: str = "") -> str:
     done = subprocess.run(["git", "-C", str(CHECKOUT), *arguments], capture_output=True, text=True, check=False)
     return done.stdout.strip() if done.returncode == 0 else missing
 
 
-def _machine() -> str:
+def machine() -> str:
+    """Return the number of cores and the name of the processor."""
     cpu = next((text for text in Path("/proc/cpuinfo").read_text().splitlines() if text.startswith("model name")), "")
     return f"{os.cpu_count()} cores, {cpu.partition(':')[2].strip() or 'unknown CPU'}"

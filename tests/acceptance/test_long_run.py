@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.acceptance.long_run import FRAMES, Growth, growth_of, heap_size
+from tests.acceptance.long_run import FRAMES, Growth, growth_of
 
 
 def test_growth_with_outliers_is_exact() -> None:
@@ -13,10 +13,3 @@ def test_growth_with_outliers_is_exact() -> None:
     relative_ms[::9] = 50
     found = growth_of(size, relative_ms)
     assert found == pytest.approx(Growth(42.0, 1.1))
-
-
-def test_heap_size_counts_arrays() -> None:
-    before = heap_size()
-    array = np.ones(10**6)
-    assert 8e6 <= heap_size() - before < 9e6
-    del array

@@ -1,0 +1,174 @@
+"""Growth over repeated visits of a place, and its bounds.
+
+The place is known after the first visit, so nothing may grow in later visits. Each block of frames is compared with the
+block at the same position of each later visit, which sees the same views. The growth is the median slope of these pairs
+(seasonal Sen slope: Hirsch, Slack and Smith, "Techniques of trend analysis for monthly water quality data", Water
+Resources Research 18(1), 1982).
+
+A bound fails if three quarters of the slopes exceed it. Growth affects all pairs. A single disturbed visit, for example
+by another program, affects at most half of the pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from framework.data import Float64
+from tests.endurance.visits import Block
+
+FIRST_RETURN = 1  # number of the first visit of a known place
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A measured quantity of a place."""
+
+    value: float
+    spread: tuple[float, float] | None  # quartiles of the slopes; None = a single value
+
+    @property
+    def certain(self) -> float:
+        """The value that is compared with the bound."""
+        return self.value if self.spread is None else self.spread[0]
+
+
+@dataclass(frozen=True)
+class Bound:
+    """The maximum value of a quantity of each place."""
+
+    quantity: str
+    unit: str
+    limit: float
+    reason: str
+    measure: Callable[[Sequence[Block]], Measured]  # measures the quantity, given the blocks of one place
+
+    def verdict(self, blocks: Sequence[Block]) -> Verdict:
+        """Compare a place with the bound, given its blocks."""
+        return Verdict(blocks[0].place, self, self.measure(blocks))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The comparison of a place with a bound."""
+
+    place: str
+    bound: Bound
+    measured: Measured
+
+    @property
+    def is_met(self) -> bool:
+        return self.measured.certain <= self.bound.limit
+
+    def __str__(self) -> str:
+        """Return the error message of a bound that is not met."""
+        bound = self.bound
+        got = f"{self.measured.value:.4g}"
+        return f"{self.place}: {bound.quantity}: expected at most {bound.limit:g} {bound.unit}, got {got}"
+
+
+def growth(
+    value: Callable[[Block], float], frames: int = 1, *, relative: bool = False
+) -> Callable[[Sequence[Block]], Measured]:
+    """Return a function that measures the growth of a value after the first visit.
+
+    Args:
+        value: The value of a block.
+        frames: The number of frames of the unit, such as 1000 for "per 1,000 frames".
+        relative: True = growth in percent of the median value.
+    """
+
+    def measure(blocks: Sequence[Block]) -> Measured:
+        values = by_visit(blocks, value)[FIRST_RETURN:]
+        scale = frames * (100 / float(np.median(values)) if relative else 1.0)
+        return sen_slope(scale * values, visit_frames(blocks))
+
+    return measure
+
+
+def sen_slope(values: Float64, step: int) -> Measured:
+    """Return the median slope of all pairs of visits at the same position, with the quartiles of the slopes.
+
+    Args:
+        values: Values (visits, positions) of at least two visits.
+        step: The number of frames of a visit.
+    """
+    earlier, later = np.triu_indices(len(values), 1)
+    slopes = (values[later] - values[earlier]) / (step * (later - earlier))[:, None]
+    lower, median, upper = (float(q) for q in np.quantile(slopes, (0.25, 0.5, 0.75)))
+    return Measured(median, (lower, upper))
+
+
+def drift_increase(blocks: Sequence[Block]) -> Measured:
+    """Return the maximum error of a later visit minus the error of the first visit, mm."""
+    first, *later = errors_mm(blocks)
+    return Measured(max(later) - first, None)
+
+
+def lost_frames(blocks: Sequence[Block]) -> Measured:
+    return Measured(sum(block.lost for block in blocks), None)
+
+
+BOUNDS = (
+    Bound("heap", "bytes per frame", 50, "5 MB per hour at 30 Hz", growth(lambda block: block.heap)),
+    Bound(
+        "resident memory", "bytes per frame", 1000, "fragmentation; pages of 4 KB and 2 MB make it coarse",
+        growth(lambda block: block.resident),
+    ),
+    Bound(
+        "map", "% per 1,000 frames", 1, "sensor noise adds a few blocks at depth edges",
+        growth(lambda block: block.map_bytes, 1000, relative=True),
+    ),
+    Bound(
+        "processor time", "% per 1,000 frames", 5, "noise of the medians, about 3 %",
+        growth(lambda block: block.relative_time, 1000, relative=True),
+    ),
+    Bound(
+        "confirmed instances", "per 1,000 frames", 1, "the objects are known after the first visit",
+        growth(lambda block: block.confirmed, 1000),
+    ),
+    Bound(
+        "tentative instances", "per 1,000 frames", 2, "new ones replace expired ones",
+        growth(lambda block: block.tentative, 1000),
+    ),
+    Bound("drift after the first visit", "mm", 5, "half of the smallest usual voxel, 1 cm", drift_increase),
+    Bound("lost frames", "frames", 0, "slow motion in a known place", lost_frames),
+)  # fmt: skip
+"""The bounds of the endurance run."""
+
+
+def verdicts(blocks: Sequence[Block]) -> list[Verdict]:
+    """Compare each place with each bound."""
+    return [bound.verdict(own) for bound in BOUNDS for own in by_place(blocks).values()]
+
+
+def by_place(blocks: Sequence[Block]) -> dict[str, list[Block]]:
+    """Return the blocks of each place."""
+    return {name: [block for block in blocks if block.place == name] for name in dict.fromkeys(b.place for b in blocks)}
+
+
+def by_visit(blocks: Sequence[Block], value: Callable[[Block], float]) -> Float64:
+    """Return the values (visits, positions) of the blocks of one place."""
+    return np.array([value(block) for block in blocks], np.float64).reshape(visits_of(blocks), -1)
+
+
+def visits_of(blocks: Sequence[Block]) -> int:
+    return 1 + max(block.visit for block in blocks)
+
+
+def visit_frames(blocks: Sequence[Block]) -> int:
+    """Return the number of frames of a visit, given the blocks of one place."""
+    return sum(len(block.cpu_ms) for block in blocks if block.visit == 0)
+
+
+def errors_mm(blocks: Sequence[Block]) -> list[float]:
+    """Return the root mean square position error of each visit, mm, given the blocks of one place."""
+    errors = [np.concatenate([b.errors_mm for b in blocks if b.visit == visit]) for visit in range(visits_of(blocks))]
+    return [rms(of_visit) for of_visit in errors]
+
+
+def rms(errors: Float64) -> float:
+    """Return the root mean square of the errors that are not NaN."""
+    return float(np.sqrt(np.nanmean(errors**2)))
