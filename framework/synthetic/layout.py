@@ -42,7 +42,7 @@ class Layout:
     free: Float64  # (rows along y, columns along x) m, distance from each floor cell to the nearest object or wall
 
 
-def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout:
+def arrange(groups: list[Group], width: float, depth: float, rng: Rng, walkway: float = 0.0) -> Layout:
     """Place furniture groups in the smallest room with space for a camera path.
 
     Args:
@@ -50,13 +50,14 @@ def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout
         width: The width of the smallest room, m.
         depth: The depth of the smallest room, m.
         rng: The random number generator.
+        walkway: The width of the free strip at the wall at -y, m.
 
     Raises:
         DataError: The groups do not fit into the largest room.
     """
     boxes = [group.boxes for group in groups]
     for factor in GROWTH:
-        plans = [_try_layout(groups, boxes, factor * width, factor * depth, rng) for _ in range(LAYOUTS)]
+        plans = [_try_layout(groups, boxes, factor * width, factor * depth, rng, walkway) for _ in range(LAYOUTS)]
         complete = [plan for plan in plans if plan is not None]
         if not complete:
             continue
@@ -79,11 +80,12 @@ class _Plan:
 
 
 def _try_layout(
-    groups: list[Group], boxes_of_groups: list[Float64], width: float, depth: float, rng: Rng
+    groups: list[Group], boxes_of_groups: list[Float64], width: float, depth: float, rng: Rng, walkway: float
 ) -> _Plan | None:
     """Return a random layout, or None if a group does not fit."""
     plan = _Plan()
-    taken = np.zeros((0, 2, 3))
+    low, high = np.array([-width, -depth]) / 2, np.array([width / 2, walkway - depth / 2])
+    taken = np.array([[[*low, 0.0], [*high, np.inf]]] if walkway else np.zeros((0, 2, 3)))
     walls: dict[str, tuple[int, float]] = {}
     for group, boxes in zip(groups, boxes_of_groups, strict=True):
         solid = group.solid

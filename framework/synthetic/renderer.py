@@ -44,7 +44,14 @@ class Renderer:
     The light is computed once for all vertices.
     """
 
-    def __init__(self, surfaces: Surfaces, lamps: list[Lamp]) -> None:
+    def __init__(self, surfaces: Surfaces, lamps: list[Lamp], irradiance: Float32 | None = None) -> None:
+        """Prepare the surfaces and their light.
+
+        Args:
+            surfaces: The surfaces.
+            lamps: The lamps.
+            irradiance: The irradiance (V, 3) of the vertices, linear RGB; None = computed from the lamps.
+        """
         self.surfaces = surfaces
         self.caster = RayCaster(surfaces.vertices, surfaces.triangles)
         corners = surfaces.vertices[surfaces.triangles].astype(np.float64)
@@ -52,7 +59,7 @@ class Renderer:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
         self._lit = LitSurfaces(
             texture=surfaces.texture,
-            irradiance=bake(surfaces, self.caster, lamps),
+            irradiance=bake(surfaces, self.caster, lamps) if irradiance is None else irradiance,
             triangles=surfaces.triangles,
             normals=normals.astype(np.float32),
             materials=surfaces.materials,

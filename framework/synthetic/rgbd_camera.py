@@ -9,6 +9,10 @@
 - Readings are missing where the projector or second camera is occluded, at many pixels along depth edges, and at
   grazing angles.
 - Dark and shiny surfaces lose readings in patches, because the correlation window is wider than a pixel.
+- Each device has a fixed error: a constant offset and a low-frequency pattern. Both grow with the square of the depth,
+  as errors of the disparity do, and warp walls at more than 3 m (Teichman, Miller and Thrun, "Unsupervised Intrinsic
+  Calibration of Depth Sensors via SLAM", RSS 2013; Basso, Menegatti and Pretto, "Robust Intrinsic and Extrinsic
+  Calibration of RGB-D Cameras", IEEE Transactions on Robotics 34(5), 2018). Its size is our choice: 1 to 3 cm at 4 m.
 - Color has noise and motion blur.
 """
 
@@ -20,6 +24,7 @@ from functools import lru_cache
 from statistics import NormalDist
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from framework.data import Camera, Float32, Float64, UInt8, UInt16
@@ -37,6 +42,9 @@ from framework.synthetic.rgbd_camera_kernels import (
 LATERAL_SIGMA = 0.8  # px at 640 px width, standard deviation: the constant term of Nguyen et al.
 PATCH = 14.0  # px at 640 px width, spacing of the random field that determines the patches without readings
 COLOR_SIGMA = 1.5  # standard deviation of color noise, in gray levels from 0 to 255
+DISPARITY_ERROR = 0.05  # px, standard deviation of the offset and of the pattern of a device that measures disparity
+RANGE_ERROR = 5e-4  # 1/m, standard deviation of both for other devices, relative to the square of the depth
+PATTERN_NODES = (4, 5)  # rows and columns of the random grid that the pattern interpolates
 
 
 class Triangulation(NamedTuple):
@@ -59,6 +67,7 @@ class DepthSensor:
     noise: float  # 0 = exact, 1 = as measured; scales standard deviations and probabilities
     max_range: float  # m, maximum depth of a reading
     kind: SensorKind = SensorKind.KINECT_V1
+    distortion: Float32 | None = None  # (H, W) 1/m, fixed error relative to the square of the depth; None = no error
 
     def measure(
         self,
@@ -77,6 +86,8 @@ class DepthSensor:
             rng: The random number generator.
             unread: The fraction of readings (H, W) that are lost on dark and shiny materials; None = 0.
         """
+        if self.distortion is not None:
+            depth = depth + self.distortion * depth * depth
         if self.noise == 0 or self.kind is SensorKind.EXACT:
             return np.where(depth <= self.max_range, depth, np.float32(0))
         noise, width, normal = self.noise, camera.width, normal_quantiles()
@@ -95,6 +106,15 @@ class DepthSensor:
             field = normal[random_bits(nodes, rng) >> SPARE_BITS]
             drop_patches(unread, field, np.float32(cell), normal, np.float32(min(noise, 1.0)), reading)
         return reading
+
+
+def device_distortion(kind: SensorKind, camera: Camera, rng: np.random.Generator) -> Float32:
+    """Return the fixed error (H, W) of a random device, 1/m, relative to the square of the depth."""
+    baseline = TRIANGULATION[kind].baseline if kind in TRIANGULATION else 0.0
+    sigma = DISPARITY_ERROR * camera.width / 640 / (camera.fx * baseline) if baseline else RANGE_ERROR
+    offset, nodes = rng.normal(), rng.normal(size=PATTERN_NODES)
+    pattern = cv2.resize(nodes, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
+    return np.asarray(sigma * (offset + pattern), np.float32)
 
 
 def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:

@@ -5,7 +5,7 @@ In the world frame, x and y are along the walls, z is up, and the origin is at t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -23,6 +23,8 @@ from framework.synthetic.paints import Material, Texture
 from framework.synthetic.surfaces import Surfaces, assemble
 
 HEIGHT = 2.55  # m, height of the ceiling
+DOORWAY = (0.9, 2.05)  # m, width and height of a doorway
+NO_DOORWAYS: Mapping[int, Sequence[float]] = {}
 WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear RGB colors of lamps and of daylight
 
 
@@ -57,7 +59,7 @@ class Room:
 
 def furnish(kind: RoomKind, rng: Rng) -> Room:
     """Return a random room of a given kind."""
-    return furnish_with(_groups(kind, rng), *MIN_ROOM_SIZES[kind], rng)
+    return furnish_with(furniture_groups(kind, rng), *MIN_ROOM_SIZES[kind], rng)
 
 
 def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, strewn: Sequence[Furniture] = ()) -> Room:
@@ -73,11 +75,11 @@ def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, st
     layout = strew(arrange(contents, width, depth, rng), strewn, rng)
     globe_lamp = clutter.ceiling_lamp(rng).placed(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), HEIGHT)
     pieces = [*layout.pieces, globe_lamp]
-    objects = ((0, _shell(layout.width, layout.depth, rng)), *enumerate(pieces, start=1))
-    return Room(layout, objects, tuple(_lamps(pieces)), assemble(objects))
+    objects = ((0, shell_of(layout.width, layout.depth, rng)), *enumerate(pieces, start=1))
+    return Room(layout, objects, tuple(lamps_of(pieces)), assemble(objects))
 
 
-def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
+def furniture_groups(kind: RoomKind, rng: Rng) -> list[Group]:
     """Return the furniture groups of a room, largest first."""
     door, window = single("door", clutter.door(rng)), single("window", clutter.window(rng), z=0.95, hung=True)
     bag = single("backpack", fixtures.backpack(rng))
@@ -107,8 +109,15 @@ def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
     return main
 
 
-def _shell(width: float, depth: float, rng: Rng) -> Furniture:
-    """Return the floor, the ceiling and the walls of a room."""
+def shell_of(width: float, depth: float, rng: Rng, doorways: Mapping[int, Sequence[float]] = NO_DOORWAYS) -> Furniture:
+    """Return the floor, the ceiling and the walls of a room.
+
+    Args:
+        width: The width of the room, m.
+        depth: The depth of the room, m.
+        rng: The random number generator.
+        doorways: The offsets of the doorways from the middle of each wall, m, by wall as in `place_on_wall`.
+    """
     shell = Furniture("shell")
     shell.add(panel(width, depth).turned("x", np.pi / 2), _floor(rng), y=depth / 2)
     ceiling = panel(width, depth).turned("x", -np.pi / 2).moved(y=-depth / 2, z=HEIGHT)
@@ -120,10 +129,27 @@ def _shell(width: float, depth: float, rng: Rng) -> Furniture:
     for wall in range(4):
         length = width if wall % 2 == 0 else depth
         x, y, angle = place_on_wall(wall, 0.0, width, depth)
-        shell.add(panel(length, HEIGHT).turned("z", angle), paper if wall == papered else plain, x, y)
-        board = rounded_box(length, 0.012, 0.08, 0.004).moved(y=0.006, z=0.04)
-        shell.add(board.turned("z", angle), skirting, x, y)
+        openings = sorted(doorways.get(wall, ()))
+        for low, high, base in _wall_pieces(length, openings):
+            piece = panel(high - low, HEIGHT - base).moved((low + high) / 2, z=base)
+            piece = replace(piece, texture=piece.texture + np.array([length / 2 - high, base, 0.0]))
+            shell.add(piece.turned("z", angle), paper if wall == papered else plain, x, y)
+            if base == 0:
+                board = rounded_box(high - low, 0.012, 0.08, 0.004).moved((low + high) / 2, y=0.006, z=0.04)
+                shell.add(board.turned("z", angle), skirting, x, y)
     return shell
+
+
+def _wall_pieces(length: float, doorways: Sequence[float]) -> list[tuple[float, float, float]]:
+    """Return the ends along a wall and the height of the base of each rectangle of a wall with doorways, m.
+
+    Args:
+        length: The length of the wall, m.
+        doorways: The offsets of the doorways from the middle of the wall, m, in ascending order.
+    """
+    above = [(middle - DOORWAY[0] / 2, middle + DOORWAY[0] / 2, DOORWAY[1]) for middle in doorways]
+    ends = [-length / 2, *(end for low, high, _ in above for end in (low, high)), length / 2]
+    return [*((low, high, 0.0) for low, high in zip(ends[::2], ends[1::2], strict=True)), *above]
 
 
 def _floor(rng: Rng) -> Material:
@@ -139,7 +165,7 @@ def _floor(rng: Rng) -> Material:
     return paints.cloth(rng, paints.pick(rng, paints.CLOTHS))
 
 
-def _lamps(pieces: list[Furniture]) -> list[Lamp]:
+def lamps_of(pieces: list[Furniture]) -> list[Lamp]:
     """Return the light sources of all objects that emit light."""
     lamps: list[Lamp] = []
     for piece in pieces:

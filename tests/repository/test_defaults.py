@@ -28,7 +28,7 @@ pytestmark = pytest.mark.integration
 DESK = PROJECT_ROOT / "data" / "desk"
 WEIGHTS = Path("plugins/detectors/maskrcnn2go_int8")
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
-OF_RENDERED_ROOMS = {"synthetic"}
+OF_RENDERED_ROOMS = {"synthetic", "synthetic_building"}
 TIMED = {"table1_runtime", "figure3_stage_times", "ablation_detection_interval"}
 
 

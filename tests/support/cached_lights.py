@@ -15,6 +15,7 @@ import numpy as np
 
 from framework.data import Float32
 from framework.synthetic import lights, renderer
+from framework.synthetic.buildings import building
 from framework.synthetic.lights import Lamp
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.surfaces import Surfaces
@@ -49,4 +50,4 @@ def _code() -> bytes:
     return b"".join((CHECKOUT / "framework" / "synthetic" / f"{name}.py").read_bytes() for name in names)
 
 
-renderer.bake = bake
+renderer.bake = building.bake = bake

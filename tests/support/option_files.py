@@ -110,6 +110,11 @@ def _seven_scenes(root: Path) -> list[str]:
     return [f"dataset.root={root}"]
 
 
+def _synthetic_building(folder: Path) -> list[str]:
+    small = ("rooms=4", "designs=1", "frames=60", f"width={CAMERA.width}", f"height={CAMERA.height}")
+    return [f"dataset.{parameter}" for parameter in (*small, f"cache_dir={folder}")]
+
+
 def _synthetic(_: Path) -> list[str]:
     return [f"dataset.frames={FRAMES}", "dataset.width=160", "dataset.height=120"]
 
@@ -227,6 +232,7 @@ WRITERS: dict[tuple[str, str], Callable[[Path], list[str]]] = {
     ("dataset", "scenenn"): _scenenn,
     ("dataset", "seven_scenes"): _seven_scenes,
     ("dataset", "synthetic"): _synthetic,
+    ("dataset", "synthetic_building"): _synthetic_building,
     ("dataset", "tum_rgbd"): _tum_rgbd,
     ("detector", "mask_rcnn"): _mask_rcnn,
     ("detector", "onnx_boxes"): _onnx_boxes,

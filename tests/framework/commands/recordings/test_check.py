@@ -27,6 +27,7 @@ def inverted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_damaged(tmp_path_factory.mktemp("desk") / "inverted", DESK, pose=inverse)
 
 
+@pytest.mark.acceptance
 def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Path) -> None:
     asked = ("dataset=rgbd_folder", f"dataset.root={inverted}")
     done = checked(tmp_path, *asked)

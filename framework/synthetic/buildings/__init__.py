@@ -1,0 +1,1 @@
+"""Synthetic buildings of several rooms."""
