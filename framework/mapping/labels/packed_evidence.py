@@ -24,9 +24,6 @@ from framework.mapping.labels.packed_evidence_kernels import (
 from framework.mapping.voxels.packed_voxels import Bits, starts_of
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, BLOCK_VOXELS
 
-# arrays that are not compressed; the others take a tenth of the time
-STORED_EVIDENCE = ("states", "instance_value", "class_ids", "class_value")
-
 
 class PackedEvidence(NamedTuple):
     """The evidence of the L labeled voxels in R rows, which have K distinct states."""
