@@ -20,8 +20,8 @@ from tests.endurance.visits import visit_all
 from tests.support.reference_time import Reference
 
 FRAMES = 10_000
-MIN_FRAMES = 80  # one frame for each block
-MIN_VISITS = 5  # four of them to a known place, i.e. six pairs
+MIN_FRAMES = 112  # one frame for each block
+MIN_VISITS = 7  # with 10,000 frames, three of them before the first tentative instances expire
 MAX_ROUND = 2_400  # frames, maximum for one visit of each place: the recordings have 300 frames, forward and backward
 CODE = ("framework", "plugins", "conf", "tests/endurance")
 

@@ -14,7 +14,7 @@ from framework.figures.figure_page import INK, PAGE_MM, PNG_DPI, SMALL_PT, Page
 from framework.figures.metric_axes import COLORS, style_axes
 from framework.files.atomic_write import atomic_write
 from framework.runtime.run_log import STAGES
-from tests.endurance.growth import FIRST_RETURN, Verdict, by_place, by_visit, errors_mm, rms, visits_of
+from tests.endurance.growth import EXPIRY, Verdict, by_place, by_visit, errors_mm, first_compared, rms, visits_of
 from tests.endurance.visits import BLOCK, REFERENCE_INTERVAL, Block
 
 NAME = "endurance"
@@ -48,8 +48,10 @@ The places are visited in turn. Each place has its own map, which stays in memor
 """
 METHOD = f"""## Method
 
+- Tentative instances, i.e. those with too few detections (`fuser.min_observations`), expire after {EXPIRY:,} frames
+  (`fuser.tentative_max_age`). From the next visit on, nothing should grow, and visits are compared.
 - A visit consists of blocks of about {BLOCK} frames. A block is compared with the block at the same position of each
-  later visit, from the second visit on. Growth is the median slope of these pairs, with the quartiles in parentheses.
+  later visit. Growth is the median slope of these pairs, with the quartiles in parentheses.
 - A bound is missed if three quarters of the slopes exceed it. A single disturbed visit affects at most half of the
   pairs.
 - Processor time: all threads in `Mapper.add`. Relative time: divided by the time to render a map of one frame, which is
@@ -58,7 +60,6 @@ METHOD = f"""## Method
   the start, and their use does not count. Process: unique set size.
 - Error: distance of the camera from its reference position, root mean square. The reference of the standing camera is
   its first position.
-- Tentative instances are not confirmed yet (`fuser.min_observations`).
 """
 
 
@@ -83,7 +84,7 @@ def write_page(folder: Path, blocks: Sequence[Block], verdicts: Sequence[Verdict
             *bounds_table(verdicts),
             "\n## Visits\n",
             *visits_table(blocks),
-            "\n## Stages\n\nMedian time of each stage, ms, in the second and in the last visit:\n",
+            "\n## Stages\n\nMedian time of each stage, ms, in the first and in the last compared visit:\n",
             *stages_table(blocks),
             "",
             METHOD,
@@ -134,7 +135,7 @@ def stages_table(blocks: Sequence[Block]) -> list[str]:
     shown = [k for k in range(len(STAGES)) if any(np.isfinite(block.stage_ms[:, k]).any() for block in blocks)]
     rows = []
     for name, own in by_place(blocks).items():
-        for visit in (1, visits_of(own) - 1):
+        for visit in (first_compared(own), visits_of(own) - 1):
             times = np.concatenate([block.stage_ms for block in own if block.visit == visit])
             rows.append([name, str(visit + 1), *(f"{np.nanmedian(times[:, k]):.1f}" for k in shown)])
     return table(["place", "visit", *(STAGES[k] for k in shown)], rows)
@@ -152,7 +153,7 @@ def figure(blocks: Sequence[Block], provenance: str) -> Page:
         PAGE_MM,
         height,
         "One line for each visit of a place, one point for each block. Processor time: median (solid), 95 % (dotted). "
-        "Heap: difference from the second visit. Instances: confirmed (solid) and tentative (dotted). "
+        "Heap: difference from the first compared visit. Instances: confirmed (solid) and tentative (dotted). "
         f"Position error: root mean square. {provenance}",
     )
     labels = ("processor time, ms", "heap growth, KB", "process, MB", "instances", "position error, mm")
@@ -170,8 +171,9 @@ def figure(blocks: Sequence[Block], provenance: str) -> Page:
         draw = partial(_draw, blocks=own, color=color)
         draw(cost, by_visit(own, lambda block: float(np.median(block.cpu_ms))))
         draw(cost, by_visit(own, lambda block: float(np.quantile(block.cpu_ms, 0.95))), style=":")
+        first = first_compared(own)
         heap_kb = by_visit(own, lambda block: block.heap / KILO)
-        draw(heap, heap_kb - heap_kb[FIRST_RETURN], first=FIRST_RETURN)
+        draw(heap, heap_kb - heap_kb[first], first=first)
         draw(instances, by_visit(own, lambda block: block.confirmed))
         draw(instances, by_visit(own, lambda block: block.tentative), style=":")
         draw(error, by_visit(own, lambda block: rms(block.errors_mm)))

@@ -21,19 +21,21 @@ def test_short_run_writes_page_and_figure(tmp_path: Path) -> None:
     found = lane.run(lane.MIN_FRAMES, tmp_path)
     assert [(one.bound, one.place) for one in found] == [(bound, place) for bound in BOUNDS for place in PLACES]
     page = (tmp_path / "endurance.md").read_text()
-    assert "maps 80 frames of 4 places" in page
+    assert "maps 112 frames of 4 places" in page
     for place in PLACES:
         rows = re.findall(rf"^\| {place} \| (\d) \| 4 \| 0 \|", page, re.MULTILINE)
-        assert rows == ["1", "2", "3", "4", "5"], f"{place}: expected five visits of 4 frames without lost frames"
+        assert rows == [str(visit) for visit in range(1, 8)], (
+            f"{place}: expected seven visits of 4 frames without lost frames"
+        )
     assert cv2.imread(str(tmp_path / "endurance.png")).shape[1] > 1000
 
 
 def test_run_of_too_few_frames_raises(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--frames: expected at least 80, got 79"):
-        lane.run(79, tmp_path)
+    with pytest.raises(ConfigError, match="--frames: expected at least 112, got 111"):
+        lane.run(111, tmp_path)
 
 
-@pytest.mark.parametrize(("value", "status"), [(49.0, 0), (51.0, 1)])
+@pytest.mark.parametrize(("value", "status"), [(499.0, 0), (501.0, 1)])
 def test_command_status_is_nonzero_if_bound_is_missed(
     value: float, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -42,5 +44,5 @@ def test_command_status_is_nonzero_if_bound_is_missed(
     with pytest.raises(SystemExit) as caught:
         lane.main()
     assert caught.value.code == status
-    expected = "room: heap: expected at most 50 bytes per frame, got 51\n" if status else ""
+    expected = "room: heap: expected at most 500 bytes per frame, got 501\n" if status else ""
     assert capsys.readouterr().err == expected
