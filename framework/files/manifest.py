@@ -173,14 +173,15 @@ def verified(path: Path) -> Iterator[None]:
         yield
         return
     with ThreadPoolExecutor(1) as hashing:  # releases the GIL; the file is read from the disk only once
-        sha256 = hashing.submit(path_hash, path)
+        pending = hashing.submit(path_hash, path)
         yield
-    change = manifest.change(path, sha256.result())
-    if change:  # `evaluate` may have replaced the file in the meantime
-        change = (Manifest.of_file(path) or manifest).change(path, path_hash(path))
-    if change:
-        fix = f"repeat the run, or accept an intended change with {VERIFY} {path.parent} --accept {path.name}"
-        raise DataError(f"{change}; {fix}")
+    sha256, before = pending.result(), None
+    while change := manifest.change(path, sha256):
+        if before == (manifest, sha256):
+            fix = f"repeat the run, or accept an intended change with {VERIFY} {path.parent} --accept {path.name}"
+            raise DataError(f"{change}; {fix}")
+        before = manifest, sha256  # `evaluate` may be replacing both files, so they are read until they are constant
+        manifest, sha256 = Manifest.of_file(path) or manifest, path_hash(path)
 
 
 def _file_name(name: str) -> str:

@@ -7,6 +7,7 @@ interrupted move with `finish_replacement`, and the next writer discards unfinis
 
 from __future__ import annotations
 
+import errno
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -114,27 +115,32 @@ def finish_replacement(directory: Path) -> None:
         DataError: The replacement cannot be completed, for example in a read-only folder.
     """
     replacing = directory / REPLACING
-    if replacing.is_symlink() or not replacing.is_dir():
-        return
-    try:
-        sync_folder(directory)
-        for path in sorted(replacing.iterdir()):
-            with suppress(FileNotFoundError):  # moved by another process
-                if path.suffix == REMOVED:
-                    (directory / path.stem).unlink(missing_ok=True)
-                    path.unlink()
-                else:
-                    path.replace(directory / path.name)
-        sync_folder(directory)
-        replacing.rmdir()
-        sync_folder(directory)
-    except FileNotFoundError:  # completed by another process
-        return
-    except OSError as error:
-        raise DataError(
-            f"{replacing}: expected a writable folder to complete an interrupted replacement, got an error "
-            f"({error.strerror}); open the directory once with write permission"
-        ) from error
+    while replacing.is_dir() and not replacing.is_symlink():
+        try:
+            _finish(directory, replacing)
+        except FileNotFoundError:  # completed by another process
+            return
+        except OSError as error:
+            if error.errno == errno.ENOTEMPTY:  # another process has begun the next replacement
+                continue
+            raise DataError(
+                f"{replacing}: expected a writable folder to complete an interrupted replacement, got an error "
+                f"({error.strerror}); open the directory once with write permission"
+            ) from error
+
+
+def _finish(directory: Path, replacing: Path) -> None:
+    sync_folder(directory)
+    for path in sorted(replacing.iterdir()):
+        with suppress(FileNotFoundError):  # moved by another process
+            if path.suffix == REMOVED:
+                (directory / path.stem).unlink(missing_ok=True)
+                path.unlink()
+            else:
+                path.replace(directory / path.name)
+    sync_folder(directory)
+    replacing.rmdir()
+    sync_folder(directory)
 
 
 def _not_writable(directory: Path, error: OSError) -> DataError:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from framework.errors import DataError
+from framework.files import manifest
 from framework.files.manifest import Manifest, RunStatus, verified
 
 CHECKOUT = Path(__file__).resolve().parents[3]
@@ -20,8 +21,8 @@ def directory(tmp_path: Path) -> Path:
     """Return a run directory with two files and a manifest."""
     (tmp_path / "config.yaml").write_text("seed: 0\n")
     (tmp_path / "metrics.json").write_text("{}\n")
-    manifest = Manifest(RunStatus.COMPLETE, {}, {"detector.weights": "0f" * 32}, {"seed": "0"})
-    manifest.with_files(tmp_path, ["config.yaml", "metrics.json", "map.npz"]).write(tmp_path)
+    written = Manifest(RunStatus.COMPLETE, {}, {"detector.weights": "0f" * 32}, {"seed": "0"})
+    written.with_files(tmp_path, ["config.yaml", "metrics.json", "map.npz"]).write(tmp_path)
     return tmp_path
 
 
@@ -135,6 +136,24 @@ def test_verified_file_replaced_while_read_is_accepted(directory: Path) -> None:
     with verified(metrics):
         metrics.write_text('{"fps": 1}\n')
         stored.with_files(directory, ["metrics.json"]).write(directory)
+
+
+def test_verified_file_replaced_repeatedly_is_accepted(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both files are replaced after the manifest is read and before the file is read."""
+    hashed, later = manifest.path_hash, [1, 2, 3]
+
+    def replaced_hash(path: Path) -> str:
+        if later:
+            path.write_text(f"{later.pop()}\n")
+            with monkeypatch.context() as unchanged:
+                unchanged.setattr(manifest, "path_hash", hashed)
+                Manifest.read(directory).with_files(directory, [path.name]).write(directory)
+        return hashed(path)
+
+    monkeypatch.setattr(manifest, "path_hash", replaced_hash)
+    with verified(directory / "metrics.json"):
+        pass
+    assert not later
 
 
 def test_verified_missing_file_is_left_to_reader(directory: Path) -> None:

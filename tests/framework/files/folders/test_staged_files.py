@@ -134,6 +134,24 @@ def test_finish_replacement_of_other_process_is_accepted(old: Path, monkeypatch:
     assert contents(old) == {"a": "new", "b": "old", "c": "old"}
 
 
+def test_finish_replacement_with_next_one_of_other_process_completes_both(
+    old: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rmdir, later = Path.rmdir, ["second", "third"]
+
+    def removed_late(folder: Path) -> None:
+        if later:
+            (folder / "a").write_text(later.pop(0))
+        rmdir(folder)
+
+    (old / REPLACING).mkdir()
+    (old / REPLACING / "a").write_text("first")
+    monkeypatch.setattr(Path, "rmdir", removed_late)
+    finish_replacement(old)
+    assert (old / "a").read_text() == "third"
+    assert not (old / REPLACING).exists()
+
+
 def test_finish_replacement_in_read_only_folder_raises(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (old / REPLACING).mkdir()
     (old / REPLACING / "a").touch()
