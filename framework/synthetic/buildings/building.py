@@ -30,6 +30,7 @@ CORRIDOR_WIDTH = 1.8  # m
 WALL = 0.12  # m, thickness of the walls between rooms
 WALKWAY = 1.5  # m, width of the free strip of each room along the corridor
 LAMP_SPACING = 4.0  # m, maximum distance between the lamps of the corridor
+PICTURE_HEIGHT = 1.35  # m, height of the pictures in the corridor
 KINDS = (RoomKind.LIVING_ROOM, RoomKind.OFFICE, RoomKind.BEDROOM, RoomKind.KITCHEN)
 
 
@@ -130,7 +131,7 @@ def _room(design: _Design, place: RoomPlace, west: bool, east: bool, first_id: i
 
 
 def _corridor(places: Sequence[RoomPlace], length: float, first_id: int, rng: Rng) -> Zone:
-    """Return the corridor, with a closed door at both ends."""
+    """Return the corridor, with a closed door at both ends and a picture opposite each doorway."""
     doorways = {
         wall: [side * (length / 2 - it.x) for it in places if it.side == side] for wall, side in ((2, 1), (0, -1))
     }
@@ -139,6 +140,11 @@ def _corridor(places: Sequence[RoomPlace], length: float, first_id: int, rng: Rn
         x, y, angle = place_on_wall(wall, 0.0, length, CORRIDOR_WIDTH)
         door = clutter.door(rng)
         pieces.append(door.placed(0, against_wall(door)).placed(x, y, 0, angle))
+    for wall, opposite in ((2, 0), (0, 2)):
+        for along in [-offset for offset in doorways[opposite]]:
+            if min(abs(along - offset) for offset in doorways[wall]) > DOORWAY[0]:
+                x, y, angle = place_on_wall(wall, along, length, CORRIDOR_WIDTH)
+                pieces.append(clutter.painting(rng).placed(0, 0.002, PICTURE_HEIGHT).placed(x, y, 0, angle))
     count = max(1, round(length / LAMP_SPACING))
     positions = length * ((np.arange(count) + 0.5) / count - 0.5)
     pieces += [clutter.ceiling_lamp(rng).placed(float(x), 0, HEIGHT) for x in positions]
