@@ -110,17 +110,15 @@ def drift_increase(blocks: Sequence[Block]) -> Measured:
 
 
 def lost_frames(blocks: Sequence[Block]) -> Measured:
-    return Measured(sum(block.lost for block in blocks), None)
+    """Return the number of lost frames in the compared visits."""
+    first = first_compared(blocks)
+    return Measured(sum(block.lost for block in blocks if block.visit >= first), None)
 
 
 BOUNDS = (
     Bound(
         "heap", "bytes per frame", 500, "decreases over time; below 50 bytes after 20,000 frames (`long_run_growth`)",
         growth(lambda block: block.heap),
-    ),
-    Bound(
-        "resident memory", "bytes per frame", 10_000, "the heap and the map; pages of 4 KB and 2 MB make it coarse",
-        growth(lambda block: block.resident),
     ),
     Bound(
         "map", "% per 1,000 frames", 5, "sensor noise adds blocks at depth edges, fewer in each visit",
@@ -139,7 +137,7 @@ BOUNDS = (
         growth(lambda block: block.tentative, 1000),
     ),
     Bound("drift", "mm", 5, "half of the smallest usual voxel, 1 cm", drift_increase),
-    Bound("lost frames", "frames", 0, "slow motion in a known place", lost_frames),
+    Bound("lost frames", "frames", 0, "the place is known", lost_frames),
 )  # fmt: skip
 """The bounds of the endurance run."""
 

@@ -49,7 +49,7 @@ The places are visited in turn. Each place has its own map, which stays in memor
 METHOD = f"""## Method
 
 - Tentative instances, i.e. those with too few detections (`fuser.min_observations`), expire after {EXPIRY:,} frames
-  (`fuser.tentative_max_age`). From the next visit on, nothing should grow, and visits are compared.
+  (`fuser.tentative_max_age`). From the next visit on, visits are compared.
 - A visit consists of blocks of about {BLOCK} frames. A block is compared with the block at the same position of each
   later visit. Growth is the median slope of these pairs, with the quartiles in parentheses.
 - A bound is missed if three quarters of the slopes exceed it. A single disturbed visit affects at most half of the
@@ -57,7 +57,8 @@ METHOD = f"""## Method
 - Processor time: all threads in `Mapper.add`. Relative time: divided by the time to render a map of one frame, which is
   measured after every {REFERENCE_INTERVAL} frames. Other programs on the machine slow down both.
 - Heap: memory that Python and all libraries allocate in the visits of a place. Most arrays of the map are reserved at
-  the start, and their use does not count. Process: unique set size.
+  the start, and their use does not count. Process: unique set size. It has no bound, because the system adds and removes
+  huge pages.
 - Error: distance of the camera from its reference position, root mean square. The reference of the standing camera is
   its first position.
 """

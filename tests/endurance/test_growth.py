@@ -35,7 +35,6 @@ def blocks(changed: Callable[[Block], dict[str, Any]] = lambda block: {}) -> lis
                 errors_mm=np.full(FRAMES, 10.0),
                 lost=0,
                 heap=10**7 + 10**6 * position,
-                resident=10**8 + 10**6 * position,
                 process=10**9,
                 map_bytes=2 * 10**7,
                 confirmed=20 if visit else 5 * position,
@@ -73,7 +72,6 @@ def test_verdicts_without_growth_are_met() -> None:
     ("quantity", "changed"),
     [
         ("heap", lambda b: {"heap": b.heap + 600 * b.all_frames}),
-        ("resident memory", lambda b: {"resident": b.resident + 11_000 * b.all_frames}),
         ("map", lambda b: {"map_bytes": b.map_bytes + 1200 * b.all_frames}),
         ("processor time", lambda b: {"cpu_ms": b.cpu_ms * (1 + 6e-5 * b.all_frames)}),
         ("confirmed instances", lambda b: {"confirmed": b.confirmed + b.all_frames // 50}),

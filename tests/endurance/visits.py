@@ -38,7 +38,6 @@ class Block:
     errors_mm: Float64  # (F,) distance of the camera from its reference position; NaN = lost, or no reference
     lost: int  # number of lost frames
     heap: int  # memory allocated with malloc in the visits of this place up to the end of the block, bytes
-    resident: int  # increase of the unique set size in the visits of this place up to the end of the block, bytes
     process: int  # unique set size of the process at the end of the block, bytes
     map_bytes: int  # size of the map at the end of the block
     confirmed: int  # number of confirmed instances at the end of the block
@@ -72,7 +71,7 @@ class Survey:
         self.place = place
         self._mapper = place.mapper()
         self._frames = 0  # number of mapped frames
-        self._heap = self._resident = 0
+        self._heap = 0
 
     def block(self, visit: int, position: int, count: int, reference: Reference, frames_before: int) -> Block:
         """Map the next `count` frames of the place, and return their measurements.
@@ -93,7 +92,6 @@ class Survey:
                 samples.reference_ms[k] = reference.milliseconds()
         after = memory()
         self._heap += after.heap - before.heap
-        self._resident += after.unique - before.unique
         scene = cast(InstanceTableMap, self._mapper.scene)
         confirmed = len(scene.instance_ids())
         return Block(
@@ -107,7 +105,6 @@ class Survey:
             errors_mm=samples.errors_mm,
             lost=samples.lost,
             heap=self._heap,
-            resident=self._resident,
             process=after.unique,
             map_bytes=scene.statistics.bytes,
             confirmed=confirmed,

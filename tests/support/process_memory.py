@@ -39,7 +39,7 @@ def restart_with_malloc() -> None:
 
 
 def memory() -> Memory:
-    """Return the memory of this process after garbage collection. Freed memory is returned to the system first.
+    """Return the memory of this process after garbage collection.
 
     Raises:
         ConfigError: The C library does not report the size of its heap.
@@ -49,7 +49,6 @@ def memory() -> Memory:
         raise ConfigError("make endurance: expected Linux with glibc >= 2.33, got another C library; run it there")
     mallinfo2.restype = _Mallinfo2
     gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)
     heap = mallinfo2()
     pages = dict(line.split()[:2] for line in Path("/proc/self/smaps_rollup").read_text().splitlines()[1:])
     unique = 1024 * (int(pages["Private_Clean:"]) + int(pages["Private_Dirty:"]))
