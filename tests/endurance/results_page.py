@@ -57,8 +57,8 @@ METHOD = f"""## Method
 - Processor time: all threads in `Mapper.add`. Relative time: divided by the time to render a map of one frame, which is
   measured after every {REFERENCE_INTERVAL} frames. Other programs on the machine slow down both.
 - Heap: memory that Python and all libraries allocate in the visits of a place. Most arrays of the map are reserved at
-  the start, and their use does not count. Process: unique set size. It has no bound, because the system adds and removes
-  huge pages.
+  the start, and their use does not count. Process: unique set size. It has no bound, because the system adds and
+  removes huge pages.
 - Error: distance of the camera from its reference position, root mean square. The reference of the standing camera is
   its first position.
 """
