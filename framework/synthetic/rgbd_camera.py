@@ -12,7 +12,7 @@
 - Each device has a fixed error: a constant offset and a low-frequency pattern. Both grow with the square of the depth,
   as errors of the disparity do, and warp walls at more than 3 m (Teichman, Miller and Thrun, "Unsupervised Intrinsic
   Calibration of Depth Sensors via SLAM", RSS 2013; Basso, Menegatti and Pretto, "Robust Intrinsic and Extrinsic
-  Calibration of RGB-D Cameras", IEEE Transactions on Robotics 34(5), 2018). Its size is our choice: 1 to 3 cm at 4 m.
+  Calibration of RGB-D Cameras", IEEE Transactions on Robotics 34(5), 2018). Its size is our choice: about 1 cm at 4 m.
 - Color has noise and motion blur.
 """
 
@@ -42,8 +42,8 @@ from framework.synthetic.rgbd_camera_kernels import (
 LATERAL_SIGMA = 0.8  # px at 640 px width, standard deviation: the constant term of Nguyen et al.
 PATCH = 14.0  # px at 640 px width, spacing of the random field that determines the patches without readings
 COLOR_SIGMA = 1.5  # standard deviation of color noise, in gray levels from 0 to 255
-DISPARITY_ERROR = 0.05  # px, standard deviation of the offset and of the pattern of a device that measures disparity
-RANGE_ERROR = 5e-4  # 1/m, standard deviation of both for other devices, relative to the square of the depth
+DISPARITY_ERROR = 0.025  # px, standard deviation of the offset and of the pattern of a device that measures disparity
+RANGE_ERROR = 4e-4  # 1/m, standard deviation of both for other devices, relative to the square of the depth
 PATTERN_NODES = (4, 5)  # rows and columns of the random grid that the pattern interpolates
 
 
