@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 from tests.support.process_memory import restart_with_malloc
 
 restart_with_malloc()
@@ -12,4 +14,5 @@ instancemap.configure_process()  # before numpy is loaded
 
 from tests.endurance.lane import main  # noqa: E402
 
+logging.getLogger("framework").setLevel(logging.ERROR)
 main()

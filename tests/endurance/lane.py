@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import sys
 import tempfile
 from datetime import date
@@ -34,7 +33,6 @@ def main() -> None:
         "--out", metavar="FOLDER", type=Path, default=CHECKOUT / "docs" / "results", help="folder of the page"
     )
     options = arguments(parser)
-    logging.getLogger("framework").setLevel(logging.ERROR)
     with one_line_errors():
         missed = [verdict for verdict in run(options.frames, options.out) if not verdict.is_met]
     for verdict in missed:
