@@ -204,6 +204,7 @@ def hashing_cost() -> Measured:
             load_map(run / "map.npz")
             return time.perf_counter() - began
 
+        os.sync()  # writing the run to the disk would take a core
         seconds()  # compiles the kernels, and reads the file into the page cache
         ratios = []
         for _ in range(15):
