@@ -176,7 +176,7 @@ class InstanceMap(InstanceTableMap):
         }
         arrays |= pack_evidence(self.labels.in_use())._asdict()
         arrays |= table_arrays(self.table, len(self.classes))
-        write_map(path, header, arrays, stored=arrays)  # compression would save a tenth, and take half as long again
+        write_map(path, header, arrays, stored=arrays)  # compression would save a tenth of the size
 
     @classmethod
     def load(cls, path: Path | str) -> InstanceMap:

@@ -21,10 +21,9 @@ from framework.files.tum_trajectory import read_tum
 from framework.geometry import transform
 from framework.synthetic.buildings.building_sequence import SyntheticBuilding
 from framework.synthetic.walk import FRAME_RATE
-from tests.acceptance.changing_scenes import distances
+from tests.acceptance.changing_scenes import LIKELY, distances
 from tests.acceptance.runner import CHECKOUT
 
-LIKELY = 0.5  # minimum confidence of a likely instance
 VIEW_STEP = 5  # frames between two views that determine the true instances
 APART = 0.05  # m, minimum distance of a vertex of a doubled surface from the true surface
 FIVE_ROOMS = {"rooms": 5, "frames": 1200}

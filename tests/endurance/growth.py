@@ -18,9 +18,10 @@ from math import ceil
 import numpy as np
 
 from framework.data import Float64
+from framework.mapping.instances.association import Association
 from tests.endurance.visits import Block
 
-EXPIRY = 1000  # frames, default of fuser.tentative_max_age
+EXPIRY = Association.tentative_max_age  # frames
 COMPARED = 4  # minimum number of compared visits, i.e. six pairs
 
 

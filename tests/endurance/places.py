@@ -18,8 +18,8 @@ from framework.synthetic.room import RoomKind
 from framework.synthetic.sequence import Synthetic
 from framework.synthetic.surfaces import assemble
 from framework.synthetic.walk import FRAME_RATE
+from tests.acceptance.runner import CHECKOUT
 
-CHECKOUT = Path(__file__).resolve().parents[2]
 SHARED = CHECKOUT.parent / "shared" / "data"
 PAUSE_S = 10.0  # s, time between two visits
 FARTHEST = 10.0  # m, maximum depth of a simulated reading

@@ -1,4 +1,4 @@
-"""Tests for the bounds of the endurance run, with made-up measurements."""
+"""Tests for the bounds of the endurance run, with synthetic measurements."""
 
 from __future__ import annotations
 
