@@ -28,9 +28,8 @@ from framework.mapping.labels.vertex_labels_kernels import color_vertices
 from framework.mapping.storage.map_file import (
     CLASS_EVIDENCE,
     check_like,
-    map_file_errors,
+    map_contents,
     plain_table,
-    read_map,
     table_arrays,
     table_of,
     write_map,
@@ -222,8 +221,7 @@ class ObjectMap(InstanceTableMap):
     @classmethod
     def load(cls, path: Path | str) -> ObjectMap:
         of_objects = (OBJECT + name for name in OBJECT_ARRAYS)
-        header, arrays = read_map(path, FORMAT, (*VOLUME_ARRAYS, *of_objects, CLASS_EVIDENCE))
-        with map_file_errors(path):
+        with map_contents(path, FORMAT, (*VOLUME_ARRAYS, *of_objects, CLASS_EVIDENCE)) as (header, arrays):
             scene = cls(TsdfVolume.load(header, arrays, 0), Confirmation.of(header.part("confirmation")))
             scene.classes = header.classes()
             scene.table = table_of(header.part("table"), len(scene.classes), arrays)

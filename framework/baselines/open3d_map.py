@@ -19,9 +19,8 @@ from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.storage.map_file import (
     CLASS_EVIDENCE,
     check_known,
-    map_file_errors,
+    map_contents,
     plain_table,
-    read_map,
     table_arrays,
     table_of,
     write_map,
@@ -165,8 +164,7 @@ class Open3DMap(InstanceTableMap):
 
     @classmethod
     def load(cls, path: Path | str) -> Open3DMap:
-        header, arrays = read_map(path, FORMAT, ("block_coords", *ATTRIBUTES, CLASS_EVIDENCE))
-        with map_file_errors(path):
+        with map_contents(path, FORMAT, ("block_coords", *ATTRIBUTES, CLASS_EVIDENCE)) as (header, arrays):
             settings = BlockGridSettings.of(header.part("settings"))
             scene = cls(settings, Confirmation.of(header.part("confirmation")))
             scene.classes = header.classes()

@@ -28,7 +28,7 @@ from framework.mapping.instances.instance_list import (
     vertices_by_id,
     vertices_of_area,
 )
-from framework.mapping.storage.map_file import map_file_errors, read_map, write_map
+from framework.mapping.storage.map_file import map_contents, write_map
 from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.packed_voxels import STORED_VOXELS
@@ -198,8 +198,7 @@ class SemanticMap(SceneMap):
 
     @classmethod
     def load(cls, path: Path | str) -> SemanticMap:
-        header, arrays = read_map(path, FORMAT, (*VOLUME_ARRAYS, *ClassEvidence._fields))
-        with map_file_errors(path):
+        with map_contents(path, FORMAT, (*VOLUME_ARRAYS, *ClassEvidence._fields)) as (header, arrays):
             volume = TsdfVolume.load(header, arrays, len(arrays["rest"]))
             bounds = {"absence_likelihood_ratio": ABSENCE, "min_area": AREA, "smoothness": SMOOTHNESS}
             scene = cls(volume, Elections(**{name: header.number(name, limits) for name, limits in bounds.items()}))

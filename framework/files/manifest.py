@@ -159,10 +159,11 @@ class Manifest:
 
 
 @contextmanager
-def verified(path: Path) -> Iterator[None]:
+def verified(path: Path) -> Iterator[bool]:
     """Compare a file with the manifest of its run while the file is read in the `with` body.
 
-    Files without a manifest are not verified.
+    The value is whether the manifest contains a hash of the file. Files without a manifest are not verified. If the
+    body fails because the file has changed, the change is reported instead.
 
     Raises:
         DataError: The file or the manifest has changed since the run, or the folder is unfinished.
@@ -170,16 +171,25 @@ def verified(path: Path) -> Iterator[None]:
     check_finished(path.parent)
     manifest = Manifest.of_file(path)
     if manifest is None or not path.is_file():
-        yield
+        yield False
         return
     with ThreadPoolExecutor(1) as hashing:  # releases the GIL; the file is read from the disk only once
         pending = hashing.submit(path_hash, path)
-        yield
-    sha256, before = pending.result(), None
+        try:
+            yield path.name in manifest.files
+        except DataError as error:
+            _check_hash(path, manifest, pending.result(), error)
+            raise
+    _check_hash(path, manifest, pending.result())
+
+
+def _check_hash(path: Path, manifest: Manifest, sha256: str, cause: Exception | None = None) -> None:
+    """Raise DataError if a file differs from its manifest."""
+    before = None
     while change := manifest.change(path, sha256):
         if before == (manifest, sha256):
             fix = f"repeat the run, or accept an intended change with {VERIFY} {path.parent} --accept {path.name}"
-            raise DataError(f"{change}; {fix}")
+            raise DataError(f"{change}; {fix}") from cause
         before = manifest, sha256  # `evaluate` may be replacing both files, so they are read until they are constant
         manifest, sha256 = Manifest.of_file(path) or manifest, path_hash(path)
 

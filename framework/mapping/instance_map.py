@@ -20,9 +20,8 @@ from framework.mapping.storage.map_file import (
     CLASS_EVIDENCE,
     check_known,
     check_memory,
-    map_file_errors,
+    map_contents,
     plain_table,
-    read_map,
     table_arrays,
     table_of,
     write_map,
@@ -180,8 +179,7 @@ class InstanceMap(InstanceTableMap):
 
     @classmethod
     def load(cls, path: Path | str) -> InstanceMap:
-        header, arrays = read_map(path, FORMAT, SAVED_ARRAYS)
-        with map_file_errors(path):
+        with map_contents(path, FORMAT, SAVED_ARRAYS) as (header, arrays):
             classes, storage = header.classes(), header.option("storage", Storage)
             table = table_of(header.part("table"), len(classes), arrays)
             volume = TsdfVolume.load(header, arrays, len(arrays["labeled"]))

@@ -156,6 +156,22 @@ def test_verified_file_replaced_repeatedly_is_accepted(directory: Path, monkeypa
     assert not later
 
 
+def test_verified_change_is_reported_instead_of_error_in_body(directory: Path) -> None:
+    path = directory / "config.yaml"
+    with pytest.raises(DataError, match=r"^expected a seed"), verified(path):
+        raise DataError("expected a seed")
+    path.write_text("seed: 1\n")
+    with pytest.raises(DataError, match=r"config\.yaml: expected the SHA-256"), verified(path):
+        raise DataError("expected a seed")
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "before.ply"])
+def test_verified_value_is_true_for_files_in_manifest(name: str, directory: Path) -> None:
+    (directory / "before.ply").write_text("of the user")
+    with verified(directory / name) as is_hashed:
+        assert is_hashed == (name == "config.yaml")
+
+
 def test_verified_missing_file_is_left_to_reader(directory: Path) -> None:
     (directory / "metrics.json").unlink()
     with pytest.raises(FileNotFoundError):

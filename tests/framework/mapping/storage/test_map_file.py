@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from framework.errors import DataError
-from framework.mapping.storage.map_file import read_map, write_map
+from framework.files.manifest import Manifest, RunStatus
+from framework.mapping.storage.map_file import map_contents, write_map
+from framework.mapping.storage.map_header import MapHeader
 
 RNG = np.random.default_rng(0)
 HEADER = {"format": 7, "names": ["a", "b"], "none": None}
@@ -25,14 +28,27 @@ ARRAYS = {
 STORED = ("noise", "strided", "empty")
 
 
+def read_map(path: Path, expected_format: int) -> tuple[MapHeader, dict[str, np.ndarray]]:
+    with map_contents(path, expected_format, list(ARRAYS)) as contents:
+        return contents
+
+
+def with_manifest(path: Path) -> Path:
+    """Add a manifest that lists the file."""
+    Manifest(RunStatus.COMPLETE, {}, {}, {}).with_files(path.parent, [path.name]).write(path.parent)
+    return path
+
+
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
     write_map(tmp_path / "map.npz", HEADER, ARRAYS, stored=STORED)
     return tmp_path / "map.npz"
 
 
-def test_map_file_round_trip_keeps_header_and_arrays(saved: Path) -> None:
-    header, arrays = read_map(saved, 7, list(ARRAYS))
+@pytest.mark.parametrize("prepared", [Path, with_manifest])
+def test_map_file_round_trip_keeps_header_and_arrays(saved: Path, prepared: Callable[[Path], Path]) -> None:
+    prepared(saved)
+    header, arrays = read_map(saved, 7)
     assert header.values == HEADER
     with np.load(saved) as file:
         assert file.files == ["header", *ARRAYS]
@@ -76,9 +92,27 @@ def test_map_file_changed_byte_raises(saved: Path, name: str) -> None:
     content[data + info.compress_size // 2] ^= 0x10
     saved.write_bytes(content)
     with pytest.raises(DataError, match=r"map\.npz"):
-        read_map(saved, 7, list(ARRAYS))
+        read_map(saved, 7)
+
+
+@pytest.mark.parametrize("name", ["header", *ARRAYS])
+def test_map_file_changed_byte_is_reported_as_difference_from_manifest(saved: Path, name: str) -> None:
+    changed = bytearray(with_manifest(saved).read_bytes())
+    with zipfile.ZipFile(saved) as archive:
+        changed[archive.getinfo(f"{name}.npy").header_offset + 70] ^= 0x10  # in the header of the array
+    saved.write_bytes(changed)
+    with pytest.raises(DataError, match=rf"^{saved}: expected the SHA-256 \w+ of manifest.json, got "):
+        read_map(saved, 7)
+
+
+def test_map_file_error_in_body_of_unchanged_file_contains_path(saved: Path) -> None:
+    with (
+        pytest.raises(DataError, match=rf"^{saved}: expected 3 classes; map again"),
+        map_contents(with_manifest(saved), 7, []),
+    ):
+        raise DataError("expected 3 classes")
 
 
 def test_map_file_of_other_format_raises(saved: Path) -> None:
     with pytest.raises(DataError, match="expected map format 8, got 7"):
-        read_map(saved, 8, list(ARRAYS))
+        read_map(saved, 8)
