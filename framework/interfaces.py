@@ -1,8 +1,10 @@
 """The interfaces between the pipeline and its plugins.
 
     frame --> Detector --> FrameMasking --> lift to 3D --> ClusterRefiner --> MapFuser --> SceneMap
-                               |                ^                                |
-                               '-------> PoseTracker <----- view of the map -----'
+                               |                ^                                |            |
+                               '-------> PoseTracker <----- view of the map -----'            |
+                                             ^                                                |
+                                             '--------- changes of submaps <--- BackEnd <-----'
 
 A plugin is a dataclass that implements one of these interfaces. Its fields are its parameters, of type bool, int,
 float, str, Path, Enum or list[str]. Document the unit and bounds next to each default. Validate the values in
@@ -15,9 +17,9 @@ from __future__ import annotations
 
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -199,6 +201,20 @@ class PoseTracker(ABC):
         """
         return None
 
+    def correct(self, change: SubmapChange) -> None:
+        """Move the poses of earlier frames with their submaps: the last pose, keyframes and predictions.
+
+        Called after the map is changed, before the next frame. Earlier frames belong to the submap of the change before
+        them, and to submap 0 before the first change.
+
+        Raises:
+            ConfigError: The poses of the tracker cannot be corrected.
+        """
+        raise ConfigError(
+            f"tracker: expected a tracker with corrections, got {type(self).__name__}; set backend=none, or implement "
+            "correct()"
+        )
+
     def renew_colors(self) -> None:  # noqa: B027  # optional
         """Discard the color images of earlier frames, which were displaced relative to depth. By default, keep them.
 
@@ -241,6 +257,7 @@ class MapFuser(ABC):
     """Fuser of clusters and frames into the map. No other stage writes the map."""
 
     scene: SceneMap
+    has_submaps: bool = False  # True = the map consists of submaps, which `correct` changes
 
     @abstractmethod
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
@@ -260,6 +277,16 @@ class MapFuser(ABC):
         Called once, when the estimated color delay is used for the first time.
         """
 
+    def correct(self, change: SubmapChange) -> Mapping[int, int]:
+        """Change the submaps of the map.
+
+        Fusers with `has_submaps` implement it. Instances of submaps that become visible are associated again.
+
+        Returns:
+            The remaining instance by merged instance. The older instance, with the smaller id, remains.
+        """
+        raise ConfigError(f"fuser: expected a fuser with submaps, got {type(self).__name__}; set backend=none")
+
     def resume(self, scene: SceneMap) -> None:
         """Resume a stored map instead of starting with an empty map.
 
@@ -269,6 +296,39 @@ class MapFuser(ABC):
         raise ConfigError(
             f"fuser: expected a fuser with support for stored maps, got {type(self).__name__}; set fuser=bayesian_tsdf"
         )
+
+
+@dataclass(frozen=True)
+class SubmapChange:
+    """A change of the submaps of a map.
+
+    A submap consists of the voxels that were last observed in its part of the trajectory. Hidden submaps are invisible
+    to the tracker and the fuser, so that a drifted camera maps a place again instead of blending two surfaces. Changes
+    are applied in the order of the fields.
+    """
+
+    motions: Mapping[int, Float64] = field(default_factory=dict)  # T_new_old (4, 4) by number, in the world frame
+    shown: frozenset[int] = frozenset()  # hidden submaps that become visible
+    hidden: frozenset[int] = frozenset()  # submaps that become hidden
+    submap: int = 0  # submap of the next frames
+
+
+class BackEnd:
+    """Back end, which corrects the map when the camera returns to a place.
+
+    This class changes nothing.
+    """
+
+    def update(self, frame: Frame, pose: Pose, scene: SceneMap) -> SubmapChange | None:
+        """Return the change of the map after a fused frame; None = no change. Called in the order of the frames.
+
+        Frames before the first change belong to submap 0. `scene` is read-only.
+        """
+        return None
+
+    def finish(self, scene: SceneMap) -> SubmapChange | None:
+        """Return the last change of the map; None = no change. Called after the last frame."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -291,7 +351,7 @@ class Gravity:
 class SceneMap(ABC):
     """The map of a fuser.
 
-    Implement `classes` and the six abstract members. Override the other seven members to provide more data or a faster
+    Implement `classes` and the six abstract members. Override the other eight members to provide more data or a faster
     implementation.
     """
 
@@ -364,6 +424,22 @@ class SceneMap(ABC):
             sensor: The kind of depth sensor, which determines the noise model.
         """
         return self.render(camera, T_world_camera)
+
+    def render_hidden(
+        self, camera: Camera, T_world_camera: Float64, submaps: Collection[int], depth: Float32 | None = None
+    ) -> SurfaceView:
+        """Return the view of hidden submaps, for the detection of loops.
+
+        Maps of fusers with `has_submaps` implement it.
+
+        Args:
+            camera: The camera.
+            T_world_camera: The pose (4, 4) of the camera.
+            submaps: The numbers of the submaps. Submaps that do not exist are ignored.
+            depth: (H, W) float32, m along z, 0 = no measurement; only the surface near or in front of it is searched.
+                None = the entire surface.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no submaps")
 
     @abstractmethod
     def mesh(self) -> InstanceMesh:
