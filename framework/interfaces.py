@@ -351,7 +351,7 @@ class Gravity:
 class SceneMap(ABC):
     """The map of a fuser.
 
-    Implement `classes` and the six abstract members. Override the other eight members to provide more data or a faster
+    Implement `classes` and the six abstract members. Override the other nine members to provide more data or a faster
     implementation.
     """
 
@@ -401,6 +401,13 @@ class SceneMap(ABC):
 
         Raises DataError if T_world_camera is not a rigid transform.
         """
+
+    def render_visible(self, camera: Camera, T_world_camera: Float64) -> View:
+        """Return the view of the visible submaps, for tracking and data association.
+
+        Maps of fusers with `has_submaps` implement it.
+        """
+        return self.render(camera, T_world_camera)
 
     def instance_at(self, u: int, v: int, camera: Camera, T_world_camera: Float64) -> int:
         """Return the instance at a pixel of the view from `camera` at T_world_camera (4, 4), 0 = none.

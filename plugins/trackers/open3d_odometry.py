@@ -89,7 +89,7 @@ class Open3dOdometry(PoseTracker):
             return Pose(T_world_camera)
         reference = self._last.image
         if self.reference is Reference.MAP:
-            view = scene.render(frame.camera, self._last.T_world_camera)
+            view = scene.render_visible(frame.camera, self._last.T_world_camera)
             reference = _rgbd_image(view.color, view.depth)
         T_last_camera, reason = self._aligned(image, reference, frame)
         if reason:
