@@ -135,6 +135,7 @@ class InstanceMap(InstanceTableMap):
         for k in instance_ids:
             self.table.remove(k)
         self.labels.remove_instances(instance_ids)
+        self.submaps.discard_rendered()
 
     def add_class(self, name: str) -> None:
         """Add a class to a map with classes. The class distributions of the instances do not change.

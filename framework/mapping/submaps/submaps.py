@@ -7,7 +7,7 @@ memory of the volume depends on the part in view. Submaps move rigidly, as in vo
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -38,7 +38,8 @@ class Submaps:
         self.hidden: dict[int, HiddenSubmap] = {}
         self._numbers = np.zeros(0, np.int32)  # (B,) submap of each block of the volume
         self._merged: dict[int, int] = {}  # remaining instance by instance merged while submaps were hidden
-        self._rendered: tuple[tuple[int, ...], Layer] | None = None  # the hidden submaps rendered last
+        self._layers: dict[int, Layer] = {}  # the hidden submaps rendered last
+        self._rendered: tuple[tuple[int, ...], Layer] | None = None  # their numbers and their fusion
 
     @property
     def byte_count(self) -> int:
@@ -60,17 +61,23 @@ class Submaps:
         """Record that instance `dropped` was merged into `kept`, for the evidence in hidden submaps."""
         if self.hidden:
             self._merged[dropped] = kept
+            self.discard_rendered()
+
+    def discard_rendered(self) -> None:
+        """Discard the rendered submaps after a change to hidden submaps or to instances."""
+        self._layers, self._rendered = {}, None
 
     def renew_colors(self) -> None:
         """Mark all colors of hidden submaps, so that the next observation of each voxel replaces its color."""
         for hidden in self.hidden.values():
             hidden.voxels.color[:] |= OUTDATED
+        self.discard_rendered()
 
     def move(self, motions: Mapping[int, Float64]) -> None:
         """Move submaps by T_new_old (4, 4), by number."""
-        self._rendered = None
+        self.discard_rendered()
         for number in sorted(motions.keys() & self.hidden.keys()):
-            self.hidden[number] = HiddenSubmap.of(resampled(self._opened(number), motions[number]))
+            self.hidden[number] = self.hidden[number].moved(motions[number])
         moved = {number: self._blocks_of([number]) for number in sorted(motions)}
         parts = {number: self.visible.part(blocks) for number, blocks in moved.items() if len(blocks)}
         if parts:
@@ -88,10 +95,11 @@ class Submaps:
         """
         if number not in self.hidden:
             return []
-        layer = self._opened(number)
+        layer = self._layers.get(number) or self._opened(number)
         pairs = shared_instances(self.visible, layer, min_overlap, min_voxels)
         self._add(number, layer)
         del self.hidden[number]
+        self._layers.pop(number, None)
         self._rendered = None
         return pairs
 
@@ -106,7 +114,7 @@ class Submaps:
                 self.hidden[number] = HiddenSubmap.of(part)
         if any(map(len, blocks.values())):
             self._remove(np.concatenate([*blocks.values()]))
-            self._rendered = None
+            self.discard_rendered()
 
     def render(
         self, camera: Camera, T_world_camera: Float64, numbers: Collection[int], depth: Float32 | None
@@ -117,7 +125,8 @@ class Submaps:
         """
         chosen = tuple(sorted(self.hidden.keys() & set(numbers)))
         if self._rendered is None or self._rendered[0] != chosen:
-            self._rendered = chosen, self._joined(chosen)
+            self._layers = {number: self._layers.get(number) or self._opened(number) for number in chosen}
+            self._rendered = chosen, self._joined()
         voxels, sensor = self._rendered[1].voxels, self.volume.sensor
         return render_surface(voxels, sensor, camera, T_world_camera, depth)
 
@@ -131,11 +140,10 @@ class Submaps:
     def _max_weight(self) -> float:
         return float(self.volume.sensor.max_weight)
 
-    def _joined(self, numbers: Iterable[int]) -> Layer:
-        """Return the fusion of hidden submaps."""
-        layers = [self._opened(number) for number in numbers]
-        joined = self.visible.like(max(sum(layer.voxels.block_count for layer in layers), 1))
-        for layer in layers:
+    def _joined(self) -> Layer:
+        """Return the fusion of the rendered submaps."""
+        joined = self.visible.like(max(sum(layer.voxels.block_count for layer in self._layers.values()), 1))
+        for layer in self._layers.values():
             fuse(joined, layer, self._max_weight)
         return joined
 
