@@ -17,6 +17,7 @@ from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError, in_one_line
 from framework.files.storage import check_storage
 from framework.interfaces import (
+    BackEnd,
     ClusterRefiner,
     Detector,
     FrameMasking,
@@ -67,6 +68,7 @@ class Pipeline:
     viewer: Viewer = field(default_factory=Viewer)
     detection_interval: int = 1  # interval between detections, in frames, >= 1; all frames are tracked and mapped
     masking: FrameMasking = field(default_factory=FrameMasking)
+    backend: BackEnd = field(default_factory=BackEnd)
 
     def __post_init__(self) -> None:
         if self.detection_interval < 1:
