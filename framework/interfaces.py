@@ -312,6 +312,11 @@ class SubmapChange:
     hidden: frozenset[int] = frozenset()  # submaps that become hidden
     submap: int = 0  # submap of the next frames
 
+    def moved(self, submap: int, T_world_a: Float64) -> Float64:
+        """Return the pose T_world_a (4, 4) in a submap after the change."""
+        T_new_old = self.motions.get(submap)
+        return T_world_a if T_new_old is None else T_new_old @ T_world_a
+
 
 class BackEnd:
     """Back end, which corrects the map when the camera returns to a place.

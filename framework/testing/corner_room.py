@@ -6,7 +6,7 @@ spheres. The world frame is the frame of the first camera: x right, y down, z fo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -150,6 +150,11 @@ class RoomMap(SceneMap):
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         depth, normals, color, ids = look(camera, T_world_camera)
         return View(camera, T_world_camera, depth, normals.astype(np.float32), color, ids, ids - 1)
+
+    def render_hidden(
+        self, camera: Camera, T_world_camera: Float64, submaps: Collection[int], depth: Float32 | None = None
+    ) -> View:
+        return self.render(camera, T_world_camera)
 
     def mesh(self) -> InstanceMesh:
         return InstanceMesh(
