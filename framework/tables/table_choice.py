@@ -20,10 +20,7 @@ LABEL = re.compile(r"[A-Za-z0-9:._/-]*")  # labels for \ref
 PLAIN = (
     *("instances.ap50", "instances.ap50_agnostic", "instances.ap25", "instances.ap", "instances.mean_iou"),
     *("instances.count", "trajectory.ate_rmse_m", "frames_lost", "fps"),
-    *(
-        f"stage_ms.{stage}.median"
-        for stage in ("refinement", "association", "update", "integration", "fusion", "backend")
-    ),
+    *(f"stage_ms.{stage}.median" for stage in ("refinement", "association", "update", "integration", "fusion")),
 )
 """Default columns of a table without an experiment: keys of metrics.json. Columns without values are omitted."""
 

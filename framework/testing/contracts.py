@@ -51,6 +51,13 @@ from framework.testing.corner_room import (
 SAME_POSE = 5e-6  # maximum difference of equal poses, m and rad; Open3D's sums in several threads differ by 2e-6
 ODOMETRY_START = exp_se3(np.array([3.0, -2.0, 1.0, 0.3, -1.2, 0.5]))  # pose of the first frame in an odometry frame
 
+CORRECTED_POSE = 1e-3  # maximum difference of a pose in a moved map, m and rad, because float32 points are rounded
+MAP_CHANGES = {
+    2: SubmapChange({0: exp_se3(np.array([0.2, -0.1, 0.3, 0.1, 0.3, -0.2]))}, submap=1),
+    5: SubmapChange(dict.fromkeys((0, 1), exp_se3(np.full(6, -0.1))), submap=1),
+}
+"""Motions of the entire map after frames, for trackers."""
+
 
 class OptionContract:
     """Tests of a config option. The plugin is built as in a run.
@@ -292,6 +299,26 @@ class TrackerContract:
         blind = replace(frame_at(1), depth=np.zeros(CAMERA.shape, np.float32))
         assert isinstance(tracker.track(blind, scene), Pose)
         assert isinstance(tracker.track(frame_at(2), scene), Pose)
+
+    def test_tracker_follows_corrections_of_map(self) -> None:
+        """The pipeline does not correct given poses."""
+        tracker, uncorrected = self.plugin(), self.plugin()
+        if tracker.poses_given or tracker.pose_source == "ground_truth":
+            return
+        T_world_room = np.eye(4)
+        for k in range(9):
+            pose = tracker.track(frame_at(k), RoomMap(T_world_room=T_world_room))
+            expected = uncorrected.track(frame_at(k), RoomMap())
+            assert pose.lost == expected.lost, pose.reason
+            np.testing.assert_allclose(
+                pose.T_world_camera,
+                T_world_room @ expected.T_world_camera,
+                atol=CORRECTED_POSE,
+                err_msg="the pose does not move with the map; implement correct()",
+            )
+            if k in MAP_CHANGES:
+                tracker.correct(MAP_CHANGES[k])
+                T_world_room = MAP_CHANGES[k].moved(0, T_world_room)
 
 
 class RefinerContract:
