@@ -23,6 +23,7 @@ LAYERS = [
     ["compilation"],
     ["rendering"],
     ["detection", "tracking", "refinement", "mapping"],
+    ["pose_graph"],
     ["baselines", "datasets"],
     ["checking", "importing", "synthetic"],
     ["live_view"],

@@ -1,0 +1,1 @@
+"""Pose graph of submaps: division of the trajectory, detection of loops, optimization."""

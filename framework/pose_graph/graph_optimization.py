@@ -1,0 +1,142 @@
+"""Pose graph of submap anchors, optimized with robust loop edges.
+
+An edge (a, b) has a measured transform T_a_b. Its residual is the twist xi with T_a_b exp(xi) = T_world_a^-1
+T_world_b. Open3D minimizes the sum of xi^T C^-1 xi with Levenberg-Marquardt. Loop edges have a line process (Choi, Zhou
+and Koltun, "Robust Reconstruction of Indoor Scenes", CVPR 2015), so that those that contradict the others lose their
+weight and are removed.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from framework.data import Float64
+from framework.geometry import nearest_rotation
+
+# standard deviations of tracked motions and of loops; only their ratios matter
+DRIFT = (0.01, 0.0035)  # translation, m, and rotation, rad, per m of the path
+STEP_NOISE = (0.003, 0.001)  # translation, m, and rotation, rad, of a short path
+LOOP_NOISE = (0.01, 0.003)  # translation, m, and rotation, rad; errors of aligned views with the distortion of a sensor
+# m, residuals of a loop edge at which its weight is 1/4; decreasing, because all residuals are large at the beginning
+# (graduated non-convexity, Yang et al., 2020)
+MAX_LOOP_RESIDUALS = (10.0, 1.0, 0.1)
+MIN_WEIGHT = 0.25  # minimum weight of a loop edge
+
+
+@dataclass(frozen=True, eq=False)
+class GraphEdge:
+    """A measured transform between two anchors."""
+
+    first: int
+    second: int
+    T_first_second: Float64  # (4, 4)
+    is_loop: bool = False
+
+    @property
+    def path(self) -> float:
+        """The length, m, of the path along which the tracker may have drifted."""
+        return 0.0 if self.is_loop else float(np.linalg.norm(self.T_first_second[:3, 3]))
+
+    @property
+    def deviations(self) -> Float64:
+        """Standard deviations (6,) of the twist in the frame of the second anchor, m and rad."""
+        if self.is_loop:
+            return np.repeat(LOOP_NOISE, 3)
+        return np.repeat(np.hypot(STEP_NOISE, self.path * np.array(DRIFT)), 3)
+
+
+@dataclass
+class AnchorGraph:
+    """Submap anchors and the edges between them. Anchor 0 is fixed."""
+
+    edges: list[GraphEdge] = field(default_factory=list)
+
+    def connected(self, first: int, second: int) -> bool:
+        """Return True if there is an edge between two anchors."""
+        return any({edge.first, edge.second} == {first, second} for edge in self.edges)
+
+    def path_lengths(self, anchor: int) -> dict[int, float]:
+        """Return the length of the shortest path from one anchor to each, m, by number (Dijkstra's algorithm)."""
+        neighbors: dict[int, list[tuple[float, int]]] = {anchor: []}
+        for edge in self.edges:
+            neighbors.setdefault(edge.first, []).append((edge.path, edge.second))
+            neighbors.setdefault(edge.second, []).append((edge.path, edge.first))
+        lengths: dict[int, float] = {}
+        queue = [(0.0, anchor)]
+        while queue:
+            length, nearest = heapq.heappop(queue)
+            if nearest not in lengths:
+                lengths[nearest] = length
+                for step, other in neighbors[nearest]:
+                    heapq.heappush(queue, (length + step, other))
+        return lengths
+
+    def extended(self, poses: Sequence[Float64]) -> list[Float64]:
+        """Return the poses (4, 4) of all anchors, given those of the first ones. The others follow by tracked motion.
+
+        Args:
+            poses: The poses (4, 4) of the first anchors.
+        """
+        known = list(poses)
+        for edge in self.edges:
+            if edge.second == len(known) and not edge.is_loop:
+                known.append(known[edge.first] @ edge.T_first_second)
+        return known
+
+
+class Optimized(NamedTuple):
+    """An optimized graph."""
+
+    poses: list[Float64]  # (4, 4) of the anchors
+    edges: list[GraphEdge]  # without those that the line process has removed
+
+
+def optimize(poses: Sequence[Float64], edges: Sequence[GraphEdge]) -> Optimized:
+    """Return the optimized graph.
+
+    Args:
+        poses: The poses (4, 4) of the anchors. The first one is fixed.
+        edges: The edges between them, which connect all anchors.
+    """
+    import open3d as o3d  # takes half a second to load
+
+    registration = o3d.pipelines.registration
+    graph = registration.PoseGraph()
+    for T_world_anchor in poses:
+        graph.nodes.append(registration.PoseGraphNode(T_world_anchor))
+    for edge in edges:
+        information = np.diag(np.roll(edge.deviations, 3) ** -2)  # Open3D's order is rotation, translation
+        graph.edges.append(
+            registration.PoseGraphEdge(edge.second, edge.first, edge.T_first_second, information, edge.is_loop)
+        )
+    for distance in MAX_LOOP_RESIDUALS:
+        is_last = distance == MAX_LOOP_RESIDUALS[-1]
+        option = registration.GlobalOptimizationOption(
+            max_correspondence_distance=distance,
+            edge_prune_threshold=MIN_WEIGHT if is_last else 0.0,
+            preference_loop_closure=1.0,
+            reference_node=0,
+        )
+        registration.global_optimization(
+            graph,
+            registration.GlobalOptimizationLevenbergMarquardt(),
+            registration.GlobalOptimizationConvergenceCriteria(),
+            option,
+        )
+    kept = {edge.transformation.tobytes() for edge in graph.edges}
+    return Optimized(
+        [_rigid(node.pose) for node in graph.nodes],
+        [edge for edge in edges if not edge.is_loop or edge.T_first_second.tobytes() in kept],
+    )
+
+
+def _rigid(pose: Float64) -> Float64:
+    """Return a pose (4, 4) without rounding errors in its rotation."""
+    T = np.array(pose)
+    T[:3, :3] = nearest_rotation(T[:3, :3])
+    return T

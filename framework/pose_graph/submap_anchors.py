@@ -1,0 +1,118 @@
+"""Division of the trajectory into submaps.
+
+A submap begins where the camera is far from the anchor of the current one. It is hidden where the camera is far from
+all views of it. The camera enters a visible submap again instead of beginning another one, so that the number of
+submaps depends on the size of the place, not on the duration of the run. Submaps are rigid, and only their anchors
+move, as in Voxgraph (Reijgwart et al., 2020) and Panoptic Multi-TSDFs (Schmid et al., 2022).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from framework.config.validation import check_bounds, require
+from framework.data import Float64
+from framework.geometry import inverse
+from framework.tracking.keyframes import Keyframe
+
+VIEW_DISTANCE = 0.5  # m, distance between two views of equal direction
+VIEW_ANGLE = 0.5  # rad, angle between two views at one position
+
+
+def view_separation(views: Float64, T_a_camera: Float64) -> Float64:
+    """Return the separation (V,) of views (V, 4, 4) from a camera pose (4, 4), 1 = far enough for a new view."""
+    distances = np.linalg.norm(views[:, :3, 3] - T_a_camera[:3, 3], axis=1)
+    cosines = (np.einsum("vij,ij->v", views[:, :3, :3], T_a_camera[:3, :3]) - 1) / 2
+    return np.asarray(distances / VIEW_DISTANCE + np.arccos(np.clip(cosines, -1, 1)) / VIEW_ANGLE)
+
+
+@dataclass
+class Submap:
+    """A rigid part of the map. Views and keyframes are in the frame of its anchor."""
+
+    number: int
+    T_world_anchor: Float64  # (4, 4), as applied to the map
+    views: Float64  # (V, 4, 4) T_anchor_camera
+    frames: list[int]  # Frame.index of each view
+    keyframes: list[Keyframe] = field(default_factory=list)  # the views with enough features
+    hidden: bool = False  # True = invisible to the tracker and the fuser
+
+    def local(self, T_world_camera: Float64) -> Float64:
+        """Return a camera pose (4, 4) in the frame of the anchor."""
+        return inverse(self.T_world_anchor) @ T_world_camera
+
+    def distance(self, T_world_camera: Float64) -> float:
+        """Return the distance of a camera from the nearest view, m."""
+        position = self.local(T_world_camera)[:3, 3]
+        return float(np.linalg.norm(self.views[:, :3, 3] - position, axis=1).min())
+
+    def nearest_view(self, T_anchor_camera: Float64) -> int:
+        """Return the number of the nearest view of a camera pose (4, 4)."""
+        return int(view_separation(self.views, T_anchor_camera).argmin())
+
+    def add_view(self, frame: int, T_world_camera: Float64) -> bool:
+        """Add a camera pose to the views, and return True if it is a new view."""
+        T_anchor_camera = self.local(T_world_camera)
+        if (view_separation(self.views, T_anchor_camera) < 1).any():
+            return False
+        self.views = np.concatenate([self.views, T_anchor_camera[None]])
+        self.frames.append(frame)
+        return True
+
+
+@dataclass
+class SubmapAnchors:
+    """The submaps of a trajectory. Each begins at its anchor, the pose of its first view."""
+
+    begin_distance: float = 2.5  # distance from the anchor of the current submap at which it ends, m, in [0.5, 100]
+    # distance from all views of a submap at which it is hidden, m, > begin_distance; more than the range of the sensor
+    hide_distance: float = 6.0
+
+    def __post_init__(self) -> None:
+        check_bounds(self, begin_distance=(0.5, 100.0), hide_distance=(0.5, 1000.0))
+        require(
+            self.hide_distance > self.begin_distance,
+            "backend.hide_distance", self.hide_distance, f"more than begin_distance ({self.begin_distance:g})",
+        )  # fmt: skip
+        self.submaps: list[Submap] = []
+        self.current = 0  # number of the current submap
+
+    def divide(self, frame: int, T_world_camera: Float64) -> bool:
+        """Begin a submap, or enter a visible one again, if the camera has left the current one.
+
+        Args:
+            frame: The index of the frame.
+            T_world_camera: The camera pose (4, 4).
+
+        Returns:
+            True if the camera has left the current submap, or if there was none.
+        """
+        if self.submaps:
+            here = T_world_camera[:3, 3]
+            distances = {one.number: float(np.linalg.norm(one.T_world_anchor[:3, 3] - here)) for one in self.visible()}
+            if distances[self.current] <= self.begin_distance:
+                return False
+            nearest = min(distances, key=lambda number: (distances[number], number))
+            if distances[nearest] <= self.begin_distance:
+                self.current = nearest
+                return True
+        self.current = len(self.submaps)
+        self.submaps.append(Submap(self.current, T_world_camera.copy(), np.eye(4)[None], [frame]))
+        return True
+
+    def visible(self) -> list[Submap]:
+        """Return the visible submaps in order."""
+        return [submap for submap in self.submaps if not submap.hidden]
+
+    def hidden(self) -> list[Submap]:
+        """Return the hidden submaps in order."""
+        return [submap for submap in self.submaps if submap.hidden]
+
+    def hide_distant(self, T_world_camera: Float64) -> frozenset[int]:
+        """Hide the visible submaps that are far away, and return their numbers."""
+        distant = [one for one in self.visible() if one.distance(T_world_camera) > self.hide_distance]
+        for submap in distant:
+            submap.hidden = True
+        return frozenset(submap.number for submap in distant)

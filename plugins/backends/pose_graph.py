@@ -1,0 +1,221 @@
+"""Loop closure with submaps and a robust pose graph."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from framework.config.validation import check_bounds
+from framework.data import Float64, Frame, Pose
+from framework.geometry import inverse, rotation_angle
+from framework.interfaces import BackEnd, SceneMap, SubmapChange
+from framework.pose_graph.delayed_result import DelayedResult
+from framework.pose_graph.graph_optimization import AnchorGraph, GraphEdge, Optimized, optimize
+from framework.pose_graph.loop_detection import Drift, Extracted, Guess, Loop, LoopDetection, Reach, QueryView
+from framework.pose_graph.loop_verification import LoopVerification, match_hidden, overlaps
+from framework.pose_graph.submap_anchors import SubmapAnchors, view_separation
+
+log = logging.getLogger(__name__)
+
+REACH = 0.75  # maximum distance of a camera from the views of a submap that it shows, fraction of the hide distance
+SAME_PLACE = 8.0  # m, maximum path between hidden submaps that are rendered together
+MIN_OVERLAP = 0.05  # minimum fraction of a frame's points on a submap that it shows
+EXTENT = 3.0  # m, distance of the surface from the anchor at which motions are compared with min_motion
+EXTRACTION_DELAY = 3  # number of frames between a view and the use of its features, which a thread extracts
+SAME_GUESS = Drift(0.1, 0.05)  # m and rad, maximum difference of two guesses of which the first one is enough
+
+
+class Correction(NamedTuple):
+    """A correction of the graph in progress."""
+
+    loops: Sequence[Loop]
+    edges: int  # number of edges that are optimized
+    result: DelayedResult[Optimized]
+
+
+@dataclass
+class PoseGraph(BackEnd):
+    """Submaps with a robust pose graph, as in Voxgraph (Reijgwart et al., 2020) and BundleFusion (Dai et al., 2017).
+
+    Distant submaps are hidden, so that the tracker does not blend a drifted view with them. When the camera returns,
+    loops with hidden submaps are detected, verified and added to the graph. The graph is optimized in a background
+    thread. Then, submaps move, and those of the loops become visible.
+
+    Results depend on frame numbers, not on the time that threads take.
+    """
+
+    anchors: SubmapAnchors = field(default_factory=SubmapAnchors)
+    detection: LoopDetection = field(default_factory=LoopDetection)
+    verification: LoopVerification = field(default_factory=LoopVerification)
+    min_motion: float = 0.01  # minimum motion of a submap's surface, m, in [0, 1]; smaller motions are omitted
+    correction_delay: int = 10  # number of frames between a detected loop and the correction, in [0, 1000]
+
+    def __post_init__(self) -> None:
+        check_bounds(self, min_motion=(0.0, 1.0), correction_delay=(0, 1000))
+        self.loops: list[Loop] = []  # the loops of all corrections
+        self._graph = AnchorGraph()
+        self._frames = 0  # number of frames
+        self._views = 0  # number of views
+        self._T_world_view: Float64 | None = None  # tracked pose of the last view
+        self._extracted: DelayedResult[Extracted] | None = None
+        self._guesses: deque[Guess] = deque()  # one per frame is verified
+        self._correction: Correction | None = None
+
+    def update(self, frame: Frame, pose: Pose, scene: SceneMap) -> SubmapChange | None:
+        if pose.lost:
+            return None
+        self._frames += 1
+        unchanged = corrected = SubmapChange(submap=self.anchors.current)
+        if self._correction is not None and self._correction.result.due <= self._frames:
+            corrected = self._corrected(self._correction)
+        if self._extracted is not None and self._extracted.due <= self._frames:
+            self._collect(self._extracted.get())
+        if self._guesses and self._correction is None:
+            self._verify(self._guesses.popleft(), scene)
+        T_world_camera = corrected.motions.get(self.anchors.current, np.eye(4)) @ pose.T_world_camera
+        self._divide(frame, T_world_camera)
+        hidden = self._look(frame, T_world_camera)
+        change = SubmapChange(corrected.motions, corrected.shown, hidden, self.anchors.current)
+        return None if change == unchanged else change
+
+    def finish(self, scene: SceneMap) -> SubmapChange | None:
+        if self._extracted is not None:
+            self._collect(self._extracted.get())
+        while self._guesses and self._correction is None:
+            self._verify(self._guesses.popleft(), scene)
+        return None if self._correction is None else self._corrected(self._correction)
+
+    def _divide(self, frame: Frame, T_world_camera: Float64) -> None:
+        """Begin a submap, or enter another one, if the camera has left the current one."""
+        left = self.anchors.current
+        self.anchors.divide(frame.index, T_world_camera)
+        entered = self.anchors.current
+        if entered != left and not self._graph.connected(left, entered):
+            T_left_entered = self.anchors.submaps[left].local(self.anchors.submaps[entered].T_world_anchor)
+            self._graph.edges.append(GraphEdge(left, entered, T_left_entered))
+
+    def _look(self, frame: Frame, T_world_camera: Float64) -> frozenset[int]:
+        """Compare the frame with the hidden submaps if its view is new, and return the submaps to hide."""
+        last = self._T_world_view
+        if last is not None and view_separation(last[None], T_world_camera)[0] < 1:
+            return frozenset()
+        self._T_world_view = T_world_camera
+        self._views += 1
+        current = self.anchors.submaps[self.anchors.current]
+        is_new = current.add_view(frame.index, T_world_camera) or self._views == 1
+        hidden = self.anchors.hide_distant(T_world_camera)
+        if self._extracted is None:
+            reaches = self._reaches(T_world_camera) if self._correction is None else ()
+            if is_new or reaches:
+                view = QueryView(self._views, frame, current, current.local(T_world_camera), is_new, reaches)
+                due = self._frames + EXTRACTION_DELAY
+                self._extracted = DelayedResult(partial(self.detection.extract, view), due)
+        return hidden
+
+    def _reaches(self, T_world_camera: Float64) -> tuple[Reach, ...]:
+        """Return the hidden submaps that may be in view, nearest first."""
+        hidden = self.anchors.hidden()
+        if not hidden:
+            return ()
+        paths = self._graph.path_lengths(self.anchors.current)
+        found = []
+        for submap in hidden:
+            drift, distance = self.detection.drift(paths[submap.number]), submap.distance(T_world_camera)
+            if distance <= REACH * self.anchors.hide_distance + drift.translation:
+                reach = Reach(submap, submap.local(T_world_camera), paths[submap.number], drift)
+                found.append((distance, submap.number, reach))
+        return tuple(reach for *_, reach in sorted(found))
+
+    def _collect(self, extracted: Extracted) -> None:
+        """Add a keyframe, and the guesses of its pose: those from features, then the tracked pose."""
+        self._extracted = None
+        view = extracted.view
+        if extracted.keyframe is not None and view.is_new:
+            view.submap.keyframes.append(extracted.keyframe)
+        tracked = [Guess(view, reach, reach.T_anchor_camera) for reach in view.reaches[:1]]
+        for guess in (*extracted.guesses, *tracked):
+            others = [one.T_world_camera for one in self._guesses if one.view is view]
+            if not any(SAME_GUESS.allows(guess.T_world_camera, T_world_other) for T_world_other in others):
+                self._guesses.append(guess)
+
+    def _verify(self, guess: Guess, scene: SceneMap) -> None:
+        """Verify a guess, and start a correction if another loop agrees with it."""
+        submap, view = guess.reach.submap, guess.view
+        if not submap.hidden:
+            return
+        paths = self._graph.path_lengths(submap.number)
+        place = [one.number for one in self.anchors.hidden() if paths[one.number] <= SAME_PLACE]
+        match = match_hidden(view.frame, guess.T_world_camera, scene, place)
+        if match is None or not self.verification.accepts(match):
+            return
+        if not guess.reach.drift.allows(match.T_world_camera, view.T_world_camera):
+            return
+        near = REACH * self.anchors.hide_distance
+        shown = {
+            number: overlap
+            for number, overlap in overlaps(view.frame, match.T_world_camera, scene, place).items()
+            if overlap >= MIN_OVERLAP and self.anchors.submaps[number].distance(match.T_world_camera) <= near
+        }
+        if not shown:
+            return
+        best = self.anchors.submaps[max(shown, key=lambda number: shown[number])]
+        T_best_camera = best.local(match.T_world_camera)
+        earlier = best.nearest_view(T_best_camera)
+        T_best_anchor = T_best_camera @ inverse(view.T_anchor_camera)
+        loop = Loop(
+            view.frame.index, best.frames[earlier], inverse(best.views[earlier]) @ T_best_camera,
+            GraphEdge(best.number, view.submap.number, T_best_anchor, is_loop=True),
+            frozenset(shown), view.number, guess.reach.path,
+        )  # fmt: skip
+        self._guesses = deque(one for one in self._guesses if one.view is not view)
+        loops = self.detection.agreeing(loop, self.anchors.submaps, view.T_world_camera)
+        if loops:
+            self._optimize(loops)
+
+    def _optimize(self, loops: Sequence[Loop]) -> None:
+        """Start the optimization of the graph with additional loops."""
+        self._guesses.clear()
+        self._graph.edges.extend(loop.edge for loop in loops)
+        poses, edges = [one.T_world_anchor for one in self.anchors.submaps], list(self._graph.edges)
+        due = self._frames + self.correction_delay
+        self._correction = Correction(loops, len(edges), DelayedResult(partial(optimize, poses, edges), due))
+
+    def _corrected(self, correction: Correction) -> SubmapChange:
+        """Move the anchors, and return the motions and the hidden submaps of the loops that agree with the graph."""
+        self._correction = None
+        optimized = correction.result.get()
+        self._graph.edges = [*optimized.edges, *self._graph.edges[correction.edges :]]
+        loops = [loop for loop in correction.loops if loop.edge in optimized.edges]
+        shown = frozenset().union(*(loop.shown for loop in loops))
+        motions = {}
+        for submap, T_world_new in zip(self.anchors.submaps, self._graph.extended(optimized.poses), strict=True):
+            T_new_old = T_world_new @ inverse(submap.T_world_anchor)
+            step = np.linalg.norm(T_world_new[:3, 3] - submap.T_world_anchor[:3, 3])
+            if loops and step + EXTENT * rotation_angle(T_new_old[:3, :3]) >= self.min_motion:
+                motions[submap.number] = T_new_old
+                submap.T_world_anchor = T_world_new
+        self._report(loops, motions)
+        for number in shown:
+            self.anchors.submaps[number].hidden = False
+        return SubmapChange(motions, shown, submap=self.anchors.current)
+
+    def _report(self, loops: Sequence[Loop], motions: Mapping[int, Float64]) -> None:
+        """Log the loops of a correction."""
+        self.loops.extend(loops)
+        for loop in loops:
+            T_new_old, T_world_anchor = (
+                motions.get(loop.edge.second, np.eye(4)),
+                self.anchors.submaps[loop.edge.second].T_world_anchor,
+            )
+            step = T_world_anchor[:3, 3] - (inverse(T_new_old) @ T_world_anchor)[:3, 3]
+            log.info(
+                "loop closed between frames %d and %d, %.1f m: correction %.0f mm, %.1f degrees",
+                loop.earlier_frame, loop.frame, loop.path, 1e3 * np.linalg.norm(step),
+                np.degrees(rotation_angle(T_new_old[:3, :3])),
+            )  # fmt: skip
