@@ -53,7 +53,7 @@ class Submaps:
 
     def observe(self, blocks: Int32) -> None:
         """Add the blocks (A,) of a frame to the current submap."""
-        if self.current:
+        if self.current or len(self._numbers):  # otherwise, all blocks belong to submap 0
             self._grow()
             self._numbers[blocks] = self.current
 

@@ -76,6 +76,15 @@ def test_submap_of_block_is_submap_of_last_observation() -> None:
     assert scene.volume.voxels.block_count == 0
 
 
+def test_submap_is_entered_again() -> None:
+    fuser = new_fuser()
+    for number, view in ((0, LEFT), (1, RIGHT), (0, RIGHT)):
+        fuser.correct(SubmapChange(submap=number))
+        fuse(fuser, [view], 2 * scene_of(fuser).volume.integrator.frames)
+    fuser.correct(SubmapChange(hidden=frozenset({0}), submap=2))
+    assert scene_of(fuser).volume.voxels.block_count == 0
+
+
 def test_hidden_submap_is_rendered_for_loops() -> None:
     fuser = new_fuser()
     fuse(fuser, POSES)
