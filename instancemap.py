@@ -33,8 +33,8 @@ Conventions: meters, seconds, radians; camera axes x right, y down, z forward; `
 coordinates in a; pixel centers at integers; instance 0 = no instance. User errors are InstanceMapErrors with a one-line
 message.
 
-Your own stages are dataclasses that implement Detector, FrameMasking, PoseTracker, ClusterRefiner or MapFuser. Combine
-them with `Pipeline(detector, tracker, refiner, fuser).run(sequence)`, or register them with a YAML file
+Your own stages are dataclasses that implement Detector, FrameMasking, PoseTracker, ClusterRefiner, MapFuser or BackEnd.
+Combine them with `Pipeline(detector, tracker, refiner, fuser).run(sequence)`, or register them with a YAML file
 (CONTRIBUTING.md). Plugins import only `instancemap`, and their tests `instancemap.testing`.
 """
 

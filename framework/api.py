@@ -42,6 +42,7 @@ from framework.files.folders.staged_files import finish_replacement
 from framework.files.search_paths import usable_path
 from framework.geometry import camera_of, pose_of
 from framework.interfaces import (
+    BackEnd,
     ClusterRefiner,
     Detector,
     FrameMasking,
@@ -53,6 +54,7 @@ from framework.interfaces import (
     RGBDSequence,
     SceneMap,
     StageTimer,
+    SubmapChange,
     Viewer,
     untimed,
 )
@@ -74,6 +76,7 @@ from framework.tracking.keyframes import read_keyframes
 from framework.vocabulary.label_spaces import ClassNames
 
 __all__ = [
+    "BackEnd",
     "Camera",
     "ClusterRefiner",
     "ConfigError",
@@ -104,6 +107,7 @@ __all__ = [
     "SceneMap",
     "SensorKind",
     "StageTimer",
+    "SubmapChange",
     "View",
     "Viewer",
     "configure_process",
@@ -140,7 +144,8 @@ def begin(config: DictConfig) -> Pipeline:
     """
     fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
     tracker = build(PoseTracker, config.get("tracker"))
-    masking, viewer = build(FrameMasking, config.get("masking")), build(Viewer, config.get("viewer"))
+    masking, backend = build(FrameMasking, config.get("masking")), build(BackEnd, config.get("backend"))
+    viewer = build(Viewer, config.get("viewer"))
     classes: tuple[str, ...] = ()
     resumed = False
     chosen = {key: config.get(key) for key in ("resume_from", "localize_in") if config.get(key) is not None}
@@ -158,7 +163,9 @@ def begin(config: DictConfig) -> Pipeline:
     detector = build(Detector, config.get("detector"))  # last, because loading a network is slow
     detector = with_cache(with_classes_of_map(detector, classes), config)
     compile_for_run()
-    pipeline = Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval, masking)
+    pipeline = Pipeline(
+        detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval, masking, backend
+    )
     pipeline.resumed = resumed
     return pipeline
 

@@ -312,6 +312,11 @@ class SubmapChange:
     hidden: frozenset[int] = frozenset()  # submaps that become hidden
     submap: int = 0  # submap of the next frames
 
+    def moved(self, submap: int, T_world_a: Float64) -> Float64:
+        """Return the pose T_world_a (4, 4) in a submap after the change."""
+        T_new_old = self.motions.get(submap)
+        return T_world_a if T_new_old is None else T_new_old @ T_world_a
+
 
 class BackEnd:
     """Back end, which corrects the map when the camera returns to a place.
@@ -351,7 +356,7 @@ class Gravity:
 class SceneMap(ABC):
     """The map of a fuser.
 
-    Implement `classes` and the six abstract members. Override the other eight members to provide more data or a faster
+    Implement `classes` and the six abstract members. Override the other nine members to provide more data or a faster
     implementation.
     """
 
@@ -401,6 +406,13 @@ class SceneMap(ABC):
 
         Raises DataError if T_world_camera is not a rigid transform.
         """
+
+    def render_visible(self, camera: Camera, T_world_camera: Float64) -> View:
+        """Return the view of the visible submaps, for tracking and data association.
+
+        Maps of fusers with `has_submaps` implement it.
+        """
+        return self.render(camera, T_world_camera)
 
     def instance_at(self, u: int, v: int, camera: Camera, T_world_camera: Float64) -> int:
         """Return the instance at a pixel of the view from `camera` at T_world_camera (4, 4), 0 = none.

@@ -1,4 +1,4 @@
-"""The mapping loop: detection, masking, tracking, lifting, refinement and fusion."""
+"""The mapping loop: detection, masking, tracking, lifting, refinement, fusion and correction."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError, in_one_line
 from framework.files.storage import check_storage
 from framework.interfaces import (
+    BackEnd,
     ClusterRefiner,
     Detector,
     FrameMasking,
@@ -26,6 +27,7 @@ from framework.interfaces import (
     RGBDSequence,
     RGBDVideo,
     SceneMap,
+    SubmapChange,
     Viewer,
 )
 from framework.live_view.guarded_viewer import GuardedViewer, watched_run
@@ -67,6 +69,7 @@ class Pipeline:
     viewer: Viewer = field(default_factory=Viewer)
     detection_interval: int = 1  # interval between detections, in frames, >= 1; all frames are tracked and mapped
     masking: FrameMasking = field(default_factory=FrameMasking)
+    backend: BackEnd = field(default_factory=BackEnd)
 
     def __post_init__(self) -> None:
         if self.detection_interval < 1:
@@ -77,6 +80,7 @@ class Pipeline:
             raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}; set it to 0")
         check_label_space(self.detector.classes)
         self.viewer = GuardedViewer(self.viewer)
+        self.backend = usable_back_end(self.backend, self.tracker, self.fuser)
         self.color_to_depth = ColorToDepth(delay=None)
         self.resumed = False  # True until a frame is compared with the map of `resume_from`
         self.T_world_color: Float64 | None = None  # (4, 4) pose of the color camera in the last tracked frame
@@ -140,6 +144,7 @@ class Pipeline:
                     self.map_all(video, journal, interruption)
             except BaseException as stop:
                 journal.stopped_by = stop
+            self.finish(journal)
             keyframes = self.keyframes(journal)
         if journal.stopped_by is not None:
             if journal.frames_in_map == 0:
@@ -148,7 +153,12 @@ class Pipeline:
                 journal.stopped_by = None  # the normal end; a second signal raises another Interrupted
         elif journal.frames_in_map == 0 or self.fuser.scene.statistics.voxels == 0:
             raise DataError(f"{video.name}: {self.empty_map_reason(journal)}")
-        return replace(journal.result(), keyframes=keyframes, color_delay=self.color_to_depth.estimate)
+        return replace(
+            journal.result(),
+            keyframes=keyframes,
+            color_delay=self.color_to_depth.estimate,
+            as_tracked=journal.tracked.as_tracked if changes_map(self.backend) else None,
+        )
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
         """Return the keyframes of the tracker by array name.
@@ -287,9 +297,12 @@ class Pipeline:
         return detections, [StageTime(frame.index, "detection", 1e3 * (time.perf_counter() - began))]
 
     def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> Pose:
-        """Mask and track a frame, lift, refine and fuse its detections, and show it. Return the pose.
+        """Mask and track a frame, lift, refine and fuse its detections, correct the map, and show the frame.
 
         A lost frame is only masked, tracked and shown.
+
+        Returns:
+            The corrected pose.
 
         Raises:
             FrameError: The frame is unusable.
@@ -314,6 +327,7 @@ class Pipeline:
         journal.frame_tracked(masked, pose, is_masked=masked is not frame)
         if not pose.lost:
             self.fuse_frame(registered, pose, detections, color_pixels, journal)
+            pose = self.correct_map(registered, pose, journal)
         self.viewer.show(masked, detections, pose, journal.stage_ms(frame.index))
         return pose
 
@@ -335,6 +349,34 @@ class Pipeline:
         journal.frame_fused(frame)
         journal.digest(frame.index, detection=detections, lifting=lifted, refinement=clusters, fusion=self.fuser.scene)
 
+    def correct_map(self, frame: Frame, pose: Pose, journal: Journal) -> Pose:
+        """Apply the change of the map after a fused frame, and return the corrected pose of the frame."""
+        with journal.timed(frame.index, "backend"):
+            change = self.backend.update(frame, pose, self.fuser.scene)
+            if change is None:
+                return pose
+            corrected = replace(pose, T_world_camera=change.moved(journal.tracked.submap, pose.T_world_camera))
+            self.apply(change, journal)
+            return corrected
+
+    def finish(self, journal: Journal) -> None:
+        """Apply the last change of the map. An error is stored in `journal.stopped_by`."""
+        try:
+            change = self.backend.finish(self.fuser.scene)
+            if change is not None:
+                self.apply(change, journal)
+        except Exception as error:
+            journal.stopped_by = journal.stopped_by or error
+
+    def apply(self, change: SubmapChange, journal: Journal) -> None:
+        """Change the map, and move the poses of earlier frames with it."""
+        merged = self.fuser.correct(change)
+        self.tracker.correct(change)
+        self.color_to_depth.correct(change, journal.tracked.submap)
+        if self.T_world_color is not None:
+            self.T_world_color = change.moved(journal.tracked.submap, self.T_world_color)
+        journal.corrected(change, merged)
+
     def compare_with_map(self, frame: Frame, pose: Pose, journal: Journal) -> None:
         """Compare the depth of a frame with the map at its given pose, and record the result.
 
@@ -346,6 +388,27 @@ class Pipeline:
             log.warning("%s", warning)
         self.resumed = False
         journal.frame_compared(frame, agreement.is_apart, agreement.disagrees, agreement.disagreeing)
+
+
+def usable_back_end(backend: BackEnd, tracker: PoseTracker, fuser: MapFuser) -> BackEnd:
+    """Return the back end, or one that changes nothing if the poses or the map cannot be corrected."""
+    if not changes_map(backend):
+        return backend
+    if tracker.poses_given or tracker.pose_source == "ground_truth":
+        reason = "the poses are given"
+    elif type(tracker).correct is PoseTracker.correct:
+        reason = f"{type(tracker).__name__} cannot correct its poses"
+    elif not fuser.has_submaps:
+        reason = f"the map of {type(fuser).__name__} has no submaps"
+    else:
+        return backend
+    log.info("back end: none instead of %s, because %s", type(backend).__name__, reason)
+    return BackEnd()
+
+
+def changes_map(backend: BackEnd) -> bool:
+    """Return True if the back end may change the map."""
+    return type(backend).update is not BackEnd.update or type(backend).finish is not BackEnd.finish
 
 
 @contextmanager

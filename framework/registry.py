@@ -30,7 +30,16 @@ from framework.config.text_values import TextKind
 from framework.config.validation import values_of, without_interpolation
 from framework.errors import ConfigError, InstanceMapError, first_line
 from framework.files.search_paths import PROJECT_ROOT, usable_path
-from framework.interfaces import ClusterRefiner, Detector, FrameMasking, MapFuser, PoseTracker, RGBDVideo, Viewer
+from framework.interfaces import (
+    BackEnd,
+    ClusterRefiner,
+    Detector,
+    FrameMasking,
+    MapFuser,
+    PoseTracker,
+    RGBDVideo,
+    Viewer,
+)
 
 STAGES: Mapping[str, type[Any]] = {
     "dataset": RGBDVideo,
@@ -39,6 +48,7 @@ STAGES: Mapping[str, type[Any]] = {
     "tracker": PoseTracker,
     "refiner": ClusterRefiner,
     "fuser": MapFuser,
+    "backend": BackEnd,
 }
 """Interface of the options in each config group that affects results."""
 

@@ -27,7 +27,18 @@ from framework.config.composition import added_config_dirs, config_loader
 from framework.config.hydra_api import version_base
 from framework.config.validation import checked_rows, without_interpolation
 
-SELECTING = ("dataset", "detector", "tracker", "refiner", "fuser", "viewer", "experiment", "preset")
+SELECTING = (
+    "dataset",
+    "detector",
+    "masking",
+    "tracker",
+    "refiner",
+    "fuser",
+    "backend",
+    "viewer",
+    "experiment",
+    "preset",
+)
 """Config groups that select the plugins of a run."""
 
 OF_HYDRA = ("hydra", "now")  # resolvers that Hydra registers when it starts an application

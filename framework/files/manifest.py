@@ -29,6 +29,7 @@ RUN_FILES = (
     "metrics.json",
     "metrics.partial.json",
     "trajectory.txt",
+    "trajectory_tracked.txt",
     "timings.csv",
     "instances.json",
     "mesh.ply",

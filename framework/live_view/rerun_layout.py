@@ -32,6 +32,7 @@ STAGE_COLORS = {
     "update": (75, 163, 199),
     "integration": (181, 131, 10),
     "fusion": (125, 102, 8),
+    "backend": (139, 94, 60),
 }
 """RGB color of each stage, the same as in reports."""
 

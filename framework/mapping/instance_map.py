@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View, check_label_space
-from framework.interfaces import Gravity, MapStatistics
+from framework.interfaces import Gravity, MapStatistics, SubmapChange
+from framework.mapping.instances.association import Association
 from framework.mapping.instances.association_kernels import look_up_instances
 from framework.mapping.instances.instance_list import Confirmation, InstanceClass, InstanceTableMap, ListedInstances
 from framework.mapping.instances.instance_table import InstanceTable
@@ -26,10 +27,14 @@ from framework.mapping.storage.map_file import (
     table_of,
     write_map,
 )
+from framework.mapping.submaps.layer import Layer
+from framework.mapping.submaps.submaps import Submaps
+from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.raycasting import render, tiles_around
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VOLUME_ARRAYS, TsdfVolume
+from framework.mapping.voxels.voxel_grid import MAX_BLOCKS
 from framework.sensors.noise_models import SensorKind
 
 FORMAT = 9  # format of the map file; increment it when the meaning of the contents changes
@@ -60,11 +65,15 @@ class InstanceMap(InstanceTableMap):
         self.listed = ListedInstances()
         self.vertex_labels = VertexLabels()
         self._merged: set[int] = set()  # instances that were merged into others since the last mesh
+        self.submaps = Submaps(volume, labels, self.table)
+        self._changes = 0  # number of changes to submaps or labels
+        self._whole: tuple[tuple[int, int], InstanceMap] | None = None  # fusion of all submaps, and its state
 
     @property
     def statistics(self) -> MapStatistics:
-        size = self.volume.voxels.byte_count + self.labels.byte_count
-        return MapStatistics(self.volume.voxel_count, size, self.labels.evicted)
+        size = self.volume.voxels.byte_count + self.labels.byte_count + self.submaps.byte_count
+        voxels = self.volume.voxel_count + self.submaps.voxel_count
+        return MapStatistics(voxels, size, self.labels.evicted)
 
     @property
     def depth_range(self) -> tuple[float, float]:
@@ -74,6 +83,20 @@ class InstanceMap(InstanceTableMap):
         if not self.classes:
             self.labels.begin(len(classes))
         super().begin(classes)
+
+    def integrate(self, frame: Frame, T_world_camera: Float64, near: float) -> SeenBlocks:
+        """Integrate one frame into the volume and the current submap.
+
+        See `TsdfVolume.integrate`.
+        """
+        seen = self.volume.integrate(frame, T_world_camera, near)
+        self.submaps.observe(seen.blocks)
+        return seen
+
+    def renew_colors(self) -> None:
+        """Mark all colors, so that the next observation of each voxel replaces its color."""
+        self.volume.renew_colors()
+        self.submaps.renew_colors()
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
         """Return the most likely instance at every stride-th pixel of a frame, 0 = none.
@@ -100,6 +123,7 @@ class InstanceMap(InstanceTableMap):
         """Merge instance `dropped` into instance `kept`."""
         self.table.merge(kept, dropped)
         self.labels.merge_instances(kept, dropped)
+        self.submaps.merged(kept, dropped)
         self._merged.add(dropped)
         self.volume.changed(NO_BLOCKS)
 
@@ -111,6 +135,7 @@ class InstanceMap(InstanceTableMap):
         for k in instance_ids:
             self.table.remove(k)
         self.labels.remove_instances(instance_ids)
+        self.submaps.discard_rendered()
 
     def add_class(self, name: str) -> None:
         """Add a class to a map with classes. The class distributions of the instances do not change.
@@ -124,9 +149,57 @@ class InstanceMap(InstanceTableMap):
         self.table.add_class()
         self.volume.changed(NO_BLOCKS)
 
+    def correct(self, change: SubmapChange, association: Association) -> dict[int, int]:
+        """Change the submaps, and associate the instances of submaps that become visible.
+
+        Returns:
+            The remaining instance by merged instance.
+
+        Raises:
+            MapFullError: If the volume needs too many blocks.
+        """
+        merged: dict[int, int] = {}
+        self.submaps.move(change.motions)
+        for number in sorted(change.shown):
+            for pair in self.submaps.show(number, association.min_overlap, association.create_points):
+                kept, dropped = sorted(_remaining(k, merged) for k in pair)
+                if kept != dropped:
+                    self.merge(kept, dropped)
+                    merged[dropped] = kept
+        self.submaps.hide(change.hidden)
+        self.submaps.current = change.submap
+        self.relabel()
+        return {k: _remaining(k, merged) for k in merged}
+
+    def whole(self) -> InstanceMap:
+        """Return the fusion of all submaps, which is the map itself if no submap is hidden."""
+        if not self.submaps.hidden:
+            return self
+        if self._whole is None or self._whole[0] != self._state():
+            volume = self.volume.like(MAX_BLOCKS)
+            labels = self.labels.like(volume.voxels)
+            whole = InstanceMap(volume, labels, self.table.logarithmic, self.confirmation, self.instance_class)
+            whole.classes, whole.table = self.classes, self.table
+            self.submaps.fuse_into(Layer(volume.voxels, labels))
+            labels.evicted = self.labels.evicted
+            self._whole = self._state(), whole
+        return self._whole[1]
+
+    def _state(self) -> tuple[int, int]:
+        """Return the numbers of integrated frames and of changes to submaps or labels."""
+        return self.volume.integrator.frames, self._changes
+
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
+        return self.whole().render_visible(camera, T_world_camera)
+
+    def render_visible(self, camera: Camera, T_world_camera: Float64) -> View:
         volume = self.volume
         return render(volume.voxels, self.labels.evidence, volume.sensor, camera, T_world_camera)
+
+    def render_hidden(
+        self, camera: Camera, T_world_camera: Float64, submaps: Collection[int], depth: Float32 | None = None
+    ) -> SurfaceView:
+        return self.submaps.render(camera, T_world_camera, submaps, depth)
 
     def instance_at(self, u: int, v: int, camera: Camera, T_world_camera: Float64) -> int:
         part, u, v = tiles_around(camera, u, v)
@@ -138,10 +211,12 @@ class InstanceMap(InstanceTableMap):
         return self.volume.render_near(camera, T_world_camera, depth, sensor)
 
     def mesh(self) -> InstanceMesh:
-        return self.volume.mesh(self._labeled)
+        whole = self.whole()
+        return whole.volume.mesh(whole._labeled)
 
     def relabel(self) -> None:
         """Discard the labels of the mesh after a change to the label evidence of any voxel."""
+        self._changes += 1
         self.vertex_labels = VertexLabels()
         self.volume.changed(NO_BLOCKS)
 
@@ -161,6 +236,9 @@ class InstanceMap(InstanceTableMap):
         return self.volume.gravity()
 
     def save(self, path: Path | str) -> None:
+        if self.submaps.hidden:
+            self.whole().save(path)
+            return
         voxels, arrays = self.volume.saved()
         header = {
             "format": FORMAT,
@@ -194,5 +272,12 @@ class InstanceMap(InstanceTableMap):
             check_memory(volume.voxels.byte_count + scene.labels.unpacked_bytes(packed))
             scene.labels.unpack(packed)
             scene.labels.evicted = header.whole("evicted")
-            scene.table = table
+            scene.table = scene.submaps.table = table
         return scene
+
+
+def _remaining(instance_id: int, merged: Mapping[int, int]) -> int:
+    """Return the instance into which an instance was merged, or its own id."""
+    while instance_id in merged:
+        instance_id = merged[instance_id]
+    return instance_id

@@ -23,7 +23,7 @@ from scipy.spatial import ConvexHull, QhullError
 from framework.data import Box, Float64
 from framework.figures.stage_times import WINDOW, running_median
 from framework.runs.timings_file import StageTimes
-from framework.runtime.run_log import FUSION, STAGES
+from framework.runtime.run_log import STAGE_ORDER
 
 WIDTH, HEIGHT, FLAT_HEIGHT, TIMES_HEIGHT, GROWTH_HEIGHT = 560.0, 380.0, 180.0, 240.0, 390.0  # px
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 40.0  # px, margins around the axes
@@ -51,6 +51,7 @@ COLORS = {
     "update": "#4ba3c7",
     "integration": "#b5830a",
     "fusion": "#7d6608",
+    "backend": "#8b5e3c",
     "run-3": "#a2459e",
     "run-4": "#8a6d00",
     "run-5": "#5b6570",
@@ -98,7 +99,7 @@ def box_corners(box: Box) -> Float64:
 def stage_rows(times: StageTimes) -> list[StageRow]:
     """Return the percentiles of each stage that ran, in pipeline order."""
     rows = []
-    for stage in (*STAGES, FUSION):
+    for stage in STAGE_ORDER:
         values = times.milliseconds.get(stage, np.zeros(0))
         if np.isfinite(values).any():
             rows.append(StageRow(stage, *np.nanpercentile(values, [5, 50, 95]).tolist()))

@@ -187,7 +187,11 @@ class RunReport:
     def _error_text(self) -> str:
         metrics = self.contents.record.metrics
         parts = []
-        for key, name in (("trajectory.ate_rmse_m", "ATE RMSE"), ("trajectory.rpe_rmse_m", "RPE RMSE")):
+        for key, name in (
+            ("trajectory.ate_rmse_m", "ATE RMSE"),
+            ("trajectory.tracked_ate_rmse_m", "ATE RMSE before correction"),
+            ("trajectory.rpe_rmse_m", "RPE RMSE"),
+        ):
             if is_number(value := metrics.get(key)):
                 parts.append(f"{name} {1e3 * value:.1f} mm")
         if is_number(value := metrics.get("trajectory.rpe_rotation_rmse_rad")):

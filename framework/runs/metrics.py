@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -22,6 +22,7 @@ from framework.evaluation.truth_coverage import TruthCoverage
 from framework.files.hashing import add_values
 from framework.interfaces import RGBDVideo, SceneMap
 from framework.mapping.gravity import floor_height
+from framework.runtime.corrected_frames import TrackedFrame
 from framework.runtime.run_log import STAGES, RunResult
 from framework.vocabulary.label_spaces import AGNOSTIC
 
@@ -81,12 +82,23 @@ def run_metrics(result: RunResult) -> Metrics:
 
 
 def trajectory_metrics(result: RunResult) -> Metrics:
-    """Return the ATE and RPE of a run, or an empty dictionary without ground-truth poses."""
-    reference: list[Float64 | None] = [None] * result.frames  # with skipped frames, so that no relative pose spans them
-    estimated = [Pose(np.eye(4), lost=True)] * result.frames
-    for frame in result.tracked:
+    """Return the ATE and RPE of a run, or an empty dictionary without ground-truth poses.
+
+    With a back end, the ATE of the poses before any correction is included.
+    """
+    metrics: Metrics = dict(_trajectory_errors(result.tracked, result.frames).metrics())
+    if metrics and result.as_tracked is not None:
+        metrics["trajectory.tracked_ate_rmse_m"] = _trajectory_errors(result.as_tracked, result.frames).ate_rmse_m
+    return metrics
+
+
+def _trajectory_errors(tracked: Sequence[TrackedFrame], frames: int) -> trajectory.TrajectoryError:
+    """Return the errors of the poses of the tracked frames. `frames` includes the skipped frames."""
+    reference: list[Float64 | None] = [None] * frames  # with skipped frames, so that no relative pose spans them
+    estimated = [Pose(np.eye(4), lost=True)] * frames
+    for frame in tracked:
         reference[frame.position], estimated[frame.position] = frame.T_world_camera_truth, frame.pose
-    return dict(trajectory.evaluate(reference, estimated).metrics())
+    return trajectory.evaluate(reference, estimated)
 
 
 def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:

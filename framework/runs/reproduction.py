@@ -22,18 +22,18 @@ from framework.runs.stored_runs import (
     KEYFRAMES,
     MAP,
     MESH,
+    TRACKED_TRAJECTORY,
     TRAJECTORY,
     Record,
     commit_of,
 )
-from framework.runtime.run_log import FUSION, STAGES
+from framework.runtime.run_log import STAGE_ORDER
 
-COMPARED = (TRAJECTORY, INSTANCES, MESH, MAP, KEYFRAMES)  # result files, which contain no run times
+COMPARED = (TRAJECTORY, TRACKED_TRAJECTORY, INSTANCES, MESH, MAP, KEYFRAMES)  # result files, which contain no run times
 PACKAGES = ("numba", "numpy", "onnxruntime", "opencv-python-headless", "scipy", "torch", "transformers")
 """Packages that may affect the last digits of results."""
 
 LARGE = (MAP, MESH, KEYFRAMES)  # files that are optional in a bundle
-ORDER = (*STAGES, FUSION)  # order of the stages within a frame
 
 
 def causes(record: Record) -> list[str]:
@@ -139,7 +139,7 @@ def _first_difference(before: Path, after: Path) -> tuple[int, str] | None:
         return None
     old, new = _digests(before), _digests(after)
     different = [key for key in dict.fromkeys([*old, *new]) if old.get(key) != new.get(key)]
-    return min(different, key=lambda key: (key[0], ORDER.index(key[1])), default=None)
+    return min(different, key=lambda key: (key[0], STAGE_ORDER.index(key[1])), default=None)
 
 
 def _digests(path: Path) -> dict[tuple[int, str], str]:
@@ -147,6 +147,6 @@ def _digests(path: Path) -> dict[tuple[int, str], str]:
     try:
         with verified(path):
             rows = list(csv.DictReader(read_text(path).splitlines()))
-        return {(int(row["frame"]), row["stage"]): row["digest"] for row in rows if row["stage"] in ORDER}
+        return {(int(row["frame"]), row["stage"]): row["digest"] for row in rows if row["stage"] in STAGE_ORDER}
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: expected the columns frame, stage and digest, got an error ({error!r})") from error

@@ -12,7 +12,7 @@ import gc
 import logging
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from framework.compilation.catalog import compile_for_run
 from framework.config.composition import one_line, resolved
 from framework.config.validation import checked_path
-from framework.data import Instance
+from framework.data import Float64, Instance
 from framework.datasets.frames.sequence_reader import Recording
 from framework.datasets.frames.world_offset import ORIGIN, as_setting, as_text, origin_comments, stored_origin
 from framework.detection.stored.cache import cache_metrics
@@ -61,10 +61,12 @@ from framework.runs.stored_runs import (
     METRICS,
     PARTIAL_METRICS,
     REPORT,
+    TRACKED_TRAJECTORY,
     TRAJECTORY,
     has_metrics,
     read_metrics,
 )
+from framework.runtime.corrected_frames import TrackedFrame
 from framework.runtime.process_settings import frozen_garbage_collector
 from framework.runtime.run_log import RunResult
 from framework.runtime.signals import ENDING, Interruption, interruptible_imports, signals_deferred
@@ -145,15 +147,15 @@ class RunRecord:
         """
         outputs = OutputFolder.open(self.directory, keep_earlier=self.in_place)
         folder, scene, attempt = outputs.path, result.scene, _Attempts(result.stopped_by)
-        for name in (MANIFEST, *MAPPED, KEYFRAMES, DIGESTS, ENVIRONMENT):  # from an earlier run
+        for name in (MANIFEST, *MAPPED, TRACKED_TRAJECTORY, KEYFRAMES, DIGESTS, ENVIRONMENT):  # from an earlier run
             attempt((folder / name).unlink, missing_ok=True)
         if not (folder / CONFIG).exists():
             attempt(_write_config, folder / CONFIG, self.config)
-        trusted = [(one.timestamp, one.pose.T_world_camera) for one in result.tracked if not one.pose.lost]
-        timestamps = np.array([timestamp for timestamp, _ in trusted])
-        poses = np.array([T_world_camera for _, T_world_camera in trusted]).reshape(-1, 4, 4)
+        timestamps, poses = _reliable(result.tracked)
         comments = origin_comments(video.world_origin)
         attempt(write_tum, folder / TRAJECTORY, timestamps, poses, comments)
+        if result.as_tracked is not None:
+            attempt(write_tum, folder / TRACKED_TRAJECTORY, *_reliable(result.as_tracked), comments)
         attempt(write_timings, folder / "timings.csv", result)
         attempt(write_digests, folder / DIGESTS, result)
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **origin_metrics(video), **(counts or {})}
@@ -338,6 +340,13 @@ class _Attempts:
             log.warning("%s", reason(error))
             self.failure = self.failure or error
             return None
+
+
+def _reliable(frames: Sequence[TrackedFrame]) -> tuple[Float64, Float64]:
+    """Return the timestamps (F,), s, and the poses (F, 4, 4) of the frames that are not lost."""
+    reliable = [(one.timestamp, one.pose.T_world_camera) for one in frames if not one.pose.lost]
+    poses = np.array([T_world_camera for _, T_world_camera in reliable]).reshape(-1, 4, 4)
+    return np.array([timestamp for timestamp, _ in reliable]), poses
 
 
 def _write_config(path: Path, config: Mapping[str, Any]) -> None:

@@ -16,7 +16,7 @@ from framework.runs.stored_runs import CHOICE, EVALUATION, Record, is_number
 DATA = "dataset.root"  # config key of the dataset folder
 ANNOTATION = "annotation"  # name of the ground-truth release in the variant of a row
 CONFIDENCE = 0.95  # level of confidence intervals
-PRESET_STAGES = ("masking", "tracker", "refiner", "fuser")  # stages set by preset=NAME
+PRESET_STAGES = ("masking", "tracker", "refiner", "fuser", "backend")  # stages set by preset=NAME
 
 OURS = "InstanceMap"  # name of runs without other settings, next to the rows of imported maps
 ABSENT = "–"  # text for a key that a run does not have

@@ -46,6 +46,7 @@ MAP = "map.npz"
 MESH = "mesh.ply"
 INSTANCES = "instances.json"
 TRAJECTORY = "trajectory.txt"
+TRACKED_TRAJECTORY = "trajectory_tracked.txt"  # poses before any correction by the back end; optional
 REPORT = "report.html"  # written by `instancemap report`
 KEYFRAMES = "keyframes.npz"  # keyframes of the tracker, to resume the map; optional
 MAPPED = (TRAJECTORY, "timings.csv", MAP, INSTANCES, MESH, "overview.png")

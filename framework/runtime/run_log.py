@@ -15,9 +15,10 @@ from typing import get_args
 import numpy as np
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from framework.data import MAX_COVERAGE, Array, DelayEstimate, Float64, Frame, PointClusters, Pose
+from framework.data import MAX_COVERAGE, Array, DelayEstimate, Frame, PointClusters, Pose
 from framework.errors import DataError, FrameError, NoPoseError
-from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
+from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer, SubmapChange
+from framework.runtime.corrected_frames import CorrectedFrames, TrackedFrame
 from framework.runtime.digests import StageDigest, digest_of
 from framework.runtime.frame_stream import steady_time
 from framework.runtime.progress import Progress
@@ -29,8 +30,9 @@ log = logging.getLogger(__name__)
 MAX_APART = 3  # frames in a row without overlap with the map, for a warning
 SKIPS_LOGGED = 10  # maximum number of logged unusable frames, so that a broken disk does not flood the log
 FUSION_STAGES: tuple[str, ...] = get_args(FusionStage)
-STAGES = ("reading", "detection", "tracking", "lifting", "refinement", *FUSION_STAGES)
+STAGES = ("reading", "detection", "tracking", "lifting", "refinement", *FUSION_STAGES, "backend")
 FUSION = "fusion"  # total time of FUSION_STAGES, if the fuser does not time them separately
+STAGE_ORDER = (*STAGES[:-1], FUSION, STAGES[-1])  # all stages of a frame, in the order of the pipeline
 COUNT_INTERVAL_S = 1.0  # s, update interval of the number of instances in the progress bar
 
 
@@ -41,17 +43,6 @@ class StageTime:
     frame: int  # Frame.index
     stage: str  # one of STAGES, or FUSION
     milliseconds: float
-
-
-@dataclass(frozen=True)
-class TrackedFrame:
-    """The estimated and the ground-truth pose of a frame."""
-
-    index: int  # Frame.index
-    position: int  # position in the sequence, counting skipped frames
-    timestamp: float  # s
-    pose: Pose
-    T_world_camera_truth: Float64 | None  # (4, 4); None = unknown
 
 
 @dataclass(frozen=True)
@@ -69,7 +60,7 @@ class RunResult:
     scene: SceneMap
     frames: int  # number of mapped, lost and skipped frames
     frames_skipped: int  # number of frames that are unreadable, inconsistent or without a required pose
-    tracked: Sequence[TrackedFrame]  # including lost frames
+    tracked: Sequence[TrackedFrame]  # including lost frames; poses corrected by the back end
     timings: Sequence[StageTime]
     seconds: float  # wall-clock time of the whole loop
     stopped_by: BaseException | None = None  # reason for an early end; None = completed
@@ -81,6 +72,7 @@ class RunResult:
     digests: Sequence[StageDigest] = ()  # of each stage and frame
     disagreeing: tuple[int, ...] | None = None  # Frame.index of the frames that contradict the map; None = not compared
     masks_omitted: int = 0  # number of masks that exceeded the limit of points of a frame
+    as_tracked: Sequence[TrackedFrame] | None = None  # poses before any correction; None = no back end
 
     @property
     def frames_lost(self) -> int:
@@ -128,7 +120,7 @@ class Journal:
 
     def __post_init__(self) -> None:
         spool = Spool(self.folder)
-        self.tracked: SpooledList[TrackedFrame] = SpooledList(spool)
+        self.tracked = CorrectedFrames(spool)
         self.timings: SpooledList[StageTime] = SpooledList(spool)
         self.digests: SpooledList[StageDigest] = SpooledList(spool)
         self.frames_began: SpooledList[float] = SpooledList(spool)  # start of each frame, s
@@ -326,6 +318,23 @@ class Journal:
         """Record the latency of a frame if the video is live."""
         if self.frames_expected is None:
             self.latencies.append(steady_time() - frame.timestamp)
+
+    def corrected(self, change: SubmapChange, merged: Mapping[int, int]) -> None:
+        """Correct the poses of the tracked frames, and log the motion of submaps and the merged instances.
+
+        Args:
+            change: The change of the map after the last tracked frame.
+            merged: The remaining instance by merged instance.
+        """
+        motion_m = self.tracked.correct(change)
+        if change.motions:
+            log.info(
+                "frame %d: submaps moved: %d, by at most %.0f mm", self.last_index, len(change.motions), 1e3 * motion_m
+            )
+        if merged:
+            pairs = ", ".join(f"{one} into {remaining}" for one, remaining in sorted(merged.items()))
+            log.info("frame %d: instances merged: %s", self.last_index, pairs)
+        self.digest(self.last_index, backend=self.scene)
 
     def result(self) -> RunResult:
         """Return the result after the loop."""

@@ -37,6 +37,7 @@ HEADS = {
     "fps_median": "Hz (median)",
     "frames_lost": "frames lost",
     "trajectory.ate_rmse_m": "ATE (m)",
+    "trajectory.tracked_ate_rmse_m": "ATE before correction (m)",
     "trajectory.rpe_rmse_m": "RPE (m)",
     "map.bytes": "map (bytes)",
     "peak_rss_bytes": "peak memory (bytes)",

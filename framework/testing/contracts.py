@@ -19,16 +19,26 @@ from omegaconf import DictConfig, OmegaConf
 
 from framework.commands.installation.plugins import registered
 from framework.config.composition import composed
-from framework.data import Detections, Float64, Frame, FrameTruth, PointClusters, Pose
+from framework.data import Detections, Float64, Frame, FrameTruth, PointClusters, Pose, check_rigid
 from framework.errors import DataError
 from framework.geometry import exp_se3
-from framework.interfaces import ClusterRefiner, Detector, FrameMasking, MapFuser, PoseTracker, RGBDSequence
+from framework.interfaces import (
+    BackEnd,
+    ClusterRefiner,
+    Detector,
+    FrameMasking,
+    MapFuser,
+    PoseTracker,
+    RGBDSequence,
+    SubmapChange,
+)
 from framework.refinement.lifting import lift
 from framework.registry import GROUPS, build, find_class, parameters
 from framework.runtime.run_log import FUSION_STAGES
 from framework.testing.corner_room import (
     CAMERA,
     CLASSES,
+    RATE,
     RoomMap,
     bleeding_clusters,
     exact_clusters,
@@ -40,6 +50,13 @@ from framework.testing.corner_room import (
 
 SAME_POSE = 5e-6  # maximum difference of equal poses, m and rad; Open3D's sums in several threads differ by 2e-6
 ODOMETRY_START = exp_se3(np.array([3.0, -2.0, 1.0, 0.3, -1.2, 0.5]))  # pose of the first frame in an odometry frame
+
+CORRECTED_POSE = 1e-3  # maximum difference of a pose in a moved map, m and rad, because float32 points are rounded
+MAP_CHANGES = {
+    2: SubmapChange({0: exp_se3(np.array([0.2, -0.1, 0.3, 0.1, 0.3, -0.2]))}, submap=1),
+    5: SubmapChange(dict.fromkeys((0, 1), exp_se3(np.full(6, -0.1))), submap=1),
+}
+"""Motions of the entire map after frames, for trackers."""
 
 
 class OptionContract:
@@ -283,6 +300,26 @@ class TrackerContract:
         assert isinstance(tracker.track(blind, scene), Pose)
         assert isinstance(tracker.track(frame_at(2), scene), Pose)
 
+    def test_tracker_follows_corrections_of_map(self) -> None:
+        """The pipeline does not correct given poses."""
+        tracker, uncorrected = self.plugin(), self.plugin()
+        if tracker.poses_given or tracker.pose_source == "ground_truth":
+            return
+        T_world_room = np.eye(4)
+        for k in range(9):
+            pose = tracker.track(frame_at(k), RoomMap(T_world_room=T_world_room))
+            expected = uncorrected.track(frame_at(k), RoomMap())
+            assert pose.lost == expected.lost, pose.reason
+            np.testing.assert_allclose(
+                pose.T_world_camera,
+                T_world_room @ expected.T_world_camera,
+                atol=CORRECTED_POSE,
+                err_msg="the pose does not move with the map; implement correct()",
+            )
+            if k in MAP_CHANGES:
+                tracker.correct(MAP_CHANGES[k])
+                T_world_room = MAP_CHANGES[k].moved(0, T_world_room)
+
 
 class RefinerContract:
     """Tests of a refiner."""
@@ -490,6 +527,66 @@ class FuserContract:
         fused(fuser, frames=1).scene.save(path)
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
         assert_data_error(lambda: type(fuser.scene).load(path), "map.npz")
+
+
+class BackEndContract:
+    """Tests of a back end.
+
+    The camera drifts away from the room and returns to it.
+    """
+
+    stage = "backend"
+
+    def plugin(self) -> BackEnd:
+        raise _plugin_missing(self, "back end")
+
+    def test_backend_changes_only_known_submaps(self) -> None:
+        backend, scene = self.plugin(), RoomMap()
+        submaps, hidden = {0}, frozenset[int]()
+        for change in changes_of(backend, scene):
+            for number, T_new_old in change.motions.items():
+                check_rigid(f"motion of submap {number}", T_new_old)
+            assert submaps >= {*change.motions, *change.shown, *change.hidden}, "a submap does not exist"
+            assert change.shown <= hidden, "a visible submap is shown"
+            assert not change.hidden & (hidden - change.shown), "a hidden submap is hidden again"
+            hidden = hidden - change.shown | change.hidden
+            submaps.add(change.submap)
+            assert submaps == set(range(len(submaps))), "a submap number was skipped"
+            assert change.submap not in hidden, "the submap of the next frames is hidden"
+
+    def test_backend_does_not_depend_on_ground_truth(self) -> None:
+        changes, misled = (list(changes_of(self.plugin(), RoomMap(), wrong)) for wrong in (False, True))
+        assert len(changes) == len(misled)
+        for one, other in zip(changes, misled, strict=True):
+            assert (one.shown, one.hidden, one.submap) == (other.shown, other.hidden, other.submap)
+            assert one.motions.keys() == other.motions.keys()
+            for number, T_new_old in one.motions.items():
+                np.testing.assert_array_equal(T_new_old, other.motions[number])
+
+    def test_backend_without_frames_changes_nothing(self) -> None:
+        assert self.plugin().finish(RoomMap()) is None
+
+
+def changes_of(backend: BackEnd, scene: RoomMap, wrong_truth: bool = False) -> Iterator[SubmapChange]:
+    """Yield the changes of a back end while the camera drifts 12 m away from the room and returns to it.
+
+    Args:
+        backend: The back end.
+        scene: The map, which does not change.
+        wrong_truth: Pass frames with wrong ground truth.
+    """
+    T_drifted_true = np.eye(4)
+    for index in range(48):
+        k = min(index, 48 - index)
+        T_drifted_true[0, 3] = k / 2
+        frame = replace(frame_at(k), index=index, timestamp=index / RATE)
+        seen = misleading(frame) if wrong_truth else frame
+        change = backend.update(seen, Pose(T_drifted_true @ pose_at(k)), scene)
+        if change is not None:
+            yield change
+    change = backend.finish(scene)
+    if change is not None:
+        yield change
 
 
 def fused(fuser: MapFuser, frames: int = 5) -> MapFuser:

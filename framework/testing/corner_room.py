@@ -6,8 +6,8 @@ spheres. The world frame is the frame of the first camera: x right, y down, z fo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from framework.data import (
 )
 from framework.detection.masks.binary_masks import tight_boxes
 from framework.errors import DataError
-from framework.geometry import exp_se3
+from framework.geometry import exp_se3, inverse
 from framework.interfaces import MapStatistics, SceneMap
 from framework.refinement.lifting import lift
 
@@ -142,14 +142,21 @@ class RoomMap(SceneMap):
     """Read-only map of the room with exact views, but without a mesh and instances."""
 
     classes: tuple[str, ...] = CLASSES
+    T_world_room: Float64 = field(default_factory=lambda: np.eye(4))  # (4, 4) motion of the room
 
     @property
     def statistics(self) -> MapStatistics:
         return MapStatistics(voxels=1, bytes=1)
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        depth, normals, color, ids = look(camera, T_world_camera)
-        return View(camera, T_world_camera, depth, normals.astype(np.float32), color, ids, ids - 1)
+        depth, normals, color, ids = look(camera, inverse(self.T_world_room) @ T_world_camera)
+        normals_world = (normals @ self.T_world_room[:3, :3].T).astype(np.float32)
+        return View(camera, T_world_camera, depth, normals_world, color, ids, ids - 1)
+
+    def render_hidden(
+        self, camera: Camera, T_world_camera: Float64, submaps: Collection[int], depth: Float32 | None = None
+    ) -> View:
+        return self.render(camera, T_world_camera)
 
     def mesh(self) -> InstanceMesh:
         return InstanceMesh(

@@ -28,6 +28,7 @@ STAGE_MS = {  # stage times of a frame, ms
     "association": 2.0,
     "update": 3.0,
     "integration": 5.0,
+    "backend": 0.2,
 }
 CONFIG = {"seed": 0, "fuser": {"voxel_size": 0.01, "max_blocks": None}, "viewer": {}}  # config of a test run
 METRICS = {"sequence": "a room", "frames": FRAMES, "instances.ap50": 0.5, "instances.ap50.bed": None, "git_dirty": True}

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import DelayEstimate, Float32, Float64, Frame
 from framework.geometry import back_project, pose_distance, project
+from framework.interfaces import SubmapChange
 from framework.tracking.color_delay_kernels import find_edges, mean_gradients
 from framework.tracking.pyramid import intrinsics
 
@@ -86,6 +87,11 @@ class DelayEstimator:
         if len(self._comparisons) >= MIN_COMPARISONS and self._compared % PERIOD == 0:
             start = float(TESTED_DELAYS[self._strengths.argmax()])
             self.estimate = regress(np.array(self._comparisons), start)
+
+    def correct(self, change: SubmapChange, submap: int) -> None:
+        """Move the poses of the recent frames with the submap of the last frame."""
+        for k, (frame, T_world_camera) in enumerate(self._recent):
+            self._recent[k] = _Tracked(frame, change.moved(submap, T_world_camera))
 
     def interrupt(self) -> None:
         """Discard recent frames, because the motion to the next frame is unknown."""

@@ -22,6 +22,7 @@ import numpy as np
 
 from framework.data import DelayEstimate, Float64, Frame, Int32, Pose, UInt8
 from framework.geometry import interpolate, inverse, rotation_angle
+from framework.interfaces import SubmapChange
 from framework.tracking.color_delay import MAX_STEP, DelayEstimator, is_usable
 from framework.tracking.color_to_depth_kernels import register_colors
 from framework.tracking.pyramid import intrinsics
@@ -98,6 +99,13 @@ class ColorToDepth:
             return RegisteredFrame(frame, T_world_color)
         color, pixels = register(frame, inverse(T_depth_color))
         return RegisteredFrame(frame.with_color(color), T_world_color, pixels)
+
+    def correct(self, change: SubmapChange, submap: int) -> None:
+        """Move the poses of the last frames with the submap of the last frame, which keeps the motion between them."""
+        for k, (time, T_world_camera) in enumerate(self._poses):
+            self._poses[k] = time, change.moved(submap, T_world_camera)
+        if self._estimator is not None:
+            self._estimator.correct(change, submap)
 
     def _use(self, frame: Frame, estimate: DelayEstimate) -> None:
         """Start to use the estimate when it is accurate enough, and log it."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,11 @@ import cv2
 import numpy as np
 
 from framework.config.validation import check_bounds
-from framework.data import Array, Float32, Float64, Frame, UInt8, check_array, check_rigid
+from framework.data import Array, Float32, Float64, Frame, Int64, UInt8, check_array, check_rigid
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import path_exists
 from framework.geometry import back_project, transform
+from framework.interfaces import SubmapChange
 from framework.mapping.storage.map_file import read_arrays, write_map
 from framework.runtime.cpu_budget import lower_priority
 from framework.tracking.absolute_pose import AbsolutePose, AbsolutePoseEstimator
@@ -46,6 +47,15 @@ class Keyframe:
     points_world: Float32  # (F, 3) m
     descriptors: UInt8  # (F, 128) RootSIFT
     bag: Float32  # (2^WORD_BITS,) bag of visual words
+    submap: int = 0
+
+    def corrected(self, change: SubmapChange) -> Keyframe:
+        """Return the keyframe after a change of its submap."""
+        T_new_old = change.motions.get(self.submap)
+        if T_new_old is None:
+            return self
+        points_world = np.asarray(transform(T_new_old, self.points_world), np.float32)
+        return replace(self, T_world_camera=T_new_old @ self.T_world_camera, points_world=points_world)
 
 
 @dataclass
@@ -55,6 +65,9 @@ class Keyframes:
     Call `add` for every frame with a reliable pose. Features of new views are extracted in a background thread. A view
     is new if distance / min_distance + angle / min_angle >= 1 for all keyframes. Methods that use the keyframes wait
     for the thread first, so that results do not depend on timing.
+
+    Call `correct` after each change of the submaps. Keyframes of hidden submaps are kept, but they are not matched, and
+    views of their places are new.
     """
 
     max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is removed
@@ -80,6 +93,8 @@ class Keyframes:
         self._words = VisualWords(self.seed)
         self._keyframes: list[Keyframe] = []
         self._poses = np.zeros((0, 4, 4))  # poses of the keyframes
+        self._submap = 0  # submap of the next keyframes
+        self._hidden: frozenset[int] = frozenset()  # hidden submaps
         self._barren: Float64 | None = None  # pose of the last frame with too few features
         self._offered: tuple[Float64, Future[Keyframe | None]] | None = None  # pose and keyframe under construction
 
@@ -139,6 +154,15 @@ class Keyframes:
             points_world = np.ascontiguousarray(points[own], np.float32)
             self._keyframes.append(Keyframe(poses[k], points_world, own_descriptors, self._words.bag(own_descriptors)))
         self._poses = np.concatenate([self._poses, poses])
+
+    def correct(self, change: SubmapChange) -> None:
+        """Move the keyframes with their submaps."""
+        self._settle()  # the keyframe under construction belongs to the submap before the change
+        self._keyframes = [keyframe.corrected(change) for keyframe in self._keyframes]
+        self._poses = np.array([keyframe.T_world_camera for keyframe in self._keyframes]).reshape(-1, 4, 4)
+        self._barren = None
+        self._hidden = self._hidden - change.shown | change.hidden
+        self._submap = change.submap
 
     def add(self, frame: Frame, T_world_camera: Float64) -> None:
         """Add the frame as a keyframe if its view is new and has enough features.
@@ -201,12 +225,17 @@ class Keyframes:
         points = back_project(frame.camera, features.pixels, features.depth)
         points_world = np.asarray(transform(T_world_camera, points), np.float32)
         bag = self._words.bag(features.descriptors)
-        return Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag)
+        return Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag, self._submap)
 
     def is_new(self, T_world_camera: Float64) -> bool:
         """Return True if a camera pose (4, 4) is far enough from all keyframes."""
+        visible = self._visible()
+        return bool((self._separation(self._poses[visible], T_world_camera) >= 1).all())
+
+    def _visible(self) -> Int64:
+        """Return the indices of the keyframes in visible submaps."""
         self._settle()
-        return bool((self._separation(self._poses, T_world_camera) >= 1).all())
+        return np.flatnonzero([keyframe.submap not in self._hidden for keyframe in self._keyframes])
 
     def _is_retry(self, T_world_other: Float64 | None, T_world_camera: Float64) -> bool:
         """Return True if a pose is too close to another pose to extract features again."""
@@ -221,18 +250,18 @@ class Keyframes:
 
     def alike(self, features: Features) -> list[Keyframe]:
         """Return the keyframes whose visual words are most similar to those of the features, best first."""
-        self._settle()
-        if not self._keyframes:
+        visible = self._visible()
+        if not len(visible):
             return []
-        bags = np.stack([keyframe.bag for keyframe in self._keyframes])
+        bags = np.stack([self._keyframes[k].bag for k in visible])
         order = np.argsort(-similarity(self._words.bag(features.descriptors), bags), kind="stable")
-        return [self._keyframes[k] for k in order[: self.candidates]]
+        return [self._keyframes[k] for k in visible[order[: self.candidates]]]
 
     def nearest(self, T_world_camera: Float64) -> list[Keyframe]:
         """Return the keyframes nearest to a camera pose (4, 4), nearest first."""
-        self._settle()
-        order = np.argsort(self._separation(self._poses, T_world_camera), kind="stable")
-        return [self._keyframes[k] for k in order[: self.candidates]]
+        visible = self._visible()
+        order = np.argsort(self._separation(self._poses[visible], T_world_camera), kind="stable")
+        return [self._keyframes[k] for k in visible[order[: self.candidates]]]
 
     def locate(self, frame: Frame, features: Features, keyframes: Sequence[Keyframe]) -> AbsolutePose | None:
         """Return the pose of a frame from its matches with the given keyframes, or None if it is not found."""

@@ -63,7 +63,7 @@ def map_agreement(frame: Frame, T_world_camera: Float64, scene: SceneMap) -> Map
     depth = frame.depth[step // 2 :: step, step // 2 :: step]
     nearest, farthest = scene.depth_range
     valid = (depth > max(nearest, 0.0)) & (depth < farthest)
-    mapped = scene.render(_sampled(frame.camera, step), T_world_camera).depth
+    mapped = scene.render_visible(_sampled(frame.camera, step), T_world_camera).depth
     visible = valid & (mapped > 0)
     close = np.maximum(CLOSE, 3 * frame.sensor.sigma(depth))
     agreeing = np.zeros_like(visible)

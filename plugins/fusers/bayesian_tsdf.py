@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters, Pose
-from framework.interfaces import MapFuser, SceneMap, StageTimer, untimed
+from framework.interfaces import MapFuser, SceneMap, StageTimer, SubmapChange, untimed
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instances.association import Association
 from framework.mapping.labels.label_evidence_kernels import Combine
@@ -36,6 +37,8 @@ class BayesianTsdf(MapFuser):
     instance_floor: float = 0.05
     absence_likelihood: float = 0.7  # P(outside the mask | matched instance), in (0, 1]; 1 = no evidence of absence
 
+    has_submaps = True
+
     def __post_init__(self) -> None:
         check_bounds(self, class_floor=(1e-6, 0.999), instance_floor=(0.0, 0.999), absence_likelihood=(1e-6, 1.0))
         self.scene: InstanceMap = self.voxels.new_map(RULE)
@@ -43,15 +46,18 @@ class BayesianTsdf(MapFuser):
     def resume(self, scene: SceneMap) -> None:
         self.scene = self.voxels.continued(scene, RULE)
 
+    def correct(self, change: SubmapChange) -> Mapping[int, int]:
+        return self.scene.correct(change, self.association)
+
     def renew_colors(self) -> None:
-        self.scene.volume.renew_colors()
+        self.scene.renew_colors()
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
         with timer("association"):
             points, matches = self.association.match(self.scene, frame, pose, clusters)
         with timer("integration"):
-            seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
+            seen = self.scene.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
         with timer("update"):
             evidence = self.evidence(clusters, len(self.scene.table.records))
             measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULE)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
 
 from framework.data import Frame, PointClusters, Pose
-from framework.interfaces import MapFuser, SceneMap, StageTimer, untimed
+from framework.interfaces import MapFuser, SceneMap, StageTimer, SubmapChange, untimed
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instances.association import Association
 from framework.mapping.labels.label_evidence_kernels import Combine
@@ -41,21 +42,26 @@ class LabelVote(MapFuser):
     association: Association = field(default_factory=Association)
     vote: Vote = Vote.COUNT  # rule for the label of a voxel
 
+    has_submaps = True
+
     def __post_init__(self) -> None:
         self.scene: InstanceMap = self.voxels.new_map(RULES[self.vote])
 
     def resume(self, scene: SceneMap) -> None:
         self.scene = self.voxels.continued(scene, RULES[self.vote])
 
+    def correct(self, change: SubmapChange) -> Mapping[int, int]:
+        return self.scene.correct(change, self.association)
+
     def renew_colors(self) -> None:
-        self.scene.volume.renew_colors()
+        self.scene.renew_colors()
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
         with timer("association"):
             points, matches = self.association.match(self.scene, frame, pose, clusters)
         with timer("integration"):
-            seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
+            seen = self.scene.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
         with timer("update"):
             weights = np.ones(len(clusters), np.float32)
             if self.vote is Vote.MAX_SCORE:

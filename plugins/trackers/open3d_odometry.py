@@ -14,7 +14,7 @@ import numpy as np
 from framework.config.validation import check_bounds
 from framework.data import Array, Float32, Float64, Frame, Pose, UInt8
 from framework.geometry import nearest_rotation, rotation_angle
-from framework.interfaces import PoseTracker, SceneMap
+from framework.interfaces import PoseTracker, SceneMap, SubmapChange
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -78,6 +78,7 @@ class Open3dOdometry(PoseTracker):
         self._loss = odometry.OdometryLossParams(depth_outlier_trunc=self.max_distance)
         self._method = getattr(odometry.Method, self.method.value)
         self._last: _Seen | None = None  # last reliable frame
+        self._submap = 0  # submap of the next frame
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         image = _rgbd_image(frame.color, frame.depth)
@@ -89,7 +90,7 @@ class Open3dOdometry(PoseTracker):
             return Pose(T_world_camera)
         reference = self._last.image
         if self.reference is Reference.MAP:
-            view = scene.render(frame.camera, self._last.T_world_camera)
+            view = scene.render_visible(frame.camera, self._last.T_world_camera)
             reference = _rgbd_image(view.color, view.depth)
         T_last_camera, reason = self._aligned(image, reference, frame)
         if reason:
@@ -99,6 +100,11 @@ class Open3dOdometry(PoseTracker):
         T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])
         self._last = _Seen(image, T_world_camera)
         return Pose(T_world_camera)
+
+    def correct(self, change: SubmapChange) -> None:
+        if self._last is not None:
+            self._last = _Seen(self._last.image, change.moved(self._submap, self._last.T_world_camera))
+        self._submap = change.submap
 
     def _aligned(
         self, image: o3d.t.geometry.RGBDImage, reference: o3d.t.geometry.RGBDImage, frame: Frame

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.data import Array, Float64, Frame, Pose
-from framework.interfaces import PoseTracker, SceneMap
+from framework.interfaces import PoseTracker, SceneMap, SubmapChange
 from framework.tracking.features import Features
 from framework.tracking.keyframes import Keyframes
 
@@ -39,6 +39,7 @@ class PycolmapPnp(PoseTracker):
     def __post_init__(self) -> None:
         self._keyframes = Keyframes(**vars(self))
         self._T_world_last: Float64 | None = None  # last reliable pose
+        self._submap = 0  # submap of the next frame
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         features = self._keyframes.extractor.extract(frame)
@@ -55,6 +56,12 @@ class PycolmapPnp(PoseTracker):
         self._T_world_last = found.T_world_camera
         self._keyframes.add_with(frame, features, found.T_world_camera)
         return Pose(found.T_world_camera)
+
+    def correct(self, change: SubmapChange) -> None:
+        self._keyframes.correct(change)
+        if self._T_world_last is not None:
+            self._T_world_last = change.moved(self._submap, self._T_world_last)
+        self._submap = change.submap
 
     def keyframes(self) -> Mapping[str, Array]:
         return self._keyframes.saved()

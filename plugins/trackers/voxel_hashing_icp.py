@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from framework.config.validation import check_bounds, require
 from framework.data import Array, Bool, Camera, Float64, Frame, Pose
 from framework.errors import DataError
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
-from framework.interfaces import PoseTracker, SceneMap
+from framework.interfaces import PoseTracker, SceneMap, SubmapChange
 from framework.tracking.absolute_pose import AbsolutePose
 from framework.tracking.alignment import LinearWeights, NormalEquations, Weights, linearize, model_view, smoothed
 from framework.tracking.depth_scale import DepthScale
@@ -153,7 +153,8 @@ class VoxelHashingIcp(PoseTracker):
         self._lost_frames = 0  # number of consecutive lost frames
         self._steady_frames = 0  # number of consecutive frames with a correct prediction
         self._keyframes = Keyframes(seed=self.seed)
-        self._visited: deque[Float64] = deque(maxlen=VISITED)
+        self._visited: deque[tuple[int, Float64]] = deque(maxlen=VISITED)  # submaps and poses
+        self._submap = 0  # submap of the next frame
         self._T_world_doubted: Float64 | None = None  # pose of the last frame if only its confirmation failed
         self._last: FrameFeatures | None = None  # features of the last reliable frame
         self._stored_scene: SceneMap | None = None  # map to relocalize in; None after success
@@ -207,6 +208,20 @@ class VoxelHashingIcp(PoseTracker):
         if is_significant(inverse(self._T_world_last) @ alignment.T_world_camera, alignment.covariance):
             return alignment
         return alignment._replace(T_world_camera=self._T_world_last)
+
+    def correct(self, change: SubmapChange) -> None:
+        self._keyframes.correct(change)
+        visited = [(submap, change.moved(submap, T)) for submap, T in self._visited if submap not in change.hidden]
+        self._visited = deque(visited, maxlen=VISITED)
+        # the last frame, and all that predicts the next one, keep their relative poses
+        if self._T_world_last is not None:
+            self._T_world_last = change.moved(self._submap, self._T_world_last)
+        if self._T_world_odom is not None:
+            self._T_world_odom = change.moved(self._submap, self._T_world_odom)
+        if self._raw_keyframe is not None:
+            T_world_camera = change.moved(self._submap, self._raw_keyframe.T_world_camera)
+            self._raw_keyframe = replace(self._raw_keyframe, T_world_camera=T_world_camera)
+        self._submap = change.submap
 
     def renew_colors(self) -> None:
         self._raw_keyframe = None
@@ -357,8 +372,8 @@ class VoxelHashingIcp(PoseTracker):
                 self._keyframes.add_with(seen.frame, seen.found, T_world_camera)
             else:
                 self._keyframes.add(seen.frame, T_world_camera)
-            if not any(self._scale.near(T, T_world_camera, VISITED_SEPARATION) for T in reversed(self._visited)):
-                self._visited.append(T_world_camera)
+            if not any(self._scale.near(T, T_world_camera, VISITED_SEPARATION) for _, T in reversed(self._visited)):
+                self._visited.append((self._submap, T_world_camera))
         return Pose(T_world_camera, covariance=covariance)
 
     def _relocalized(
@@ -374,7 +389,7 @@ class VoxelHashingIcp(PoseTracker):
         if found is not None:
             alignment = self._confirmed(alignment, found.T_world_camera, levels, scene)
         if self._lost_frames and self._visited and not alignment.reliable:
-            T_world_visited = self._visited[-1 - self._lost_frames % len(self._visited)]
+            _, T_world_visited = self._visited[-1 - self._lost_frames % len(self._visited)]
             again = self._align_twice(levels, scene, T_world_visited)
             if again.reliable:
                 return again

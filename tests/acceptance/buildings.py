@@ -1,14 +1,16 @@
-"""Maps of synthetic buildings: drift, doubled instances and doubled surfaces."""
+"""Maps of synthetic buildings: drift, doubled instances and doubled surfaces, with and without loop closures."""
 
 from __future__ import annotations
 
+import functools
 import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,8 +28,6 @@ from tests.acceptance.runner import CHECKOUT
 
 VIEW_STEP = 5  # frames between two views that determine the true instances
 APART = 0.05  # m, minimum distance of a vertex of a doubled surface from the true surface
-FIVE_ROOMS = {"rooms": 5, "frames": 1200}
-EIGHT_ROOMS = {"rooms": 8, "frames": 3000}
 
 
 @dataclass(frozen=True)
@@ -37,26 +37,25 @@ class BuildingRun:
     ate: float  # m
     frames_lost: int
     ap50: float
+    mean_iou: float
     doubled: frozenset[int]  # true instances that the map contains more than once
     distance: float  # m, median distance of the vertices from the true surface
     apart: float  # fraction of the vertices that are at least APART from the true surface
 
     @classmethod
-    def of(cls, building: dict[str, int], *overrides: str) -> BuildingRun:
+    def of(cls, building: Mapping[str, int], directory: Path, *overrides: str) -> BuildingRun:
         """Map a building, and print the results.
 
         Args:
             building: Parameters of the dataset.
+            directory: The run directory.
             overrides: Other overrides of the run.
         """
-        with tempfile.TemporaryDirectory() as directory:
-            run = Path(directory, "run")
-            chosen = [f"dataset.{name}={value}" for name, value in building.items()]
-            chosen = ["dataset=synthetic_building", "fuser.voxel_size=0.02", *chosen, *overrides]
-            subprocess.run(
-                [sys.executable, "-m", "framework", *chosen, f"hydra.run.dir={run}"], cwd=CHECKOUT, check=True
-            )
-            found = cls.read(run, SyntheticBuilding(**building))  # type: ignore[arg-type]
+        chosen = [f"dataset.{name}={value}" for name, value in building.items()]
+        chosen = ["dataset=synthetic_building", "fuser.voxel_size=0.02", "detector=ground_truth", *chosen, *overrides]
+        command = [sys.executable, "-m", "framework", *chosen, f"hydra.run.dir={directory}"]
+        subprocess.run(command, cwd=CHECKOUT, check=True)
+        found = cls.read(directory, SyntheticBuilding(**building))
         print(" ".join(chosen), found, flush=True)
         return found
 
@@ -79,6 +78,7 @@ class BuildingRun:
             metrics["trajectory.ate_rmse_m"],
             metrics["frames_lost"],
             metrics["instances.ap50"],
+            metrics["instances.mean_iou"],
             frozenset(doubled_instances(true_ids, mesh.instance_ids, likely)),
             float(np.median(apart)),
             float((apart > APART).mean()),
@@ -93,11 +93,35 @@ def _views(sequence: SyntheticBuilding, indices: Float64, poses: Float64) -> Ite
         yield LabeledDepth(frame.depth, frame.truth.instance_ids, frame.camera, T_world_camera)
 
 
-def main() -> None:
-    for seed in range(3):
-        for tracker in ("voxel_hashing_icp", "ground_truth"):
-            BuildingRun.of(FIVE_ROOMS | {"seed": seed}, f"tracker={tracker}", "detector=ground_truth")
+class Comparison(NamedTuple):
+    """Runs of one building that differ in their poses."""
+
+    drifted: BuildingRun  # without a back end
+    corrected: BuildingRun
+    oracle: BuildingRun  # mapped again with the corrected poses
+    given: BuildingRun  # with the true poses
+
+
+@functools.cache
+def compared(seed: int, rooms: int = 5, frames: int = 1200) -> Comparison:
+    """Map a building with and without a back end, again with the corrected poses, and with the true poses."""
+    building = {"rooms": rooms, "frames": frames, "seed": seed}
+    with tempfile.TemporaryDirectory() as directory:
+        runs = {name: Path(directory, name) for name in Comparison._fields}
+        trajectory = f"tracker.path={runs['corrected'] / 'trajectory.txt'}"
+        return Comparison(
+            drifted=BuildingRun.of(building, runs["drifted"], "backend=none"),
+            corrected=BuildingRun.of(building, runs["corrected"], "backend=pose_graph"),
+            oracle=BuildingRun.of(building, runs["oracle"], "tracker=trajectory_file", trajectory),
+            given=BuildingRun.of(building, runs["given"], "tracker=ground_truth"),
+        )
+
+
+def five_rooms() -> list[Comparison]:
+    """Return the comparisons of three buildings of five rooms."""
+    return [compared(seed) for seed in range(3)]
 
 
 if __name__ == "__main__":
-    main()
+    five_rooms()
+    compared(0, rooms=8, frames=3000)

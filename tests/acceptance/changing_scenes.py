@@ -18,7 +18,7 @@ from framework.api import begin, load_map, open_dataset
 from framework.config.composition import composed
 from framework.data import Float32, Float64, Int32
 from framework.evaluation.trajectory import evaluate
-from framework.runtime.run_log import TrackedFrame
+from framework.runtime.corrected_frames import TrackedFrame
 from framework.synthetic.dynamics import Dynamics
 from framework.synthetic.room import RoomKind
 from framework.synthetic.sequence import Synthetic

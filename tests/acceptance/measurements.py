@@ -15,6 +15,7 @@ from typing import Any
 
 from framework.tables.statistics import bootstrap_interval
 from tests.acceptance import changing_scenes, long_run, recording_checks
+from tests.acceptance.buildings import five_rooms
 from tests.acceptance.large_map import measure_large_map
 from tests.acceptance.runner import CHECKOUT, Measured, measurement
 
@@ -196,6 +197,43 @@ def hashing_cost() -> Measured:
         printed = subprocess.run(command, cwd=CHECKOUT, check=True, capture_output=True, text=True).stdout
     cost = 100 * (float(printed) - 1)
     return cost, cost <= 5
+
+
+@measurement("largest ATE with / without back end <= 1/3, 3 buildings of 5 rooms", *PIPELINE)
+def building_ate() -> Measured:
+    value = max(one.corrected.ate / one.drifted.ate for one in five_rooms())
+    return value, value <= 1 / 3
+
+
+@measurement("largest loss of AP50 against true poses <= 0.03, 3 buildings of 5 rooms", *PIPELINE)
+def building_ap50() -> Measured:
+    value = max(one.given.ap50 - one.corrected.ap50 for one in five_rooms())
+    return value, value <= 0.03
+
+
+@measurement("0 instances are doubled that true poses do not double, 3 buildings of 5 rooms", *PIPELINE)
+def building_doubled() -> Measured:
+    value = sum(len(one.corrected.doubled - one.given.doubled) for one in five_rooms())
+    return value, value == 0
+
+
+@measurement("largest median distance from the true surface <= 10 mm, 3 buildings of 5 rooms", *PIPELINE)
+def building_surface() -> Measured:
+    value = 1e3 * max(one.corrected.distance for one in five_rooms())
+    return value, value <= 10
+
+
+@measurement("largest difference of AP50 and mean IoU from the oracle <= 0.01, 3 buildings of 5 rooms", *PIPELINE)
+def building_oracle() -> Measured:
+    pairs = [(one.corrected, one.oracle) for one in five_rooms()]
+    value = max(max(abs(a.ap50 - b.ap50), abs(a.mean_iou - b.mean_iou)) for a, b in pairs)
+    return value, value <= 0.01
+
+
+@measurement("largest difference of the surface distance from the oracle <= 2 mm, 3 buildings of 5 rooms", *PIPELINE)
+def building_oracle_surface() -> Measured:
+    value = 1e3 * max(abs(one.corrected.distance - one.oracle.distance) for one in five_rooms())
+    return value, value <= 2
 
 
 @measurement("slowest query <= 10 ms, unchanged map of 20 rooms, 1 cm", *PIPELINE)

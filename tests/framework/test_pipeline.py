@@ -95,7 +95,7 @@ def test_pipeline_sums_fuser_stage_times(room: CornerRoom) -> None:
                 time.sleep(0.003)
 
     timings = pipeline(fuser=Timed()).run(room).timings
-    assert [one.stage for one in timings if one.frame == 4][-2:] == ["association", "integration"]
+    assert [one.stage for one in timings if one.frame == 4][-3:] == ["association", "integration", "backend"]
     assert all(one.milliseconds >= 6 for one in timings if one.stage == "association")
     assert "fusion" not in {one.stage for one in timings}
 
@@ -586,7 +586,7 @@ def test_viewer_receives_all_frames_in_order(prefetch: int, tmp_path: Path) -> N
         *("mapped 0 with 2", skipped, "mapped 2 with 2", "lost 3 with 2", "mapped 4 with 2", "mapped 5 with 2"),
         "end",
     ]
-    every = {"reading", "detection", "tracking", "lifting", "refinement", "fusion"}
+    every = {"reading", "detection", "tracking", "lifting", "refinement", "fusion", "backend"}
     assert listener.stages == [every, every, {"reading", "detection", "tracking"}, every, every]
 
 

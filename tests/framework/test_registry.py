@@ -280,7 +280,7 @@ def test_registry_reports_conflicting_plugins_package(tmp_path: Path) -> None:
 
 
 def test_registry_has_interface_for_each_stage() -> None:
-    assert list(STAGES) == ["dataset", "detector", "masking", "tracker", "refiner", "fuser"]
+    assert list(STAGES) == ["dataset", "detector", "masking", "tracker", "refiner", "fuser", "backend"]
     assert list(GROUPS) == [*STAGES, "viewer"]
 
 

@@ -102,7 +102,7 @@ def test_page_plugins_and_parameters_exist(built: Path) -> None:
     for stage in GROUPS:
         reference = (built / "configuration" / f"{stage}.html").read_text()
         chosen = set(re.findall(rf"(?<![\w.@]){stage}=([a-z]\w*)", text)) - OF_TUTORIALS
-        assert len(chosen) > {"viewer": 0, "masking": 1}.get(stage, 2)
+        assert len(chosen) > {"viewer": 0, "masking": 1, "backend": 0}.get(stage, 2)
         assert not [name for name in chosen if f'id="{stage}-{name.replace("_", "-")}"' not in reference]
         given = set(re.findall(rf"(?<![\w./:(]){stage}\.([a-z]\w*)\b(?![.(])", text)) - {"hue", "scene"}
         assert not [name for name in given if f"{stage}.{name}</span>" not in reference]

@@ -17,6 +17,7 @@ import pytest
 from framework.data import Frame
 from framework.interfaces import LiveVideo, RGBDSequence
 from framework.testing.contracts import (
+    BackEndContract,
     DetectorContract,
     FuserContract,
     MaskingContract,
@@ -69,6 +70,12 @@ class TestFusers(FuserContract):
     @pytest.fixture(autouse=True, params=registered.names("fuser"))
     def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
         self.plugin = lambda: ready("fuser", request.param)
+
+
+class TestBackEnds(BackEndContract):
+    @pytest.fixture(autouse=True, params=registered.names("backend"))
+    def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
+        self.plugin = lambda: ready("backend", request.param)
 
 
 class TestViewers(ViewerContract):

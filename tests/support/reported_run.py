@@ -28,6 +28,7 @@ CONFIG: dict[str, Any] = {
     "tracker": {"_target_": "tests.support.scenes.corner_room.GivenPose"},
     "refiner": {"_target_": "tests.support.scenes.corner_room.KeepAll"},
     "fuser": {"_target_": "plugins.fusers.bayesian_tsdf.BayesianTsdf", "voxel_size": 0.03, "min_observations": 2},
+    "backend": {"_target_": "plugins.backends.none.NoBackEnd"},
     "viewer": {"_target_": "plugins.viewers.none.NoViewer"},
 }
 

@@ -23,6 +23,7 @@ from framework.commands.installation.plugins import options_of
 from framework.data import Camera, Detections, Frame, Instance, PointClusters, Pose, SurfaceView
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import make_folder, sync_file, sync_folder
+from framework.interfaces import SubmapChange
 from framework.registry import GROUPS
 
 TEMPLATES = Path(framework.__file__).with_name("templates")
@@ -47,6 +48,7 @@ TRIES = {  # by stage: command that compares the new plugin with an existing plu
     "tracker": f"instancemap -m tracker=voxel_hashing_icp,$name detector=simulated {SMALL} {FIRST}",
     "refiner": f"instancemap -m refiner=gmm_em,$name detector=simulated {SMALL} {FIRST}",
     "fuser": f"instancemap -m fuser=bayesian_tsdf,$name detector=simulated {SMALL} {FIRST}",
+    "backend": f"instancemap -m backend=none,$name detector=simulated {SMALL} {FIRST}",
     "dataset": f"instancemap -m refiner=identity,gmm_em dataset=$name dataset.root=DIR {FIRST}",
     "viewer": f"instancemap viewer=$name detector=simulated {SMALL} hydra.run.dir=outputs/first_run",
 }
@@ -62,6 +64,7 @@ DATA: dict[str, tuple[type, ...]] = {  # by stage: data types of its arguments a
     "tracker": (Frame, Camera, SurfaceView, Pose),
     "refiner": (PointClusters, Frame, Camera),
     "fuser": (Frame, Camera, Pose, PointClusters, Instance),
+    "backend": (Frame, Camera, Pose, SubmapChange),
     "dataset": (Frame, Camera),
     "viewer": (Frame, Camera, Detections, Pose, Instance),
 }
@@ -71,6 +74,7 @@ VARIANTS = {  # by stage: changed parameter of the example variant in the README
     "tracker": "max_distance: 0.2",
     "refiner": "reach: 0.6",
     "fuser": "least: 0.3",
+    "backend": "length: 4.0",
     "dataset": "stride: 2",
     "viewer": "min_score: 0.6",
 }

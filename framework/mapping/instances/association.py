@@ -151,8 +151,8 @@ class LabeledMap(Protocol):
         look-up never returns an instance that is hidden behind a new object.
         """
 
-    def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Return the ray-cast view of the map."""
+    def render_visible(self, camera: Camera, T_world_camera: Float64) -> View:
+        """Return the ray-cast view of the visible part of the map."""
 
     def merge(self, kept: int, dropped: int) -> None:
         """Merge instance `dropped` into instance `kept`."""
@@ -262,7 +262,7 @@ class Association:
         """Return the overlaps of the clusters with the instances of the map."""
         stride = vote_stride(frame.camera)
         if self.association is InstanceSource.RAYCAST:
-            view = scene.render(frame.camera, pose.T_world_camera)
+            view = scene.render_visible(frame.camera, pose.T_world_camera)
             return count_overlaps(points, np.ascontiguousarray(view.instance_ids[::stride, ::stride]), stride)
         return count_overlaps(points, scene.instances_seen(frame, pose.T_world_camera, stride), stride)
 

@@ -16,8 +16,11 @@ from framework.data import Bool, Float64, Int32
 from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS, ClassIds, class_id_type
 from framework.mapping.labels.evidence_rows_kernels import (
     BITS,
+    add_rows,
+    count_unlabeled,
     fewest_free,
     find_list_bits,
+    find_row_bits,
     label_new,
     merge_instances,
     number_new,
@@ -25,7 +28,7 @@ from framework.mapping.labels.evidence_rows_kernels import (
     sum_classes_of_instances,
     update_rows,
 )
-from framework.mapping.labels.label_evidence import UNSEEN, Evidence, Measurement
+from framework.mapping.labels.label_evidence import LARGEST_SCORE, MAX_SCORE, UNSEEN, Evidence, Measurement
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.packed_evidence import PackedEvidence, unpack_evidence
 from framework.mapping.voxels.integration import SeenBlocks
@@ -115,6 +118,79 @@ class EvidenceRows:
             array, given = getattr(own, name), getattr(saved, name)
             array[:, : given.shape[1]] = given
             array[:, given.shape[1] :] = 0
+
+    def like(self, voxels: VoxelGrid) -> EvidenceRows:
+        """Return empty evidence of the same kind for another grid."""
+        other = EvidenceRows(voxels, self.combine, self.storage, self.score_scale)
+        other._instance_slots, other._class_slots = self._instance_slots, self._class_slots
+        other._class_id_type = self._class_id_type
+        other._free()
+        return other
+
+    def best_ids(self) -> Int32:
+        """Return the instances that are the most likely ones of a voxel, ascending."""
+        evidence = self.in_use()
+        return np.unique(evidence.instance_ids[:, 0][evidence.instance_value[:, 0] > 0])
+
+    def voxels_of(self, blocks: Int32) -> Int32:
+        """Return the index (N, 512) of each voxel of the blocks (N,) among the labeled voxels, -1 = not labeled."""
+        rows = self.voxels.grid.label_row[blocks]
+        found = np.full((len(blocks), BLOCK_VOXELS), -1, np.int32)
+        found[rows >= 0] = self._labeled[rows[rows >= 0]]
+        return found
+
+    def gather(self, source: EvidenceRows, voxels: Int32) -> None:
+        """Replace the evidence with copies of evidence of the same kind.
+
+        Args:
+            source: The other evidence.
+            voxels: The index (B, 512) of the source of each voxel among the labeled voxels of `source`, -1 = none.
+        """
+        has_row = np.asarray((voxels >= 0).any(axis=1))
+        labeled = voxels[has_row]
+        found = labeled >= 0
+        chosen = labeled[found]
+        labeled[found] = np.arange(len(chosen), dtype=np.int32)
+        self._reserve(len(labeled), len(chosen))
+        self._labeled[: self.row_count] = labeled
+        self._slots[: self.voxel_count] = source._slots[chosen]
+        find_row_bits(self.in_use(), self._row_bits)
+        self._set_label_rows(has_row)
+
+    def replace(self, other: EvidenceRows) -> None:
+        """Replace the evidence with a copy of evidence of the same kind, whose blocks have the same order."""
+        self._reserve(other.row_count, other.voxel_count)
+        self._labeled[: self.row_count] = other._labeled[: self.row_count]
+        self._row_bits[: self.row_count] = other._row_bits[: self.row_count]
+        self._slots[: self.voxel_count] = other._slots[: self.voxel_count]
+        count = other.voxels.block_count
+        self.voxels.grid.label_row[:count] = other.voxels.grid.label_row[:count]
+
+    def _set_label_rows(self, has_row: Bool) -> None:
+        """Number the rows of the blocks (B,) that have one, in the order of the blocks."""
+        rows = np.where(has_row, np.cumsum(has_row) - 1, -1)
+        self.voxels.grid.label_row[: len(has_row)] = rows
+
+    def add(self, blocks: Int32, other: EvidenceRows) -> None:
+        """Add evidence of the same kind.
+
+        Args:
+            blocks: The block (B,) of each block of the other grid.
+            other: The other evidence.
+        """
+        theirs = other.voxels.grid.label_row[: other.voxels.block_count]
+        new = NewVoxels(*np.empty((3, len(blocks)), np.int32))
+        label_row, evicted = self.voxels.grid.label_row, np.zeros(len(blocks), np.int32)
+        if self.storage is Storage.EXACT:
+            self._make_room_for_instances(other._instance_slots)
+        count_unlabeled(label_row, blocks, self.evidence, theirs, other.evidence, new.counts)
+        self._make_room(blocks, new)
+        limit = MAX_SCORE if self.storage is Storage.COMPACT else LARGEST_SCORE
+        add_rows(
+            label_row, blocks, self.evidence, self._row_bits, theirs, other.evidence, other._row_bits, new,
+            int(self.combine), limit, evicted,
+        )  # fmt: skip
+        self.evicted += int(evicted.sum())
 
     @property
     def max_instance_slots(self) -> int:

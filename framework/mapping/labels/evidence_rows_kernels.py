@@ -8,6 +8,7 @@ from numba import prange
 from framework.compilation.kernel_cache import njit
 from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.label_evidence_kernels import (
+    LATEST,
     UNBOUNDED,
     add_evidence,
     best_counted_instance,
@@ -254,3 +255,117 @@ def sum_classes_of_instances(evidence, counts, sums):
             if label == NO_CLASS:  # slots are filled from the front
                 break
             sums[instance, label - 1] += evidence.class_value[voxel, s]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def find_row_bits(evidence, row_bits):
+    """Compute the instance set (R,) of each row."""
+    for row in prange(evidence.labeled.shape[0]):
+        bits = np.uint64(0)
+        for voxel in evidence.labeled[row]:
+            for s in range(evidence.instance_ids.shape[1] if voxel >= 0 else 0):
+                instance = evidence.instance_ids[voxel, s]
+                if instance == 0:  # slots are filled from the front
+                    break
+                bits |= instance_bit(instance)
+        row_bits[row] = bits
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def count_unlabeled(label_row, blocks, evidence, their_row, theirs, counts):
+    """Count the voxels (B,) of each block that only the other evidence labels.
+
+    Args:
+        label_row: The row of every block, -1 = none.
+        blocks: The block (B,) of each block of the other grid.
+        evidence: The label evidence.
+        their_row: The row (B,) of each block of the other grid, -1 = none.
+        theirs: The other evidence.
+        counts: The output.
+    """
+    for b in prange(blocks.shape[0]):
+        row, other = label_row[blocks[b]], their_row[b]
+        count = np.int32(0)
+        for n in range(BLOCK_VOXELS if other >= 0 else 0):
+            missing = row < 0 or evidence.labeled[max(row, 0), n] < 0
+            count = one_more(count, theirs.labeled[other, n] >= 0 and missing)
+        counts[b] = count
+
+
+@device
+def _copy_slots(evidence, voxel, theirs, other):
+    """Copy the slots of a voxel of the other evidence, which has at most as many slots."""
+    for s in range(evidence.instance_ids.shape[1]):
+        has_slot = s < theirs.instance_ids.shape[1]
+        evidence.instance_ids[voxel, s] = theirs.instance_ids[other, s] if has_slot else 0
+        evidence.instance_value[voxel, s] = theirs.instance_value[other, s] if has_slot else 0
+    for s in range(evidence.class_ids.shape[1]):
+        evidence.class_ids[voxel, s] = theirs.class_ids[other, s]
+        evidence.class_value[voxel, s] = theirs.class_value[other, s]
+
+
+@device
+def _add_slots(evidence, voxel, theirs, other, combine, limit):
+    """Add the evidence of a voxel of the other evidence, and return the number of evicted labels."""
+    evicted = 0
+    ids, values = evidence.instance_ids[voxel], evidence.instance_value[voxel]
+    for s in range(theirs.instance_ids.shape[1]):
+        label = theirs.instance_ids[other, s]
+        if label == 0:  # slots are filled from the front
+            break
+        evicted += add_evidence(ids, values, 0, label, theirs.instance_value[other, s], combine, UNBOUNDED)
+    best_first(ids, values, 0)
+    classes, scores = evidence.class_ids[voxel], evidence.class_value[voxel]
+    for s in range(theirs.class_ids.shape[1]):
+        label = theirs.class_ids[other, s]
+        if label == NO_CLASS:
+            break
+        score = np.int64(theirs.class_value[other, s])  # a sum of two scores may exceed 16 bits
+        evicted += add_evidence(classes, scores, NO_CLASS, label, score, combine, limit)
+    best_first(classes, scores, NO_CLASS)
+    return evicted
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def add_rows(
+    label_row, blocks, evidence, row_bits, their_row, theirs, their_bits, new, combine, limit, evicted
+):  # fmt: skip
+    """Add other evidence. If the latest label replaces all others, only the voxels without labels are changed.
+
+    Args:
+        label_row: The row of every block, -1 = none; modified in place.
+        blocks: The block (B,) of each block of the other grid.
+        evidence: The label evidence, modified in place.
+        row_bits: The instance set (R,) of each row, modified in place.
+        their_row: The row (B,) of each block of the other grid, -1 = none.
+        theirs: The other evidence.
+        their_bits: The instance set of each row of the other evidence.
+        new: The voxels of each block that become labeled.
+        combine: The rule for combining evidence, a value of Combine.
+        limit: The maximum absolute class score.
+        evicted: The output (B,), the number of evicted labels of each block.
+    """
+    # Numba 0.68 loses assignments to an element of a tuple's array within prange
+    rows, starts, labeled = new.rows, new.starts, evidence.labeled
+    for b in prange(blocks.shape[0]):
+        other_row = their_row[b]
+        if other_row < 0:
+            continue
+        row, voxel = rows[b], starts[b]
+        label_row[blocks[b]] = row
+        if row < 0:
+            continue
+        row_bits[row] |= their_bits[other_row]
+        count = 0
+        for n in range(BLOCK_VOXELS):
+            other = theirs.labeled[other_row, n]
+            if other < 0:
+                continue
+            own = labeled[row, n]
+            if own < 0:
+                labeled[row, n] = voxel
+                _copy_slots(evidence, voxel, theirs, other)
+                voxel += np.int32(1)
+            elif combine != LATEST:
+                count += _add_slots(evidence, own, theirs, other, combine, limit)
+        evicted[b] = count

@@ -35,6 +35,7 @@ from framework.mapping.labels.class_slots import NEW_CLASSES, ClassIds
 
 Integers = npt.NDArray[Any]  # of int16, int32 or int64
 MAX_SCORE = 30_000  # maximum quantized class score in compact storage; the excess is subtracted from all scores
+LARGEST_SCORE = 2**62  # maximum quantized class score in exact storage
 MAX_CLUSTER_SCORE = 2**15 - 1 - MAX_SCORE  # maximum quantized score of a cluster; a larger one could overflow int16
 
 # log-odds of the most likely class over a class that no detector could detect; exp(-UNSEEN) is 0 in float32

@@ -17,6 +17,7 @@ from framework.mapping.instances.instance_list import Confirmation, InstanceClas
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
 from framework.mapping.labels.label_evidence import (
+    LARGEST_SCORE,
     MAX_CLUSTER_SCORE,
     MAX_SCORE,
     Measurement,
@@ -167,7 +168,7 @@ class LabeledVoxels:
             class_scores=pack_class_scores(relative, scale, bits, np.int32 if compact else np.int64),
             named_classes=named,
             combine=int(rule.combine),
-            max_score=MAX_SCORE if compact else 1 << 62,
+            max_score=MAX_SCORE if compact else LARGEST_SCORE,
         )
 
     def supported_instances(self, table: InstanceTable, matches: Matches) -> Bool:

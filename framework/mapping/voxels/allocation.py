@@ -37,6 +37,10 @@ class Allocator:
         """Return the state without unused capacity."""
         return {**vars(self), "_stamp": self._stamp[: self.voxels.block_count]}
 
+    def renumbered(self) -> None:
+        """Discard the data about blocks after they were renumbered."""
+        self._stamp[:] = 0
+
     def active_blocks(self, frame: Frame, T_world_camera: Float64) -> Int32:
         """Return the indices (A,) of the blocks that a frame updates.
 

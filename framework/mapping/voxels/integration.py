@@ -77,6 +77,10 @@ class Integrator:
         self._allocator.allocate(frame.camera, depth, T_world_camera)
         return self._update(frame, T_world_camera, near_band, np.arange(self.voxels.block_count, dtype=np.int32))
 
+    def renumbered(self) -> None:
+        """Discard the data about blocks after they were renumbered."""
+        self._allocator.renumbered()
+
     def _sensor_of(self, frame: Frame) -> Sensor:
         """Return the sensor parameters for a frame."""
         # the full-weight depth of the sensor of the frame, if larger

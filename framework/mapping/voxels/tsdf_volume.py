@@ -45,6 +45,16 @@ class TsdfVolume:
         """Return the state without data derived from the voxels."""
         return {**vars(self), "_nets": None, "_mesh": None}
 
+    def like(self, max_blocks: int) -> TsdfVolume:
+        """Return an empty volume with the parameters and the gravity direction of this volume."""
+        other = TsdfVolume(self.voxel_size, self.sensor, max_blocks)
+        other.voxels.grid = other.voxels.grid._replace(
+            voxel_size=self.voxels.grid.voxel_size, tsdf_unit=self.voxels.grid.tsdf_unit
+        )
+        other.integrator.frames = self.integrator.frames
+        other.gravity_estimator = self.gravity_estimator
+        return other
+
     @property
     def voxel_size(self) -> float:
         """Side of a voxel, m."""
@@ -81,6 +91,11 @@ class TsdfVolume:
             self._nets = None
         elif self._nets is not None:
             self._nets.changed(blocks)
+
+    def renumbered(self) -> None:
+        """Discard the data derived from block indices after the blocks were renumbered."""
+        self.integrator.renumbered()
+        self.changed()
 
     @property
     def nets(self) -> SurfaceNets:

@@ -21,7 +21,14 @@ import numpy.typing as npt
 
 from framework.data import Int32, UInt8
 from framework.errors import MapFullError
-from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, BLOCK_VOXELS, NO_KEY, insert_blocks, rehash
+from framework.mapping.voxels.voxel_grid_kernels import (
+    BLOCK_SIDE,
+    BLOCK_VOXELS,
+    NO_KEY,
+    find_blocks,
+    insert_blocks,
+    rehash,
+)
 
 try:
     import resource
@@ -58,6 +65,7 @@ class Grid(NamedTuple):
     label_row: Int32  # (B,) row of the block in the label evidence, -1 = none
 
 
+VOXEL_ARRAYS = ("tsdf", "weight", "color", "solid")  # fields that do not refer to blocks or rows
 OF_BLOCKS = Grid._fields[Grid._fields.index("block_coords") :]  # fields of shape (B, ...)
 
 
@@ -113,6 +121,28 @@ class VoxelGrid:
         blocks = {name: getattr(self.grid, name)[: self.block_count] for name in OF_BLOCKS}
         return {**vars(self), "grid": self.grid._replace(**blocks)}
 
+    def like(self, max_blocks: int) -> VoxelGrid:
+        """Return an empty grid with voxels of the same size."""
+        other = VoxelGrid(float(self.grid.voxel_size), TSDF_MAX * float(self.grid.tsdf_unit), max_blocks)
+        other.grid = other.grid._replace(tsdf_unit=self.grid.tsdf_unit)  # exactly
+        return other
+
+    def part(self, blocks: Int32) -> VoxelGrid:
+        """Return a copy of the blocks (N,), without label rows."""
+        other = self.like(max(len(blocks), 1))
+        other.allocate(self.grid.block_coords[blocks])
+        for name in VOXEL_ARRAYS:
+            getattr(other.grid, name)[: len(blocks)] = getattr(self.grid, name)[blocks]
+        return other
+
+    def replace(self, other: VoxelGrid) -> None:
+        """Replace all blocks with a copy of the blocks of another grid, without label rows."""
+        self.grid.table_keys[:] = NO_KEY
+        self.region_count = self.block_count = 0
+        self.allocate(other.grid.block_coords[: other.block_count])
+        for name in VOXEL_ARRAYS:
+            getattr(self.grid, name)[: self.block_count] = getattr(other.grid, name)[: other.block_count]
+
     @property
     def byte_count(self) -> int:
         """Size of the arrays in use, bytes. Unused capacity takes no memory."""
@@ -143,6 +173,12 @@ class VoxelGrid:
                     "fuser.max_blocks or fuser.voxel_size"
                 )
             self._grow()
+
+    def find(self, coords: Int32) -> Int32:
+        """Return the block indices (N,) at block coordinates (N, 3), -1 = not allocated."""
+        blocks = np.empty(len(coords), np.int32)
+        find_blocks(self.grid, coords, blocks)
+        return blocks
 
     def _grow(self) -> None:
         """Double each exhausted capacity."""

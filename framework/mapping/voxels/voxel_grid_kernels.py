@@ -97,6 +97,14 @@ def find_block(grid, bx, by, bz, last_key, last_region):
 
 
 @njit(cache=True, nogil=True)
+def find_blocks(grid, coords, blocks):
+    """Write the block indices (N,) at block coordinates (N, 3) to `blocks`, -1 = not allocated."""
+    key, region = NO_LOOK_UP
+    for i in range(coords.shape[0]):
+        blocks[i], key, region = find_block(grid, coords[i, 0], coords[i, 1], coords[i, 2], key, region)
+
+
+@njit(cache=True, nogil=True)
 def insert_blocks(grid, coords, start, region_count, block_count, blocks):
     """Allocate the blocks at the given coordinates, from index `start` on, and write their indices to `blocks` (N,).
 

@@ -13,6 +13,7 @@ import pytest
 pytest.register_assert_rewrite("framework.testing")  # shows the values of failed assertions
 
 from framework.testing.contracts import (
+    BackEndContract,
     DetectorContract,
     FuserContract,
     MaskingContract,
@@ -49,6 +50,7 @@ __all__ = [
     "LOST",
     "SKIPPED",
     "STAGE_MS",
+    "BackEndContract",
     "DetectorContract",
     "FuserContract",
     "MaskingContract",

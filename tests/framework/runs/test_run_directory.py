@@ -31,7 +31,8 @@ from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import instance_metrics, run_metrics, trajectory_metrics
 from framework.runs.run_directory import RunRecord, headline
 from framework.runs.stored_runs import MAPPED, read_record
-from framework.runtime.run_log import FUSION, STAGES, RunResult, TrackedFrame
+from framework.runtime.corrected_frames import TrackedFrame
+from framework.runtime.run_log import FUSION, STAGES, RunResult
 from tests.support import registered
 from tests.support.scenes.corner_room import (
     CLASSES,
@@ -43,6 +44,7 @@ from tests.support.scenes.corner_room import (
     SphereDetector,
     pose_at,
 )
+from tests.support.scenes.given_changes import AS_TRACKED, CORRECTED, GivenChanges, RoomTracker, SubmapFuser
 
 pytestmark = pytest.mark.integration
 
@@ -249,6 +251,23 @@ def test_rpe_ignores_steps_over_skipped_frames(room: CornerRoom) -> None:
     assert metrics["trajectory.rpe_rmse_m"] == pytest.approx(0.01)
 
 
+def test_run_directory_of_corrected_run_has_both_trajectories(record: RunRecord, room: CornerRoom) -> None:
+    corrected = Pipeline(SphereDetector(), RoomTracker(), KeepAll(), SubmapFuser(), backend=GivenChanges()).run(room)
+    record.write(room, corrected)
+    for name, T_world_room in (("trajectory.txt", CORRECTED), ("trajectory_tracked.txt", AS_TRACKED)):
+        _, poses = read_tum(record.directory / name)
+        np.testing.assert_allclose(poses, [T @ pose_at(k) for k, T in enumerate(T_world_room)], atol=1e-8)
+    metrics = metrics_of(record)
+    assert metrics["trajectory.ate_rmse_m"] == trajectory_metrics(corrected)["trajectory.ate_rmse_m"]
+    tracked = trajectory_metrics(replace(corrected, tracked=corrected.as_tracked))["trajectory.ate_rmse_m"]
+    assert metrics["trajectory.tracked_ate_rmse_m"] == tracked
+    assert tracked != metrics["trajectory.ate_rmse_m"]
+    assert "trajectory_tracked.txt" in Manifest.read(record.directory).files
+    record.write(room, mapped(room))  # without a back end
+    assert not (record.directory / "trajectory_tracked.txt").exists()
+    assert "trajectory.tracked_ate_rmse_m" not in metrics_of(record)
+
+
 def test_run_directory_of_stopped_run_has_partial_metrics(record: RunRecord, room: CornerRoom) -> None:
     result = mapped(room, capacity=2)
     assert isinstance(result.stopped_by, MapFullError)
@@ -342,7 +361,7 @@ def test_timings_csv_matches_stage_metrics(record: RunRecord, room: CornerRoom) 
     record.write(room, result)
     with (record.directory / "timings.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == len(result.timings) == 36
+    assert len(rows) == len(result.timings) == 6 * 7
     assert set(rows[0]) == {"frame", "stage", "milliseconds"}
     fuse = [float(row["milliseconds"]) for row in rows if row["stage"] == "fusion"]
     assert metrics_of(record)["stage_ms.fusion.median"] == pytest.approx(np.median(fuse), abs=1e-3)

@@ -15,8 +15,11 @@ import pytest
 
 from framework.config import composition
 from framework.data import Detections, Frame, PointClusters, Pose
-from framework.interfaces import ClusterRefiner, PoseTracker, SceneMap, StageTimer, Viewer, untimed
+from framework.errors import DataError
+from framework.geometry import inverse
+from framework.interfaces import ClusterRefiner, PoseTracker, SceneMap, StageTimer, SubmapChange, Viewer, untimed
 from framework.testing.contracts import (
+    BackEndContract,
     DetectorContract,
     FuserContract,
     OptionContract,
@@ -27,6 +30,7 @@ from framework.testing.contracts import (
 from framework.testing.corner_room import CAMERA
 from framework.testing.viewer import ViewerContract
 from tests.support.scenes.corner_room import CornerRoom, GridFuser, SphereDetector
+from tests.support.scenes.given_changes import GivenChanges, RoomTracker
 
 pytestmark = pytest.mark.integration
 
@@ -152,6 +156,42 @@ class Writing(PoseTracker):
         return Pose(np.diag([1.0, -1.0, -1.0, 1.0]))
 
 
+class Staying(RoomTracker):
+    """Tracker that does not follow corrections of the map."""
+
+    def correct(self, change: SubmapChange) -> None:
+        pass
+
+
+class Scaling(GivenChanges):
+    """Back end whose motion is not rigid."""
+
+    def update(self, frame: Frame, pose: Pose, scene: SceneMap) -> SubmapChange | None:
+        return SubmapChange({0: np.diag([1.1, 1.1, 1.1, 1.0])}) if frame.index == 2 else None
+
+
+class Skipping(GivenChanges):
+    """Back end that omits a submap number."""
+
+    def update(self, frame: Frame, pose: Pose, scene: SceneMap) -> SubmapChange | None:
+        return SubmapChange(submap=2) if frame.index == 2 else None
+
+
+class Hiding(GivenChanges):
+    """Back end that hides the submap of the next frames."""
+
+    def update(self, frame: Frame, pose: Pose, scene: SceneMap) -> SubmapChange | None:
+        return SubmapChange(hidden=frozenset({0})) if frame.index == 2 else None
+
+
+class Knowing(GivenChanges):
+    """Back end that moves the map to the ground-truth pose."""
+
+    def update(self, frame: Frame, pose: Pose, scene: SceneMap) -> SubmapChange | None:
+        assert frame.T_world_camera is not None
+        return SubmapChange({0: frame.T_world_camera @ inverse(pose.T_world_camera)}) if frame.index == 2 else None
+
+
 class Careless(GridFuser):
     """Fuser whose map accepts any pose for rendering, even an invalid one."""
 
@@ -196,6 +236,12 @@ class Backwards(CornerRoom):
         (TrackerContract, partial(Boasting, fraction=0.5), "test_tracker_pose_source_is_correct"),
         (TrackerContract, Following, "test_tracker_does_not_depend_on_odometry_frame"),
         (TrackerContract, Erasing, "test_tracker_returns_poses_without_changing_map"),
+        (TrackerContract, Staying, "test_tracker_follows_corrections_of_map"),
+        (BackEndContract, partial(Scaling, last=None), "test_backend_changes_only_known_submaps"),
+        (BackEndContract, partial(Skipping, last=None), "test_backend_changes_only_known_submaps"),
+        (BackEndContract, partial(Hiding, last=None), "test_backend_changes_only_known_submaps"),
+        (BackEndContract, partial(Knowing, last=None), "test_backend_does_not_depend_on_ground_truth"),
+        (BackEndContract, GivenChanges, "test_backend_without_frames_changes_nothing"),
         (FuserContract, Careless, "test_fuser_map_rejects_invalid_poses"),
         (FuserContract, Relocating, "test_fuser_does_not_depend_on_ground_truth"),
         (FuserContract, Smoothing, "test_fuser_does_not_depend_on_ground_truth"),
@@ -205,7 +251,7 @@ class Backwards(CornerRoom):
 def test_contract_detects_broken_plugin(contract: type[Any], plugin: Callable[[], object], test: str) -> None:
     tests = contract()
     tests.plugin = plugin
-    with pytest.raises((AssertionError, FrozenInstanceError)):
+    with pytest.raises((AssertionError, FrozenInstanceError, DataError)):
         getattr(tests, test)()
 
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Camera, Float64, Frame, Pose
 from framework.geometry import exp_se3, inverse, project
+from framework.interfaces import SubmapChange
 from framework.tracking.color_to_depth import ColorToDepth, register
 from tests.framework.tracking.test_color_delay import delayed_frames
 from tests.support.scenes.analytic_scene import CAMERA, Scene
@@ -135,6 +136,25 @@ def test_color_to_depth_short_delay_does_not_displace_colors() -> None:
         assert not registration.displaced_before
     assert registration.estimate is not None
     assert registration.estimate.known
+
+
+def test_color_to_depth_correction_keeps_motion() -> None:
+    plain, corrected = ColorToDepth(None), ColorToDepth(None)
+    change = SubmapChange({1: exp_se3(np.array([0.5, -0.2, 0.1, 0.3, 0.9, -0.4]))})
+    T_new_old = np.eye(4)
+    for k, (frame, T_world_camera) in enumerate(delayed_frames(0.03)):
+        expected = plain.tracked(frame, Pose(T_world_camera))
+        found = corrected.tracked(frame, Pose(T_new_old @ T_world_camera))
+        np.testing.assert_allclose(found.T_world_color, T_new_old @ expected.T_world_color, atol=1e-5)
+        assert (found.color_pixels is None) == (expected.color_pixels is None)
+        if k % 20 == 10:
+            corrected.correct(change, submap=1)
+            T_new_old = change.moved(1, T_new_old)
+    assert found.color_pixels is not None
+    assert corrected.delay == pytest.approx(plain.delay, abs=1e-5)
+    assert corrected.estimate is not None
+    assert plain.estimate is not None
+    assert corrected.estimate.frames == plain.estimate.frames
 
 
 def random_frame(seed: int) -> Frame:

@@ -15,7 +15,8 @@ import pytest
 from framework.data import Frame
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError
-from framework.geometry import exp_se3, inverse, rotation_angle
+from framework.geometry import exp_se3, inverse, rotation_angle, transform
+from framework.interfaces import SubmapChange
 from framework.tracking.features import FeatureExtractor, Features
 from framework.tracking.keyframes import Keyframes, VisualWords, similarity
 from tests.support.scenes.papered_room import CAMERA, papered_frame
@@ -195,6 +196,39 @@ def test_relocalize_in_unknown_scene_returns_none(keyframes: Keyframes) -> None:
         "expected no pose for a photo of the room, which is at another depth"
     )
     assert Keyframes().relocalize(frame) is None
+
+
+def test_keyframes_move_with_their_submap() -> None:
+    """The keyframe that is under construction during the correction belongs to the submap before it."""
+    keyframes, fixed = Keyframes(), Keyframes()
+    slowed(keyframes, 0.05)
+    first, second = pose(0.5, 0.4), pose(-0.7, 1.0)
+    for x in (0.0, 0.6):
+        for one in (keyframes, fixed):
+            one.add(papered_frame(pose(x)), pose(x))
+        keyframes.correct(SubmapChange({0: first} if x == 0 else {1: second}, submap=1))
+    before, after = fixed.saved(), keyframes.saved()
+    np.testing.assert_allclose(after["poses"], [first @ pose(0), second @ pose(0.6)], atol=1e-12)
+    np.testing.assert_array_equal(after["descriptors"], before["descriptors"])
+    np.testing.assert_array_equal(after["counts"], before["counts"])
+    for own, T_new_old in ((slice(before["counts"][0]), first), (slice(before["counts"][0], None), second)):
+        expected = transform(T_new_old, before["points_world"][own].astype(np.float64))
+        np.testing.assert_allclose(after["points_world"][own], expected, atol=1e-6)
+    assert apart(keyframes.nearest(second @ pose(0.6))[0].T_world_camera, second @ pose(0.6)) < (1e-6, 1e-6)
+
+
+def test_keyframes_of_hidden_submaps_are_not_matched() -> None:
+    keyframes = Keyframes()
+    frame = papered_frame(pose(0))
+    keyframes.add(frame, pose(0))
+    keyframes.correct(SubmapChange(hidden=frozenset({0}), submap=1))
+    assert keyframes.nearest(pose(0)) == []
+    assert keyframes.relocalize(frame) is None
+    assert has_become_one(keyframes, frame, pose(0.1)), "expected a new keyframe at the place of the hidden one"
+    assert [one.submap for one in keyframes.nearest(pose(0))] == [1]
+    keyframes.correct(SubmapChange(shown=frozenset({0}), submap=2))
+    assert [one.submap for one in keyframes.nearest(pose(0))] == [0, 1]
+    assert len(keyframes.saved()["poses"]) == 2
 
 
 def test_keyframes_are_bounded_and_keep_distant_frames() -> None:

@@ -11,7 +11,9 @@ import pytest
 
 from framework.data import Float64, Frame, Pose
 from framework.geometry import exp_se3, inverse, pose_distance
+from framework.interfaces import SubmapChange
 from framework.registry import assemble
+from framework.testing.corner_room import CAMERA, RoomMap, look
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
 from tests.support.scenes.analytic_scene import Scene, pose, room, walk
 from tests.support.tracked_frames import track_and_fuse
@@ -49,6 +51,21 @@ def test_odometry_predicts_large_steps() -> None:
     assert any(one.lost for one in without)
     assert not any(one.lost for one in found)
     assert max(map(error, found, frames)) < 0.01, "expected less than half a voxel"
+
+
+def test_odometry_predicts_large_step_in_corrected_map() -> None:
+    motion = [pose(0.0), pose(0.01), pose(0.02), pose(0.1, rotvec=(0, -0.6, 0))]
+    tracker, change = VoxelHashingIcp(**NO_FEATURES), SubmapChange({0: START}, submap=1)
+    T_world_room = np.eye(4)
+    for k, T_room_camera in enumerate(motion):
+        depth, _, color, _ = look(CAMERA, T_room_camera)
+        frame = Frame(k, k / 30, color, depth, CAMERA, T_room_camera if k == 0 else None, T_odom_camera=T_room_camera)
+        found = tracker.track(frame, RoomMap(T_world_room=T_world_room))
+        assert not found.lost, found.reason
+        assert pose_distance(T_world_room @ T_room_camera, found.T_world_camera) < 0.01
+        if k == 2:
+            tracker.correct(change)
+            T_world_room = START
 
 
 @pytest.mark.parametrize("relocalize", [False, True])

@@ -13,9 +13,10 @@ from framework.data import Camera, Frame, Pose
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError
 from framework.geometry import exp_se3, inverse, rotation_angle
-from framework.interfaces import SceneMap
+from framework.interfaces import SceneMap, SubmapChange
 from framework.registry import assemble
 from framework.sensors.noise_models import SensorKind
+from framework.testing.corner_room import RoomMap, frame_at, pose_at
 from framework.tracking.absolute_pose import AbsolutePose
 from framework.tracking.features import Features
 from framework.tracking.keyframes import Keyframe
@@ -506,3 +507,29 @@ def test_voxel_hashing_icp_tracks_coarse_depth_without_normals(monkeypatch: pyte
     monkeypatch.setattr(voxel_hashing_icp, "is_coarse", lambda *_, **__: False)
     run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert np.mean(matched) < 0.9 * without_normals, "expected fewer matches with normals, which depth steps distort"
+
+
+def test_correction_moves_each_pose_with_its_submap() -> None:
+    """The pose of the last frame, the raw keyframe and odometry move with the submap of the last frame."""
+    tracker, T_last = VoxelHashingIcp(), np.eye(4)
+    first, second = (exp_se3(np.array(xi)) for xi in ([0.3, 0, 0.1, 0, 0.2, 0], [-0.1, 0.2, 0, 0.3, 0, 0]))
+    for k in (0, 2, 4, 14, 15):
+        frame = dataclasses.replace(frame_at(k), T_odom_camera=pose_at(k))
+        T_last = tracker.track(frame, RoomMap()).T_world_camera
+        if k == 4:
+            tracker.correct(SubmapChange(submap=1))
+    assert tracker._T_world_odom is not None
+    assert tracker._raw_keyframe is not None
+    T_odom, T_raw = tracker._T_world_odom, tracker._raw_keyframe.T_world_camera
+    [(_, T_visited), (_, T_revisited)] = tracker._visited
+    tracker.correct(SubmapChange({0: first, 1: second}, submap=1))
+    np.testing.assert_array_equal(tracker._T_world_last, second @ T_last)
+    np.testing.assert_array_equal(tracker._T_world_odom, second @ T_odom)
+    np.testing.assert_array_equal(tracker._raw_keyframe.T_world_camera, second @ T_raw)
+    for (submap, T), number, expected in zip(
+        tracker._visited, (0, 1), (first @ T_visited, second @ T_revisited), strict=True
+    ):
+        assert submap == number
+        np.testing.assert_array_equal(T, expected)
+    tracker.correct(SubmapChange(hidden=frozenset({0}), submap=2))
+    assert [submap for submap, _ in tracker._visited] == [1]

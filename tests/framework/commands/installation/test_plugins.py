@@ -139,7 +139,7 @@ def test_plugins_lists_options_of_installed_package(environment: dict[str, str],
 
 
 def test_installed_package_option_runs(environment: dict[str, str], tmp_path: Path) -> None:
-    fakes = [f"{stage}=fake" for stage in STAGES if stage not in ("detector", "masking")]
+    fakes = [f"{stage}=fake" for stage in STAGES if stage not in ("detector", "masking", "backend")]
     places = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), "hydra.run.dir=run"]
     done = run(environment, tmp_path, "framework", *places, *fakes, "detector=acme_everything", "dataset.frames=1")
     assert done.returncode == 0, done.stderr

@@ -1,0 +1,1 @@
+"""Submaps: hidden parts of a map, their motion and their fusion."""

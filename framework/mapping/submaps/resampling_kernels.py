@@ -1,0 +1,159 @@
+"""Kernels of resampling.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from framework.compilation.kernel_cache import njit
+from framework.mapping.voxels.voxel_grid_kernels import (
+    BLOCK_SIDE,
+    BLOCK_VOXELS,
+    COLORED,
+    NO_KEY,
+    NO_LOOK_UP,
+    OUTDATED,
+    UNSEEN,
+    device,
+    find_block,
+    pack_color,
+    pack_key,
+    unpack_color,
+)
+from framework.mapping.voxels.voxel_walk import voxel_number
+
+MAX_COVERED = 27  # maximum number of blocks that a moved block overlaps: three along each axis
+MIN_OBSERVED = 0.5  # minimum fraction of the trilinear weight on observed voxels
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def covered_blocks(block_coords, R, t, keys):
+    """Write the keys of the blocks that each moved block overlaps to `keys` (B, MAX_COVERED), NO_KEY = none.
+
+    Args:
+        block_coords: The block coordinates (B, 3).
+        R: The rotation (3, 3) of the motion.
+        t: The translation (3,) of the motion, voxels.
+        keys: The output.
+    """
+    half = 0.5 * (BLOCK_SIDE - 1)
+    for b in prange(block_coords.shape[0]):
+        low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+        for axis in range(3):
+            center, extent = t[axis], 0.0
+            for other in range(3):
+                center += R[axis, other] * (block_coords[b, other] * BLOCK_SIDE + half)
+                extent += abs(R[axis, other]) * half
+            # voxels less than 1 from the moved block can be interpolated from it
+            low[axis] = np.int64(np.floor(np.floor(center - extent) / BLOCK_SIDE))
+            high[axis] = np.int64(np.floor(np.ceil(center + extent) / BLOCK_SIDE))
+        n = 0
+        for z in range(low[2], high[2] + 1):
+            for y in range(low[1], high[1] + 1):
+                for x in range(low[0], high[0] + 1):
+                    keys[b, n] = pack_key(x, y, z)
+                    n += 1
+        for rest in range(n, MAX_COVERED):
+            keys[b, rest] = NO_KEY
+
+
+@device
+def _corner_voxels(grid, i, j, k, found, look_up):
+    """Write the eight voxels at the corners of a cell to `found`, as block * 512 + index in the block, -1 = none.
+
+    Args:
+        grid: The voxel grid.
+        i: The first index of the first corner.
+        j: The second index.
+        k: The third index.
+        found: The output (8,), x fastest.
+        look_up: The key and the region of the last look-up.
+
+    Returns:
+        Whether any of the blocks exists, and the key and the region of the last look-up.
+    """
+    key, region = look_up
+    block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
+    exists = block >= 0
+    first = block
+    crosses = (np.int32((i & 7) == 7), np.int32((j & 7) == 7), np.int32((k & 7) == 7))
+    for c in range(8):
+        dx, dy, dz = c & 1, (c >> 1) & 1, c >> 2
+        block = first  # most cells are inside one block
+        if (dx & crosses[0]) | (dy & crosses[1]) | (dz & crosses[2]):
+            block, key, region = find_block(grid, (i + dx) >> 3, (j + dy) >> 3, (k + dz) >> 3, key, region)
+            exists = exists or block >= 0
+        found[c] = block * BLOCK_VOXELS + voxel_number(i + dx, j + dy, k + dz) if block >= 0 else np.int32(-1)
+    return exists, (key, region)
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def resample(source, R, t, target, most_jump, nearest):
+    """Resample moved voxels.
+
+    Distances, weights and colors are interpolated trilinearly between observed voxels. If the distances at the corners
+    of a cell differ by more than `most_jump`, the nearest voxel is copied, because there is no surface in between.
+
+    Args:
+        source: The voxel grid before the motion.
+        R: The rotation (3, 3) from new to old coordinates.
+        t: The translation (3,) from new to old coordinates, voxels.
+        target: The output grid, whose blocks are allocated and unobserved.
+        most_jump: The maximum difference of the distances at the corners, in stored units.
+        nearest: The output (B, 512), the nearest observed source voxel as block * 512 + index in the block, -1 = none.
+    """
+    coords, tsdf, weight, color = target.block_coords, target.tsdf, target.weight, target.color
+    old_tsdf, old_weight, old_color = source.tsdf.ravel(), source.weight.ravel(), source.color.ravel()
+    for block in prange(nearest.shape[0]):
+        found = np.empty(8, np.int32)
+        portions = np.empty(8, np.float64)
+        look_up = NO_LOOK_UP
+        for n in range(BLOCK_VOXELS):
+            nearest[block, n] = -1
+            x = np.float64(coords[block, 0] * BLOCK_SIDE + (n & 7))
+            y = np.float64(coords[block, 1] * BLOCK_SIDE + ((n >> 3) & 7))
+            z = np.float64(coords[block, 2] * BLOCK_SIDE + (n >> 6))
+            px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
+            py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
+            pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+            fx, fy, fz = np.floor(px), np.floor(py), np.floor(pz)
+            exists, look_up = _corner_voxels(source, np.int32(fx), np.int32(fy), np.int32(fz), found, look_up)
+            if not exists:
+                continue
+            wx, wy, wz = px - fx, py - fy, pz - fz
+            observed = 0.0
+            best = -1
+            lowest, highest = np.int32(32767), np.int32(-32768)
+            for c in range(8):
+                portion = (wx if c & 1 else 1.0 - wx) * (wy if c & 2 else 1.0 - wy) * (wz if c & 4 else 1.0 - wz)
+                voxel = found[c]
+                if voxel < 0 or old_tsdf[voxel] == UNSEEN or portion <= 0.0:
+                    portions[c] = 0.0
+                    continue
+                portions[c] = portion
+                observed += portion
+                lowest, highest = min(lowest, old_tsdf[voxel]), max(highest, old_tsdf[voxel])
+                if best < 0 or portion > portions[best]:
+                    best = c
+            if observed < MIN_OBSERVED:
+                continue
+            if highest - lowest > most_jump:
+                for c in range(8):
+                    portions[c] = 1.0 if c == best else 0.0
+                observed = 1.0
+            distance = mass = colored = red = green = blue = 0.0
+            for c in range(8):
+                if portions[c] > 0.0:
+                    distance += portions[c] * old_tsdf[found[c]]
+                    mass += portions[c] * old_weight[found[c]]
+                    packed = old_color[found[c]]
+                    if packed & COLORED:
+                        r, g, b = unpack_color(packed)
+                        colored += portions[c]
+                        red, green, blue = red + portions[c] * r, green + portions[c] * g, blue + portions[c] * b
+            nearest[block, n] = found[best]
+            tsdf[block, n] = np.int16(np.rint(distance / observed))
+            weight[block, n] = np.uint16(max(1.0, np.rint(mass / observed)))
+            if colored >= MIN_OBSERVED * observed:
+                mean = pack_color(np.rint(red / colored), np.rint(green / colored), np.rint(blue / colored))
+                color[block, n] = mean | (old_color[found[best]] & OUTDATED)
