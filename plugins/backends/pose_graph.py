@@ -78,7 +78,7 @@ class PoseGraph(BackEnd):
             self._collect(self._extracted.get())
         if self._guesses and self._correction is None:
             self._verify(self._guesses.popleft(), scene)
-        T_world_camera = corrected.motions.get(self.anchors.current, np.eye(4)) @ pose.T_world_camera
+        T_world_camera = corrected.moved(self.anchors.current, pose.T_world_camera)
         self._divide(frame, T_world_camera)
         hidden = self._look(frame, T_world_camera)
         change = SubmapChange(corrected.motions, corrected.shown, hidden, self.anchors.current)
@@ -150,7 +150,11 @@ class PoseGraph(BackEnd):
         if not submap.hidden:
             return
         paths = self._graph.path_lengths(submap.number)
-        place = [one.number for one in self.anchors.hidden() if paths[one.number] <= SAME_PLACE]
+        place = [
+            one.number
+            for one in self.anchors.hidden()
+            if paths[one.number] <= SAME_PLACE and one.distance(guess.T_world_camera) <= self.anchors.hide_distance
+        ]
         match = match_hidden(view.frame, guess.T_world_camera, scene, place)
         if match is None or not self.verification.accepts(match):
             return
