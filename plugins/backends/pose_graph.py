@@ -17,7 +17,7 @@ from framework.geometry import inverse, rotation_angle
 from framework.interfaces import BackEnd, SceneMap, SubmapChange
 from framework.pose_graph.delayed_result import DelayedResult
 from framework.pose_graph.graph_optimization import AnchorGraph, GraphEdge, Optimized, optimize
-from framework.pose_graph.loop_detection import Drift, Extracted, Guess, Loop, LoopDetection, Reach, QueryView
+from framework.pose_graph.loop_detection import Drift, Extracted, Guess, Loop, LoopDetection, QueryView, Reach
 from framework.pose_graph.loop_verification import LoopVerification, match_hidden, overlaps
 from framework.pose_graph.submap_anchors import SubmapAnchors, view_separation
 
