@@ -19,9 +19,9 @@ from framework.data import Float64
 from framework.geometry import nearest_rotation
 
 # standard deviations of tracked motions and of loops; only their ratios matter
-DRIFT = (0.01, 0.0035)  # translation, m, and rotation, rad, per m of the path
-STEP_NOISE = (0.003, 0.001)  # translation, m, and rotation, rad, of a short path
-LOOP_NOISE = (0.01, 0.003)  # translation, m, and rotation, rad; errors of aligned views with the distortion of a sensor
+DRIFT = (0.02, 0.01)  # translation, m, and rotation, rad, per m of the path
+STEP_NOISE = (0.005, 0.002)  # translation, m, and rotation, rad, of a short path
+LOOP_NOISE = (0.02, 0.006)  # translation, m, and rotation, rad; includes the drift within a submap
 # m, residuals of a loop edge at which its weight is 1/4; decreasing, because all residuals are large at the beginning
 # (graduated non-convexity, Yang et al., 2020)
 MAX_LOOP_RESIDUALS = (10.0, 1.0, 0.1)
