@@ -35,6 +35,7 @@ from tests.support.failing_disk import FailingDisk, Fault
 from tests.support.scenes.analytic_scene import Scene
 from tests.support.scenes.analytic_scene import room as analytic_room
 from tests.support.scenes.corner_room import CornerRoom, pose_at
+from tests.support.scenes.given_changes import A, C, GivenChanges, RoomTracker, SubmapFuser
 
 pytestmark = pytest.mark.integration
 
@@ -581,3 +582,13 @@ def test_import_error_names_conflicting_framework_package(tmp_path: Path) -> Non
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import instancemap"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert f"got {tmp_path}/framework/__init__.py; rename the other package" in done.stderr
+
+
+def test_mapper_returns_corrected_poses(room: CornerRoom) -> None:
+    mapper = Mapper(*STAGES, "detector=none")
+    pipeline = mapper.pipeline
+    pipeline.tracker, pipeline.fuser, pipeline.backend = RoomTracker(), SubmapFuser(), GivenChanges()
+    for k, T_world_room in enumerate((np.eye(4), np.eye(4), A, A, C @ A, C @ A)):
+        found = mapper.add(replace(room[k], truth=None))
+        np.testing.assert_allclose(found.T_world_camera, T_world_room @ pose_at(k), atol=1e-14)
+        np.testing.assert_allclose(mapper._T_world_color, found.T_world_camera, atol=1e-14)
