@@ -8,11 +8,13 @@ from functools import cache
 
 import numpy as np
 
-from framework.data import Camera, Float32, Float64, Frame, PointClusters, Pose
-from framework.geometry import back_project, exp_se3, inverse, project, rotation_angle, transform
+from framework.data import Float32, Float64, Frame, PointClusters, Pose
+from framework.geometry import exp_se3, inverse, pose_distance, project, rotation_angle, transform
+from framework.interfaces import SceneMap
 from framework.mapping.labels.label_rule import LabeledVoxels
 from framework.mapping.voxels.tsdf_volume import Tsdf, VoxelHashing
 from framework.pose_graph.loop_detection import Loop
+from framework.pose_graph.submap_anchors import DepthSamples, Submap
 from framework.synthetic.buildings.building_sequence import SyntheticBuilding
 from plugins.backends.pose_graph import PoseGraph
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
@@ -26,7 +28,6 @@ VOXEL = 0.02  # m
 CORRECTION_DELAY = 2  # frames, as long as 10 frames of the whole sequence
 IN_VIEW = 0.3  # minimum fraction of the points of a frame that hidden submaps have seen
 LENGTH = 1.0  # m, minimum length of a passage in which hidden submaps are in view
-POINT_STEP = 32  # px, distance between the points that are compared
 SAME_SURFACE = 0.1  # m, maximum depth difference of a point that two frames see
 NOTHING = PointClusters(  # a frame without detections
     np.zeros((0, 3), np.float32), np.zeros((0, 2), np.int32), np.zeros(0, np.int32), np.zeros((0, 1), np.float32),
@@ -36,25 +37,20 @@ NOTHING = PointClusters(  # a frame without detections
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """A frame whose images are reduced to few points."""
+    """A frame without its images."""
 
     index: int
     T_true: Float64  # (4, 4) true pose
     submap: int
-    points_camera: Float32  # (P, 3) m
-    camera: Camera  # of the reduced depth
-    depth: Float32  # (h, w) m
+    T_anchor_camera: Float64  # (4, 4) pose with drift in its submap
+    samples: DepthSamples
+    points_camera: Float32  # (P, 3) the samples, m
 
     @classmethod
-    def of(cls, frame: Frame, submap: int) -> SeenFrame:
+    def of(cls, frame: Frame, submap: int, T_anchor_camera: Float64) -> SeenFrame:
         assert frame.T_world_camera is not None
-        c, half = frame.camera, POINT_STEP // 2
-        depth = frame.depth[half::POINT_STEP, half::POINT_STEP]
-        fx, fy, cx, cy = (value / POINT_STEP for value in (c.fx, c.fy, c.cx - half, c.cy - half))
-        camera = Camera(depth.shape[1], depth.shape[0], fx, fy, cx, cy)
-        v, u = np.nonzero(depth)
-        points = back_project(camera, np.stack([u, v], axis=1).astype(np.float32), depth[v, u])
-        return cls(frame.index, frame.T_world_camera, submap, points, camera, depth)
+        samples = DepthSamples.of(frame)
+        return cls(frame.index, frame.T_world_camera, submap, T_anchor_camera, samples, samples.points())
 
     def seen_in(self, others: Iterable[SeenFrame]) -> float:
         """Return the fraction of the points that are visible in at least one of the other frames."""
@@ -62,11 +58,27 @@ class SeenFrame:
         for other in others:
             points = transform(inverse(other.T_true) @ self.T_true, self.points_camera)
             in_front = np.flatnonzero(points[:, 2] > 0.1)
-            u, v = np.rint(project(other.camera, points[in_front])).astype(int).T
-            inside = (u >= 0) & (u < other.camera.width) & (v >= 0) & (v < other.camera.height)
+            u, v = np.rint(project(other.samples.camera, points[in_front])).astype(int).T
+            inside = (u >= 0) & (u < other.samples.camera.width) & (v >= 0) & (v < other.samples.camera.height)
             at = in_front[inside]
-            visible[at] |= np.abs(other.depth[v[inside], u[inside]] - points[at, 2]) < SAME_SURFACE
+            visible[at] |= np.abs(other.samples.depth[v[inside], u[inside]] - points[at, 2]) < SAME_SURFACE
         return float(visible.mean()) if len(visible) else 0.0
+
+    def in_hidden(self, frames: Sequence[SeenFrame], submaps: Sequence[Submap], scene: SceneMap) -> float:
+        """Return the fraction of the readings on the surface of hidden submaps, as seen from the true pose.
+
+        Args:
+            frames: Frames of hidden submaps, at least one.
+            submaps: All submaps.
+            scene: The map.
+        """
+        nearest = min(frames, key=lambda one: pose_distance(one.T_true, self.T_true))
+        T_world_nearest = submaps[nearest.submap].T_world_anchor @ nearest.T_anchor_camera
+        T_world_camera = T_world_nearest @ inverse(nearest.T_true) @ self.T_true
+        seeing = {one.submap for one in frames if self.seen_in([one]) > 0}
+        depth, mapped = self.samples.depth, scene.render_hidden(self.samples.camera, T_world_camera, seeing).depth
+        same = (mapped > 0) & (depth > 0) & (np.abs(mapped - depth) < SAME_SURFACE)
+        return float(same.sum() / max(np.count_nonzero(depth), 1))
 
 
 @dataclass(frozen=True)
@@ -88,14 +100,17 @@ class LoopCounts:
         in_view = []
         T_world_camera = np.eye(4)
         for frame in sequence:
-            submap = back_end.anchors.current
-            frames.append(SeenFrame.of(frame, submap))
-            if len(frames) > 1:
-                T_world_camera = _drifted(T_world_camera, *(one.T_true for one in frames[-2:]), rng)
+            assert frame.T_world_camera is not None
+            if frames:
+                T_world_camera = _drifted(T_world_camera, frames[-1].T_true, frame.T_world_camera, rng)
             else:
-                T_world_camera = frames[0].T_true
-            hidden = {one.number for one in back_end.anchors.hidden()}
-            in_view.append(frames[-1].seen_in(one for one in frames if one.submap in hidden) >= IN_VIEW)
+                T_world_camera = frame.T_world_camera
+            submaps, submap = back_end.anchors.submaps, back_end.anchors.current
+            T_anchor_camera = submaps[submap].local(T_world_camera) if submaps else np.eye(4)
+            seen = SeenFrame.of(frame, submap, T_anchor_camera)
+            hidden = [one for one in frames if submaps[one.submap].hidden]
+            in_view.append(seen.seen_in(hidden) >= IN_VIEW and seen.in_hidden(hidden, submaps, fuser.scene) >= IN_VIEW)
+            frames.append(seen)
             fuser.fuse(frame, Pose(T_world_camera), NOTHING)
             change = back_end.update(frame, Pose(T_world_camera), fuser.scene)
             if change is not None:
