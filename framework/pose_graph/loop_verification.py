@@ -60,7 +60,7 @@ class LoopVerification:
     min_agreement: float = 0.8  # minimum fraction of the visible points that agree with the surface, in [0, 1]
     max_occluded: float = 0.05  # maximum fraction of the visible points behind the surface, in [0, 1]
     # minimum ratio of smallest to mean eigenvalue of the dimensionless normal matrix, in [0, 1]
-    min_information: float = 3e-3
+    min_information: float = 5e-3
 
     def __post_init__(self) -> None:
         check_bounds(
