@@ -57,8 +57,8 @@ class LoopVerification:
     """Verification of the pose of a frame relative to hidden submaps."""
 
     min_visible: float = 0.3  # minimum fraction of a frame's points that are visible in the submaps, in [0, 1]
-    min_agreement: float = 0.85  # minimum fraction of the visible points that agree with the surface, in [0, 1]
-    max_occluded: float = 0.03  # maximum fraction of the visible points behind the surface, in [0, 1]
+    min_agreement: float = 0.8  # minimum fraction of the visible points that agree with the surface, in [0, 1]
+    max_occluded: float = 0.05  # maximum fraction of the visible points behind the surface, in [0, 1]
     # minimum ratio of smallest to mean eigenvalue of the dimensionless normal matrix, in [0, 1]
     min_information: float = 5e-3
 

@@ -13,12 +13,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from framework.config.validation import check_bounds, require
-from framework.data import Float64
-from framework.geometry import inverse
+from framework.data import Camera, Float32, Float64, Frame
+from framework.geometry import back_project, inverse, project, transform
 from framework.tracking.keyframes import Keyframe
 
 VIEW_DISTANCE = 0.5  # m, distance between two views of equal direction
 VIEW_ANGLE = 0.5  # rad, angle between two views at one position
+CELLS = 16  # number of depth samples along the longer image side
+MIN_DEPTH = 0.1  # m, minimum depth of a point in view
+NEAR_DEPTH = 0.1  # maximum depth difference of near points, fraction of the depth
 
 
 def view_separation(views: Float64, T_a_camera: Float64) -> Float64:
@@ -28,14 +31,53 @@ def view_separation(views: Float64, T_a_camera: Float64) -> Float64:
     return np.asarray(distances / VIEW_DISTANCE + np.arccos(np.clip(cosines, -1, 1)) / VIEW_ANGLE)
 
 
+@dataclass(frozen=True)
+class DepthSamples:
+    """Few samples of a depth image, one for each cell of a grid."""
+
+    camera: Camera  # whose pixels are the cells
+    depth: Float32  # (h, w) m, 0 = no reading
+
+    @classmethod
+    def of(cls, frame: Frame) -> DepthSamples:
+        """Return the samples of a frame."""
+        step = -(-max(frame.camera.shape) // CELLS)
+        depth = frame.depth[step // 2 :: step, step // 2 :: step]
+        c, height, width = frame.camera, *depth.shape
+        fx, fy, cx, cy = (value / step for value in (c.fx, c.fy, c.cx - step // 2, c.cy - step // 2))
+        return cls(Camera(width, height, fx, fy, cx, cy), depth)
+
+    def points(self) -> Float32:
+        """Return the sampled points (P, 3) in the camera frame, m."""
+        v, u = np.nonzero(self.depth)
+        return back_project(self.camera, np.stack([u, v], axis=1).astype(np.float32), self.depth[v, u])
+
+    def coverage(self, points_camera: Float32, tolerance: float) -> float:
+        """Return the fraction of the samples near one of the points (P, 3) in the camera frame, m.
+
+        Args:
+            points_camera: The points.
+            tolerance: The maximum difference of the depths, m, in addition to NEAR_DEPTH.
+        """
+        points = points_camera[points_camera[:, 2] > MIN_DEPTH]
+        u, v = np.rint(project(self.camera, points)).astype(np.int64).T
+        inside = (u >= 0) & (u < self.camera.width) & (v >= 0) & (v < self.camera.height)
+        u, v, z = u[inside], v[inside], points[inside, 2]
+        near = (self.depth[v, u] > 0) & (np.abs(self.depth[v, u] - z) <= tolerance + NEAR_DEPTH * z)
+        covered = np.zeros(self.depth.shape, np.bool_)
+        covered[v[near], u[near]] = True
+        return float(np.count_nonzero(covered)) / max(int(np.count_nonzero(self.depth)), 1)
+
+
 @dataclass
 class Submap:
-    """A rigid part of the map. Views and keyframes are in the frame of its anchor."""
+    """A rigid part of the map. Views, points and keyframes are in the frame of its anchor."""
 
     number: int
     T_world_anchor: Float64  # (4, 4), as applied to the map
-    views: Float64  # (V, 4, 4) T_anchor_camera
-    frames: list[int]  # Frame.index of each view
+    views: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (V, 4, 4) T_anchor_camera
+    frames: list[int] = field(default_factory=list)  # Frame.index of each view
+    points: Float32 = field(default_factory=lambda: np.zeros((0, 3), np.float32))  # (P, 3) few points of each view, m
     keyframes: list[Keyframe] = field(default_factory=list)  # the views with enough features
     hidden: bool = False  # True = invisible to the tracker and the fuser
 
@@ -52,14 +94,26 @@ class Submap:
         """Return the number of the nearest view of a camera pose (4, 4)."""
         return int(view_separation(self.views, T_anchor_camera).argmin())
 
-    def add_view(self, frame: int, T_world_camera: Float64) -> bool:
-        """Add a camera pose to the views, and return True if it is a new view."""
+    def add_view(self, frame: Frame, T_world_camera: Float64) -> bool:
+        """Add a frame at T_world_camera (4, 4) to the views, and return True if its view is new."""
         T_anchor_camera = self.local(T_world_camera)
         if (view_separation(self.views, T_anchor_camera) < 1).any():
             return False
+        points = transform(T_anchor_camera, DepthSamples.of(frame).points())
+        self.points = np.concatenate([self.points, np.asarray(points, np.float32)])
         self.views = np.concatenate([self.views, T_anchor_camera[None]])
-        self.frames.append(frame)
+        self.frames.append(frame.index)
         return True
+
+    def coverage(self, samples: DepthSamples, T_anchor_camera: Float64, tolerance: float) -> float:
+        """Return the fraction of the depth samples of a view that are near the points of the submap.
+
+        Args:
+            samples: The depth samples.
+            T_anchor_camera: The pose (4, 4) of the view.
+            tolerance: The maximum difference of the depths, m, as the pose is inaccurate.
+        """
+        return samples.coverage(np.asarray(transform(inverse(T_anchor_camera), self.points), np.float32), tolerance)
 
 
 @dataclass
@@ -79,11 +133,11 @@ class SubmapAnchors:
         self.submaps: list[Submap] = []
         self.current = 0  # number of the current submap
 
-    def divide(self, frame: int, T_world_camera: Float64) -> bool:
+    def divide(self, frame: Frame, T_world_camera: Float64) -> bool:
         """Begin a submap, or enter a visible one again, if the camera has left the current one.
 
         Args:
-            frame: The index of the frame.
+            frame: The frame.
             T_world_camera: The camera pose (4, 4).
 
         Returns:
@@ -99,7 +153,8 @@ class SubmapAnchors:
                 self.current = nearest
                 return True
         self.current = len(self.submaps)
-        self.submaps.append(Submap(self.current, T_world_camera.copy(), np.eye(4)[None], [frame]))
+        self.submaps.append(Submap(self.current, T_world_camera.copy()))
+        self.submaps[-1].add_view(frame, T_world_camera)
         return True
 
     def visible(self) -> list[Submap]:

@@ -19,11 +19,12 @@ from framework.pose_graph.delayed_result import DelayedResult
 from framework.pose_graph.graph_optimization import AnchorGraph, GraphEdge, Optimized, optimize
 from framework.pose_graph.loop_detection import Drift, Extracted, Guess, Loop, LoopDetection, QueryView, Reach
 from framework.pose_graph.loop_verification import LoopVerification, match_hidden, overlaps
-from framework.pose_graph.submap_anchors import SubmapAnchors, view_separation
+from framework.pose_graph.submap_anchors import DepthSamples, SubmapAnchors, view_separation
 
 log = logging.getLogger(__name__)
 
 REACH = 0.75  # maximum distance of a camera from the views of a submap that it shows, fraction of the hide distance
+MIN_COVERAGE = 0.05  # minimum fraction of the depth samples of a frame near the points of a submap in view
 SAME_PLACE = 8.0  # m, maximum path between hidden submaps that are rendered together
 MIN_OVERLAP = 0.05  # minimum fraction of a frame's points on a submap that it shows
 EXTENT = 3.0  # m, distance of the surface from the anchor at which motions are compared with min_motion
@@ -78,7 +79,7 @@ class PoseGraph(BackEnd):
             self._collect(self._extracted.get())
         if self._guesses and self._correction is None:
             self._verify(self._guesses.popleft(), scene)
-        T_world_camera = corrected.motions.get(self.anchors.current, np.eye(4)) @ pose.T_world_camera
+        T_world_camera = corrected.moved(self.anchors.current, pose.T_world_camera)
         self._divide(frame, T_world_camera)
         hidden = self._look(frame, T_world_camera)
         change = SubmapChange(corrected.motions, corrected.shown, hidden, self.anchors.current)
@@ -94,7 +95,7 @@ class PoseGraph(BackEnd):
     def _divide(self, frame: Frame, T_world_camera: Float64) -> None:
         """Begin a submap, or enter another one, if the camera has left the current one."""
         left = self.anchors.current
-        self.anchors.divide(frame.index, T_world_camera)
+        self.anchors.divide(frame, T_world_camera)
         entered = self.anchors.current
         if entered != left and not self._graph.connected(left, entered):
             T_left_entered = self.anchors.submaps[left].local(self.anchors.submaps[entered].T_world_anchor)
@@ -108,28 +109,30 @@ class PoseGraph(BackEnd):
         self._T_world_view = T_world_camera
         self._views += 1
         current = self.anchors.submaps[self.anchors.current]
-        is_new = current.add_view(frame.index, T_world_camera) or self._views == 1
+        is_new = current.add_view(frame, T_world_camera) or current.frames == [frame.index]
         hidden = self.anchors.hide_distant(T_world_camera)
         if self._extracted is None:
-            reaches = self._reaches(T_world_camera) if self._correction is None else ()
+            reaches = self._reaches(frame, T_world_camera) if self._correction is None else ()
             if is_new or reaches:
                 view = QueryView(self._views, frame, current, current.local(T_world_camera), is_new, reaches)
                 due = self._frames + EXTRACTION_DELAY
                 self._extracted = DelayedResult(partial(self.detection.extract, view), due)
         return hidden
 
-    def _reaches(self, T_world_camera: Float64) -> tuple[Reach, ...]:
-        """Return the hidden submaps that may be in view, nearest first."""
+    def _reaches(self, frame: Frame, T_world_camera: Float64) -> tuple[Reach, ...]:
+        """Return the hidden submaps that may be in view, those that cover most of the frame first."""
         hidden = self.anchors.hidden()
         if not hidden:
             return ()
-        paths = self._graph.path_lengths(self.anchors.current)
+        samples, paths = DepthSamples.of(frame), self._graph.path_lengths(self.anchors.current)
         found = []
         for submap in hidden:
-            drift, distance = self.detection.drift(paths[submap.number]), submap.distance(T_world_camera)
-            if distance <= REACH * self.anchors.hide_distance + drift.translation:
-                reach = Reach(submap, submap.local(T_world_camera), paths[submap.number], drift)
-                found.append((distance, submap.number, reach))
+            T_anchor_camera, drift = submap.local(T_world_camera), self.detection.drift(paths[submap.number])
+            if submap.distance(T_world_camera) <= REACH * self.anchors.hide_distance + drift.translation:
+                coverage = submap.coverage(samples, T_anchor_camera, drift.translation)
+                if coverage >= MIN_COVERAGE:
+                    reach = Reach(submap, T_anchor_camera, paths[submap.number], drift)
+                    found.append((-coverage, submap.number, reach))
         return tuple(reach for *_, reach in sorted(found))
 
     def _collect(self, extracted: Extracted) -> None:
@@ -150,7 +153,8 @@ class PoseGraph(BackEnd):
         if not submap.hidden:
             return
         paths = self._graph.path_lengths(submap.number)
-        place = [one.number for one in self.anchors.hidden() if paths[one.number] <= SAME_PLACE]
+        reached = (reach.submap for reach in view.reaches)
+        place = [one.number for one in reached if one.hidden and paths[one.number] <= SAME_PLACE]
         match = match_hidden(view.frame, guess.T_world_camera, scene, place)
         if match is None or not self.verification.accepts(match):
             return

@@ -17,6 +17,7 @@ from framework.tables.statistics import bootstrap_interval
 from tests.acceptance import changing_scenes, long_run, recording_checks
 from tests.acceptance.buildings import five_rooms
 from tests.acceptance.large_map import measure_large_map
+from tests.acceptance.loops import counted_loops
 from tests.acceptance.runner import CHECKOUT, Measured, measurement
 
 SHARED = CHECKOUT.parent / "shared" / "data"
@@ -234,6 +235,18 @@ def building_oracle() -> Measured:
 def building_oracle_surface() -> Measured:
     value = 1e3 * max(abs(one.corrected.distance - one.oracle.distance) for one in five_rooms())
     return value, value <= 2
+
+
+@measurement("0 false loops, 20 buildings with identical rooms, drift of 1 to 2%", *PIPELINE)
+def false_loops() -> Measured:
+    value = sum(one.false for one in counted_loops())
+    return value, value == 0
+
+
+@measurement("recall of revisits >= 0.8, 20 buildings with identical rooms, drift of 1 to 2%", *PIPELINE)
+def loop_recall() -> Measured:
+    value = sum(one.found for one in counted_loops()) / sum(one.revisits for one in counted_loops())
+    return value, value >= 0.8
 
 
 @measurement("slowest query <= 10 ms, unchanged map of 20 rooms, 1 cm", *PIPELINE)

@@ -19,7 +19,7 @@ def turned(yaw: float, x: float = 0) -> np.ndarray:
 
 
 def submap(number: int, T_world_anchor: np.ndarray) -> Submap:
-    return Submap(number, T_world_anchor, np.eye(4)[None], [0])
+    return Submap(number, T_world_anchor)
 
 
 def query(number: int, T_true: np.ndarray, where: Submap, *reaches: Reach) -> QueryView:

@@ -58,7 +58,7 @@ def test_match_featureless_wall_is_rejected() -> None:
 
 
 def test_match_surface_in_front_of_frame_is_rejected() -> None:
-    curtain = Scene(planes=room().planes, spheres=[*room().spheres, (np.array([-0.35, -0.35, 1.0]), 0.12)])
+    curtain = Scene(planes=room().planes, spheres=[*room().spheres, (np.array([-0.35, -0.35, 1.0]), 0.2)])
     assert not accepted(room().frame(pose()), pose(), curtain)
     assert accepted(curtain.frame(pose()), pose(), curtain)
 

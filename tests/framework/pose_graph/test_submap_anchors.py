@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from framework.data import Frame
 from framework.errors import ConfigError
-from framework.pose_graph.submap_anchors import SubmapAnchors
-from tests.support.scenes.analytic_scene import pose
+from framework.pose_graph.submap_anchors import DepthSamples, SubmapAnchors
+from tests.support.scenes.analytic_scene import pose, room
+
+FRAME = room().frame(pose())
+
+
+def frame(index: int) -> Frame:
+    return replace(FRAME, index=index)
 
 
 def walked(anchors: SubmapAnchors, positions: np.ndarray) -> list[int]:
     """Return the current submap at each position along x."""
     current = []
     for k, x in enumerate(positions):
-        anchors.divide(k, pose(x))
-        anchors.submaps[anchors.current].add_view(k, pose(x))
+        anchors.divide(frame(k), pose(x))
+        anchors.submaps[anchors.current].add_view(frame(k), pose(x))
         anchors.hide_distant(pose(x))
         current.append(anchors.current)
     return current
@@ -54,17 +63,19 @@ def test_anchors_in_small_place_hide_nothing() -> None:
     angles = np.linspace(0, 40, 2000)
     for k, angle in enumerate(angles):
         T_world_camera = pose(2.5 * np.cos(angle), 0, 2.5 * np.sin(angle), (0, angle, 0))
-        anchors.divide(k, T_world_camera)
-        anchors.submaps[anchors.current].add_view(k, T_world_camera)
+        anchors.divide(frame(k), T_world_camera)
+        anchors.submaps[anchors.current].add_view(frame(k), T_world_camera)
         assert not anchors.hide_distant(T_world_camera)
     assert len(anchors.submaps) <= 5
 
 
 def test_add_view_similar_view_is_not_added() -> None:
     anchors = SubmapAnchors()
-    anchors.divide(0, pose())
+    anchors.divide(frame(0), pose())
     submap = anchors.submaps[0]
-    added = [submap.add_view(k, T) for k, T in enumerate([pose(), pose(0.3), pose(0.6), pose(0, 0, 0, (0, 0.6, 0))])]
+    added = [
+        submap.add_view(frame(k), T) for k, T in enumerate([pose(), pose(0.3), pose(0.6), pose(0, 0, 0, (0, 0.6, 0))])
+    ]
     assert added == [False, False, True, True]
     assert submap.nearest_view(pose(0.5)) == 1
     assert submap.distance(pose(1.6)) == pytest.approx(1.0)
@@ -73,3 +84,13 @@ def test_add_view_similar_view_is_not_added() -> None:
 def test_hide_distance_below_begin_distance_raises() -> None:
     with pytest.raises(ConfigError, match="hide_distance: expected more than begin_distance"):
         SubmapAnchors(begin_distance=3, hide_distance=3)
+
+
+def test_coverage_is_fraction_of_samples_near_points() -> None:
+    anchors = SubmapAnchors()
+    anchors.divide(frame(0), pose(1))
+    submap, samples = anchors.submaps[0], DepthSamples.of(FRAME)
+    assert submap.coverage(samples, np.eye(4), 0) == 1
+    assert submap.coverage(samples, pose(0.1), 0.2) > 0.8
+    assert submap.coverage(samples, pose(0, 0, -1), 0) < 0.2
+    assert submap.coverage(samples, pose(0, 0, 0, (0, np.pi, 0)), 0) == 0
