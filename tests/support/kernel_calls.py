@@ -18,6 +18,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 from numba.core.typing.typeof import Purpose, typeof
@@ -25,9 +26,11 @@ from numba.core.typing.typeof import Purpose, typeof
 from framework.commands.running.run import run
 from framework.compilation.catalog import DEFAULT, LIST, OTHERS, line_of
 from framework.config.composition import composed
-from framework.data import Detections, Frame
-from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
+from framework.data import Detections, Frame, Pose
+from framework.geometry import exp_se3
+from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SubmapChange
 from framework.pipeline import Pipeline
+from framework.refinement.lifting import lift
 from framework.registry import build
 from framework.runtime.process_settings import Settings
 
@@ -102,6 +105,20 @@ def run_others() -> None:
             pipeline.run(video)
             pipeline.fuser.scene.mesh()
             pipeline.fuser.scene.instances()
+            if pipeline.fuser.has_submaps and stage == "fuser":
+                change_submaps(pipeline.fuser, video[0])
+
+
+def change_submaps(fuser: MapFuser, frame: Frame) -> None:
+    """Move, hide, render and show the submaps of a map."""
+    motion = exp_se3(np.full(6, 0.01))
+    fuser.correct(SubmapChange({0: motion}, hidden=frozenset({0}), submap=1))
+    fuser.scene.render_hidden(frame.camera, np.eye(4), {0}, frame.depth)
+    fuser.scene.render_hidden(frame.camera, np.eye(4), {0})
+    fuser.scene.mesh()
+    nothing = Detections.none(frame.depth.shape, fuser.scene.classes)
+    fuser.fuse(frame, Pose(np.eye(4)), lift(nothing, frame, Pose(np.eye(4))))
+    fuser.correct(SubmapChange({0: motion}, shown=frozenset({0}), submap=1))
 
 
 def run_rendered(directory: Path) -> None:

@@ -142,12 +142,12 @@ def test_color_to_depth_correction_keeps_motion() -> None:
     plain, corrected = ColorToDepth(None), ColorToDepth(None)
     change = SubmapChange({1: exp_se3(np.array([0.5, -0.2, 0.1, 0.3, 0.9, -0.4]))})
     T_new_old = np.eye(4)
-    for k, (frame, T_world_camera) in enumerate(delayed_frames(0.03)):
+    for k, (frame, T_world_camera) in enumerate(delayed_frames(0.03, count=36)):
         expected = plain.tracked(frame, Pose(T_world_camera))
         found = corrected.tracked(frame, Pose(T_new_old @ T_world_camera))
         np.testing.assert_allclose(found.T_world_color, T_new_old @ expected.T_world_color, atol=1e-5)
         assert (found.color_pixels is None) == (expected.color_pixels is None)
-        if k % 20 == 10:
+        if k % 10 == 9:
             corrected.correct(change, submap=1)
             T_new_old = change.moved(1, T_new_old)
     assert found.color_pixels is not None
