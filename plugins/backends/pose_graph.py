@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
@@ -200,6 +200,7 @@ class PoseGraph(BackEnd):
         optimized = correction.result.get()
         self._graph.edges = [*optimized.edges, *self._graph.edges[correction.edges :]]
         loops = [loop for loop in correction.loops if loop.edge in optimized.edges]
+        self._report(loops)
         shown = frozenset().union(*(loop.shown for loop in loops))
         motions = {}
         for submap, T_world_new in zip(self.anchors.submaps, self._graph.extended(optimized.poses), strict=True):
@@ -208,20 +209,17 @@ class PoseGraph(BackEnd):
             if loops and step + EXTENT * rotation_angle(T_new_old[:3, :3]) >= self.min_motion:
                 motions[submap.number] = T_new_old
                 submap.T_world_anchor = T_world_new
-        self._report(loops, motions)
         for number in shown:
             self.anchors.submaps[number].hidden = False
         return SubmapChange(motions, shown, submap=self.anchors.current)
 
-    def _report(self, loops: Sequence[Loop], motions: Mapping[int, Float64]) -> None:
-        """Log the loops of a correction."""
+    def _report(self, loops: Sequence[Loop]) -> None:
+        """Log loops before the anchors move."""
         self.loops.extend(loops)
         for loop in loops:
-            T_new_old, T_world_anchor = (
-                motions.get(loop.edge.second, np.eye(4)),
-                self.anchors.submaps[loop.edge.second].T_world_anchor,
-            )
-            step = T_world_anchor[:3, 3] - (inverse(T_new_old) @ T_world_anchor)[:3, 3]
+            T_new_old = loop.correction(self.anchors.submaps)
+            T_world_anchor = self.anchors.submaps[loop.edge.second].T_world_anchor
+            step = (T_new_old @ T_world_anchor)[:3, 3] - T_world_anchor[:3, 3]
             log.info(
                 "loop closed between frames %d and %d, %.1f m: correction %.0f mm, %.1f degrees",
                 loop.earlier_frame, loop.frame, loop.path, 1e3 * np.linalg.norm(step),

@@ -124,3 +124,4 @@ def test_backend_logs_each_loop(caplog: pytest.LogCaptureFixture) -> None:
         changes(back_end)
     lines = [one for one in caplog.messages if one.startswith("loop closed between frames")]
     assert len(lines) == len(back_end.loops) >= 2
+    assert all("correction 2" in line and line.endswith("2.4 degrees") for line in lines)  # DRIFT
