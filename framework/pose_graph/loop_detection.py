@@ -53,6 +53,7 @@ class Reach(NamedTuple):
     T_anchor_camera: Float64  # (4, 4) tracked pose in the hidden submap
     path: float  # m, length of the path since the submap was visible
     drift: Drift  # plausible drift since the submap was visible
+    coverage: float  # fraction of the depth samples of the frame near points of the submap
 
 
 @dataclass(frozen=True)

@@ -90,8 +90,8 @@ def match_hidden(frame: Frame, T_world_guess: Float64, scene: SceneMap, submaps:
     levels = pyramid(frame)
     if not levels[0].depth.any():
         return None
-    first = _align(levels, scene.render_hidden(levels[0].camera, T_world_guess, submaps))
-    if first.equations.visible < MIN_OVERLAP * np.count_nonzero(levels[0].depth):
+    first = _align(levels, scene.render_hidden(levels[0].camera, T_world_guess, submaps), finest=1)
+    if first.equations.visible < MIN_OVERLAP * np.count_nonzero(levels[1].depth):
         return None
     T_world_first = first.view.T_world_camera @ first.T_view_camera
     second = _align(levels, scene.render_hidden(levels[0].camera, T_world_first, submaps, levels[0].depth))
@@ -141,11 +141,11 @@ class _Alignment(NamedTuple):
     equations: NormalEquations  # at this pose
 
 
-def _align(levels: list[PyramidLevel], view: SurfaceView) -> _Alignment:
-    """Return the alignment of a frame to a view, computed coarse to fine."""
+def _align(levels: list[PyramidLevel], view: SurfaceView, finest: int = 0) -> _Alignment:
+    """Return the alignment of a frame to a view, computed coarse to fine up to the given level."""
     model, intensities = model_view(view), model_intensities(view, LEVELS)
     T_view_camera, brightness = np.eye(4), 0.0
-    for level in reversed(range(LEVELS)):
+    for level in reversed(range(finest, LEVELS)):
         smooth = smoothed(model, level)
         weights = WEIGHTS._replace(  # as in the tracker, larger residuals are allowed at coarse levels
             max_distance=WEIGHTS.max_distance * np.float32(1 + level),
@@ -160,5 +160,5 @@ def _align(levels: list[PyramidLevel], view: SurfaceView) -> _Alignment:
             T_view_camera = exp_se3(xi) @ T_view_camera
             if np.abs(xi).max() < CONVERGED * 4**level:
                 break
-    equations = linearize(levels[0], model, intensities[0], T_view_camera, weights, brightness)
+    equations = linearize(levels[finest], smooth, intensities[finest], T_view_camera, weights, brightness)
     return _Alignment(view, T_view_camera, equations)

@@ -21,6 +21,7 @@ VIEW_DISTANCE = 0.5  # m, distance between two views of equal direction
 VIEW_ANGLE = 0.5  # rad, angle between two views at one position
 CELLS = 16  # number of depth samples along the longer image side
 MIN_DEPTH = 0.1  # m, minimum depth of a point in view
+ENTERED_COVERAGE = 0.25  # minimum coverage of a frame by a submap that is entered again; it may be behind a wall
 NEAR_DEPTH = 0.1  # maximum depth difference of near points, fraction of the depth
 
 
@@ -148,10 +149,14 @@ class SubmapAnchors:
             distances = {one.number: float(np.linalg.norm(one.T_world_anchor[:3, 3] - here)) for one in self.visible()}
             if distances[self.current] <= self.begin_distance:
                 return False
-            nearest = min(distances, key=lambda number: (distances[number], number))
-            if distances[nearest] <= self.begin_distance:
-                self.current = nearest
-                return True
+            samples = DepthSamples.of(frame)
+            for number in sorted(distances, key=distances.__getitem__):
+                submap = self.submaps[number]
+                if distances[number] <= self.begin_distance and (
+                    submap.coverage(samples, submap.local(T_world_camera), 0) >= ENTERED_COVERAGE
+                ):
+                    self.current = number
+                    return True
         self.current = len(self.submaps)
         self.submaps.append(Submap(self.current, T_world_camera.copy()))
         self.submaps[-1].add_view(frame, T_world_camera)

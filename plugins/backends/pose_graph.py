@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 
 REACH = 0.75  # maximum distance of a camera from the views of a submap that it shows, fraction of the hide distance
 MIN_COVERAGE = 0.05  # minimum fraction of the depth samples of a frame near the points of a submap in view
+TRACKED_COVERAGE = 0.2  # minimum fraction for a guess that is the tracked pose
 SAME_PLACE = 8.0  # m, maximum path between hidden submaps that are rendered together
 MIN_OVERLAP = 0.05  # minimum fraction of a frame's points on a submap that it shows
 EXTENT = 3.0  # m, distance of the surface from the anchor at which motions are compared with min_motion
@@ -131,9 +132,8 @@ class PoseGraph(BackEnd):
             if submap.distance(T_world_camera) <= REACH * self.anchors.hide_distance + drift.translation:
                 coverage = submap.coverage(samples, T_anchor_camera, drift.translation)
                 if coverage >= MIN_COVERAGE:
-                    reach = Reach(submap, T_anchor_camera, paths[submap.number], drift)
-                    found.append((-coverage, submap.number, reach))
-        return tuple(reach for *_, reach in sorted(found))
+                    found.append(Reach(submap, T_anchor_camera, paths[submap.number], drift, coverage))
+        return tuple(sorted(found, key=lambda reach: -reach.coverage))
 
     def _collect(self, extracted: Extracted) -> None:
         """Add a keyframe, and the guesses of its pose: those from features, then the tracked pose."""
@@ -141,7 +141,11 @@ class PoseGraph(BackEnd):
         view = extracted.view
         if extracted.keyframe is not None and view.is_new:
             view.submap.keyframes.append(extracted.keyframe)
-        tracked = [Guess(view, reach, reach.T_anchor_camera) for reach in view.reaches[:1]]
+        tracked = [
+            Guess(view, reach, reach.submap.local(view.T_world_camera))
+            for reach in view.reaches[:1]
+            if reach.coverage >= TRACKED_COVERAGE
+        ]
         for guess in (*extracted.guesses, *tracked):
             others = [one.T_world_camera for one in self._guesses if one.view is view]
             if not any(SAME_GUESS.allows(guess.T_world_camera, T_world_other) for T_world_other in others):

@@ -40,7 +40,7 @@ def first() -> Submap:
 
 def guesses(first: Submap, T_true: np.ndarray, drift: Drift) -> list[Guess]:
     second = submap(1, DRIFT)
-    return LoopDetection().extract(query(20, T_true, second, Reach(first, DRIFT @ T_true, 20, drift))).guesses
+    return LoopDetection().extract(query(20, T_true, second, Reach(first, DRIFT @ T_true, 20, drift, 1))).guesses
 
 
 def test_extract_revisited_place_is_located(first: Submap) -> None:
@@ -58,7 +58,7 @@ def test_extract_keyframe_in_other_direction_is_not_matched(first: Submap) -> No
     opposite = submap(0, turned(np.pi))
     opposite.keyframes = first.keyframes
     T_true = turned(1.1)
-    reach = Reach(opposite, inverse(opposite.T_world_anchor) @ T_true, 20, LoopDetection().drift(20))
+    reach = Reach(opposite, inverse(opposite.T_world_anchor) @ T_true, 20, LoopDetection().drift(20), 1)
     assert not LoopDetection().extract(query(20, T_true, submap(1, np.eye(4)), reach)).guesses
 
 

@@ -10,7 +10,7 @@ import pytest
 from framework.data import Frame
 from framework.errors import ConfigError
 from framework.pose_graph.submap_anchors import DepthSamples, SubmapAnchors
-from tests.support.scenes.analytic_scene import pose, room
+from tests.support.scenes.analytic_scene import Scene, pose, room
 
 FRAME = room().frame(pose())
 
@@ -43,6 +43,14 @@ def test_divide_near_visible_anchor_enters_it_again() -> None:
     assert len(anchors.submaps) == 2
 
 
+def test_divide_anchor_behind_wall_begins_submap() -> None:
+    anchors = SubmapAnchors(begin_distance=2.5)
+    walked(anchors, np.arange(0, 3.5))
+    wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -0.5)]).frame(pose())
+    assert anchors.divide(wall, pose(0))
+    assert anchors.current == 2
+
+
 def test_divide_near_hidden_anchor_begins_submap() -> None:
     anchors = SubmapAnchors(begin_distance=2.5, hide_distance=6)
     there = np.arange(0, 20.0)
@@ -66,7 +74,7 @@ def test_anchors_in_small_place_hide_nothing() -> None:
         anchors.divide(frame(k), T_world_camera)
         anchors.submaps[anchors.current].add_view(frame(k), T_world_camera)
         assert not anchors.hide_distant(T_world_camera)
-    assert len(anchors.submaps) <= 5
+    assert len(anchors.submaps) <= 8
 
 
 def test_add_view_similar_view_is_not_added() -> None:
