@@ -28,7 +28,7 @@ REFINEMENTS = 5  # maximum number of least-squares fits to all inliers
 SAME = 1.0  # m and rad, maximum difference of transforms that are the same solution
 
 
-class Matches(NamedTuple):
+class PointMatches(NamedTuple):
     """Matched points of two maps."""
 
     points_a: Float64  # (M, 3) m, in the world of the first map
@@ -39,21 +39,21 @@ class Matches(NamedTuple):
         """Return a Boolean array (M,), True for the matches that agree with a transform (4, 4)."""
         return np.asarray(np.linalg.norm(transform(T_a_b, self.points_b) - self.points_a, axis=1) <= MAX_ERROR)
 
-    def part(self, chosen: Bool | slice) -> Matches:
+    def part(self, chosen: Bool | slice) -> PointMatches:
         """Return some of the matches as those of one pair."""
         points_a, points_b = self.points_a[chosen], self.points_b[chosen]
-        return Matches(points_a, points_b, [0, len(points_a)])
+        return PointMatches(points_a, points_b, [0, len(points_a)])
 
 
 class Registration(NamedTuple):
     """A transform between two maps, with its evidence."""
 
     T_a_b: Float64  # (4, 4)
-    matches: Matches  # the inliers
+    matches: PointMatches  # the inliers
     rivals: int  # number of inliers of the best different transform
 
 
-def match_keyframes(keyframes_a: Sequence[Keyframe], keyframes_b: Sequence[Keyframe]) -> Matches:
+def match_keyframes(keyframes_a: Sequence[Keyframe], keyframes_b: Sequence[Keyframe]) -> PointMatches:
     """Return the matched points of the keyframes with similar visual words."""
     bags = np.stack([one.bag for one in keyframes_a])
     found_a, found_b, starts = [np.zeros((0, 3))], [np.zeros((0, 3))], [0]
@@ -65,10 +65,10 @@ def match_keyframes(keyframes_a: Sequence[Keyframe], keyframes_b: Sequence[Keyfr
                 found_b.append(b.points_world[pairs[:, 0]].astype(np.float64))
                 found_a.append(a.points_world[pairs[:, 1]].astype(np.float64))
                 starts.append(starts[-1] + len(pairs))
-    return Matches(np.concatenate(found_a), np.concatenate(found_b), starts)
+    return PointMatches(np.concatenate(found_a), np.concatenate(found_b), starts)
 
 
-def register(matches: Matches) -> Registration | None:
+def register(matches: PointMatches) -> Registration | None:
     """Return the transform with the most inliers, or None if there are too few."""
     rng = np.random.default_rng(0)
     hypotheses = []
@@ -83,7 +83,7 @@ def register(matches: Matches) -> Registration | None:
     return Registration(T_a_b, matches.part(matches.inliers(T_a_b)), max(rivals, default=0))
 
 
-def _best_of_pair(pair: Matches, rng: np.random.Generator) -> Float64 | None:
+def _best_of_pair(pair: PointMatches, rng: np.random.Generator) -> Float64 | None:
     """Return the transform (4, 4) of three matches with the most inliers of a pair of keyframes."""
     samples = rng.integers(len(pair.points_a), size=(TRIALS, 3))
     a, b = pair.points_a[samples], pair.points_b[samples]  # (TRIALS, 3, 3)
@@ -108,7 +108,7 @@ def _fitted(a: Float64, b: Float64) -> Float64:
     return transforms
 
 
-def _refined(T_a_b: Float64, matches: Matches) -> Float64:
+def _refined(T_a_b: Float64, matches: PointMatches) -> Float64:
     """Return the least-squares transform of all matches that agree with a transform."""
     inliers = matches.inliers(T_a_b)
     for _ in range(REFINEMENTS):

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from framework.data import Float64
-from framework.editing.keyframe_registration import Matches
+from framework.editing.keyframe_registration import PointMatches
 from framework.geometry import exp_se3, nearest_rotation, transform
 from framework.rendering.surface import Surface
 
@@ -21,7 +21,7 @@ PLANE_SIGMA, FEATURE_SIGMA = 0.01, 0.03  # m, standard deviations of distances t
 CONVERGED = 1e-5  # m and rad, maximum last step
 
 
-def registered(a: Surface, b: Surface, T_a_b: Float64, matches: Matches) -> Float64:
+def registered(a: Surface, b: Surface, T_a_b: Float64, matches: PointMatches) -> Float64:
     """Return a refined transform T_a_b (4, 4).
 
     Args:
@@ -50,7 +50,7 @@ def registered(a: Surface, b: Surface, T_a_b: Float64, matches: Matches) -> Floa
 
 
 def _step(
-    points: Float64, normals: Float64, residuals: Float64, radius: float, T_a_b: Float64, matches: Matches
+    points: Float64, normals: Float64, residuals: Float64, radius: float, T_a_b: Float64, matches: PointMatches
 ) -> Float64:
     """Return the twist (6,) of a Gauss-Newton step.
 

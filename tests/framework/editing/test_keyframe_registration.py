@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from framework.data import Float64
-from framework.editing.keyframe_registration import MAX_ERROR, MIN_INLIERS, Matches, match_keyframes, register
+from framework.editing.keyframe_registration import MAX_ERROR, MIN_INLIERS, PointMatches, match_keyframes, register
 from framework.geometry import exp_se3, inverse, pose_distance, transform
 from framework.tracking.keyframes import Keyframe, Keyframes
 from tests.support.scenes.papered_room import papered_frame
@@ -14,19 +14,19 @@ from tests.support.scenes.papered_room import papered_frame
 T_A_B = exp_se3(np.array([2.0, -0.7, 1.1, 0.4, -1.9, 0.3]))
 
 
-def matches_of(T_a_b: Float64, inliers: int, outliers: int, seed: int, noise: float = 0.005) -> Matches:
+def matches_of(T_a_b: Float64, inliers: int, outliers: int, seed: int, noise: float = 0.005) -> PointMatches:
     """Return random matches of one pair of keyframes."""
     rng = np.random.default_rng(seed)
     points_b = rng.uniform(-2, 2, (inliers + outliers, 3))
     points_a = transform(T_a_b, points_b) + rng.normal(0, noise, points_b.shape)
     points_a[inliers:] = rng.uniform(-3, 3, (outliers, 3))
-    return Matches(points_a, points_b, [0, inliers + outliers])
+    return PointMatches(points_a, points_b, [0, inliers + outliers])
 
 
-def joined(*pairs: Matches) -> Matches:
+def joined(*pairs: PointMatches) -> PointMatches:
     starts = np.cumsum([0, *(len(one.points_a) for one in pairs)]).tolist()
     points_a, points_b = (np.concatenate([one[k] for one in pairs]) for k in (0, 1))
-    return Matches(points_a, points_b, starts)
+    return PointMatches(points_a, points_b, starts)
 
 
 def keyframes(yaws: list[float], T_other_world: Float64, paper: int = 0) -> list[Keyframe]:
@@ -63,8 +63,8 @@ def test_registration_counts_matches_of_rival() -> None:
 
 
 @pytest.mark.parametrize("pairs", [[], [matches_of(T_A_B, MIN_INLIERS - 10, 40, 0)], [matches_of(T_A_B, 0, 200, 0)]])
-def test_registration_with_few_inliers_is_none(pairs: list[Matches]) -> None:
-    assert register(joined(*pairs) if pairs else Matches(np.zeros((0, 3)), np.zeros((0, 3)), [0])) is None
+def test_registration_with_few_inliers_is_none(pairs: list[PointMatches]) -> None:
+    assert register(joined(*pairs) if pairs else PointMatches(np.zeros((0, 3)), np.zeros((0, 3)), [0])) is None
 
 
 def test_registration_of_room_finds_transform() -> None:

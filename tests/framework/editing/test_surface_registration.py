@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from framework.data import Float64
-from framework.editing.keyframe_registration import Matches
+from framework.editing.keyframe_registration import PointMatches
 from framework.editing.surface_registration import registered
 from framework.geometry import exp_se3, inverse, pose_distance, transform
 from framework.rendering.surface import Surface
@@ -28,12 +28,12 @@ def surface(low: float, high: float, step: float, bumps: float, T_other_world: F
     return Surface(transform(T_other_world, vertices).astype(np.float32), triangles)
 
 
-def features(T_a_b: Float64, count: int, noise: float, bumps: float = 0.0) -> Matches:
+def features(T_a_b: Float64, count: int, noise: float, bumps: float = 0.0) -> PointMatches:
     """Return matched points of both surfaces."""
     rng = np.random.default_rng(0)
     x, y = rng.uniform(1.5, 3.0, count), rng.uniform(0, 2, count)
     points = np.stack([x, y, height(x, y, bumps)], axis=1)
-    return Matches(points + rng.normal(0, noise, points.shape), transform(inverse(T_a_b), points), [0, count])
+    return PointMatches(points + rng.normal(0, noise, points.shape), transform(inverse(T_a_b), points), [0, count])
 
 
 def test_registered_surfaces_with_partial_overlap_agree() -> None:

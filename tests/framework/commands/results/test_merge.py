@@ -17,6 +17,7 @@ from tests.support.forked_commands import completed
 
 pytestmark = pytest.mark.integration
 
+KITCHEN = Path(__file__).resolve().parents[5] / "shared" / "data" / "redkitchen"
 FIRST, SECOND = (0, 40), (28, 68)  # frames of the desk; 12 are common
 
 
@@ -70,3 +71,21 @@ def test_merged_map_can_be_localized_in(runs: list[Path], monkeypatch: pytest.Mo
     _, stored = read_tum(tmp_path / "merged" / "trajectory.txt")
     expected = stored[FIRST[1] + 50 - SECOND[0] :][: len(poses)]
     assert np.median([pose_distance(*pair) for pair in zip(poses, expected, strict=True)]) < 0.03
+
+
+@pytest.mark.acceptance
+@pytest.mark.skipif(not KITCHEN.is_dir(), reason="needs the recordings in ../shared")
+def test_merge_of_different_rooms_is_refused(
+    runs: list[Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("dataset=rgbd_folder", f"dataset.root={KITCHEN}", "dataset.stop=60", "detector=none")
+    done = completed(tmp_path, *words, "fuser.voxel_size=0.03", f"hydra.run.dir={tmp_path / 'kitchen'}")
+    assert done.returncode == 0, done.stderr
+    with pytest.raises(SystemExit, match="1"):
+        merged(monkeypatch, runs[0], tmp_path / "kitchen", "--out", tmp_path / "merged")
+    [line] = capsys.readouterr().err.splitlines()
+    assert line == (
+        f"error: {tmp_path / 'kitchen'}: expected an overlap with at least 40 consistent feature matches, got fewer; "
+        f"map it again with localize_in={runs[0]}"
+    )
+    assert not (tmp_path / "merged").exists()
