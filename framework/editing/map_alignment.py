@@ -54,20 +54,22 @@ def align_maps(a: KeyframedMap, b: KeyframedMap) -> Float64:
         Surface(mesh.vertices, mesh.triangles) for mesh in (a.visit.scene.mesh(), b.visit.scene.mesh())
     )
     T_a_b = registered(surface_a, surface_b, found.T_a_b, found.matches)
-    _check_visible(a.visit, surface_b, T_a_b)
-    _check_visible(b.visit, surface_a, inverse(T_a_b))
+    check_agreement(a.visit, b.visit, T_a_b)
     return T_a_b
 
 
-def _check_visible(visit: Visit, other: Surface, T_world_other: Float64) -> None:
-    """Raise DataError unless the cameras of a map see the surface of the other map where it is."""
-    vertices = other.vertices[:: max(1, len(other.vertices) // CHECKED)]
-    there, through = look_for(visit, transform(T_world_other, vertices.astype(np.float64)).astype(np.float32))
-    seen = int(np.count_nonzero(there | through))
-    if seen < MIN_SEEN * len(vertices):
-        raise DataError(f"expected an overlap of at least {MIN_SEEN:.0%}, got {seen / max(len(vertices), 1):.0%}")
-    agreement = np.count_nonzero(there) / max(seen, 1)
-    if agreement < MIN_AGREEMENT:
-        raise DataError(
-            f"expected surfaces that agree on at least {MIN_AGREEMENT:.0%} of the overlap, got {agreement:.0%}"
-        )
+def check_agreement(a: Visit, b: Visit, T_a_b: Float64) -> None:
+    """Raise DataError unless the cameras of each map see the surface of the other map where it is."""
+    for visit, other, T_world_other in ((a, b, T_a_b), (b, a, inverse(T_a_b))):
+        vertices = other.scene.mesh().vertices
+        sampled = vertices[:: max(1, len(vertices) // CHECKED)].astype(np.float64)
+        there, through = look_for(visit, transform(T_world_other, sampled).astype(np.float32))
+        seen = int(np.count_nonzero(there | through))
+        if not seen or seen < MIN_SEEN * len(sampled):
+            found = seen / max(len(sampled), 1)
+            raise DataError(f"expected an overlap of at least {MIN_SEEN:.0%}, got {found:.0%}")
+        agreement = np.count_nonzero(there) / seen
+        if agreement < MIN_AGREEMENT:
+            raise DataError(
+                f"expected surfaces that agree on at least {MIN_AGREEMENT:.0%} of the overlap, got {agreement:.0%}"
+            )

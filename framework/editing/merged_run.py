@@ -13,7 +13,7 @@ import numpy as np
 
 from framework.data import Array, Float64
 from framework.datasets.frames.world_offset import origin_comments, stored_origin
-from framework.editing.map_alignment import KeyframedMap, align_maps
+from framework.editing.map_alignment import KeyframedMap, align_maps, check_agreement
 from framework.editing.opened_run import OVERVIEW, OpenedRun, check_empty
 from framework.errors import DataError
 from framework.files.folders.staged_files import staged_files
@@ -22,7 +22,6 @@ from framework.files.manifest import RUN_FILES, Manifest, RunStatus
 from framework.files.tum_trajectory import write_tum
 from framework.geometry import transform
 from framework.mapping.instances.association import Association
-from framework.queries.changes import Visit
 from framework.rendering.overview import write_overview
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
@@ -42,7 +41,7 @@ from framework.runs.stored_runs import (
     METRICS,
     TRAJECTORY,
 )
-from framework.runs.world_frames import contains, known_transform
+from framework.runs.world_frames import contains, have_given_poses, known_transform
 from framework.tracking.keyframes import Keyframes, read_keyframes, write_keyframes
 from framework.vocabulary.label_spaces import label_space_of
 
@@ -80,17 +79,20 @@ class MergedRun:
                 )
         a, b = (_opened(run) for run in (first, second))
         saved_a, saved_b = (read_keyframes(run / KEYFRAMES) for run in (first, second))
-        T_a_b = known_transform(first, second)
-        if T_a_b is None:
-            try:
-                T_a_b = align_maps(_keyframed(a, saved_a), _keyframed(b, saved_b))
-            except DataError as error:
-                raise DataError(f"{second}: {error}; map it again with localize_in={first}") from error
-        before = {*a.scene.table.records}
         try:
-            ids = a.scene.absorb(b.scene, T_a_b, _association(a.record.config))
+            a.scene.check_compatible(b.scene)
         except DataError as error:
             raise DataError(f"{second}: {error}") from error
+        T_a_b = known_transform(first, second)
+        try:
+            if T_a_b is None:
+                T_a_b = align_maps(_keyframed(a, saved_a), _keyframed(b, saved_b))
+            elif have_given_poses(first, second):  # which may be those of different buildings
+                check_agreement(a.visit, b.visit, T_a_b)
+        except DataError as error:
+            raise DataError(f"{second}: {error}; map it again with localize_in={first}") from error
+        before = {*a.scene.table.records}
+        ids = a.scene.absorb(b.scene, T_a_b, _association(a.record.config))
         later = b.timestamps
         if len(a.timestamps) and len(later) and later[0] <= a.timestamps[-1]:
             later = later + math.ceil(a.timestamps[-1] - later[0] + 1)  # keeps the fractions of a second
@@ -163,7 +165,7 @@ def _keyframed(run: OpenedRun, saved: Mapping[str, Array]) -> KeyframedMap:
     keyframes = Keyframes()
     if saved:
         keyframes.restore(saved)
-    return KeyframedMap(Visit(run.scene, run.poses), [*keyframes])
+    return KeyframedMap(run.visit, [*keyframes])
 
 
 def _joined(saved_a: Mapping[str, Array], saved_b: Mapping[str, Array], T_a_b: Float64) -> dict[str, Array]:

@@ -13,6 +13,7 @@ from framework.files.manifest import Manifest
 from framework.files.tum_trajectory import read_tum
 from framework.mapping.instance_map import FORMAT, InstanceMap
 from framework.mapping.storage.map_file import read_format
+from framework.queries.changes import Visit
 from framework.runs.stored_runs import MAP, TRAJECTORY, Record, read_record
 
 OVERVIEW = "overview.png"
@@ -27,6 +28,11 @@ class OpenedRun:
     scene: InstanceMap
     timestamps: Float64  # (F,) s, of the mapped frames
     poses: Float64  # (F, 4, 4) T_world_camera of the mapped frames
+
+    @property
+    def visit(self) -> Visit:
+        """The map with its camera poses."""
+        return Visit(self.scene, self.poses)
 
     @classmethod
     def of(cls, run: Path) -> OpenedRun:

@@ -11,10 +11,11 @@ import numpy as np
 from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View, check_label_space
 from framework.errors import DataError
 from framework.interfaces import Gravity, MapStatistics, SubmapChange
-from framework.mapping.instances.association import Association
+from framework.mapping.instances.association import Association, agreed_classes
 from framework.mapping.instances.association_kernels import look_up_instances
 from framework.mapping.instances.instance_list import Confirmation, InstanceClass, InstanceTableMap, ListedInstances
 from framework.mapping.instances.instance_table import InstanceTable
+from framework.mapping.instances.object_embedding import agreed_space
 from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
 from framework.mapping.labels.packed_evidence import PackedEvidence, checked_evidence, pack_evidence
 from framework.mapping.labels.vertex_labels import VertexLabels
@@ -183,10 +184,10 @@ class InstanceMap(InstanceTableMap):
             The id in this map of each instance of the other map.
 
         Raises:
-            DataError: If the maps have different parameters or classes. This map is then unchanged.
+            DataError: If the maps have different parameters, classes or embeddings. This map is then unchanged.
             MapFullError: If the volume needs too many blocks.
         """
-        self._check_like(other)
+        self.check_compatible(other)
         for one, classes in ((self, other.classes), (other, self.classes)):
             if classes:
                 one.begin(classes)
@@ -203,14 +204,18 @@ class InstanceMap(InstanceTableMap):
         self.relabel()
         return {k: _remaining(k + offset, merged) for k in other.table.records}
 
-    def _check_like(self, other: InstanceMap) -> None:
-        """Raise DataError unless another map has the same parameters."""
+    def check_compatible(self, other: InstanceMap) -> None:
+        """Raise DataError unless another map can be added: it has the same parameters, classes and embeddings."""
         own, theirs = ({**one.parameters(), "fuser": one.label_rule} for one in (self, other))
         for name, value in own.items():
             if theirs[name] != value:
                 raise DataError(
                     f"{name}: expected {value} (as in the first map), got {theirs[name]}; map both with the same fuser"
                 )
+        if self.classes and other.classes:
+            agreed_classes(self.classes, other.classes)
+        if other.embedding_space:
+            agreed_space(self.embedding_space, other.embedding_space)
 
     def parameters(self) -> dict[str, str]:
         """Return the values of the fuser's parameters that the map cannot change, by config key."""

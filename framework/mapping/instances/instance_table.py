@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from framework.data import Bool, Float32, Float64, Int32
-from framework.mapping.instances.object_embedding import ObjectEmbedding, added, agreed_space
+from framework.mapping.instances.object_embedding import ObjectEmbedding, added
 from framework.mapping.labels.label_evidence import UNSEEN
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.runtime.spooled_list import Spool
@@ -189,13 +189,10 @@ class InstanceTable:
     def absorb(self, other: InstanceTable) -> int:
         """Add the instances of another table, and return the offset of their ids.
 
-        Their frames follow the frames of this table. The distance is a multiple of PAGE.
-
-        Raises:
-            DataError: If the embeddings have different spaces. Nothing is then changed.
+        Their frames follow the frames of this table. The distance is a multiple of PAGE. Embeddings of both tables must
+        have the same space.
         """
-        if other.embedding_space:
-            self.embedding_space = agreed_space(self.embedding_space, other.embedding_space)
+        self.embedding_space = self.embedding_space or other.embedding_space
         self.begin_recording()
         first = min((record.first_frame for record in other.records.values()), default=0)
         pages = self._last_before // PAGE + 1 - first // PAGE

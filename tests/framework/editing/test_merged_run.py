@@ -21,6 +21,8 @@ from framework.evaluation.instances import Transfer
 from framework.files.manifest import Manifest, RunStatus
 from framework.files.tum_trajectory import read_tum
 from framework.geometry import exp_se3, transform
+from framework.mapping.instance_map import InstanceMap
+from framework.mapping.instances.association import Association
 from framework.registry import assemble
 from framework.runs.instances_file import read_instances
 from framework.runs.mesh_file import read_mesh
@@ -158,6 +160,19 @@ def test_merge_of_edited_run_raises(runs: tuple[Path, Path], tmp_path: Path) -> 
 def test_merge_with_other_voxel_size_raises(runs: tuple[Path, Path], tmp_path: Path) -> None:
     other = changed_copy(runs[1], tmp_path / "run", "map.npz", assemble(BayesianTsdf, voxel_size=0.04).scene.save)
     with pytest.raises(DataError, match=r"run: fuser.voxel_size: expected 0.03 \(as in the first map\), got 0.04"):
+        MergedRun.of(runs[0], other)
+
+
+def test_merge_of_different_scenes_with_given_poses_raises(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    """The world frames of given poses may be those of different buildings."""
+
+    def move(file: Path) -> None:
+        fuser = assemble(BayesianTsdf, voxel_size=0.03)
+        fuser.scene.absorb(InstanceMap.load(file), exp_se3(np.array([0.0, 0.0, -0.3, 0.0, 0.2, 0.0])), Association())
+        fuser.scene.save(file)
+
+    other = changed_copy(runs[1], tmp_path / "run", "map.npz", move)
+    with pytest.raises(DataError, match=r"run: expected surfaces that agree .*; map it again with localize_in="):
         MergedRun.of(runs[0], other)
 
 

@@ -116,3 +116,11 @@ def test_absorbed_map_with_other_classes_raises() -> None:
     with pytest.raises(DataError, match="detector: expected the label space of the map"):
         found.absorb(other, HERE, Association())
     assert set(found.table.records) == {1, 2, 3}
+
+
+def test_absorbed_map_with_other_embeddings_raises() -> None:
+    found, other = map_of(POSES[:1]), map_of(POSES[:1])
+    found.table.embedding_space, other.table.embedding_space = "clip@1", "siglip@1"
+    with pytest.raises(DataError, match="detector: expected embeddings from clip@1"):
+        found.absorb(other, HERE, Association())
+    assert set(found.table.records) == {1, 2, 3}
