@@ -25,6 +25,7 @@ COMMANDS = {
     "check": "validate an RGB-D sequence and suggest parameter fixes",
     "diff": "list objects that appeared, vanished or moved between two runs",
     "edit": "merge, split, rename and delete instances of a run, for use as ground truth",
+    "merge": "merge the maps of two runs of overlapping places",
     "export": "export a run to standard 3D and map formats: GLB, USD, PLY, OBJ, ROS map, scene graph",
     "verify": "compare the files of runs with the hashes in their manifests",
     "bundle": "pack the runs, tables and plugin code of an experiment into a ZIP file",
@@ -48,7 +49,7 @@ COMMANDS = {
 FOLDERS = {
     "running": ("run", "detect", "show-refinement"),
     "results": (
-        *("tables", "figures", "raycast", "report", "diff", "edit", "export", "query"),
+        *("tables", "figures", "raycast", "report", "diff", "edit", "merge", "export", "query"),
         *("import-map", "evaluate", "verify", "bundle", "reproduce"),
     ),
     "recordings": ("import", "check", "synthesize", "convert-oni"),

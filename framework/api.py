@@ -560,10 +560,11 @@ def edit(run: Path | str, edits: Sequence[Mapping[str, Any]] | Path | str, out: 
     """
     from framework.editing import edited_run
     from framework.editing.edits import edits_of, read_edits
+    from framework.editing.opened_run import check_empty
 
     source = usable_path("run", run)
     directory = edited_run.default_directory(source) if out is None else usable_path("out", out)
-    edited_run.check_empty(directory)
+    check_empty(directory)
     entries = read_edits(usable_path("edits", edits)) if isinstance(edits, str | Path) else edits_of("edits", edits)
     edited_run.EditedRun.of(source, entries).write(directory)
     return directory

@@ -15,14 +15,12 @@ import numpy as np
 from framework.data import Float64
 from framework.editing.edited_map import EditedMap
 from framework.editing.edits import Edit, write_edits
+from framework.editing.opened_run import OVERVIEW, OpenedRun, check_empty, directory_next_to
 from framework.errors import DataError, InstanceMapError
-from framework.files.folders.restartable_folder import check_new
-from framework.files.folders.staged_files import finish_replacement, staged_files
+from framework.files.folders.staged_files import staged_files
 from framework.files.json_file import write_json
 from framework.files.manifest import Manifest
-from framework.files.tum_trajectory import read_tum
-from framework.mapping.instance_map import FORMAT, InstanceMap
-from framework.mapping.storage.map_file import read_format
+from framework.mapping.instance_map import InstanceMap
 from framework.rendering.overview import InstanceState, write_comparison, write_overview
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
@@ -36,9 +34,7 @@ from framework.runs.stored_runs import (
     MAP,
     MESH,
     METRICS,
-    TRAJECTORY,
     Record,
-    read_record,
 )
 from framework.vocabulary.label_spaces import label_space_of
 
@@ -46,7 +42,6 @@ log = logging.getLogger(__name__)
 
 EDITS = "edits.json"
 PREVIEW = "edits.png"
-OVERVIEW = "overview.png"
 REWRITTEN = (INSTANCES, MESH, MAP, OVERVIEW, EDITS, METRICS)  # listed files that depend on the instances
 
 
@@ -69,15 +64,8 @@ class EditedRun:
         Raises:
             DataError: The run is incomplete or changed, its map has no label evidence, or an edit is invalid.
         """
-        record, manifest = read_record(run), Manifest.read(run)
-        if changed := manifest.changed_files(run):
-            raise DataError(f"{changed[0]}; repeat the run")
-        if (found := read_format(run / MAP)) != str(FORMAT):
-            raise DataError(
-                f"{run / MAP}: expected map format {FORMAT}, got {found}; map with a fuser that stores instances in "
-                "voxels, such as fuser=bayesian_tsdf"
-            )
-        scene = InstanceMap.load(run / MAP)
+        opened = OpenedRun.of(run)
+        scene = opened.scene
         if not scene.instances():
             raise DataError(f"{run}: expected a map with instances, got none")
         edited = EditedMap(scene)
@@ -88,8 +76,7 @@ class EditedRun:
                 changes.append(edited.apply(edit))
             except DataError as error:
                 raise DataError(f"edit {number}, {json.dumps(edit.entry)}: {error}") from error
-        _, poses = read_tum(run / TRAJECTORY)
-        return cls(record, manifest, poses, before, scene, tuple(edits), tuple(changes))
+        return cls(opened.record, opened.manifest, opened.poses, before, scene, tuple(edits), tuple(changes))
 
     def write_preview(self, path: Path) -> None:
         """Write an image of the instances before and after the edits as a PNG file."""
@@ -147,16 +134,9 @@ class EditedRun:
             return metrics
 
 
-def check_empty(out: Path) -> None:
-    """Raise DataError unless a path is a new or empty folder. Unfinished files of a killed process are ignored."""
-    finish_replacement(out)
-    check_new(out)
-
-
 def default_directory(run: Path) -> Path:
     """Return the default directory of the edited run, next to the stored run."""
-    named = run if run.name not in ("", "..") else run.resolve()
-    return named.with_name(f"{named.name}_edited")
+    return directory_next_to(run, "edited")
 
 
 def _state(title: str, scene: InstanceMap) -> InstanceState:

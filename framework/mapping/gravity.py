@@ -60,6 +60,12 @@ class GravityEstimator:
             self.sensed_up += np.round(T_world_camera[:3, :3] @ up_camera, DIGITS)
             self.sensed_frames += 1
 
+    def absorb(self, other: GravityEstimator, R_world_other: Float64) -> None:
+        """Add the frames of another estimator, whose world frame is rotated by R_world_other (3, 3)."""
+        self.camera_up += R_world_other @ other.camera_up
+        self.sensed_up += R_world_other @ other.sensed_up
+        self.sensed_frames += other.sensed_frames
+
     def saved(self) -> dict[str, Any]:
         """Return the entries for the header of the map file."""
         return {

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View, check_label_space
+from framework.errors import DataError
 from framework.interfaces import Gravity, MapStatistics, SubmapChange
-from framework.mapping.instances.association import Association
+from framework.mapping.instances.association import Association, agreed_classes
 from framework.mapping.instances.association_kernels import look_up_instances
 from framework.mapping.instances.instance_list import Confirmation, InstanceClass, InstanceTableMap, ListedInstances
 from framework.mapping.instances.instance_table import InstanceTable
+from framework.mapping.instances.object_embedding import agreed_space
 from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
 from framework.mapping.labels.packed_evidence import PackedEvidence, checked_evidence, pack_evidence
 from framework.mapping.labels.vertex_labels import VertexLabels
@@ -28,6 +30,7 @@ from framework.mapping.storage.map_file import (
     write_map,
 )
 from framework.mapping.submaps.layer import Layer
+from framework.mapping.submaps.resampling import resampled
 from framework.mapping.submaps.submaps import Submaps
 from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.integration_parameters import pinhole
@@ -161,15 +164,78 @@ class InstanceMap(InstanceTableMap):
         merged: dict[int, int] = {}
         self.submaps.move(change.motions)
         for number in sorted(change.shown):
-            for pair in self.submaps.show(number, association.min_overlap, association.create_points):
-                kept, dropped = sorted(_remaining(k, merged) for k in pair)
-                if kept != dropped:
-                    self.merge(kept, dropped)
-                    merged[dropped] = kept
+            self._merge_pairs(self.submaps.show(number, association.min_overlap, association.create_points), merged)
         self.submaps.hide(change.hidden)
         self.submaps.current = change.submap
         self.relabel()
         return {k: _remaining(k, merged) for k in merged}
+
+    def absorb(self, other: InstanceMap, T_world_other: Float64, association: Association) -> dict[int, int]:
+        """Add another map, which must not be used afterwards, and associate its instances.
+
+        The instances of this map keep their ids. The frames of the other map follow the frames of this map.
+
+        Args:
+            other: The other map.
+            T_world_other: The pose (4, 4) of its world frame.
+            association: The rule of the data association.
+
+        Returns:
+            The id in this map of each instance of the other map.
+
+        Raises:
+            DataError: If the maps have different parameters, classes or embeddings. This map is then unchanged.
+            MapFullError: If the volume needs too many blocks.
+        """
+        self.check_compatible(other)
+        for one, classes in ((self, other.classes), (other, self.classes)):
+            if classes:
+                one.begin(classes)
+        layer = other.whole().submaps.visible
+        if not np.array_equal(T_world_other, np.eye(4)):
+            layer = resampled(layer, T_world_other)
+        offset = self.table.absorb(other.table)
+        layer.labels.renumber_instances(offset)
+        pairs = self.submaps.add(self.submaps.current, layer, association.min_overlap, association.create_points)
+        merged = self._merge_pairs(pairs, {})
+        self.volume.integrator.frames += other.volume.integrator.frames
+        self.volume.gravity_estimator.absorb(other.volume.gravity_estimator, T_world_other[:3, :3])
+        self.labels.evicted += other.labels.evicted
+        self.relabel()
+        return {k: _remaining(k + offset, merged) for k in other.table.records}
+
+    def check_compatible(self, other: InstanceMap) -> None:
+        """Raise DataError unless another map can be added: it has the same parameters, classes and embeddings."""
+        own, theirs = ({**one.parameters(), "fuser": one.label_rule} for one in (self, other))
+        for name, value in own.items():
+            if theirs[name] != value:
+                raise DataError(
+                    f"{name}: expected {value} (as in the first map), got {theirs[name]}; map both with the same fuser"
+                )
+        if self.classes and other.classes:
+            agreed_classes(self.classes, other.classes)
+        if other.embedding_space:
+            agreed_space(self.embedding_space, other.embedding_space)
+
+    def parameters(self) -> dict[str, str]:
+        """Return the values of the fuser's parameters that the map cannot change, by config key."""
+        sensor = {f"fuser.{name}": f"{value:g}" for name, value in self.volume.sensor._asdict().items()}
+        return {"fuser.voxel_size": f"{self.volume.voxel_size:g}", "fuser.storage": self.labels.storage.name, **sensor}
+
+    @property
+    def label_rule(self) -> str:
+        """Description of the label rule."""
+        table, scale = self.table, self.labels.score_scale
+        return f"combine={table.combine.name}, logarithmic={table.logarithmic}, score_scale={scale}"
+
+    def _merge_pairs(self, pairs: Iterable[tuple[int, int]], merged: dict[int, int]) -> dict[int, int]:
+        """Merge pairs of instances, of which the older one remains, and add them to `merged`."""
+        for pair in pairs:
+            kept, dropped = sorted(_remaining(k, merged) for k in pair)
+            if kept != dropped:
+                self.merge(kept, dropped)
+                merged[dropped] = kept
+        return merged
 
     def whole(self) -> InstanceMap:
         """Return the fusion of all submaps, which is the map itself if no submap is hidden."""

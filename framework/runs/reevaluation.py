@@ -36,7 +36,16 @@ from framework.runs.metrics import (
 )
 from framework.runs.provenance import code_version, leaves
 from framework.runs.stored_map import read_objects
-from framework.runs.stored_runs import CONFIG, EVALUATION, GROUND_TRUTH, METRICS, TRAJECTORY, Record, read_record
+from framework.runs.stored_runs import (
+    CONFIG,
+    EVALUATION,
+    GROUND_TRUTH,
+    MERGED_POSES,
+    METRICS,
+    TRAJECTORY,
+    Record,
+    read_record,
+)
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +89,9 @@ class Truth:
         """
         if record.is_imported:
             return self.scene
-        return self.scene and in_map_world(self.scene, *read_tum(record.directory / TRAJECTORY))
+        # the poses of the second run of `instancemap merge` have other times
+        own = slice(record.metrics.get(MERGED_POSES))
+        return self.scene and in_map_world(self.scene, *(one[own] for one in read_tum(record.directory / TRAJECTORY)))
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,8 @@ ENVIRONMENT = "environment.txt"  # versions of all installed packages, as constr
 EVALUATION = "evaluation."  # prefix of keys about the last re-evaluation
 GROUND_TRUTH = EVALUATION + "ground_truth"  # key of the last re-evaluated `dataset.ground_truth`; optional
 EDITED_FROM = "edited_from"  # key with the path of the run that `instancemap edit` has edited; optional
+MERGED_FROM, MERGED_WITH = "merged_from", "merged_with"  # keys with the runs of `instancemap merge`; optional
+MERGED_POSES = "merged_from_poses"  # key with the number of poses of the first of these runs
 
 EXTERNAL = "external"  # value of `pose_source` and of the chosen stages of an imported map
 CHOICE = "choice."  # prefix of the chosen options in metrics.json
@@ -110,9 +112,13 @@ class Record:
         return str(self.metrics.get("annotation_release") or "")
 
     @property
-    def edited(self) -> str:
-        """Description of an edited run, or "" for an unedited run."""
-        return f"edited map of {self.metrics[EDITED_FROM]}" if EDITED_FROM in self.metrics else ""
+    def derived(self) -> str:
+        """Description of a run that `edit` or `merge` has derived from other runs, or "" for other runs."""
+        if EDITED_FROM in self.metrics:
+            return f"edited map of {self.metrics[EDITED_FROM]}"
+        if MERGED_FROM in self.metrics:
+            return f"merged map of {self.metrics[MERGED_FROM]} and {self.metrics.get(MERGED_WITH)}"
+        return ""
 
     @property
     def is_imported(self) -> bool:
@@ -233,23 +239,23 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
 def completed_runs(root: Path) -> tuple[list[Record], list[Incomplete]]:
     """Return the completed and the other runs in a folder that contains at least one completed run.
 
-    Edited runs are among the other runs.
+    Edited and merged runs are among the other runs.
 
     Raises:
         DataError: The folder is missing or contains no completed run.
     """
     if not root.is_dir():
         raise DataError(f"{root}: expected a folder of runs, got no folder")
-    records, incomplete = without_edited(*find_records(root))
+    records, incomplete = without_derived(*find_records(root))
     if not records:
         raise no_run_error(root, incomplete)
     return records, incomplete
 
 
-def without_edited(records: Sequence[Record], others: Sequence[Incomplete]) -> tuple[list[Record], list[Incomplete]]:
-    """Move edited runs to the other runs, because manually corrected maps are no results of a method."""
-    edited = [Incomplete(one.directory, one.edited) for one in records if one.edited]
-    return [one for one in records if not one.edited], [*others, *edited]
+def without_derived(records: Sequence[Record], others: Sequence[Incomplete]) -> tuple[list[Record], list[Incomplete]]:
+    """Move edited and merged runs to the other runs, because their maps are no results of a method."""
+    derived = [Incomplete(one.directory, one.derived) for one in records if one.derived]
+    return [one for one in records if not one.derived], [*others, *derived]
 
 
 def no_run_error(root: Path, incomplete: Sequence[Incomplete]) -> DataError:

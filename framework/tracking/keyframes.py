@@ -6,7 +6,7 @@ See PTAM (Klein and Murray, 2007) and ORB-SLAM (Mur-Artal et al., 2015).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -106,6 +106,10 @@ class Keyframes:
     def __len__(self) -> int:
         self._settle()
         return len(self._keyframes)
+
+    def __iter__(self) -> Iterator[Keyframe]:
+        self._settle()
+        return iter([*self._keyframes])
 
     def saved(self) -> dict[str, Array]:
         """Return the keyframes as arrays.

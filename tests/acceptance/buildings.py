@@ -51,10 +51,8 @@ class BuildingRun:
             directory: The run directory.
             overrides: Other overrides of the run.
         """
-        chosen = [f"dataset.{name}={value}" for name, value in building.items()]
-        chosen = ["dataset=synthetic_building", "fuser.voxel_size=0.02", "detector=ground_truth", *chosen, *overrides]
-        command = [sys.executable, "-m", "framework", *chosen, f"hydra.run.dir={directory}"]
-        subprocess.run(command, cwd=CHECKOUT, check=True)
+        chosen = [f"dataset.{name}={value}" for name, value in building.items()] + [*overrides]
+        mapped(directory, *chosen)
         found = cls.read(directory, SyntheticBuilding(**building))
         print(" ".join(chosen), found, flush=True)
         return found
@@ -93,6 +91,14 @@ def _views(sequence: SyntheticBuilding, indices: Float64, poses: Float64) -> Ite
         yield LabeledDepth(frame.depth, frame.truth.instance_ids, frame.camera, T_world_camera)
 
 
+def mapped(directory: Path, *overrides: str) -> Path:
+    """Map a building into a run directory, and return the directory."""
+    chosen = ["dataset=synthetic_building", "fuser.voxel_size=0.02", "detector=ground_truth", *overrides]
+    command = [sys.executable, "-m", "framework", *chosen, f"hydra.run.dir={directory}"]
+    subprocess.run(command, cwd=CHECKOUT, check=True)
+    return directory
+
+
 class Comparison(NamedTuple):
     """Runs of one building that differ in their poses."""
 
@@ -120,6 +126,27 @@ def compared(seed: int, rooms: int = 5, frames: int = 1200) -> Comparison:
 def five_rooms() -> list[Comparison]:
     """Return the comparisons of three buildings of five rooms."""
     return [compared(seed) for seed in range(3)]
+
+
+def second_round() -> float:
+    """Return the size of the map after two rounds through a building, divided by its size after one round."""
+    frames = SyntheticBuilding(rooms=5).tour.frames
+    sizes = []
+    with tempfile.TemporaryDirectory() as directory:
+        for rounds in (1, 2):
+            chosen = ("dataset.rooms=5", f"dataset.frames={rounds * frames}", "backend=pose_graph")
+            run = mapped(Path(directory, f"{rounds}"), *chosen)
+            sizes.append(json.loads((run / "metrics.json").read_text())["map.bytes"])
+    return float(sizes[1] / sizes[0])
+
+
+def files_that_depend_on_threads() -> list[str]:
+    """Return the result files of a building with loops that differ between one and two threads."""
+    names = ("map.npz", "trajectory.txt", "trajectory_tracked.txt", "instances.json", "mesh.ply")
+    with tempfile.TemporaryDirectory() as directory:
+        chosen = ("dataset.rooms=5", "dataset.frames=1200", "backend=pose_graph")
+        one, two = (mapped(Path(directory, f"{k}"), *chosen, f"threads={k}") for k in (1, 2))
+        return [name for name in names if (one / name).read_bytes() != (two / name).read_bytes()]
 
 
 if __name__ == "__main__":

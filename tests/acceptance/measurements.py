@@ -15,7 +15,7 @@ from typing import Any
 
 from framework.tables.statistics import bootstrap_interval
 from tests.acceptance import changing_scenes, long_run, recording_checks
-from tests.acceptance.buildings import five_rooms
+from tests.acceptance.buildings import files_that_depend_on_threads, five_rooms, second_round
 from tests.acceptance.large_map import measure_large_map
 from tests.acceptance.loops import counted_loops
 from tests.acceptance.runner import CHECKOUT, Measured, measurement
@@ -247,6 +247,17 @@ def false_loops() -> Measured:
 def loop_recall() -> Measured:
     value = sum(one.found for one in counted_loops()) / sum(one.revisits for one in counted_loops())
     return value, value >= 0.8
+
+
+@measurement("size of the map after two rounds / one round <= 1.05, building of 5 rooms", *PIPELINE)
+def building_second_round() -> Measured:
+    value = second_round()
+    return value, value <= 1.05
+
+
+@measurement("0 result files differ between one and two threads, building of 5 rooms", *PIPELINE)
+def building_threads() -> Measured:
+    return counted(files_that_depend_on_threads())
 
 
 @measurement("slowest query <= 10 ms, unchanged map of 20 rooms, 1 cm", *PIPELINE)

@@ -259,6 +259,7 @@ FAULTY = {
     "report": ["nowhere"],
     "diff": ["old", "old"],
     "edit": ["nowhere", "--delete", "9"],
+    "merge": ["nowhere", "old"],
     "export": ["nowhere", "--to", "glb"],
     "query": ["old", "a red chair"],
     "import-map": ["nowhere.ply", "new"],

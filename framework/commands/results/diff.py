@@ -13,7 +13,8 @@ from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum
 from framework.queries.changes import Change, Kind, Visit, changes
 from framework.queries.labeled_surface import LabeledSurface
-from framework.runs.stored_runs import EDITED_FROM, EXTERNAL, METRICS, TRAJECTORY, read_config, read_metrics
+from framework.runs.stored_runs import EXTERNAL, METRICS, TRAJECTORY, read_metrics
+from framework.runs.world_frames import in_world
 
 log = logging.getLogger(__name__)
 
@@ -67,22 +68,6 @@ def visits_of(*runs: Path) -> list[Visit]:
 def is_imported(run: Path) -> bool:
     """Return True for the run directory of an imported map."""
     return path_exists(run / METRICS) and read_metrics(run).get("pose_source") == EXTERNAL
-
-
-def in_world(run: Path, world: Path) -> bool:
-    """Return True if two runs are known to have the same world frame.
-
-    This is the case if `run` was localized in `world`, resumed it or is an edit of it, or if both used ground-truth
-    poses. Imported maps are in the world frame of these poses.
-    """
-    config = read_config(run)
-    worlds = [config.get(key) for key in ("localize_in", "resume_from")]
-    metrics = [read_metrics(one) if path_exists(one / METRICS) else {} for one in (run, world)]
-    worlds.append(metrics[0].get(EDITED_FROM))
-    if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in worlds):
-        return True
-    shared = ("ground_truth", EXTERNAL)
-    return all(one.get("pose_source") in shared for one in metrics)
 
 
 def world_fix(before: Path, after: Path) -> str:

@@ -46,8 +46,9 @@ def main() -> None:
         parser.error("expected at least one of --merge, --split, --rename, --delete and --edits, got none")
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
-        from framework.editing.edited_run import PREVIEW, EditedRun, check_empty, default_directory  # slow import
+        from framework.editing.edited_run import PREVIEW, EditedRun, default_directory  # slow import
         from framework.editing.edits import Edit, edit_of, read_edits
+        from framework.editing.opened_run import check_empty
 
         def edits_of_option(option: str, values: Any) -> Sequence[Edit]:
             if option == "--edits":

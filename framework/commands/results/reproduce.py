@@ -20,7 +20,7 @@ from framework.errors import ConfigError, DataError
 from framework.registry import text_kind
 from framework.runs.reproduction import Reproduction, causes
 from framework.runs.run_bundle import opened_bundle
-from framework.runs.stored_runs import METRICS, Record, find_records, no_run_error, read_record, without_edited
+from framework.runs.stored_runs import METRICS, Record, find_records, no_run_error, read_record, without_derived
 from framework.tables.comparison import ComparisonTable
 from framework.tables.table_check import TABLE_FORMATS, changed_tables
 
@@ -72,7 +72,7 @@ def reproduce_all(folder: Path, overrides: Sequence[str], row: str | None, out: 
     """
     found, invalid = find_records(folder)
     edited = [one for one in invalid if (one.directory / METRICS).exists()]
-    records, incomplete = without_edited(found, invalid)
+    records, incomplete = without_derived(found, invalid)
     if not records and not edited:
         raise no_run_error(folder, incomplete)
     if records and row is not None:

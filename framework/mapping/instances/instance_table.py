@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import takewhile
 from struct import Struct
 from typing import Protocol
@@ -185,6 +185,39 @@ class InstanceTable:
         self.records[record.id] = record
         self.last_id = max(self.last_id, record.id)
         self._changed.add(record.id)
+
+    def absorb(self, other: InstanceTable) -> int:
+        """Add the instances of another table, and return the offset of their ids.
+
+        Their frames follow the frames of this table. The distance is a multiple of PAGE. Embeddings of both tables must
+        have the same space.
+        """
+        self.embedding_space = self.embedding_space or other.embedding_space
+        self.begin_recording()
+        first = min((record.first_frame for record in other.records.values()), default=0)
+        pages = self._last_before // PAGE + 1 - first // PAGE
+        offset, self.last_id = self.last_id, self.last_id + other.last_id
+        for record in other.records.values():
+            frames = [
+                self.frame_set({number + pages: bits for number, bits in one.pages().items()})
+                for one in (record.observed_in, record.in_view)
+            ]
+            first_frame, last_frame = record.first_frame + pages * PAGE, record.last_frame + pages * PAGE
+            self.add(
+                replace(
+                    record,
+                    id=record.id + offset,
+                    first_frame=first_frame,
+                    last_frame=last_frame,
+                    observed_in=frames[0],
+                    in_view=frames[1],
+                )
+            )
+        since = self.frames_detected - other.frames_detected
+        ages = self.tentative | {k + offset: frame + since for k, frame in other.tentative.items()}
+        self.tentative = dict(sorted(ages.items(), key=lambda entry: entry[1]))
+        self.begin_recording()
+        return offset
 
     def remove(self, instance_id: int) -> None:
         """Remove an instance. The caller removes it from the voxels."""

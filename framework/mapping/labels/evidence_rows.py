@@ -272,6 +272,12 @@ class EvidenceRows:
         """
         remove_instances(self.evidence, self._row_bits[: self.row_count], np.array(sorted(instance_ids), np.int32))
 
+    def renumber_instances(self, offset: int) -> None:
+        """Add an offset to the ids of all instances in every voxel."""
+        evidence = self.in_use()
+        evidence.instance_ids[evidence.instance_ids > 0] += offset
+        find_row_bits(evidence, self._row_bits)
+
     def blocks_with(self, instance_ids: Collection[int]) -> Int32:
         """Return the blocks that may have evidence for any of the instances, which are more than those that do."""
         if not instance_ids or not self.row_count:

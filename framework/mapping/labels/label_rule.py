@@ -26,7 +26,6 @@ from framework.mapping.labels.label_evidence import (
 )
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.pixel_lists import PixelLists, keep_on_top, remove_supports
-from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VoxelHashing
 
 OTHER_CLASS = 0.3  # maximum Bhattacharyya coefficient of the class distributions of objects of different classes
@@ -112,25 +111,17 @@ class LabeledVoxels:
                 "fuser that made the map"
             )
         own = self.new_map(rule)
-        parameters: dict[str, tuple[object, object]] = {
-            "fuser.voxel_size": (f"{scene.volume.voxel_size:g}", f"{own.volume.voxel_size:g}"),
-            "fuser.storage": (scene.labels.storage.name, self.storage.name),
-        }
-        for name, was, now in zip(Sensor._fields, scene.volume.sensor, own.volume.sensor, strict=True):
-            parameters[f"fuser.{name}"] = f"{was:g}", f"{now:g}"
-        for name, (stored, given) in parameters.items():
-            if stored != given:
+        given = own.parameters()
+        for name, stored in scene.parameters().items():
+            if stored != given[name]:
                 raise ConfigError(
-                    f"{name}: expected {stored} (as in the stored map), got {given}; set {name}={stored}, or map into "
-                    "an empty folder"
+                    f"{name}: expected {stored} (as in the stored map), got {given[name]}; set {name}={stored}, or map "
+                    "into an empty folder"
                 )
-        described = "combine={}, logarithmic={}, score_scale={}".format
-        stored_rule = described(scene.table.combine.name, scene.table.logarithmic, scene.labels.score_scale)
-        given_rule = described(rule.combine.name, rule.logarithmic, own.labels.score_scale)
-        if stored_rule != given_rule:
+        if scene.label_rule != own.label_rule:
             raise ConfigError(
-                f"fuser: expected the label rule of the stored map ({stored_rule}), got {given_rule}; choose the "
-                "fuser that made the map"
+                f"fuser: expected the label rule of the stored map ({scene.label_rule}), got {own.label_rule}; choose "
+                "the fuser that made the map"
             )
         scene.confirmation = self.confirmation
         scene.instance_class = self.instance_class

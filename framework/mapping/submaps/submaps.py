@@ -96,11 +96,22 @@ class Submaps:
         if number not in self.hidden:
             return []
         layer = self._layers.get(number) or self._opened(number)
-        pairs = shared_instances(self.visible, layer, min_overlap, min_voxels)
-        self._add(number, layer)
+        pairs = self.add(number, layer, min_overlap, min_voxels)
         del self.hidden[number]
         self._layers.pop(number, None)
         self._rendered = None
+        return pairs
+
+    def add(self, number: int, layer: Layer, min_overlap: float, min_voxels: int) -> list[tuple[int, int]]:
+        """Add a layer to a visible submap, and return the pairs of instances that are the same object.
+
+        The arguments are explained at `shared_instances`.
+
+        Raises:
+            MapFullError: If the volume needs too many blocks.
+        """
+        pairs = shared_instances(self.visible, layer, min_overlap, min_voxels)
+        self._add(number, layer)
         return pairs
 
     def hide(self, numbers: Collection[int]) -> None:

@@ -19,6 +19,7 @@ from framework.commands.results import (
     export,
     figures,
     import_map,
+    merge,
     raycast,
     report,
     tables,
@@ -44,6 +45,7 @@ COMMANDS: dict[str, tuple[ModuleType, tuple[str, ...]]] = {
     "edit": (edit, ("run", "--delete", "1", "--out", "edited")),
     "evaluate": (evaluate, ("run", "--label-space", "agnostic")),
     "export": (export, ("run", "--to", "glb", "ply", "obj", "--out", "exported")),
+    "merge": (merge, ("run", "other", "--out", "merged")),
     "import-map": (import_map, ("run/mesh.ply", "imported")),
     "figures": (figures, ("run", "figure.kind=stage_times")),
     "import": (import_recording, ("phone", "recording")),
@@ -114,6 +116,8 @@ def test_command_after_power_cut_has_no_damaged_files(
     name: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     module, arguments = COMMANDS[name]
+    if name == "merge":
+        shutil.copytree(folder / "run", folder / "other")
 
     def action() -> None:
         status, _, error = call_command(module, arguments, monkeypatch, capsys)

@@ -12,7 +12,6 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 import instancemap
-from framework.commands.results.diff import in_world
 from framework.commands.results.reproduce import reproduce_all
 from framework.commands.running.run import run as run_pipeline
 from framework.config import composition
@@ -28,6 +27,7 @@ from framework.registry import assemble
 from framework.runs.instances_file import read_instances
 from framework.runs.mesh_file import read_mesh
 from framework.runs.stored_runs import completed_runs, read_record
+from framework.runs.world_frames import in_world
 from framework.testing.corner_room import exact_clusters, frame_at, pose_at
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.support import reported_run
