@@ -156,6 +156,7 @@ def begin(config: DictConfig) -> Pipeline:
         scene = scene_of(key, run)
         if key == "resume_from":
             fuser.resume(scene)
+            backend.resume()
             classes, resumed = scene.classes, True
         keyframes = read_keyframes(run / KEYFRAMES)
         with errors_of(run / KEYFRAMES):

@@ -331,6 +331,12 @@ class BackEnd:
         """
         return None
 
+    def resume(self) -> None:
+        """Prepare for the frames of a stored map. It is submap 0, which must neither move nor be hidden.
+
+        Called before the first frame. The frames belong to other submaps from the first change on.
+        """
+
     def finish(self, scene: SceneMap) -> SubmapChange | None:
         """Return the last change of the map; None = no change. Called after the last frame."""
         return None

@@ -81,6 +81,7 @@ class Submap:
     points: Float32 = field(default_factory=lambda: np.zeros((0, 3), np.float32))  # (P, 3) few points of each view, m
     keyframes: list[Keyframe] = field(default_factory=list)  # the views with enough features
     hidden: bool = False  # True = invisible to the tracker and the fuser
+    stored: bool = False  # True = a stored map, which has no views and is never hidden
 
     def local(self, T_world_camera: Float64) -> Float64:
         """Return a camera pose (4, 4) in the frame of the anchor."""
@@ -134,6 +135,10 @@ class SubmapAnchors:
         self.submaps: list[Submap] = []
         self.current = 0  # number of the current submap
 
+    def resume(self) -> None:
+        """Begin with a stored map as submap 0."""
+        self.submaps.append(Submap(0, np.eye(4), stored=True))
+
     def divide(self, frame: Frame, T_world_camera: Float64) -> bool:
         """Begin a submap, or enter a visible one again, if the camera has left the current one.
 
@@ -144,10 +149,10 @@ class SubmapAnchors:
         Returns:
             True if the camera has left the current submap, or if there was none.
         """
-        if self.submaps:
-            here = T_world_camera[:3, 3]
-            distances = {one.number: float(np.linalg.norm(one.T_world_anchor[:3, 3] - here)) for one in self.visible()}
-            if distances[self.current] <= self.begin_distance:
+        here = T_world_camera[:3, 3]
+        distances = {one.number: float(np.linalg.norm(one.T_world_anchor[:3, 3] - here)) for one in self.visible()}
+        if distances:
+            if distances.get(self.current, np.inf) <= self.begin_distance:
                 return False
             samples = DepthSamples.of(frame)
             for number in sorted(distances, key=distances.__getitem__):
@@ -163,8 +168,8 @@ class SubmapAnchors:
         return True
 
     def visible(self) -> list[Submap]:
-        """Return the visible submaps in order."""
-        return [submap for submap in self.submaps if not submap.hidden]
+        """Return the visible submaps of this run in order."""
+        return [submap for submap in self.submaps if not (submap.hidden or submap.stored)]
 
     def hidden(self) -> list[Submap]:
         """Return the hidden submaps in order."""

@@ -563,6 +563,13 @@ class BackEndContract:
             for number, T_new_old in one.motions.items():
                 np.testing.assert_array_equal(T_new_old, other.motions[number])
 
+    def test_backend_keeps_stored_map(self) -> None:
+        backend = self.plugin()
+        backend.resume()
+        for change in changes_of(backend, RoomMap()):
+            assert 0 not in change.hidden, "the stored map is hidden"
+            assert 0 not in change.motions, "the stored map moves"
+
     def test_backend_without_frames_changes_nothing(self) -> None:
         assert self.plugin().finish(RoomMap()) is None
 

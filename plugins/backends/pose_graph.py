@@ -69,6 +69,9 @@ class PoseGraph(BackEnd):
         self._guesses: deque[Guess] = deque()  # one per frame is verified
         self._correction: Correction | None = None
 
+    def resume(self) -> None:
+        self.anchors.resume()
+
     def update(self, frame: Frame, pose: Pose, scene: SceneMap) -> SubmapChange | None:
         if pose.lost:
             return None

@@ -51,6 +51,14 @@ def test_divide_anchor_behind_wall_begins_submap() -> None:
     assert anchors.current == 2
 
 
+def test_resumed_map_is_neither_entered_nor_hidden() -> None:
+    anchors = SubmapAnchors(begin_distance=2.5, hide_distance=6)
+    anchors.resume()
+    assert walked(anchors, [0, 1, *np.arange(1, 20.0), *np.arange(20.0)[::-1]])[:2] == [1, 1]
+    assert not anchors.submaps[0].hidden
+    assert anchors.submaps[1].hidden
+
+
 def test_divide_near_hidden_anchor_begins_submap() -> None:
     anchors = SubmapAnchors(begin_distance=2.5, hide_distance=6)
     there = np.arange(0, 20.0)
