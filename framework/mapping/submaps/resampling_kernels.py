@@ -23,6 +23,7 @@ from framework.mapping.voxels.voxel_grid_kernels import (
 from framework.mapping.voxels.voxel_walk import voxel_number
 
 MAX_COVERED = 27  # maximum number of blocks that a moved block overlaps: three along each axis
+ROUNDING = 1e-6  # voxels, bound of rounding errors
 MIN_OBSERVED = 0.5  # minimum fraction of the trilinear weight on observed voxels
 
 
@@ -58,33 +59,73 @@ def covered_blocks(block_coords, R, t, keys):
 
 
 @device
-def _corner_voxels(grid, i, j, k, found, look_up):
-    """Write the eight voxels at the corners of a cell to `found`, as block * 512 + index in the block, -1 = none.
+def _nearby_blocks(source, R, t, coords, nearby):
+    """Find the source blocks that a target block can be interpolated from.
 
     Args:
-        grid: The voxel grid.
+        source: The voxel grid before the motion.
+        R: The rotation (3, 3) from new to old coordinates.
+        t: The translation (3,) from new to old coordinates, voxels.
+        coords: The coordinates (3,) of the target block.
+        nearby: The output (27,), three blocks along each axis, x fastest, -1 = not allocated.
+
+    Returns:
+        Whether any of the blocks is allocated, and the coordinates of the first one.
+    """
+    half = 0.5 * (BLOCK_SIDE - 1)
+    x, y, z = (BLOCK_SIDE * coords[0] + half, BLOCK_SIDE * coords[1] + half, BLOCK_SIDE * coords[2] + half)
+    first = (
+        _first_block(R[0, 0], R[0, 1], R[0, 2], t[0], x, y, z),
+        _first_block(R[1, 0], R[1, 1], R[1, 2], t[1], x, y, z),
+        _first_block(R[2, 0], R[2, 1], R[2, 2], t[2], x, y, z),
+    )
+    exists = False
+    key, region = NO_LOOK_UP
+    for c in range(27):
+        nearby[c], key, region = find_block(
+            source, first[0] + c % 3, first[1] + c // 3 % 3, first[2] + c // 9, key, region
+        )
+        exists = exists or nearby[c] >= 0
+    return exists, first
+
+
+@device
+def _first_block(a, b, c, shift, x, y, z):
+    """Return the smallest old block coordinate, along one axis, of a target block with the center (x, y, z)."""
+    half = 0.5 * (BLOCK_SIDE - 1) + ROUNDING
+    low = a * x + b * y + c * z + shift - half * (abs(a) + abs(b) + abs(c))
+    return np.int32(np.int32(np.floor(low)) >> 3)
+
+
+@device
+def _corner_voxels(nearby, first, i, j, k, found):
+    """Write the voxels at the corners of a cell to `found`, as block * 512 + index in the block, -1 = none.
+
+    Args:
+        nearby: The blocks (27,) around the cell.
+        first: The coordinates of the first of these blocks.
         i: The first index of the first corner.
         j: The second index.
         k: The third index.
         found: The output (8,), x fastest.
-        look_up: The key and the region of the last look-up.
 
     Returns:
-        Whether any of the blocks exists, and the key and the region of the last look-up.
+        Whether any of the blocks is allocated.
     """
-    key, region = look_up
-    block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
-    exists = block >= 0
-    first = block
-    crosses = (np.int32((i & 7) == 7), np.int32((j & 7) == 7), np.int32((k & 7) == 7))
+    n = ((k >> 3) - first[2]) * 9 + ((j >> 3) - first[1]) * 3 + (i >> 3) - first[0]
+    block = nearby[n]
+    if (i & 7) != 7 and (j & 7) != 7 and (k & 7) != 7:  # most cells are inside one block
+        start = block * BLOCK_VOXELS + voxel_number(i, j, k) if block >= 0 else np.int32(-1)
+        for c in range(8):
+            found[c] = start + (c & 1) + 8 * ((c >> 1) & 1) + 64 * (c >> 2) if block >= 0 else np.int32(-1)
+        return block >= 0
+    exists = False
     for c in range(8):
-        dx, dy, dz = c & 1, (c >> 1) & 1, c >> 2
-        block = first  # most cells are inside one block
-        if (dx & crosses[0]) | (dy & crosses[1]) | (dz & crosses[2]):
-            block, key, region = find_block(grid, (i + dx) >> 3, (j + dy) >> 3, (k + dz) >> 3, key, region)
-            exists = exists or block >= 0
-        found[c] = block * BLOCK_VOXELS + voxel_number(i + dx, j + dy, k + dz) if block >= 0 else np.int32(-1)
-    return exists, (key, region)
+        x, y, z = i + (c & 1), j + ((c >> 1) & 1), k + (c >> 2)
+        block = nearby[((z >> 3) - first[2]) * 9 + ((y >> 3) - first[1]) * 3 + (x >> 3) - first[0]]
+        found[c] = block * BLOCK_VOXELS + voxel_number(x, y, z) if block >= 0 else np.int32(-1)
+        exists = exists or block >= 0
+    return exists
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -105,11 +146,11 @@ def resample(source, R, t, target, most_jump, nearest):
     coords, tsdf, weight, color = target.block_coords, target.tsdf, target.weight, target.color
     old_tsdf, old_weight, old_color = source.tsdf.ravel(), source.weight.ravel(), source.color.ravel()
     for block in prange(nearest.shape[0]):
-        found = np.empty(8, np.int32)
+        found, nearby = np.empty(8, np.int32), np.empty(27, np.int32)
         portions = np.empty(8, np.float64)
-        look_up = NO_LOOK_UP
-        for n in range(BLOCK_VOXELS):
-            nearest[block, n] = -1
+        nearest[block] = -1
+        exists, first = _nearby_blocks(source, R, t, coords[block], nearby)
+        for n in range(BLOCK_VOXELS if exists else 0):
             x = np.float64(coords[block, 0] * BLOCK_SIDE + (n & 7))
             y = np.float64(coords[block, 1] * BLOCK_SIDE + ((n >> 3) & 7))
             z = np.float64(coords[block, 2] * BLOCK_SIDE + (n >> 6))
@@ -117,8 +158,7 @@ def resample(source, R, t, target, most_jump, nearest):
             py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
             pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
             fx, fy, fz = np.floor(px), np.floor(py), np.floor(pz)
-            exists, look_up = _corner_voxels(source, np.int32(fx), np.int32(fy), np.int32(fz), found, look_up)
-            if not exists:
+            if not _corner_voxels(nearby, first, np.int32(fx), np.int32(fy), np.int32(fz), found):
                 continue
             wx, wy, wz = px - fx, py - fy, pz - fz
             observed = 0.0

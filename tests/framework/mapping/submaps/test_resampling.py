@@ -57,8 +57,9 @@ def test_resampled_whole_voxels_copies_voxels(layer: Layer, shift: tuple[int, in
     assert after == {tuple(np.add(place, shift).tolist()): values for place, values in before.items()}
 
 
-def test_resampled_equals_slow_reference(layer: Layer) -> None:
-    T = motion((0.3, -2.6, 5.1), (0.02, -0.05, 0.03))
+@pytest.mark.parametrize("rotvec", [(0.02, -0.05, 0.03), (0.5, -0.7, 0.4), (0.0, 0.0, 2.5)])
+def test_resampled_equals_slow_reference(layer: Layer, rotvec: tuple[float, float, float]) -> None:
+    T = motion((0.3, -2.6, 5.1), rotvec)
     before, after = voxels(layer), voxels(resampled(layer, T))
     most_jump = MAX_JUMP * VOXEL / float(layer.voxels.grid.tsdf_unit)
     T_old_new = np.linalg.inv(T)
