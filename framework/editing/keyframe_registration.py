@@ -50,7 +50,7 @@ class Registration(NamedTuple):
 
     T_a_b: Float64  # (4, 4)
     matches: PointMatches  # the inliers
-    rivals: int  # number of inliers of the best different transform
+    other_inliers: int  # number of inliers of the best different transform
 
 
 def match_keyframes(keyframes_a: Sequence[Keyframe], keyframes_b: Sequence[Keyframe]) -> PointMatches:
@@ -79,8 +79,8 @@ def register(matches: PointMatches) -> Registration | None:
     if max((count for count, _ in hypotheses), default=0) < MIN_INLIERS:
         return None
     T_a_b = _refined(max(hypotheses, key=lambda one: one[0])[1], matches)
-    rivals = [count for count, other in hypotheses if pose_distance(T_a_b, other) > SAME]
-    return Registration(T_a_b, matches.part(matches.inliers(T_a_b)), max(rivals, default=0))
+    others = [count for count, other in hypotheses if pose_distance(T_a_b, other) > SAME]
+    return Registration(T_a_b, matches.part(matches.inliers(T_a_b)), max(others, default=0))
 
 
 def _best_of_pair(pair: PointMatches, rng: np.random.Generator) -> Float64 | None:

@@ -20,7 +20,8 @@ from framework.queries.changes import Visit, look_for
 from framework.rendering.surface import Surface
 from framework.tracking.keyframes import Keyframe
 
-MAX_RIVALS = 0.5  # maximum ratio of the inliers of the best different transform to the inliers; repeated rooms have 1
+# maximum inliers of the best different transform, fraction of the inliers; repeated rooms have 1
+MAX_OTHER_INLIERS = 0.5
 CHECKED = 5000  # approximate number of vertices of each map that are compared with the other map
 MIN_SEEN = 0.05  # minimum fraction of the vertices of each map that the cameras of the other map see
 # Minimum fraction of the seen vertices that are on the surface of the other map. Overlapping parts of real recordings
@@ -48,8 +49,8 @@ def align_maps(a: KeyframedMap, b: KeyframedMap) -> Float64:
     if found is None:
         raise DataError(f"expected an overlap with at least {MIN_INLIERS} consistent feature matches, got fewer")
     count = len(found.matches.points_a)
-    if found.rivals > MAX_RIVALS * count:
-        raise DataError(f"expected one transform, got two with {count} and {found.rivals} feature matches")
+    if found.other_inliers > MAX_OTHER_INLIERS * count:
+        raise DataError(f"expected one transform, got two with {count} and {found.other_inliers} feature matches")
     surface_a, surface_b = (
         Surface(mesh.vertices, mesh.triangles) for mesh in (a.visit.scene.mesh(), b.visit.scene.mesh())
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from framework.mapping.storage.map_file import (
 )
 from framework.mapping.submaps.layer import Layer
 from framework.mapping.submaps.resampling import resampled
-from framework.mapping.submaps.submaps import Submaps
+from framework.mapping.submaps.submaps import Submaps, remaining
 from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
@@ -119,7 +119,7 @@ class InstanceMap(InstanceTableMap):
         if self.instance_class is InstanceClass.DETECTIONS:
             return super().class_evidence()
         counts = self.confirmation.counts(self.table)
-        evidence = self.labels.classes_of_instances(counts, len(self.classes))
+        evidence = self.whole().labels.classes_of_instances(counts, len(self.classes))
         return {int(k): evidence[k] for k in np.flatnonzero(counts)}
 
     def merge(self, kept: int, dropped: int) -> None:
@@ -168,7 +168,7 @@ class InstanceMap(InstanceTableMap):
         self.submaps.hide(change.hidden)
         self.submaps.current = change.submap
         self.relabel()
-        return {k: _remaining(k, merged) for k in merged}
+        return {k: remaining(k, merged) for k in merged}
 
     def absorb(self, other: InstanceMap, T_world_other: Float64, association: Association) -> dict[int, int]:
         """Add another map, which must not be used afterwards, and associate its instances.
@@ -202,7 +202,7 @@ class InstanceMap(InstanceTableMap):
         self.volume.gravity_estimator.absorb(other.volume.gravity_estimator, T_world_other[:3, :3])
         self.labels.evicted += other.labels.evicted
         self.relabel()
-        return {k: _remaining(k + offset, merged) for k in other.table.records}
+        return {k: remaining(k + offset, merged) for k in other.table.records}
 
     def check_compatible(self, other: InstanceMap) -> None:
         """Raise DataError unless another map can be added: it has the same parameters, classes and embeddings."""
@@ -231,7 +231,7 @@ class InstanceMap(InstanceTableMap):
     def _merge_pairs(self, pairs: Iterable[tuple[int, int]], merged: dict[int, int]) -> dict[int, int]:
         """Merge pairs of instances, of which the older one remains, and add them to `merged`."""
         for pair in pairs:
-            kept, dropped = sorted(_remaining(k, merged) for k in pair)
+            kept, dropped = sorted(remaining(k, merged) for k in pair)
             if kept != dropped:
                 self.merge(kept, dropped)
                 merged[dropped] = kept
@@ -247,6 +247,7 @@ class InstanceMap(InstanceTableMap):
             whole = InstanceMap(volume, labels, self.table.logarithmic, self.confirmation, self.instance_class)
             whole.classes, whole.table = self.classes, self.table
             self.submaps.fuse_into(Layer(volume.voxels, labels))
+            volume.voxels.max_blocks = max(self.volume.voxels.max_blocks, volume.voxels.block_count)
             labels.evicted = self.labels.evicted
             self._whole = self._state(), whole
         return self._whole[1]
@@ -299,7 +300,7 @@ class InstanceMap(InstanceTableMap):
         return InstanceMesh(surface.vertices, surface.triangles, labels.colors, instance_ids, class_ids, self.classes)
 
     def gravity(self) -> Gravity:
-        return self.volume.gravity()
+        return self.whole().volume.gravity()
 
     def save(self, path: Path | str) -> None:
         if self.submaps.hidden:
@@ -340,10 +341,3 @@ class InstanceMap(InstanceTableMap):
             scene.labels.evicted = header.whole("evicted")
             scene.table = scene.submaps.table = table
         return scene
-
-
-def _remaining(instance_id: int, merged: Mapping[int, int]) -> int:
-    """Return the instance into which an instance was merged, or its own id."""
-    while instance_id in merged:
-        instance_id = merged[instance_id]
-    return instance_id

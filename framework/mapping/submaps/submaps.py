@@ -78,7 +78,7 @@ class Submaps:
         self.discard_rendered()
         for number in sorted(motions.keys() & self.hidden.keys()):
             self.hidden[number] = self.hidden[number].moved(motions[number])
-        moved = {number: self._blocks_of([number]) for number in sorted(motions)}
+        moved = {number: self._blocks_of(number) for number in sorted(motions)}
         parts = {number: self.visible.part(blocks) for number, blocks in moved.items() if len(blocks)}
         if parts:
             self._remove(np.concatenate([moved[number] for number in parts]))
@@ -116,7 +116,7 @@ class Submaps:
 
     def hide(self, numbers: Collection[int]) -> None:
         """Hide submaps."""
-        blocks = {number: self._blocks_of([number]) for number in sorted(numbers)}
+        blocks = {number: self._blocks_of(number) for number in sorted(numbers)}
         for number, own in blocks.items():
             if len(own):
                 part = self.visible.part(own)
@@ -164,18 +164,12 @@ class Submaps:
         layer = hidden.layer(self.visible)
         instance_ids = hidden.instance_ids()
         for k in instance_ids:
-            if (kept := self._remaining(k)) != k:
+            if (kept := remaining(k, self._merged)) != k:
                 layer.labels.merge_instances(kept, k)
-        removed = [k for k in instance_ids if self._remaining(k) == k and k not in self.table.records]
+        removed = [k for k in instance_ids if remaining(k, self._merged) == k and k not in self.table.records]
         if removed:
             layer.labels.remove_instances(removed)
         return layer
-
-    def _remaining(self, instance_id: int) -> int:
-        """Return the instance into which an instance was merged, or its own id."""
-        while instance_id in self._merged:
-            instance_id = self._merged[instance_id]
-        return instance_id
 
     def _add(self, number: int, layer: Layer) -> None:
         """Add a layer to the visible layer. Its new blocks belong to the given submap."""
@@ -197,13 +191,24 @@ class Submaps:
         self._numbers[: len(rest)] = numbers
         self.volume.renumbered()
 
-    def _blocks_of(self, numbers: Collection[int]) -> Int32:
-        """Return the visible blocks of submaps."""
+    def _blocks_of(self, number: int) -> Int32:
+        """Return the visible blocks of a submap."""
         self._grow()
-        own = np.isin(self._numbers[: self.visible.voxels.block_count], [*numbers])
-        return np.flatnonzero(own).astype(np.int32)
+        return np.flatnonzero(self._numbers[: self.visible.voxels.block_count] == number).astype(np.int32)
 
     def _grow(self) -> None:
         capacity = len(self.volume.voxels.grid.block_coords)
         if len(self._numbers) < capacity:
             self._numbers = grown(self._numbers, capacity, zeros=True)
+
+
+def remaining(instance_id: int, merged: Mapping[int, int]) -> int:
+    """Return the instance into which an instance was merged, or its own id.
+
+    Args:
+        instance_id: The instance.
+        merged: The instance into which each merged instance was merged, which may be merged, too.
+    """
+    while instance_id in merged:
+        instance_id = merged[instance_id]
+    return instance_id

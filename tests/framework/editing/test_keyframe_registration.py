@@ -43,7 +43,7 @@ def test_registration_ignores_outliers() -> None:
     assert found is not None
     assert pose_distance(found.T_a_b, T_A_B) < 0.005
     assert 90 <= len(found.matches.points_a) <= 95
-    assert found.rivals < 15
+    assert found.other_inliers < 15
 
 
 def test_registration_is_deterministic() -> None:
@@ -59,7 +59,7 @@ def test_registration_counts_matches_of_rival() -> None:
     T_other = exp_se3(np.array([5.0, 0, 0, 0, 0, 0])) @ T_A_B
     found = register(joined(matches_of(T_A_B, 60, 0, 0), matches_of(T_other, 50, 0, 1)))
     assert found is not None
-    assert (len(found.matches.points_a), found.rivals) == (60, 50)
+    assert (len(found.matches.points_a), found.other_inliers) == (60, 50)
 
 
 @pytest.mark.parametrize("pairs", [[], [matches_of(T_A_B, MIN_INLIERS - 10, 40, 0)], [matches_of(T_A_B, 0, 200, 0)]])

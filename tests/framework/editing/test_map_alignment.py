@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from framework.data import Float64, Pose
+from framework.data import Pose
 from framework.editing.map_alignment import KeyframedMap, align_maps
 from framework.errors import DataError
 from framework.geometry import exp_se3, inverse, pose_distance, transform
 from framework.queries.changes import Visit
-from framework.tracking.keyframes import Keyframes
+from framework.tracking.keyframes import Keyframe, Keyframes
 from tests.support import registered
 from tests.support.scenes.analytic_scene import NOTHING
 from tests.support.scenes.papered_room import papered_frame
@@ -47,6 +47,12 @@ def test_alignment_of_different_rooms_raises() -> None:
         align_maps(map_of(0.0, 2.0), map_of(0.0, 2.0, paper=1))
 
 
+def moved_keyframes(one: KeyframedMap, *twist: float) -> list[Keyframe]:
+    """Return the keyframes of a map with points moved by a twist, m and rad."""
+    T = exp_se3(np.array(twist))
+    return [replace(key, points_world=transform(T, key.points_world)) for key in one.keyframes]
+
+
 def test_alignment_without_keyframes_raises() -> None:
     with pytest.raises(DataError, match="expected keyframes in both runs, got 0 and"):
         align_maps(replace(map_of(0.0, 2.0), keyframes=()), map_of(1.0, 3.0, here=False))
@@ -55,24 +61,19 @@ def test_alignment_without_keyframes_raises() -> None:
 def test_alignment_with_wrong_features_raises() -> None:
     """The features agree with a transform that the surfaces contradict, as in a similar room of another size."""
     a, b = map_of(0.0, 2.0), map_of(1.0, 3.0, here=False)
-    wrong = exp_se3(np.array([0.0, 0.0, 0.6, 0.0, 0.2, 0.0]))
-    moved = [replace(one, points_world=transform(wrong, one.points_world)) for one in a.keyframes]
     with pytest.raises(DataError, match="expected surfaces that agree on at least 80% of the overlap"):
-        align_maps(replace(a, keyframes=moved), b)
+        align_maps(replace(a, keyframes=moved_keyframes(a, 0.0, 0.0, 0.6, 0.0, 0.2, 0.0)), b)
 
 
 def test_alignment_without_common_views_raises() -> None:
     a, b = map_of(0.0, 2.0), map_of(1.0, 3.0, here=False)
-    far = exp_se3(np.array([0.0, 9.0, 0.0, 0.0, 0.0, 0.0]))
-    moved = [replace(one, points_world=transform(far, one.points_world)) for one in a.keyframes]
     with pytest.raises(DataError, match="expected an overlap of at least 5%, got 0%"):
-        align_maps(replace(a, keyframes=moved), b)
+        align_maps(replace(a, keyframes=moved_keyframes(a, 0.0, 9.0, 0.0, 0.0, 0.0, 0.0)), b)
 
 
 def test_alignment_with_repeated_room_raises() -> None:
     """The first map contains the room of the second map twice."""
     a, b = map_of(0.0, 2.0), map_of(1.0, 3.0, here=False)
-    T: Float64 = exp_se3(np.array([7.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    again = [replace(one, points_world=transform(T, one.points_world)) for one in a.keyframes]
+    again = moved_keyframes(a, 7.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     with pytest.raises(DataError, match="expected one transform, got two"):
         align_maps(replace(a, keyframes=[*a.keyframes, *again]), b)

@@ -185,8 +185,22 @@ def test_map_with_hidden_submaps_is_saved_whole(tmp_path: Path) -> None:
     scene = scene_of(fuser)
     scene.save(tmp_path / "map.npz")
     loaded = InstanceMap.load(tmp_path / "map.npz")
+    assert loaded.volume.voxels.max_blocks == scene.volume.voxels.max_blocks
+    np.testing.assert_array_equal(loaded.gravity().up, scene.gravity().up)
     for found, expected in zip(sorted_mesh(loaded), sorted_mesh(scene), strict=True):
         np.testing.assert_array_equal(found, expected)
+
+
+def test_class_evidence_of_voxels_includes_hidden_submaps() -> None:
+    fuser = new_fuser("bayesian_tsdf", "fuser.instance_class=VOXELS")
+    fuse(fuser, POSES)
+    scene = scene_of(fuser)
+    before = scene.class_evidence()
+    fuser.correct(SubmapChange(hidden=frozenset({0}), submap=1))
+    after = scene.class_evidence()
+    assert before.keys() == after.keys() == {1, 2, 3}
+    for k, evidence in before.items():
+        np.testing.assert_array_equal(after[k], evidence)
 
 
 def test_removed_blocks_are_observed_again() -> None:
