@@ -73,8 +73,6 @@ class PoseGraph(BackEnd):
         self.anchors.resume()
 
     def update(self, frame: Frame, pose: Pose, scene: SceneMap) -> SubmapChange | None:
-        if pose.lost:
-            return None
         self._frames += 1
         unchanged = corrected = SubmapChange(submap=self.anchors.current)
         if self._correction is not None and self._correction.result.due <= self._frames:
