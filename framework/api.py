@@ -64,8 +64,9 @@ from framework.queries.map_queries import Map
 from framework.queries.text_search import Match, QueryResult, TextQuery, search
 from framework.registry import build, text_kind
 from framework.runs.data_frame import load_runs
+from framework.runs.depth_distortion_file import read_depth_distortion
 from framework.runs.run_directory import write_run
-from framework.runs.stored_runs import KEYFRAMES, MAP, REPORT
+from framework.runs.stored_runs import DEPTH_DISTORTION, KEYFRAMES, MAP, REPORT
 from framework.runtime.cpu_budget import limited_threads
 from framework.runtime.forked_process import check_not_forked
 from framework.runtime.process_settings import Settings, configure_process
@@ -147,7 +148,7 @@ def begin(config: DictConfig) -> Pipeline:
     masking, backend = build(FrameMasking, config.get("masking")), build(BackEnd, config.get("backend"))
     viewer = build(Viewer, config.get("viewer"))
     classes: tuple[str, ...] = ()
-    resumed = False
+    resumed, distortion = False, None
     chosen = {key: config.get(key) for key in ("resume_from", "localize_in") if config.get(key) is not None}
     if len(chosen) > 1:
         raise ConfigError("resume_from and localize_in: expected at most one of these keys, got both; remove one")
@@ -158,6 +159,7 @@ def begin(config: DictConfig) -> Pipeline:
             fuser.resume(scene)
             backend.resume()
             classes, resumed = scene.classes, True
+        distortion = read_depth_distortion(run / DEPTH_DISTORTION)
         keyframes = read_keyframes(run / KEYFRAMES)
         with errors_of(run / KEYFRAMES):
             tracker.load_keyframes(keyframes, scene)
@@ -167,7 +169,7 @@ def begin(config: DictConfig) -> Pipeline:
     pipeline = Pipeline(
         detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval, masking, backend
     )
-    pipeline.resumed = resumed
+    pipeline.resumed, pipeline.depth_distortion = resumed, distortion
     return pipeline
 
 
@@ -334,6 +336,7 @@ class Mapper(Map):
     def _map(self, frame: Frame) -> Pose:
         pipeline, journal = self.pipeline, self._journal
         try:
+            frame = pipeline.corrected(frame)
             detections, times = pipeline.detect(frame, self._frames - 1)
             journal.record(times)
             return pipeline.map_frame(frame, detections, journal)

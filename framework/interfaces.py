@@ -39,6 +39,7 @@ from framework.data import (
     View,
 )
 from framework.errors import ConfigError, FrameError
+from framework.sensors.depth_distortion import DepthDistortion
 from framework.sensors.noise_models import SensorKind
 
 FrameReader = Callable[[], Frame]
@@ -318,11 +319,33 @@ class SubmapChange:
         return T_world_a if T_new_old is None else T_new_old @ T_world_a
 
 
+class DepthCalibrator(ABC):
+    """Self-calibration of depth with the first frames of a sequence, which are mapped before the run."""
+
+    @property
+    @abstractmethod
+    def frames(self) -> int:
+        """Number of first frames that are mapped for the calibration; 0 = no calibration."""
+
+    @abstractmethod
+    def add(self, frame: Frame, pose: Pose) -> None:
+        """Add a tracked frame. Called in the order of the frames."""
+
+    @abstractmethod
+    def distortion(self) -> DepthDistortion | None:
+        """Return the correction of depth for the run; None = no correction. Called after the last frame."""
+
+
 class BackEnd:
     """Back end, which corrects the map when the camera returns to a place.
 
     This class changes nothing.
     """
+
+    @property
+    def calibrator(self) -> DepthCalibrator | None:
+        """Self-calibration of depth before a run; None = no calibration."""
+        return None
 
     def update(self, frame: Frame, pose: Pose, scene: SceneMap) -> SubmapChange | None:
         """Return the change of the map after a fused frame; None = no change. Called in the order of the frames.

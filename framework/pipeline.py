@@ -12,6 +12,7 @@ from itertools import count
 from pathlib import Path
 from typing import cast
 
+from framework.checking.changed_sequences import FirstFrames
 from framework.data import Array, Detections, Float64, Frame, Int32, Pose, check_label_space
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError, in_one_line
@@ -31,13 +32,16 @@ from framework.interfaces import (
     Viewer,
 )
 from framework.live_view.guarded_viewer import GuardedViewer, watched_run
+from framework.pose_graph.calibration_stages import CalibratingBackEnd, NoObjects
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
+from framework.registry import rebuilt
 from framework.runtime.cpu_budget import CpuBudget, parallel_kernels_are_thread_safe
 from framework.runtime.forked_process import check_not_forked
 from framework.runtime.frame_stream import FrameStream, Turns, prefetched_map, stream_of
 from framework.runtime.run_log import Journal, RunResult, StageTime
 from framework.runtime.signals import Interruption, signals_deferred
+from framework.sensors.depth_distortion import DepthDistortion
 from framework.tracking.color_to_depth import ColorToDepth
 from framework.tracking.map_agreement import check_distance, check_resumed, map_agreement
 
@@ -82,6 +86,7 @@ class Pipeline:
         self.viewer = GuardedViewer(self.viewer)
         self.backend = usable_back_end(self.backend, self.tracker, self.fuser)
         self.color_to_depth = ColorToDepth(delay=None)
+        self.depth_distortion: DepthDistortion | None = None  # of the sensor; None = depth is not corrected
         self.resumed = False  # True until a frame is compared with the map of `resume_from`
         self.T_world_color: Float64 | None = None  # (4, 4) pose of the color camera in the last tracked frame
 
@@ -132,6 +137,7 @@ class Pipeline:
         warn_outside_domain(self.detector, video)
         if isinstance(video, RGBDSequence):
             self.detector.check_sequence(video)
+            self.calibrate_depth(video)
         self.color_to_depth = ColorToDepth(video.constant_color_delay())
         journal = Journal(self.fuser.scene, frames_expected, self.tracker.pose_source, directory)
         with (
@@ -158,7 +164,39 @@ class Pipeline:
             keyframes=keyframes,
             color_delay=self.color_to_depth.estimate,
             as_tracked=journal.tracked.as_tracked if changes_map(self.backend) else None,
+            depth_distortion=self.depth_distortion,
         )
+
+    def calibrate_depth(self, video: RGBDSequence) -> None:
+        """Calibrate depth with the first frames of a sequence, which are mapped without objects before the run.
+
+        A sequence that continues a stored map has the correction of that map.
+
+        Raises:
+            BaseException: A signal was received, or a stage raised an error.
+        """
+        calibrator = self.backend.calibrator
+        if calibrator is None or calibrator.frames == 0 or self.fuser.scene.statistics.voxels:
+            return
+        frames = FirstFrames(video, calibrator.frames)
+        log.info("calibration of depth: mapping the first %d frames", len(frames))
+        trial = Pipeline(
+            NoObjects(), rebuilt(self.tracker), self.refiner, rebuilt(self.fuser), self.prefetch,
+            backend=CalibratingBackEnd(calibrator),
+        )  # fmt: skip
+        try:
+            stopped_by = trial.run_to_any_end(frames).stopped_by
+        except DataError:  # no frame was mapped; the run reports the reason
+            return
+        if stopped_by is not None and not isinstance(stopped_by, MapFullError):
+            raise stopped_by
+        self.depth_distortion = calibrator.distortion()
+
+    def corrected(self, frame: Frame) -> Frame:
+        """Return a frame with corrected depth."""
+        if self.depth_distortion is None:
+            return frame
+        return replace(frame, depth=self.depth_distortion.corrected(frame.depth))
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
         """Return the keyframes of the tracker by array name.
@@ -277,7 +315,7 @@ class Pipeline:
                 if read_frame is None or isinstance(read_frame, FrameError):
                     return read_frame
                 began = time.perf_counter()
-                frame = read_frame()
+                frame = self.corrected(read_frame())
                 reading = StageTime(frame.index, "reading", 1e3 * (time.perf_counter() - began))
             detections, times = self.detect(frame, number)
         except FrameError as error:

@@ -155,6 +155,15 @@ def assemble(plugin_class: type[Plugin], /, **values: Any) -> Plugin:
     return plugin_class(**parts, **values)
 
 
+def rebuilt(plugin: Plugin) -> Plugin:
+    """Return a plugin with the parameters of another one, but without its state."""
+    values = {
+        name: rebuilt(getattr(plugin, name)) if _is_part(kind) else getattr(plugin, name)
+        for name, (_, kind) in _fields(type(plugin)).items()
+    }
+    return type(plugin)(**values)
+
+
 def parameter_fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
     """Return the field and type of each parameter of a plugin, by name.
 

@@ -47,3 +47,16 @@ class DelayedDepth(ChangedSequence):
         if not 0 <= k + self.delay < len(self.sequence):
             raise FrameError(f"frame {k}: expected a depth image at an offset of {self.delay} frames, got none")
         return replace(self.sequence[k], depth=self.sequence[k + self.delay].depth)
+
+
+@dataclass
+class FirstFrames(ChangedSequence):
+    """The first frames of a sequence."""
+
+    count: int  # number of frames, if the sequence has as many
+
+    def __len__(self) -> int:
+        return min(self.count, len(self.sequence))
+
+    def __getitem__(self, k: int) -> Frame:
+        return self.sequence[k]

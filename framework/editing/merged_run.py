@@ -29,6 +29,7 @@ from framework.runs.metrics import is_evaluation, room_metrics
 from framework.runs.run_directory import caption, likely_labels
 from framework.runs.stored_runs import (
     CONFIG,
+    DEPTH_DISTORTION,
     EDITED_FROM,
     EVALUATION,
     INSTANCES,
@@ -120,7 +121,9 @@ class MergedRun:
         comments = origin_comments(stored_origin(first.record.metrics))
         metrics = self._metrics() | {"instances.count": len(found)}
         with staged_files(out) as folder:
-            shutil.copyfile(first.record.directory / CONFIG, folder / CONFIG)
+            for name in (CONFIG, DEPTH_DISTORTION):
+                if (first.record.directory / name).exists():
+                    shutil.copyfile(first.record.directory / name, folder / name)
             write_tum(folder / TRAJECTORY, self.timestamps, self.poses, comments)
             scene.save(folder / MAP)
             if self.keyframes:

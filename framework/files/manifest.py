@@ -36,6 +36,7 @@ RUN_FILES = (
     "map.npz",
     "overview.png",
     "keyframes.npz",
+    "depth_distortion.json",
     "digests.csv",
     "environment.txt",
 )

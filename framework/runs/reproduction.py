@@ -16,6 +16,7 @@ from framework.runs.plugin_code import changed_code, plugin_code
 from framework.runs.provenance import code_version, leaves, package_version, parameters_of
 from framework.runs.stored_runs import (
     CONFIG,
+    DEPTH_DISTORTION,
     DIGESTS,
     ENVIRONMENT,
     INSTANCES,
@@ -29,7 +30,8 @@ from framework.runs.stored_runs import (
 )
 from framework.runtime.run_log import STAGE_ORDER
 
-COMPARED = (TRAJECTORY, TRACKED_TRAJECTORY, INSTANCES, MESH, MAP, KEYFRAMES)  # result files, which contain no run times
+# result files, which contain no run times
+COMPARED = (TRAJECTORY, TRACKED_TRAJECTORY, DEPTH_DISTORTION, INSTANCES, MESH, MAP, KEYFRAMES)
 PACKAGES = ("numba", "numpy", "onnxruntime", "opencv-python-headless", "scipy", "torch", "transformers")
 """Packages that may affect the last digits of results."""
 

@@ -41,6 +41,7 @@ from framework.live_view.guarded_viewer import watched_run
 from framework.pipeline import Pipeline
 from framework.registry import STAGES, build
 from framework.rendering.overview import write_overview
+from framework.runs.depth_distortion_file import write_depth_distortion
 from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
@@ -50,6 +51,7 @@ from framework.runs.provenance import code_version, config_hash, environment, fr
 from framework.runs.stored_runs import (
     CHOICE,
     CONFIG,
+    DEPTH_DISTORTION,
     DIGESTS,
     ENVIRONMENT,
     GROUPS,
@@ -147,7 +149,15 @@ class RunRecord:
         """
         outputs = OutputFolder.open(self.directory, keep_earlier=self.in_place)
         folder, scene, attempt = outputs.path, result.scene, _Attempts(result.stopped_by)
-        for name in (MANIFEST, *MAPPED, TRACKED_TRAJECTORY, KEYFRAMES, DIGESTS, ENVIRONMENT):  # from an earlier run
+        for name in (
+            MANIFEST,
+            *MAPPED,
+            TRACKED_TRAJECTORY,
+            DEPTH_DISTORTION,
+            KEYFRAMES,
+            DIGESTS,
+            ENVIRONMENT,
+        ):  # from an earlier run
             attempt((folder / name).unlink, missing_ok=True)
         if not (folder / CONFIG).exists():
             attempt(_write_config, folder / CONFIG, self.config)
@@ -156,6 +166,8 @@ class RunRecord:
         attempt(write_tum, folder / TRAJECTORY, timestamps, poses, comments)
         if result.as_tracked is not None:
             attempt(write_tum, folder / TRACKED_TRAJECTORY, *_reliable(result.as_tracked), comments)
+        if result.depth_distortion is not None:
+            attempt(write_depth_distortion, folder / DEPTH_DISTORTION, result.depth_distortion)
         attempt(write_timings, folder / "timings.csv", result)
         attempt(write_digests, folder / DIGESTS, result)
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **origin_metrics(video), **(counts or {})}

@@ -48,6 +48,7 @@ INSTANCES = "instances.json"
 TRAJECTORY = "trajectory.txt"
 TRACKED_TRAJECTORY = "trajectory_tracked.txt"  # poses before any correction by the back end; optional
 REPORT = "report.html"  # written by `instancemap report`
+DEPTH_DISTORTION = "depth_distortion.json"  # correction of depth, also for runs that resume the map; optional
 KEYFRAMES = "keyframes.npz"  # keyframes of the tracker, to resume the map; optional
 MAPPED = (TRAJECTORY, "timings.csv", MAP, INSTANCES, MESH, "overview.png")
 """Files of a map in the order of writing. In case the disk becomes full, files that can be recomputed are last."""

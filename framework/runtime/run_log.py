@@ -23,6 +23,7 @@ from framework.runtime.digests import StageDigest, digest_of
 from framework.runtime.frame_stream import steady_time
 from framework.runtime.progress import Progress
 from framework.runtime.spooled_list import Spool, SpooledList
+from framework.sensors.depth_distortion import DepthDistortion
 from framework.sensors.noise_models import SensorKind
 
 log = logging.getLogger(__name__)
@@ -73,6 +74,7 @@ class RunResult:
     disagreeing: tuple[int, ...] | None = None  # Frame.index of the frames that contradict the map; None = not compared
     masks_omitted: int = 0  # number of masks that exceeded the limit of points of a frame
     as_tracked: Sequence[TrackedFrame] | None = None  # poses before any correction; None = no back end
+    depth_distortion: DepthDistortion | None = None  # correction of depth; None = none
 
     @property
     def frames_lost(self) -> int:

@@ -14,8 +14,9 @@ import numpy as np
 from framework.config.validation import check_bounds
 from framework.data import Float64, Frame, Pose
 from framework.geometry import inverse, rotation_angle
-from framework.interfaces import BackEnd, SceneMap, SubmapChange
+from framework.interfaces import BackEnd, DepthCalibrator, SceneMap, SubmapChange
 from framework.pose_graph.delayed_result import DelayedResult
+from framework.pose_graph.depth_calibration import DepthCalibration
 from framework.pose_graph.graph_optimization import AnchorGraph, GraphEdge, Optimized, optimize
 from framework.pose_graph.loop_detection import Drift, Extracted, Guess, Loop, LoopDetection, QueryView, Reach
 from framework.pose_graph.loop_verification import LoopVerification, match_hidden, overlaps
@@ -55,6 +56,7 @@ class PoseGraph(BackEnd):
     anchors: SubmapAnchors = field(default_factory=SubmapAnchors)
     detection: LoopDetection = field(default_factory=LoopDetection)
     verification: LoopVerification = field(default_factory=LoopVerification)
+    calibration: DepthCalibration = field(default_factory=DepthCalibration)
     min_motion: float = 0.01  # minimum motion of a submap's surface, m, in [0, 1]; smaller motions are omitted
     correction_delay: int = 10  # number of frames between a detected loop and the correction, in [0, 1000]
 
@@ -68,6 +70,10 @@ class PoseGraph(BackEnd):
         self._extracted: DelayedResult[Extracted] | None = None
         self._guesses: deque[Guess] = deque()  # one per frame is verified
         self._correction: Correction | None = None
+
+    @property
+    def calibrator(self) -> DepthCalibrator:
+        return self.calibration
 
     def resume(self) -> None:
         self.anchors.resume()

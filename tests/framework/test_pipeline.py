@@ -301,12 +301,12 @@ def test_pipeline_empty_map_raises_with_frame_summary() -> None:
 
 @PREFETCH
 def test_pipeline_error_leaves_no_threads(prefetch: int) -> None:
-    before = threading.active_count()
+    before = working_threads()
     with pytest.raises(DataError, match="expected a ground-truth pose"):
         pipeline(prefetch, detector=_Blind()).run(CornerRoom(truth=False))
     with pytest.raises(DataError, match="expected ground-truth instances"):  # raised in the worker
         pipeline(prefetch).run(CornerRoom(truth=False))
-    assert threading.active_count() == before
+    assert working_threads() == before
 
 
 @dataclass

@@ -22,7 +22,7 @@ from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
 from framework.interfaces import Detector, PoseTracker, RGBDSequence, RGBDVideo
-from framework.registry import GROUPS, STAGES, assemble, build, find_class, parameter_fields
+from framework.registry import GROUPS, STAGES, assemble, build, find_class, parameter_fields, rebuilt
 
 pytestmark = pytest.mark.integration
 
@@ -150,6 +150,15 @@ def test_build_flattens_parameters_of_parts() -> None:
     assert list(parameter_fields(Assembled))[-3:] == ["nms", "agnostic", "size"]
     with pytest.raises(TypeError, match="agnostik"):
         assemble(Assembled, weights=Path("w.bin"), agnostik=True)
+
+
+def test_rebuilt_plugin_has_parameters_without_state() -> None:
+    used = Assembled(Path("w.bin"), limit=4, suppression=Suppression(nms=0.25), size=5)
+    used.suppression.seen = used.seen = True  # type: ignore[attr-defined]
+    copy = rebuilt(used)
+    assert copy == used
+    assert not hasattr(copy, "seen")
+    assert not hasattr(copy.suppression, "seen")
 
 
 @pytest.mark.parametrize(

@@ -9,16 +9,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
 from framework.api import load_map
 from framework.files.manifest import Manifest
 from framework.files.tum_trajectory import read_tum
+from framework.runs.depth_distortion_file import read_depth_distortion, write_depth_distortion
 from framework.runs.instances_file import read_instances
 from framework.runs.mesh_file import read_mesh
 from framework.runs.stored_runs import read_metrics, read_yaml
 from framework.runs.timings_file import read_timings
+from framework.sensors.depth_distortion import NODES, DepthDistortion
 from framework.tracking.keyframes import Keyframes, read_keyframes, write_keyframes
 from tests.support.recordings.damaged_files import EXAMPLES, check, damaged
 from tests.support.reported_run import write_run
@@ -47,18 +50,20 @@ READERS: dict[str, Callable[[Path], object]] = {
     "mesh.ply": read_mesh,
     "map.npz": load_map,
     "keyframes.npz": read_keyframes,
+    "depth_distortion.json": read_depth_distortion,
     "manifest.json": lambda path: Manifest.read(path.parent),
 }
 
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the directory of a run with keyframes."""
+    """Return the directory of a run with keyframes and a correction of depth."""
     directory = write_run(tmp_path_factory.mktemp("runs") / "run", frames=3)
     room, keyframes = CornerRoom(frames=3), Keyframes()
     for k in range(3):
         keyframes.add(room[k], room[k].T_world_camera)
     write_keyframes(directory / "keyframes.npz", keyframes.saved())
+    write_depth_distortion(directory / "depth_distortion.json", DepthDistortion(np.full(NODES, 0.01), (72, 96)))
     return directory
 
 
