@@ -64,7 +64,7 @@ from framework.queries.map_queries import Map
 from framework.queries.text_search import Match, QueryResult, TextQuery, search
 from framework.registry import build, text_kind
 from framework.runs.data_frame import load_runs
-from framework.runs.depth_distortion_file import read_depth_distortion
+from framework.runs.depth_distortion_file import stored_depth_distortion
 from framework.runs.run_directory import write_run
 from framework.runs.stored_runs import DEPTH_DISTORTION, KEYFRAMES, MAP, REPORT
 from framework.runtime.cpu_budget import limited_threads
@@ -159,10 +159,18 @@ def begin(config: DictConfig) -> Pipeline:
             fuser.resume(scene)
             backend.resume()
             classes, resumed = scene.classes, True
-        distortion = read_depth_distortion(run / DEPTH_DISTORTION)
+        distortion = stored_depth_distortion(run)
         keyframes = read_keyframes(run / KEYFRAMES)
         with errors_of(run / KEYFRAMES):
             tracker.load_keyframes(keyframes, scene)
+    if config.get("depth_distortion_from") is not None:
+        run = checked_path("depth_distortion_from", config.depth_distortion_from)
+        distortion = stored_depth_distortion(run)
+        if distortion is None:
+            raise DataError(
+                f"depth_distortion_from: expected a run directory with {DEPTH_DISTORTION}, got {run} without it; name "
+                "a run whose log reports a correction of depth"
+            )
     detector = build(Detector, config.get("detector"))  # last, because loading a network is slow
     detector = with_cache(with_classes_of_map(detector, classes), config)
     compile_for_run()

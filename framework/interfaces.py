@@ -322,10 +322,9 @@ class SubmapChange:
 class DepthCalibrator(ABC):
     """Self-calibration of depth with the first frames of a sequence, which are mapped before the run."""
 
-    @property
     @abstractmethod
-    def frames(self) -> int:
-        """Number of first frames that are mapped for the calibration; 0 = no calibration."""
+    def frames(self, available: int) -> int:
+        """Return the number of first frames to map, of the `available` ones; 0 = no calibration."""
 
     @abstractmethod
     def add(self, frame: Frame, pose: Pose) -> None:

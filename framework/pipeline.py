@@ -170,22 +170,24 @@ class Pipeline:
     def calibrate_depth(self, video: RGBDSequence) -> None:
         """Calibrate depth with the first frames of a sequence, which are mapped without objects before the run.
 
-        A sequence that continues a stored map has the correction of that map.
+        A known correction is used instead. A stored map without correction is resumed without correction.
 
         Raises:
             BaseException: A signal was received, or a stage raised an error.
         """
         calibrator = self.backend.calibrator
-        if calibrator is None or calibrator.frames == 0 or self.fuser.scene.statistics.voxels:
+        if calibrator is None or self.depth_distortion is not None or self.fuser.scene.statistics.voxels:
             return
-        frames = FirstFrames(video, calibrator.frames)
-        log.info("calibration of depth: mapping the first %d frames", len(frames))
+        count = calibrator.frames(len(video))
+        if count == 0:
+            return
+        log.info("calibration of depth: mapping the first %d frames", count)
         trial = Pipeline(
             NoObjects(), rebuilt(self.tracker), self.refiner, rebuilt(self.fuser), self.prefetch,
             backend=CalibratingBackEnd(calibrator),
         )  # fmt: skip
         try:
-            stopped_by = trial.run_to_any_end(frames).stopped_by
+            stopped_by = trial.run_to_any_end(FirstFrames(video, count)).stopped_by
         except DataError:  # no frame was mapped; the run reports the reason
             return
         if stopped_by is not None and not isinstance(stopped_by, MapFullError):

@@ -53,10 +53,10 @@ class DelayedDepth(ChangedSequence):
 class FirstFrames(ChangedSequence):
     """The first frames of a sequence."""
 
-    count: int  # number of frames, if the sequence has as many
+    count: int  # number of frames
 
     def __len__(self) -> int:
-        return min(self.count, len(self.sequence))
+        return self.count
 
     def __getitem__(self, k: int) -> Frame:
         return self.sequence[k]

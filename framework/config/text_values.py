@@ -71,7 +71,8 @@ class TextKind(Enum):
 
 
 KEYS: Mapping[str, TextKind] = {
-    **dict.fromkeys(("resume_from", "localize_in", "detection_cache_dir", "out"), TextKind.OPTIONAL_PATH),
+    **dict.fromkeys(("resume_from", "localize_in", "depth_distortion_from"), TextKind.OPTIONAL_PATH),
+    **dict.fromkeys(("detection_cache_dir", "out"), TextKind.OPTIONAL_PATH),
     **dict.fromkeys(("network.start_from", "pictures.folder"), TextKind.OPTIONAL_PATH),  # of train-detector
     **dict.fromkeys(("hydra.run.dir", "hydra.sweep.dir"), TextKind.PATH),
     **dict.fromkeys(("evaluation.label_space", "table.base"), TextKind.OPTIONAL_TEXT),

@@ -97,15 +97,19 @@ class DepthCalibration(DepthCalibrator):
         self._shape = (0, 0)  # height and width of the frames
         self._tracked = 0  # number of tracked frames
 
+    def frames(self, available: int) -> int:
+        used = min(available, self.calibration_frames)
+        return used if used > (MIN_VIEWS - 1) * self._interval else 0
+
     @property
-    def frames(self) -> int:
-        return self.calibration_frames
+    def _interval(self) -> int:
+        """Number of frames between two views."""
+        return -(-self.calibration_frames // VIEWS)
 
     def add(self, frame: Frame, pose: Pose) -> None:
         """Add a tracked frame. Frames of another camera than that of the first one are omitted."""
-        interval = -(-self.calibration_frames // VIEWS)
         self._tracked += 1
-        if (self._tracked - 1) % interval:
+        if (self._tracked - 1) % self._interval:
             return
         view = CalibrationView.of(frame, pose.T_world_camera)
         if not self._views or view.camera == self._views[0].camera:

@@ -104,7 +104,7 @@ class Comparison(NamedTuple):
 
     drifted: BuildingRun  # without a back end
     corrected: BuildingRun
-    oracle: BuildingRun  # mapped again with the corrected poses
+    oracle: BuildingRun  # mapped again with the corrected poses and depth
     given: BuildingRun  # with the true poses
 
 
@@ -114,11 +114,12 @@ def compared(seed: int, rooms: int = 5, frames: int = 1200) -> Comparison:
     building = {"rooms": rooms, "frames": frames, "seed": seed}
     with tempfile.TemporaryDirectory() as directory:
         runs = {name: Path(directory, name) for name in Comparison._fields}
-        trajectory = f"tracker.path={runs['corrected'] / 'trajectory.txt'}"
+        corrected = runs["corrected"]
+        again = (f"tracker.path={corrected / 'trajectory.txt'}", f"depth_distortion_from={corrected}")
         return Comparison(
             drifted=BuildingRun.of(building, runs["drifted"], "backend=none"),
             corrected=BuildingRun.of(building, runs["corrected"], "backend=pose_graph"),
-            oracle=BuildingRun.of(building, runs["oracle"], "tracker=trajectory_file", trajectory),
+            oracle=BuildingRun.of(building, runs["oracle"], "tracker=trajectory_file", *again),
             given=BuildingRun.of(building, runs["given"], "tracker=ground_truth"),
         )
 

@@ -28,8 +28,11 @@ from framework.interfaces import MapFuser
 from framework.pipeline import Pipeline
 from framework.refinement.lifting import lift
 from framework.registry import build
+from framework.runs.depth_distortion_file import write_depth_distortion
 from framework.runs.metrics import room_metrics
+from framework.sensors.depth_distortion import NODES, DepthDistortion
 from framework.sensors.noise_models import SensorKind
+from framework.testing.corner_room import CAMERA
 from tests.support import registered
 from tests.support.failing_disk import FailingDisk, Fault
 from tests.support.scenes.analytic_scene import Scene
@@ -336,6 +339,22 @@ def test_mapper_arrays_follow_frame_of_any_index(room: CornerRoom) -> None:
     mapper.add(replace(room[0], index=41))
     mapper.add(room[1].color, room[1].depth, room[1].T_world_camera)
     assert mapper._journal.last_index == 42
+
+
+@pytest.mark.parametrize("key", ["depth_distortion_from", "resume_from", "localize_in"])
+def test_mapper_corrects_depth_as_stored_run(key: str, room: CornerRoom, tmp_path: Path) -> None:
+    mapper = Mapper(*STAGES)
+    for frame in room:
+        mapper.add(frame)
+    mapper.save(tmp_path / "map.npz")
+    write_depth_distortion(tmp_path / "depth_distortion.json", DepthDistortion(np.full(NODES, 0.1), CAMERA.shape))
+    corrected = Mapper(*STAGES, **{key: tmp_path}).pipeline.corrected(room[0])
+    np.testing.assert_allclose(corrected.depth, room[0].depth + 0.1 * room[0].depth ** 2, rtol=1e-5)
+
+
+def test_mapper_depth_distortion_of_other_run_raises(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"depth_distortion_from: expected a run directory with depth_distortion\.json"):
+        Mapper(*STAGES, depth_distortion_from=tmp_path)
 
 
 def test_mapper_timestamp_order_is_logged_once(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:

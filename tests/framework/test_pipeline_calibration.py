@@ -27,9 +27,8 @@ class GivenDistortion(DepthCalibrator):
     count: int = 4
     added: list[int] = field(default_factory=list)
 
-    @property
-    def frames(self) -> int:
-        return self.count
+    def frames(self, available: int) -> int:
+        return min(self.count, available)
 
     def add(self, frame: Frame, pose: Pose) -> None:
         self.added.append(frame.index)
@@ -110,7 +109,7 @@ def test_calibration_of_live_video_is_omitted() -> None:
     assert result.depth_distortion is None
 
 
-def test_calibration_of_resumed_map_keeps_its_correction(room: CornerRoom) -> None:
+def test_calibration_of_resumed_map_is_omitted(room: CornerRoom) -> None:
     backend = Calibrating({}, last=None)
     mapping = pipeline(backend)
     mapping.run(room)
@@ -119,6 +118,14 @@ def test_calibration_of_resumed_map_keeps_its_correction(room: CornerRoom) -> No
     mapping.run(CornerRoom(frames=12, start=6))
     assert not backend.calibration.added
     assert mapping.depth_distortion is None
+
+
+def test_calibration_is_omitted_if_correction_is_known(room: CornerRoom) -> None:
+    backend, known = Calibrating({}, last=None), DepthDistortion(np.full(NODES, 0.01), CAMERA.shape)
+    mapping = pipeline(backend)
+    mapping.depth_distortion = known
+    assert mapping.run(room).depth_distortion is known
+    assert not backend.calibration.added
 
 
 def test_calibration_without_usable_frames_reports_error_of_run(room: CornerRoom) -> None:

@@ -170,6 +170,12 @@ def test_depth_calibration_with_few_views_corrects_nothing() -> None:
     assert calibration.distortion() is None
 
 
+def test_depth_calibration_of_short_sequence_needs_no_frames() -> None:
+    calibration = DepthCalibration(calibration_frames=300)
+    assert [calibration.frames(available) for available in (95, 96, 1000)] == [0, 96, 300]
+    assert DepthCalibration(calibration_frames=0).frames(1000) == 0
+
+
 def test_depth_calibration_omits_frames_of_other_cameras() -> None:
     other = replace(CAMERA, fx=140.0)
     calibration = DepthCalibration(calibration_frames=20)
