@@ -381,6 +381,24 @@ class Gravity:
     source: str = ""  # "sensor" or "surfaces"; "" = unknown
 
 
+class SubmapSurfaces(ABC):
+    """The surfaces of hidden submaps at one time. One thread at a time may render them, also while the map changes."""
+
+    @abstractmethod
+    def render(
+        self, camera: Camera, T_world_camera: Float64, submaps: Collection[int], depth: Float32 | None = None
+    ) -> SurfaceView:
+        """Return the view of submaps.
+
+        Args:
+            camera: The camera.
+            T_world_camera: The pose (4, 4) of the camera.
+            submaps: The numbers of the submaps. Submaps that are not hidden are ignored.
+            depth: (H, W) float32, m along z, 0 = no measurement; only the surface near or in front of it is searched.
+                None = the entire surface.
+        """
+
+
 class SceneMap(ABC):
     """The map of a fuser.
 
@@ -465,19 +483,10 @@ class SceneMap(ABC):
         """
         return self.render(camera, T_world_camera)
 
-    def render_hidden(
-        self, camera: Camera, T_world_camera: Float64, submaps: Collection[int], depth: Float32 | None = None
-    ) -> SurfaceView:
-        """Return the view of hidden submaps, for the detection of loops.
+    def hidden_surfaces(self) -> SubmapSurfaces:
+        """Return the surfaces of the hidden submaps, for the detection of loops.
 
-        Maps of fusers with `has_submaps` implement it.
-
-        Args:
-            camera: The camera.
-            T_world_camera: The pose (4, 4) of the camera.
-            submaps: The numbers of the submaps. Submaps that do not exist are ignored.
-            depth: (H, W) float32, m along z, 0 = no measurement; only the surface near or in front of it is searched.
-                None = the entire surface.
+        Later changes of the map do not affect them. Maps of fusers with `has_submaps` implement it.
         """
         raise NotImplementedError(f"{type(self).__name__} has no submaps")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View, check_label_space
 from framework.errors import DataError
-from framework.interfaces import Gravity, MapStatistics, SubmapChange
+from framework.interfaces import Gravity, MapStatistics, SubmapChange, SubmapSurfaces
 from framework.mapping.instances.association import Association, agreed_classes
 from framework.mapping.instances.association_kernels import look_up_instances
 from framework.mapping.instances.instance_list import Confirmation, InstanceClass, InstanceTableMap, ListedInstances
@@ -138,7 +138,6 @@ class InstanceMap(InstanceTableMap):
         for k in instance_ids:
             self.table.remove(k)
         self.labels.remove_instances(instance_ids)
-        self.submaps.discard_rendered()
 
     def add_class(self, name: str) -> None:
         """Add a class to a map with classes. The class distributions of the instances do not change.
@@ -263,10 +262,8 @@ class InstanceMap(InstanceTableMap):
         volume = self.volume
         return render(volume.voxels, self.labels.evidence, volume.sensor, camera, T_world_camera)
 
-    def render_hidden(
-        self, camera: Camera, T_world_camera: Float64, submaps: Collection[int], depth: Float32 | None = None
-    ) -> SurfaceView:
-        return self.submaps.render(camera, T_world_camera, submaps, depth)
+    def hidden_surfaces(self) -> SubmapSurfaces:
+        return self.submaps.surfaces()
 
     def instance_at(self, u: int, v: int, camera: Camera, T_world_camera: Float64) -> int:
         part, u, v = tiles_around(camera, u, v)

@@ -96,6 +96,11 @@ class Optimized(NamedTuple):
     edges: list[GraphEdge]  # without those that the line process has removed
 
 
+def load_optimizer() -> None:
+    """Import Open3D, which takes a second."""
+    import open3d  # noqa: F401
+
+
 def optimize(poses: Sequence[Float64], edges: Sequence[GraphEdge]) -> Optimized:
     """Return the optimized graph.
 
@@ -103,7 +108,7 @@ def optimize(poses: Sequence[Float64], edges: Sequence[GraphEdge]) -> Optimized:
         poses: The poses (4, 4) of the anchors. The first one is fixed.
         edges: The edges between them, which connect all anchors.
     """
-    import open3d as o3d  # takes half a second to load
+    import open3d as o3d  # slow; see load_optimizer
 
     registration = o3d.pipelines.registration
     graph = registration.PoseGraph()

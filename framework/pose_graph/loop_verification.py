@@ -18,7 +18,7 @@ import numpy as np
 from framework.config.validation import check_bounds
 from framework.data import Float64, Frame, SurfaceView
 from framework.geometry import exp_se3, nearest_rotation, pose_distance
-from framework.interfaces import SceneMap
+from framework.interfaces import SubmapSurfaces
 from framework.tracking.alignment import NormalEquations, Weights, linearize, model_view, smoothed
 from framework.tracking.depth_scale import DepthScale
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, model_intensities
@@ -78,23 +78,25 @@ class LoopVerification:
         )
 
 
-def match_hidden(frame: Frame, T_world_guess: Float64, scene: SceneMap, submaps: Collection[int]) -> SubmapMatch | None:
+def match_hidden(
+    frame: Frame, T_world_guess: Float64, surfaces: SubmapSurfaces, submaps: Collection[int]
+) -> SubmapMatch | None:
     """Return the alignment of a frame to hidden submaps, or None if hardly any of them is in view.
 
     Args:
         frame: The frame.
         T_world_guess: The pose (4, 4) where the alignment starts, in the world frame of the submaps.
-        scene: The map.
+        surfaces: The surfaces of the hidden submaps.
         submaps: The numbers of the submaps.
     """
     levels = pyramid(frame)
     if not levels[0].depth.any():
         return None
-    first = _align(levels, scene.render_hidden(levels[0].camera, T_world_guess, submaps), finest=1)
+    first = _align(levels, surfaces.render(levels[0].camera, T_world_guess, submaps), finest=1)
     if first.equations.visible < MIN_OVERLAP * np.count_nonzero(levels[1].depth):
         return None
     T_world_first = first.view.T_world_camera @ first.T_view_camera
-    second = _align(levels, scene.render_hidden(levels[0].camera, T_world_first, submaps, levels[0].depth))
+    second = _align(levels, surfaces.render(levels[0].camera, T_world_first, submaps, levels[0].depth))
     T_world_camera = T_world_first @ second.T_view_camera
     T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])
     equations = second.equations
@@ -113,13 +115,15 @@ def match_hidden(frame: Frame, T_world_guess: Float64, scene: SceneMap, submaps:
     )
 
 
-def overlaps(frame: Frame, T_world_camera: Float64, scene: SceneMap, submaps: Collection[int]) -> dict[int, float]:
+def overlaps(
+    frame: Frame, T_world_camera: Float64, surfaces: SubmapSurfaces, submaps: Collection[int]
+) -> dict[int, float]:
     """Return the fraction of the frame's points that agree with the surface of each hidden submap, by number."""
     level = pyramid(frame)[-1]
     points, close = level.depth > 0, np.maximum(WEIGHTS.close_distance, 3 * level.sensor.sigma(level.depth))
     found = {}
     for number in sorted(submaps):
-        mapped = scene.render_hidden(level.camera, T_world_camera, [number], level.depth).depth
+        mapped = surfaces.render(level.camera, T_world_camera, [number], level.depth).depth
         agreeing = points & (mapped > 0) & (np.abs(mapped - level.depth) < close)
         found[number] = float(np.count_nonzero(agreeing) / np.count_nonzero(points))
     return found

@@ -30,7 +30,7 @@ from framework.data import (
 from framework.detection.masks.binary_masks import tight_boxes
 from framework.errors import DataError
 from framework.geometry import exp_se3, inverse
-from framework.interfaces import MapStatistics, SceneMap
+from framework.interfaces import MapStatistics, SceneMap, SubmapSurfaces
 from framework.refinement.lifting import lift
 
 CLASSES = ("chair", "couch")
@@ -153,10 +153,8 @@ class RoomMap(SceneMap):
         normals_world = (normals @ self.T_world_room[:3, :3].T).astype(np.float32)
         return View(camera, T_world_camera, depth, normals_world, color, ids, ids - 1)
 
-    def render_hidden(
-        self, camera: Camera, T_world_camera: Float64, submaps: Collection[int], depth: Float32 | None = None
-    ) -> View:
-        return self.render(camera, T_world_camera)
+    def hidden_surfaces(self) -> SubmapSurfaces:
+        return RoomSurfaces(self)
 
     def mesh(self) -> InstanceMesh:
         return InstanceMesh(
@@ -177,3 +175,15 @@ class RoomMap(SceneMap):
     @classmethod
     def load(cls, path: Path | str) -> RoomMap:
         raise DataError("RoomMap.load: expected a map of a fuser, got the map of the contract tests")
+
+
+@dataclass(frozen=True)
+class RoomSurfaces(SubmapSurfaces):
+    """Submaps that all contain the room."""
+
+    room: RoomMap
+
+    def render(
+        self, camera: Camera, T_world_camera: Float64, submaps: Collection[int], depth: Float32 | None = None
+    ) -> View:
+        return self.room.render(camera, T_world_camera)

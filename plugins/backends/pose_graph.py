@@ -14,10 +14,10 @@ import numpy as np
 from framework.config.validation import check_bounds
 from framework.data import Float64, Frame, Pose
 from framework.geometry import inverse, rotation_angle
-from framework.interfaces import BackEnd, DepthCalibrator, SceneMap, SubmapChange
+from framework.interfaces import BackEnd, DepthCalibrator, SceneMap, SubmapChange, SubmapSurfaces
 from framework.pose_graph.delayed_result import DelayedResult
 from framework.pose_graph.depth_calibration import DepthCalibration
-from framework.pose_graph.graph_optimization import AnchorGraph, GraphEdge, Optimized, optimize
+from framework.pose_graph.graph_optimization import AnchorGraph, GraphEdge, Optimized, load_optimizer, optimize
 from framework.pose_graph.loop_detection import Drift, Extracted, Guess, Loop, LoopDetection, QueryView, Reach
 from framework.pose_graph.loop_verification import LoopVerification, match_hidden, overlaps
 from framework.pose_graph.submap_anchors import DepthSamples, SubmapAnchors, view_separation
@@ -32,6 +32,13 @@ MIN_OVERLAP = 0.05  # minimum fraction of a frame's points on a submap that it s
 EXTENT = 3.0  # m, distance of the surface from the anchor at which motions are compared with min_motion
 EXTRACTION_DELAY = 3  # number of frames between a view and the use of its features, which a thread extracts
 SAME_GUESS = Drift(0.1, 0.05)  # m and rad, maximum difference of two guesses of which the first one is enough
+
+
+class Verification(NamedTuple):
+    """A verification of the guesses of a view in progress."""
+
+    view: QueryView
+    result: DelayedResult[Loop | None]
 
 
 class Correction(NamedTuple):
@@ -58,7 +65,8 @@ class PoseGraph(BackEnd):
     verification: LoopVerification = field(default_factory=LoopVerification)
     calibration: DepthCalibration = field(default_factory=DepthCalibration)
     min_motion: float = 0.01  # minimum motion of a submap's surface, m, in [0, 1]; smaller motions are omitted
-    correction_delay: int = 10  # number of frames between a detected loop and the correction, in [0, 1000]
+    # number of frames until the results of verification and of optimization in other threads are used, in [0, 1000]
+    correction_delay: int = 10
 
     def __post_init__(self) -> None:
         check_bounds(self, min_motion=(0.0, 1.0), correction_delay=(0, 1000))
@@ -68,7 +76,8 @@ class PoseGraph(BackEnd):
         self._views = 0  # number of views
         self._T_world_view: Float64 | None = None  # tracked pose of the last view
         self._extracted: DelayedResult[Extracted] | None = None
-        self._guesses: deque[Guess] = deque()  # one per frame is verified
+        self._guesses: deque[Sequence[Guess]] = deque()  # of one view each, best first
+        self._verification: Verification | None = None
         self._correction: Correction | None = None
 
     @property
@@ -80,12 +89,16 @@ class PoseGraph(BackEnd):
 
     def update(self, frame: Frame, pose: Pose, scene: SceneMap) -> SubmapChange | None:
         self._frames += 1
+        if self._frames == 1:
+            DelayedResult(load_optimizer, due=0)  # would slow down the frames after the first loop
         unchanged = corrected = SubmapChange(submap=self.anchors.current)
         if self._correction is not None and self._correction.result.due <= self._frames:
             corrected = self._corrected(self._correction)
         if self._extracted is not None and self._extracted.due <= self._frames:
             self._collect(self._extracted.get())
-        if self._guesses and self._correction is None:
+        if self._verification is not None and self._verification.result.due <= self._frames:
+            self._collect_loop(self._verification)
+        if self._guesses and self._verification is None and self._correction is None:
             self._verify(self._guesses.popleft(), scene)
         T_world_camera = corrected.moved(self.anchors.current, pose.T_world_camera)
         self._divide(frame, T_world_camera)
@@ -96,8 +109,11 @@ class PoseGraph(BackEnd):
     def finish(self, scene: SceneMap) -> SubmapChange | None:
         if self._extracted is not None:
             self._collect(self._extracted.get())
-        while self._guesses and self._correction is None:
-            self._verify(self._guesses.popleft(), scene)
+        while self._correction is None and (self._verification is not None or self._guesses):
+            if self._verification is None:
+                self._verify(self._guesses.popleft(), scene)
+            else:
+                self._collect_loop(self._verification)
         return None if self._correction is None else self._corrected(self._correction)
 
     def _divide(self, frame: Frame, T_world_camera: Float64) -> None:
@@ -153,45 +169,64 @@ class PoseGraph(BackEnd):
             for reach in view.reaches[:1]
             if reach.coverage >= TRACKED_COVERAGE
         ]
+        guesses: list[Guess] = []
         for guess in (*extracted.guesses, *tracked):
-            others = [one.T_world_camera for one in self._guesses if one.view is view]
-            if not any(SAME_GUESS.allows(guess.T_world_camera, T_world_other) for T_world_other in others):
-                self._guesses.append(guess)
+            if not any(SAME_GUESS.allows(guess.T_world_camera, one.T_world_camera) for one in guesses):
+                guesses.append(guess)
+        if guesses:
+            self._guesses.append(guesses)
 
-    def _verify(self, guess: Guess, scene: SceneMap) -> None:
-        """Verify a guess, and start a correction if another loop agrees with it."""
-        submap, view = guess.reach.submap, guess.view
-        if not submap.hidden:
-            return
-        paths = self._graph.path_lengths(submap.number)
-        reached = (reach.submap for reach in view.reaches)
-        place = [one.number for one in reached if one.hidden and paths[one.number] <= SAME_PLACE]
-        match = match_hidden(view.frame, guess.T_world_camera, scene, place)
+    def _verify(self, guesses: Sequence[Guess], scene: SceneMap) -> None:
+        """Start the verification of the guesses of a view."""
+        view, placed = guesses[0].view, []
+        for guess in guesses:
+            if guess.reach.submap.hidden:
+                paths = self._graph.path_lengths(guess.reach.submap.number)
+                reached = (reach.submap for reach in view.reaches)
+                placed.append(
+                    (guess, [one.number for one in reached if one.hidden and paths[one.number] <= SAME_PLACE])
+                )
+        call = partial(self._first_loop, placed, scene.hidden_surfaces())
+        self._verification = Verification(view, DelayedResult(call, self._frames + self.correction_delay))
+
+    def _first_loop(self, placed: Sequence[tuple[Guess, Sequence[int]]], surfaces: SubmapSurfaces) -> Loop | None:
+        """Return the loop of the first correct guess, each with the submaps at the same place; None = no loop."""
+        return next((loop for one in placed if (loop := self._loop(*one, surfaces)) is not None), None)
+
+    def _loop(self, guess: Guess, place: Sequence[int], surfaces: SubmapSurfaces) -> Loop | None:
+        """Return the loop of a correct guess, or None. Hidden submaps do not change until it is collected."""
+        view = guess.view
+        match = match_hidden(view.frame, guess.T_world_camera, surfaces, place)
         if match is None or not self.verification.accepts(match):
-            return
+            return None
         if not guess.reach.drift.allows(match.T_world_camera, view.T_world_camera):
-            return
+            return None
         near = REACH * self.anchors.hide_distance
         shown = {
             number: overlap
-            for number, overlap in overlaps(view.frame, match.T_world_camera, scene, place).items()
+            for number, overlap in overlaps(view.frame, match.T_world_camera, surfaces, place).items()
             if overlap >= MIN_OVERLAP and self.anchors.submaps[number].distance(match.T_world_camera) <= near
         }
         if not shown:
-            return
+            return None
         best = self.anchors.submaps[max(shown, key=lambda number: shown[number])]
         T_best_camera = best.local(match.T_world_camera)
         earlier = best.nearest_view(T_best_camera)
         T_best_anchor = T_best_camera @ inverse(view.T_anchor_camera)
-        loop = Loop(
+        return Loop(
             view.frame.index, best.frames[earlier], inverse(best.views[earlier]) @ T_best_camera,
             GraphEdge(best.number, view.submap.number, T_best_anchor, is_loop=True),
             frozenset(shown), view.number, guess.reach.path,
         )  # fmt: skip
-        self._guesses = deque(one for one in self._guesses if one.view is not view)
-        loops = self.detection.agreeing(loop, self.anchors.submaps, view.T_world_camera)
-        if loops:
-            self._optimize(loops)
+
+    def _collect_loop(self, verification: Verification) -> None:
+        """Start a correction if another loop agrees with the verified one."""
+        self._verification = None
+        loop = verification.result.get()
+        if loop is not None:
+            loops = self.detection.agreeing(loop, self.anchors.submaps, verification.view.T_world_camera)
+            if loops:
+                self._optimize(loops)
 
     def _optimize(self, loops: Sequence[Loop]) -> None:
         """Start the optimization of the graph with additional loops."""

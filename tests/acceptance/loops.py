@@ -76,7 +76,10 @@ class SeenFrame:
         T_world_nearest = submaps[nearest.submap].T_world_anchor @ nearest.T_anchor_camera
         T_world_camera = T_world_nearest @ inverse(nearest.T_true) @ self.T_true
         seeing = {one.submap for one in frames if self.seen_in([one]) > 0}
-        depth, mapped = self.samples.depth, scene.render_hidden(self.samples.camera, T_world_camera, seeing).depth
+        depth, mapped = (
+            self.samples.depth,
+            scene.hidden_surfaces().render(self.samples.camera, T_world_camera, seeing).depth,
+        )
         same = (mapped > 0) & (depth > 0) & (np.abs(mapped - depth) < SAME_SURFACE)
         return float(same.sum() / max(np.count_nonzero(depth), 1))
 

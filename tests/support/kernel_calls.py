@@ -113,8 +113,8 @@ def change_submaps(fuser: MapFuser, frame: Frame) -> None:
     """Move, hide, render and show the submaps of a map."""
     motion = exp_se3(np.full(6, 0.01))
     fuser.correct(SubmapChange({0: motion}, hidden=frozenset({0}), submap=1))
-    fuser.scene.render_hidden(frame.camera, np.eye(4), {0}, frame.depth)
-    fuser.scene.render_hidden(frame.camera, np.eye(4), {0})
+    fuser.scene.hidden_surfaces().render(frame.camera, np.eye(4), {0}, frame.depth)
+    fuser.scene.hidden_surfaces().render(frame.camera, np.eye(4), {0})
     fuser.scene.mesh()
     nothing = Detections.none(frame.depth.shape, fuser.scene.classes)
     fuser.fuse(frame, Pose(np.eye(4)), lift(nothing, frame, Pose(np.eye(4))))

@@ -12,7 +12,7 @@ from framework.data import Int32
 from framework.mapping.instances.association import OverlapRule, Overlaps, match_one_to_one
 from framework.mapping.submaps.fusion_kernels import count_shared, fuse_voxels
 from framework.mapping.submaps.layer import Layer
-from framework.mapping.voxels.voxel_grid import WEIGHT_ONE
+from framework.mapping.voxels.voxel_grid import WEIGHT_ONE, VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import find_solid_blocks
 
 
@@ -27,10 +27,16 @@ def fuse(layer: Layer, other: Layer, max_weight: float) -> Int32:
     Raises:
         MapFullError: If the layer needs too many blocks. It is then unchanged, except for new empty blocks.
     """
-    blocks = layer.voxels.allocate(other.voxels.grid.block_coords[: other.voxels.block_count])
-    fuse_voxels(layer.voxels.grid, blocks, other.voxels.grid, WEIGHT_ONE * max_weight)
+    blocks = fuse_grids(layer.voxels, other.voxels, max_weight)
     layer.labels.add(blocks, other.labels)
-    find_solid_blocks(layer.voxels.grid, layer.voxels.block_count)
+    return blocks
+
+
+def fuse_grids(voxels: VoxelGrid, other: VoxelGrid, max_weight: float) -> Int32:
+    """Add the voxels of another grid, without labels. See `fuse`."""
+    blocks = voxels.allocate(other.grid.block_coords[: other.block_count])
+    fuse_voxels(voxels.grid, blocks, other.grid, WEIGHT_ONE * max_weight)
+    find_solid_blocks(voxels.grid, voxels.block_count)
     return blocks
 
 

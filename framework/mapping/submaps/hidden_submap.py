@@ -9,8 +9,9 @@ import numpy as np
 from framework.data import Float64, Int32
 from framework.mapping.labels.packed_evidence import PackedEvidence, pack_evidence
 from framework.mapping.submaps.layer import Layer
-from framework.mapping.submaps.resampling import resampled
+from framework.mapping.submaps.resampling import resampled, resampled_voxels
 from framework.mapping.voxels.packed_voxels import PackedVoxels, pack_voxels, unpack_voxels
+from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import find_solid_blocks
 
 
@@ -36,13 +37,24 @@ class HiddenSubmap(NamedTuple):
 
     def layer(self, like: Layer) -> Layer:
         """Return the layer, with the parameters of another layer."""
-        layer = like.like(max(len(self.block_coords), 1))
-        layer.voxels.allocate(self.block_coords)
-        layer.voxels.grid.label_row[: len(self.label_row)] = self.label_row
-        unpack_voxels(self.voxels, layer.voxels)
-        find_solid_blocks(layer.voxels.grid, layer.voxels.block_count)
+        voxels = self._stored_voxels(like.voxels)
+        layer = Layer(voxels, like.labels.like(voxels))
+        voxels.grid.label_row[: len(self.label_row)] = self.label_row
         layer.labels.unpack(self.evidence)
         return layer if self.T_world_blocks is None else resampled(layer, self.T_world_blocks)
+
+    def surface(self, like: VoxelGrid) -> VoxelGrid:
+        """Return the voxels without labels, with the parameters of another grid."""
+        voxels = self._stored_voxels(like)
+        return voxels if self.T_world_blocks is None else resampled_voxels(voxels, self.T_world_blocks)[0]
+
+    def _stored_voxels(self, like: VoxelGrid) -> VoxelGrid:
+        """Return the voxels before the motion, without labels."""
+        voxels = like.like(max(len(self.block_coords), 1))
+        voxels.allocate(self.block_coords)
+        unpack_voxels(self.voxels, voxels)
+        find_solid_blocks(voxels.grid, voxels.block_count)
+        return voxels
 
     def moved(self, T_new_old: Float64) -> HiddenSubmap:
         """Return the submap after a motion T_new_old (4, 4)."""

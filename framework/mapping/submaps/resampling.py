@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from framework.data import Float64
+from framework.data import Float64, Int32
 from framework.geometry import inverse
 from framework.mapping.submaps.layer import Layer
 from framework.mapping.submaps.resampling_kernels import MAX_COVERED, covered_blocks, resample
 from framework.mapping.voxels.allocation_kernels import unpack
 from framework.mapping.voxels.meshing import MAX_JUMP
+from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, NO_KEY, find_solid_blocks
 
 
@@ -22,25 +23,34 @@ def resampled(layer: Layer, T_new_old: Float64) -> Layer:
 
     The order of its blocks depends on their coordinates alone.
     """
-    grid, count = layer.voxels.grid, layer.voxels.block_count
+    voxels, nearest = resampled_voxels(layer.voxels, T_new_old)
+    labels, count = layer.labels.like(voxels), layer.voxels.block_count
+    labeled = layer.labels.voxels_of(np.arange(count, dtype=np.int32)).ravel()
+    labels.gather(layer.labels, np.where(nearest >= 0, labeled[nearest], np.int32(-1)))
+    return Layer(voxels, labels)
+
+
+def resampled_voxels(voxels: VoxelGrid, T_new_old: Float64) -> tuple[VoxelGrid, Int32]:
+    """Return voxels without labels after a motion, and the nearest old voxel (B, 512) of each voxel, -1 = none.
+
+    The number of an old voxel is 512 times its block plus its position in the block. See `resampled`.
+    """
+    grid, count = voxels.grid, voxels.block_count
     voxel_size = float(grid.voxel_size)
     keys = np.empty((count, MAX_COVERED), np.int64)
     covered_blocks(grid.block_coords[:count], *_in_voxels(T_new_old, voxel_size), keys)
     covered = np.unique(keys[keys != NO_KEY])
     coords = np.empty((len(covered), 3), np.int32)
     unpack(covered, coords)
-    candidates = layer.voxels.like(max(len(covered), 1))
+    candidates = voxels.like(max(len(covered), 1))
     candidates.allocate(coords)
     nearest = np.empty((len(covered), BLOCK_VOXELS), np.int32)
     most_jump = np.int32(MAX_JUMP * voxel_size / float(grid.tsdf_unit))
     resample(grid, *_in_voxels(inverse(T_new_old), voxel_size), candidates.grid, most_jump, nearest)
     blocks = np.flatnonzero((nearest >= 0).any(axis=1)).astype(np.int32)
-    voxels = candidates.part(blocks)
-    find_solid_blocks(voxels.grid, len(blocks))
-    labels, nearest = layer.labels.like(voxels), nearest[blocks]
-    labeled = layer.labels.voxels_of(np.arange(count, dtype=np.int32)).ravel()
-    labels.gather(layer.labels, np.where(nearest >= 0, labeled[nearest], np.int32(-1)))
-    return Layer(voxels, labels)
+    moved = candidates.part(blocks)
+    find_solid_blocks(moved.grid, len(blocks))
+    return moved, nearest[blocks]
 
 
 def _in_voxels(T: Float64, voxel_size: float) -> tuple[Float64, Float64]:

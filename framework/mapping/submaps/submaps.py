@@ -11,14 +11,14 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from framework.data import Camera, Float32, Float64, Int32, SurfaceView
+from framework.data import Float64, Int32
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.labels.evidence_rows import EvidenceRows
 from framework.mapping.submaps.fusion import fuse, shared_instances
 from framework.mapping.submaps.hidden_submap import HiddenSubmap
+from framework.mapping.submaps.hidden_surfaces import HiddenSurfaces
 from framework.mapping.submaps.layer import Layer
 from framework.mapping.submaps.resampling import resampled
-from framework.mapping.voxels.raycasting import render_surface
 from framework.mapping.voxels.tsdf_volume import TsdfVolume
 from framework.mapping.voxels.voxel_grid import grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, OUTDATED
@@ -38,8 +38,7 @@ class Submaps:
         self.hidden: dict[int, HiddenSubmap] = {}
         self._numbers = np.zeros(0, np.int32)  # (B,) submap of each block of the volume
         self._merged: dict[int, int] = {}  # remaining instance by instance merged while submaps were hidden
-        self._layers: dict[int, Layer] = {}  # the hidden submaps rendered last
-        self._rendered: tuple[tuple[int, ...], Layer] | None = None  # their numbers and their fusion
+        self._surfaces: HiddenSurfaces | None = None  # of the hidden submaps, when they were last used
 
     @property
     def byte_count(self) -> int:
@@ -61,21 +60,15 @@ class Submaps:
         """Record that instance `dropped` was merged into `kept`, for the evidence in hidden submaps."""
         if self.hidden:
             self._merged[dropped] = kept
-            self.discard_rendered()
-
-    def discard_rendered(self) -> None:
-        """Discard the rendered submaps after a change to hidden submaps or to instances."""
-        self._layers, self._rendered = {}, None
 
     def renew_colors(self) -> None:
         """Mark all colors of hidden submaps, so that the next observation of each voxel replaces its color."""
-        for hidden in self.hidden.values():
-            hidden.voxels.color[:] |= OUTDATED
-        self.discard_rendered()
+        for number, hidden in self.hidden.items():
+            voxels = hidden.voxels._replace(color=hidden.voxels.color | OUTDATED)
+            self.hidden[number] = hidden._replace(voxels=voxels)
 
     def move(self, motions: Mapping[int, Float64]) -> None:
         """Move submaps by T_new_old (4, 4), by number."""
-        self.discard_rendered()
         for number in sorted(motions.keys() & self.hidden.keys()):
             self.hidden[number] = self.hidden[number].moved(motions[number])
         moved = {number: self._blocks_of(number) for number in sorted(motions)}
@@ -95,11 +88,8 @@ class Submaps:
         """
         if number not in self.hidden:
             return []
-        layer = self._layers.get(number) or self._opened(number)
-        pairs = self.add(number, layer, min_overlap, min_voxels)
+        pairs = self.add(number, self._opened(number), min_overlap, min_voxels)
         del self.hidden[number]
-        self._layers.pop(number, None)
-        self._rendered = None
         return pairs
 
     def add(self, number: int, layer: Layer, min_overlap: float, min_voxels: int) -> list[tuple[int, int]]:
@@ -125,21 +115,15 @@ class Submaps:
                 self.hidden[number] = HiddenSubmap.of(part)
         if any(map(len, blocks.values())):
             self._remove(np.concatenate([*blocks.values()]))
-            self.discard_rendered()
 
-    def render(
-        self, camera: Camera, T_world_camera: Float64, numbers: Collection[int], depth: Float32 | None
-    ) -> SurfaceView:
-        """Return the view of hidden submaps.
+    def surfaces(self) -> HiddenSurfaces:
+        """Return the surfaces of the hidden submaps.
 
-        See `SceneMap.render_hidden`.
+        See `SceneMap.hidden_surfaces`.
         """
-        chosen = tuple(sorted(self.hidden.keys() & set(numbers)))
-        if self._rendered is None or self._rendered[0] != chosen:
-            self._layers = {number: self._layers.get(number) or self._opened(number) for number in chosen}
-            self._rendered = chosen, self._joined()
-        voxels, sensor = self._rendered[1].voxels, self.volume.sensor
-        return render_surface(voxels, sensor, camera, T_world_camera, depth)
+        if self._surfaces is None or not self._surfaces.are_of(self.hidden):
+            self._surfaces = HiddenSurfaces(self.hidden, self.visible.voxels, self.volume.sensor, self._surfaces)
+        return self._surfaces
 
     def fuse_into(self, layer: Layer) -> None:
         """Add all submaps to an empty layer."""
@@ -150,13 +134,6 @@ class Submaps:
     @property
     def _max_weight(self) -> float:
         return float(self.volume.sensor.max_weight)
-
-    def _joined(self) -> Layer:
-        """Return the fusion of the rendered submaps."""
-        joined = self.visible.like(max(sum(layer.voxels.block_count for layer in self._layers.values()), 1))
-        for layer in self._layers.values():
-            fuse(joined, layer, self._max_weight)
-        return joined
 
     def _opened(self, number: int) -> Layer:
         """Return a hidden submap, with the instances that were merged or removed since it was hidden."""

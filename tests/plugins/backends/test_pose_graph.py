@@ -66,7 +66,7 @@ def changes(back_end: PoseGraph, drift: np.ndarray = DRIFT) -> list[tuple[int, S
 
 
 def test_backend_returning_camera_corrects_drift() -> None:
-    back_end = PoseGraph()
+    back_end = PoseGraph(correction_delay=1)
     found = changes(back_end)
     corrections = [(frame, change) for frame, change in found if change.motions]
     assert len(corrections) == 1
@@ -76,7 +76,7 @@ def test_backend_returning_camera_corrects_drift() -> None:
     T_world_camera = T_new_old @ DRIFT @ inside(0)
     assert pose_distance(T_world_camera, inside(0)) < 0.02
     assert 0 not in change.motions
-    assert frame == back_end.loops[-1].frame + pose_graph.EXTRACTION_DELAY + back_end.correction_delay
+    assert frame == back_end.loops[-1].frame + pose_graph.EXTRACTION_DELAY + 2 * back_end.correction_delay
 
 
 def test_backend_in_one_room_changes_nothing() -> None:

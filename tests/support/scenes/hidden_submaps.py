@@ -1,4 +1,4 @@
-"""Map whose hidden submaps are an exact scene."""
+"""Hidden submaps that are exact scenes."""
 
 from __future__ import annotations
 
@@ -9,18 +9,22 @@ import numpy as np
 
 from framework.data import Camera, Frame, SurfaceView
 from framework.geometry import inverse
+from framework.interfaces import SubmapSurfaces
 from framework.tracking.pyramid import normals_of
 
 FrameAt = Callable[[np.ndarray, Camera], Frame]  # renders a frame from a pose (4, 4) in the scene
 
 
 @dataclass
-class HiddenSubmaps:
-    """Map whose hidden submaps show one scene each."""
+class HiddenSubmaps(SubmapSurfaces):
+    """Hidden submaps that show one scene each."""
 
     scenes: dict[int, tuple[FrameAt, np.ndarray]]  # each scene and T_world_scene (4, 4), by submap
 
-    def render_hidden(
+    def hidden_surfaces(self) -> HiddenSubmaps:
+        return self
+
+    def render(
         self, camera: Camera, T_world_camera: np.ndarray, submaps: Collection[int], depth: np.ndarray | None = None
     ) -> SurfaceView:
         """Return the nearest surface of the submaps."""

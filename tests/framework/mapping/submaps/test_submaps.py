@@ -91,9 +91,9 @@ def test_hidden_submap_is_rendered_for_loops() -> None:
     scene = scene_of(fuser)
     before = scene.render_visible(CAMERA, POSES[3])
     fuser.correct(SubmapChange(hidden=frozenset({0}), submap=1))
-    after = scene.render_hidden(CAMERA, POSES[3], {0, 7})
+    after = scene.hidden_surfaces().render(CAMERA, POSES[3], {0, 7})
     np.testing.assert_array_equal(after.depth, before.depth)
-    assert not scene.render_hidden(CAMERA, POSES[3], {7}).depth.any()
+    assert not scene.hidden_surfaces().render(CAMERA, POSES[3], {7}).depth.any()
 
 
 def test_shown_submap_equals_joint_integration() -> None:
