@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from framework.tables.statistics import bootstrap_interval
-from tests.acceptance import changing_scenes, long_run, recording_checks
+from tests.acceptance import changing_scenes, depth_calibration, long_run, recording_checks
 from tests.acceptance.buildings import files_that_depend_on_threads, five_rooms, second_round
 from tests.acceptance.large_map import measure_large_map
 from tests.acceptance.loops import counted_loops
@@ -235,6 +235,18 @@ def building_oracle() -> Measured:
 def building_oracle_surface() -> Measured:
     value = 1e3 * max(abs(one.corrected.distance - one.oracle.distance) for one in five_rooms())
     return value, value <= 2
+
+
+@measurement("ATE with / without back end <= 0.8, freiburg1_rpy, motion capture", *PIPELINE)
+def calibrated_freiburg1_ate() -> Measured:
+    value = depth_calibration.of_freiburg1().ratio
+    return value, value <= 0.8
+
+
+@measurement("distance from structure from motion with / without back end <= 0.5, redkitchen", *PIPELINE)
+def calibrated_kitchen_distance() -> Measured:
+    value = depth_calibration.of_kitchen().ratio
+    return value, value <= 0.5
 
 
 @measurement("0 false loops, 20 buildings with identical rooms, drift of 1 to 2%", *PIPELINE)
