@@ -43,9 +43,11 @@ from framework.files.search_paths import usable_path
 from framework.geometry import camera_of, pose_of
 from framework.interfaces import (
     BackEnd,
+    ClosedLoop,
     ClusterRefiner,
     Detector,
     FrameMasking,
+    GraphAnchor,
     Gravity,
     LiveVideo,
     MapFuser,
@@ -55,6 +57,7 @@ from framework.interfaces import (
     SceneMap,
     StageTimer,
     SubmapChange,
+    SubmapGraph,
     Viewer,
     untimed,
 )
@@ -79,6 +82,7 @@ from framework.vocabulary.label_spaces import ClassNames
 __all__ = [
     "BackEnd",
     "Camera",
+    "ClosedLoop",
     "ClusterRefiner",
     "ConfigError",
     "DataError",
@@ -88,6 +92,7 @@ __all__ = [
     "FrameError",
     "FrameMasking",
     "FrameResult",
+    "GraphAnchor",
     "Gravity",
     "Instance",
     "InstanceMapError",
@@ -109,6 +114,7 @@ __all__ = [
     "SensorKind",
     "StageTimer",
     "SubmapChange",
+    "SubmapGraph",
     "View",
     "Viewer",
     "configure_process",
