@@ -45,6 +45,7 @@ from framework.interfaces import (
     BackEnd,
     ClosedLoop,
     ClusterRefiner,
+    DepthCalibrator,
     Detector,
     FrameMasking,
     GraphAnchor,
@@ -74,6 +75,7 @@ from framework.runtime.cpu_budget import limited_threads
 from framework.runtime.forked_process import check_not_forked
 from framework.runtime.process_settings import Settings, configure_process
 from framework.runtime.run_log import Journal
+from framework.sensors.depth_distortion import DepthDistortion
 from framework.sensors.noise_models import SensorKind
 from framework.tables.experiment_tables import write_tables
 from framework.tracking.keyframes import read_keyframes
@@ -86,6 +88,8 @@ __all__ = [
     "ClusterRefiner",
     "ConfigError",
     "DataError",
+    "DepthCalibrator",
+    "DepthDistortion",
     "Detections",
     "Detector",
     "Frame",
