@@ -43,9 +43,12 @@ from framework.files.search_paths import usable_path
 from framework.geometry import camera_of, pose_of
 from framework.interfaces import (
     BackEnd,
+    ClosedLoop,
     ClusterRefiner,
+    DepthCalibrator,
     Detector,
     FrameMasking,
+    GraphAnchor,
     Gravity,
     LiveVideo,
     MapFuser,
@@ -55,22 +58,24 @@ from framework.interfaces import (
     SceneMap,
     StageTimer,
     SubmapChange,
+    SubmapGraph,
     Viewer,
     untimed,
 )
 from framework.live_view.guarded_viewer import watched_run
 from framework.pipeline import Pipeline, watched
+from framework.pose_graph.depth_distortion_file import read_depth_distortion
 from framework.queries.map_queries import Map
 from framework.queries.text_search import Match, QueryResult, TextQuery, search
 from framework.registry import build, text_kind
 from framework.runs.data_frame import load_runs
-from framework.runs.depth_distortion_file import stored_depth_distortion
 from framework.runs.run_directory import write_run
 from framework.runs.stored_runs import DEPTH_DISTORTION, KEYFRAMES, MAP, REPORT
 from framework.runtime.cpu_budget import limited_threads
 from framework.runtime.forked_process import check_not_forked
 from framework.runtime.process_settings import Settings, configure_process
 from framework.runtime.run_log import Journal
+from framework.sensors.depth_distortion import DepthDistortion
 from framework.sensors.noise_models import SensorKind
 from framework.tables.experiment_tables import write_tables
 from framework.tracking.keyframes import read_keyframes
@@ -79,15 +84,19 @@ from framework.vocabulary.label_spaces import ClassNames
 __all__ = [
     "BackEnd",
     "Camera",
+    "ClosedLoop",
     "ClusterRefiner",
     "ConfigError",
     "DataError",
+    "DepthCalibrator",
+    "DepthDistortion",
     "Detections",
     "Detector",
     "Frame",
     "FrameError",
     "FrameMasking",
     "FrameResult",
+    "GraphAnchor",
     "Gravity",
     "Instance",
     "InstanceMapError",
@@ -109,6 +118,7 @@ __all__ = [
     "SensorKind",
     "StageTimer",
     "SubmapChange",
+    "SubmapGraph",
     "View",
     "Viewer",
     "configure_process",
@@ -159,13 +169,13 @@ def begin(config: DictConfig) -> Pipeline:
             fuser.resume(scene)
             backend.resume()
             classes, resumed = scene.classes, True
-        distortion = stored_depth_distortion(run)
+        distortion = read_depth_distortion(run / DEPTH_DISTORTION)
         keyframes = read_keyframes(run / KEYFRAMES)
         with errors_of(run / KEYFRAMES):
             tracker.load_keyframes(keyframes, scene)
     if config.get("depth_distortion_from") is not None:
         run = checked_path("depth_distortion_from", config.depth_distortion_from)
-        distortion = stored_depth_distortion(run)
+        distortion = read_depth_distortion(run / DEPTH_DISTORTION)
         if distortion is None:
             raise DataError(
                 f"depth_distortion_from: expected a run directory with {DEPTH_DISTORTION}, got {run} without it; name "

@@ -37,8 +37,9 @@ from framework.data import (
     SceneTruth,
     SurfaceView,
     View,
+    check_rigid,
 )
-from framework.errors import ConfigError, FrameError
+from framework.errors import ConfigError, DataError, FrameError
 from framework.sensors.depth_distortion import DepthDistortion
 from framework.sensors.noise_models import SensorKind
 
@@ -319,6 +320,55 @@ class SubmapChange:
         return T_world_a if T_new_old is None else T_new_old @ T_world_a
 
 
+@dataclass(frozen=True)
+class GraphAnchor:
+    """The anchor of a submap, a node of a pose graph."""
+
+    first_frame: int | None  # Frame.index of the first frame of the submap; None = a stored map
+    T_world_anchor: Float64  # (4, 4) after all corrections
+
+    def __post_init__(self) -> None:
+        if self.first_frame is not None and self.first_frame < 0:
+            raise DataError(f"GraphAnchor.first_frame: expected at least 0, got {self.first_frame}")
+        check_rigid("GraphAnchor.T_world_anchor", self.T_world_anchor)
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """A loop of a pose graph: a frame that observes the place of an earlier frame again."""
+
+    earlier_frame: int  # Frame.index
+    frame: int  # Frame.index
+    submaps: tuple[int, int]  # numbers of the submaps of the earlier frame and of the frame
+    path: float  # m, length of the path that the loop closes
+    correction_mm: float  # motion of the submap of the frame that the loop implied when it was closed
+    correction_deg: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.earlier_frame <= self.frame:
+            raise DataError(
+                f"ClosedLoop: expected 0 <= earlier_frame <= frame, got {self.earlier_frame} and {self.frame}"
+            )
+        for name in ("path", "correction_mm", "correction_deg"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise DataError(f"ClosedLoop.{name}: expected a finite value >= 0, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class SubmapGraph:
+    """The pose graph of a run after all corrections."""
+
+    anchors: tuple[GraphAnchor, ...]  # by number of the submap
+    odometry: tuple[tuple[int, int], ...]  # pairs of submaps that are connected by tracked motion
+    loops: tuple[ClosedLoop, ...]  # in the order in which they were closed; those that were removed later are omitted
+
+    def __post_init__(self) -> None:
+        for pair in (*self.odometry, *(loop.submaps for loop in self.loops)):
+            if not all(0 <= number < len(self.anchors) for number in pair):
+                last = len(self.anchors) - 1
+                raise DataError(f"SubmapGraph: expected edges between submaps 0 to {last}, got one between {pair}")
+
+
 class DepthCalibrator(ABC):
     """Self-calibration of depth with the first frames of a sequence, which are mapped before the run."""
 
@@ -361,6 +411,10 @@ class BackEnd:
 
     def finish(self, scene: SceneMap) -> SubmapChange | None:
         """Return the last change of the map; None = no change. Called after the last frame."""
+        return None
+
+    def graph(self) -> SubmapGraph | None:
+        """Return the pose graph, for viewers and reports; None = no graph. Called after a change and after `finish`."""
         return None
 
 
@@ -539,6 +593,17 @@ class Viewer:
 
     def skip(self, reason: str) -> None:
         """Show the reason for a skipped frame."""
+
+    def correct(self, change: SubmapChange, graph: SubmapGraph | None) -> None:
+        """Move the poses of earlier frames with their submaps.
+
+        Called after the map is changed, before `show` of the last fused frame, whose pose is corrected. Frames up to
+        this one belong to the submap of the change before, and to submap 0 before the first change.
+
+        Args:
+            change: The change of the map.
+            graph: The pose graph after the change; None = unknown.
+        """
 
     def end(self) -> None:
         """Finish showing the video. Called once after `begin`, also after an error of the run."""

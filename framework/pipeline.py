@@ -29,6 +29,7 @@ from framework.interfaces import (
     RGBDVideo,
     SceneMap,
     SubmapChange,
+    SubmapGraph,
     Viewer,
 )
 from framework.live_view.guarded_viewer import GuardedViewer, watched_run
@@ -150,7 +151,7 @@ class Pipeline:
                     self.map_all(video, journal, interruption)
             except BaseException as stop:
                 journal.stopped_by = stop
-            self.finish(journal)
+            graph = self.finish(journal)
             keyframes = self.keyframes(journal)
         if journal.stopped_by is not None:
             if journal.frames_in_map == 0:
@@ -164,6 +165,7 @@ class Pipeline:
             keyframes=keyframes,
             color_delay=self.color_to_depth.estimate,
             as_tracked=journal.tracked.as_tracked if changes_map(self.backend) else None,
+            graph=graph,
             depth_distortion=self.depth_distortion,
         )
 
@@ -399,14 +401,16 @@ class Pipeline:
             self.apply(change, journal)
             return corrected
 
-    def finish(self, journal: Journal) -> None:
-        """Apply the last change of the map. An error is stored in `journal.stopped_by`."""
+    def finish(self, journal: Journal) -> SubmapGraph | None:
+        """Apply the last change of the map, and return the pose graph. An error is stored in `journal.stopped_by`."""
         try:
             change = self.backend.finish(self.fuser.scene)
             if change is not None:
                 self.apply(change, journal)
+            return self.backend.graph()
         except Exception as error:
             journal.stopped_by = journal.stopped_by or error
+            return None
 
     def apply(self, change: SubmapChange, journal: Journal) -> None:
         """Change the map, and move the poses of earlier frames with it."""
@@ -416,6 +420,7 @@ class Pipeline:
         if self.T_world_color is not None:
             self.T_world_color = change.moved(journal.tracked.submap, self.T_world_color)
         journal.corrected(change, merged)
+        self.viewer.correct(change, self.backend.graph())
 
     def compare_with_map(self, frame: Frame, pose: Pose, journal: Journal) -> None:
         """Compare the depth of a frame with the map at its given pose, and record the result.

@@ -30,6 +30,7 @@ RUN_FILES = (
     "metrics.partial.json",
     "trajectory.txt",
     "trajectory_tracked.txt",
+    "pose_graph.json",
     "timings.csv",
     "instances.json",
     "mesh.ply",

@@ -19,7 +19,7 @@ import numba
 
 from framework.data import Detections, Float64, Frame, InstanceMesh, Pose
 from framework.errors import in_one_line
-from framework.interfaces import SceneMap
+from framework.interfaces import SceneMap, SubmapChange, SubmapGraph
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +38,14 @@ class FrameNote:
     timestamp: float  # s
     pose: Pose
     stage_ms: Mapping[str, float]  # stage times by name, ms
+
+
+@dataclass(frozen=True)
+class CorrectionNote:
+    """A change of the submaps after a frame, whose note is next."""
+
+    change: SubmapChange
+    graph: SubmapGraph | None  # None = unknown
 
 
 @dataclass(frozen=True)
@@ -63,11 +71,13 @@ class MapSnapshot:
 class Drawing(Protocol):
     """Receiver of updates. All methods are called from one thread."""
 
-    def draw_frames(self, notes: Sequence[FrameNote], skipped: Sequence[str], picture: FrameUpdate | None) -> None:
+    def draw_frames(
+        self, notes: Sequence[FrameNote | CorrectionNote], skipped: Sequence[str], picture: FrameUpdate | None
+    ) -> None:
         """Draw all frames since the last call.
 
         Args:
-            notes: Data of the frames.
+            notes: Data of the frames, and changes of the submaps.
             skipped: Reasons for skipped frames.
             picture: New image; None = no image.
         """
@@ -83,7 +93,7 @@ class Drawing(Protocol):
 class _Pending:
     """Data for the next drawing."""
 
-    notes: list[FrameNote] = field(default_factory=list)
+    notes: list[FrameNote | CorrectionNote] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
     picture: FrameUpdate | None = None
     snapshot: MapSnapshot | None = None
@@ -133,6 +143,12 @@ class DrawingThread:
         with self._lock:
             if not self._failed:
                 self._pending.skipped.append(reason)
+
+    def correct(self, change: SubmapChange, graph: SubmapGraph | None) -> None:
+        """Add a change of the submaps."""
+        with self._lock:
+            if not self._failed:
+                self._pending.notes.append(CorrectionNote(change, graph))
 
     def end(self) -> None:
         """Draw pending data and the final map, and close the drawing."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from framework.data import Detections, Frame, Pose
 from framework.errors import in_one_line
-from framework.interfaces import SceneMap, Viewer
+from framework.interfaces import SceneMap, SubmapChange, SubmapGraph, Viewer
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +67,11 @@ class GuardedViewer(Viewer):
         if not self._failed:
             with self._guard():
                 self._viewer.skip(reason)
+
+    def correct(self, change: SubmapChange, graph: SubmapGraph | None) -> None:
+        if not self._failed:
+            with self._guard():
+                self._viewer.correct(change, graph)
 
     def end(self) -> None:
         with self._guard():

@@ -12,9 +12,11 @@ import open3d  # noqa: F401  # required for boxes; imported early to avoid a del
 import simplejpeg
 from scipy.spatial.transform import Rotation
 
-from framework.data import Float32, Float64, Frame, InstanceMesh, Int32, Pose, UInt8
+from framework.data import Float64, Frame, InstanceMesh, Int32, Pose, UInt8
+from framework.interfaces import ClosedLoop
 from framework.live_view import rerun_layout as at
-from framework.live_view.drawing_thread import FrameNote, FrameUpdate, MapSnapshot
+from framework.live_view.drawing_thread import CorrectionNote, FrameNote, FrameUpdate, MapSnapshot
+from framework.live_view.drawn_path import DrawnPath
 from framework.live_view.instance_colors import InstanceColors, seen_instances
 from framework.live_view.mesh_regions import MeshRegions
 from framework.mapping.instances.instance_list import box_around, vertices_by_id
@@ -23,14 +25,14 @@ from framework.vocabulary.label_spaces import label_space_of
 if TYPE_CHECKING:
     import rerun as rr
 
-PATH_PIECE = 200  # maximum number of poses that are redrawn for a new pose
 MM = 1000  # depth image units per m
 UNKNOWN = 65535  # label of masks without an instance of the map
 UNKNOWN_COLOR = np.array([235, 235, 235], np.uint8)
 MASK_OPACITY = 0.5
-PATH_COLOR, LOST_COLOR = (40, 160, 255), (230, 60, 50)
+PATH_COLOR, LOST_COLOR, LOOP_COLOR = (40, 160, 255), (230, 60, 50), (255, 170, 40)
 NAME_RADIUS = 0.005  # m, radius of the point that carries an object name
 PATH_RADIUS = 0.004  # m, radius of the line of the camera path
+LOOP_RADIUS = 0.012  # m, radius of the line between the two camera positions of a loop
 FRUSTUM_M = 0.25  # m, distance of the image plane from the camera
 MIN_TURN = 0.01  # minimum change of a component of the up direction (unit vector) to rotate the scene again
 
@@ -48,8 +50,8 @@ class RerunDrawing:
         self._regions, self._colors = MeshRegions(region), InstanceColors()
         self._label_space: str | None = None  # of the map; None = not yet drawn
         self._first_s: float | None = None  # timestamp of the first frame
-        self._path: list[Float32] = []  # (3,) positions of the last path segment
-        self._pieces = 0
+        self._path = DrawnPath()
+        self._loops: tuple[ClosedLoop, ...] | None = None  # to be drawn; None = unchanged
         self._up: Float64 | None = None  # (3,) up direction, as drawn
         self._forward: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) z axis of the first camera
         self._mesh: InstanceMesh | None = None  # as last drawn, with the shown instances
@@ -60,14 +62,18 @@ class RerunDrawing:
         recording.log(at.STAGE_MS, rerun.SeriesLines(names=stages, colors=colors), static=True)
         self._name_masks()
 
-    def draw_frames(self, notes: Sequence[FrameNote], skipped: Sequence[str], picture: FrameUpdate | None) -> None:
+    def draw_frames(
+        self, notes: Sequence[FrameNote | CorrectionNote], skipped: Sequence[str], picture: FrameUpdate | None
+    ) -> None:
         for note in notes:
-            self._note(note)
-        self._draw_times(notes)
+            if isinstance(note, CorrectionNote):
+                self._correct(note)
+            else:
+                self._note(note)
+        self._draw_times([note for note in notes if isinstance(note, FrameNote)])
         for reason in skipped:
             self._recording.log(at.LOG, self._rr.TextLog(f"skipped: {reason}", level="WARN"))
-        if self._path:
-            self._draw_path()
+        self._draw_path()
         if picture is not None:
             self._set_time(picture.frame.index, picture.frame.timestamp)
             self._draw_camera(picture.frame, picture.pose)
@@ -127,25 +133,27 @@ class RerunDrawing:
         if note.pose.lost:
             reason = note.pose.reason or "no reason from the tracker"
             self._recording.log(at.LOG, self._rr.TextLog(f"lost: {reason}", level="WARN"))
-            self._end_piece()
+            self._path.interrupt()
             return
         T_world_camera = note.pose.T_world_camera
         if self._up is None:
             self._begin_world(T_world_camera)
-        self._path.append(T_world_camera[:3, 3].astype(np.float32))
-        if len(self._path) == PATH_PIECE:
-            self._end_piece()
-            self._path.append(T_world_camera[:3, 3].astype(np.float32))
+        self._path.add(note.index, T_world_camera[:3, 3])
+
+    def _correct(self, note: CorrectionNote) -> None:
+        self._path.correct(note.change)
+        if note.graph is not None:
+            self._loops = note.graph.loops
 
     def _draw_path(self) -> None:
-        strip = self._rr.LineStrips3D([self._path], colors=PATH_COLOR, radii=PATH_RADIUS)
-        self._recording.log(f"{at.PATH}/{self._pieces}", strip)
-
-    def _end_piece(self) -> None:
-        if self._path:
-            self._draw_path()
-            self._pieces += 1
-            self._path = []
+        """Draw the changed pieces of the path, and a line between the two camera positions of each loop."""
+        for k, line in self._path.changed():
+            strip = self._rr.LineStrips3D([line], colors=PATH_COLOR, radii=PATH_RADIUS)
+            self._recording.log(f"{at.PATH}/{k}", strip)
+        if self._loops is not None:
+            ends = [[self._path.position(k) for k in (loop.earlier_frame, loop.frame)] for loop in self._loops]
+            self._recording.log(at.LOOPS, self._rr.LineStrips3D(ends, colors=LOOP_COLOR, radii=LOOP_RADIUS))
+            self._loops = None
 
     def _draw_times(self, notes: Sequence[FrameNote]) -> None:
         if notes:

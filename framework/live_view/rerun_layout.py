@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
 WORLD = "world"  # world frame of the map, rotated upright
-MESH, PATH = f"{WORLD}/mesh", f"{WORLD}/path"
+MESH, PATH, LOOPS = f"{WORLD}/mesh", f"{WORLD}/path", f"{WORLD}/loops"
 OBJECTS, OBJECT_NAMES = f"{WORLD}/objects/boxes", f"{WORLD}/objects/names"
 CAMERA = f"{WORLD}/camera"
 COLOR, DEPTH = f"{CAMERA}/color", f"{CAMERA}/depth"

@@ -17,6 +17,7 @@ import numpy as np
 from framework.config.validation import check_bounds
 from framework.data import Float64, Frame
 from framework.geometry import inverse, rotation_angle
+from framework.interfaces import ClosedLoop
 from framework.pose_graph.graph_optimization import GraphEdge
 from framework.pose_graph.submap_anchors import Submap
 from framework.tracking.features import Features
@@ -110,6 +111,16 @@ class Loop:
         """Return the motion (4, 4) of the camera's submap in the world frame that closes the loop."""
         T_world_hidden, T_world_camera = (submaps[k].T_world_anchor for k in (self.edge.first, self.edge.second))
         return T_world_hidden @ self.edge.T_first_second @ inverse(T_world_camera)
+
+    def closed(self, submaps: Sequence[Submap]) -> ClosedLoop:
+        """Return the loop with its correction, before the submaps move."""
+        T_new_old = self.correction(submaps)
+        T_world_anchor = submaps[self.edge.second].T_world_anchor
+        step = (T_new_old @ T_world_anchor)[:3, 3] - T_world_anchor[:3, 3]
+        return ClosedLoop(
+            self.earlier_frame, self.frame, (self.edge.first, self.edge.second), self.path,
+            1e3 * float(np.linalg.norm(step)), float(np.degrees(rotation_angle(T_new_old[:3, :3]))),
+        )  # fmt: skip
 
 
 @dataclass

@@ -24,8 +24,10 @@ from framework.data import Box, Float64
 from framework.figures.stage_times import WINDOW, running_median
 from framework.runs.timings_file import StageTimes
 from framework.runtime.run_log import STAGE_ORDER
+from framework.sensors.depth_distortion import DepthDistortion
 
 WIDTH, HEIGHT, FLAT_HEIGHT, TIMES_HEIGHT, GROWTH_HEIGHT = 560.0, 380.0, 180.0, 240.0, 390.0  # px
+DEPTH_HEIGHT, SCALE_PX, IMAGE_STEP = 200.0, 16.0, 4  # px: height of a depth image, its color scale, and pixel step
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 40.0  # px, margins around the axes
 TEXT_PX, DOT_PX = 12.0, 10.0  # font size, and diameter of the dots at the ends of a path
 FOOT = 36.0  # px, height below a top view for the scale bar
@@ -82,6 +84,14 @@ class PlottedPath:
 
 
 @dataclass(frozen=True)
+class PlottedGraph:
+    """The anchors and loops of a pose graph."""
+
+    anchors: Float64  # (A, 3) m, positions in the world frame
+    loops: Sequence[tuple[int, int]]  # pairs of anchors
+
+
+@dataclass(frozen=True)
 class StageRow:
     """Percentiles of the run time of one stage, ms."""
 
@@ -112,6 +122,7 @@ def top_view(
     objects: Sequence[Footprint],
     up: Float64,
     height: float = HEIGHT,
+    graph: PlottedGraph | None = None,
 ) -> tuple[str, float]:
     """Draw camera paths and objects in top view.
 
@@ -121,6 +132,7 @@ def top_view(
         objects: Objects to draw as filled outlines.
         up: Up direction (3,) in the world frame, a unit vector.
         height: Height of the chart, px.
+        graph: Pose graph to draw on the paths; None = none.
 
     Returns:
         The SVG element, and the longer side of the area covered by the paths, relative to the width of the chart.
@@ -155,6 +167,12 @@ def top_view(
         axes.plot(*lost.T, "o", color=COLORS["bad"], markersize=8, gid="chart-lost")
         for point, fill in ((points[0], COLORS["card"]), (points[-1], color)):
             axes.plot(*point, "o", color=fill, markersize=DOT_PX, markeredgecolor=color, markeredgewidth=2.5)
+    if graph is not None:
+        anchors = graph.anchors @ plane.T
+        for pair in dict.fromkeys(graph.loops):
+            axes.plot(*anchors[list(pair)].T, color=COLORS["refinement"], linewidth=3, gid="chart-loop")
+        style: dict[str, Any] = {"color": COLORS["ink"], "markeredgecolor": COLORS["card"], "markeredgewidth": 1.5}
+        axes.plot(*anchors.T, "s", markersize=DOT_PX, gid="chart-anchors", **style)
     length = round_length(0.12 * WIDTH * px)
     label = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
     x, y = left + 16 * px, bottom - 28 * px
@@ -171,10 +189,43 @@ def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT
         errors: Position errors (n,), m.
         height: Height of the chart, px.
     """
-    figure, axes = _chart(height, frames[0], frames[-1], "Position error, mm")
-    axes.plot(frames, 1e3 * errors, color=COLORS["accent"], linewidth=2, gid="chart-errors")
-    axes.set_ylim(0, max(1.08e3 * float(errors.max(initial=0.0)), 1e-3))
-    return _svg(figure, "Position error by frame")
+    return _distances(frames, errors, height, "Position error", "chart-errors")
+
+
+def motions(frames: Sequence[int], distances: Float64, height: float = FLAT_HEIGHT) -> str:
+    """Draw a line chart of the correction of the camera position by frame, and return its SVG element.
+
+    Args:
+        frames: Frame numbers (n,).
+        distances: Distances (n,) between the tracked and the corrected positions, m.
+        height: Height of the chart, px.
+    """
+    return _distances(frames, distances, height, "Correction of the position", "chart-motions")
+
+
+def depth_corrections(distortion: DepthDistortion, depth: float) -> str:
+    """Draw the correction of a depth, m, as an image with a color scale in mm, and return its SVG element."""
+    mm_per_correction = 1e3 * depth**2
+    largest = max(mm_per_correction * float(np.abs(distortion.nodes).max()), 0.1)
+    rows, columns = distortion.shape
+    width = min((DEPTH_HEIGHT - 2 * SCALE_PX) * columns / rows, WIDTH - 6 * SCALE_PX)
+    figure = Figure((WIDTH / 72, DEPTH_HEIGHT / 72), dpi=72, facecolor="none")
+    bottom, tall = SCALE_PX / DEPTH_HEIGHT, 1 - 2 * SCALE_PX / DEPTH_HEIGHT
+    shown: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest, "aspect": "auto"}
+    axes = figure.add_axes((0, bottom, width / WIDTH, tall))
+    axes.imshow(mm_per_correction * distortion.corrections[::IMAGE_STEP, ::IMAGE_STEP], gid="chart-depth", **shown)
+    axes.axis("off")
+    scale = figure.add_axes(((width + SCALE_PX) / WIDTH, bottom, SCALE_PX / WIDTH, tall))
+    steps = np.linspace(-largest, largest, 100)[:, None]
+    scale.imshow(steps, origin="lower", extent=(0, 1, -largest, largest), **shown)
+    scale.yaxis.tick_right()
+    scale.set_xticks([])
+    ticks = [-largest, 0, largest]
+    scale.set_yticks(ticks, [f"{tick:+.1f} mm" if tick else "0" for tick in ticks])
+    scale.tick_params(length=0, labelsize=TEXT_PX, labelcolor=COLORS["faint"])
+    for one in (axes, scale):
+        one.spines[:].set_visible(False)
+    return _svg(figure, f"Correction of depth at {depth:g} m")
 
 
 def stage_areas(times: StageTimes) -> str:
@@ -241,6 +292,14 @@ def _chart(height: float, first: float, last: float, title: str, right: float = 
     axes.set_xlabel("frame", loc="right", fontsize=TEXT_PX, color=COLORS["faint"])
     axes.set_title(title, loc="left", fontsize=TEXT_PX, color=COLORS["faint"])
     return figure, axes
+
+
+def _distances(frames: Sequence[int], distances: Float64, height: float, name: str, gid: str) -> str:
+    """Draw a line chart of distances (n,), m, by frame, and return its SVG element."""
+    figure, axes = _chart(height, frames[0], frames[-1], f"{name}, mm")
+    axes.plot(frames, 1e3 * distances, color=COLORS["accent"], linewidth=2, gid=gid)
+    axes.set_ylim(0, max(1.08e3 * float(distances.max(initial=0.0)), 1e-3))
+    return _svg(figure, f"{name} by frame")
 
 
 def _horizontal(positions: Float64, up: Float64) -> Float64:

@@ -13,15 +13,21 @@ from framework.errors import DataError
 from framework.files.atomic_write import check_regular, path_exists
 from framework.files.folders.staged_files import finish_replacement
 from framework.files.tum_trajectory import read_tum
+from framework.interfaces import SubmapGraph
+from framework.pose_graph.depth_distortion_file import read_depth_distortion
+from framework.pose_graph.graph_file import read_pose_graph
 from framework.rendering.viewpoint import surrounding_poses
 from framework.runs.instances_file import StoredInstance, read_instances
 from framework.runs.mesh_file import read_mesh
 from framework.runs.stored_map import read_objects
 from framework.runs.stored_runs import (
+    DEPTH_DISTORTION,
     INSTANCES,
     MESH,
     METRICS,
     PARTIAL_METRICS,
+    POSE_GRAPH,
+    TRACKED_TRAJECTORY,
     TRAJECTORY,
     Record,
     is_number,
@@ -30,6 +36,7 @@ from framework.runs.stored_runs import (
 )
 from framework.runs.timings_file import StageTimes, read_timings
 from framework.runtime.run_log import FUSION, FUSION_STAGES
+from framework.sensors.depth_distortion import DepthDistortion
 
 TIMINGS_HEADER = "frame,stage,milliseconds\n"
 
@@ -45,6 +52,9 @@ class RunContents:
     timestamps: Float64  # (P,) s, of the mapped frames
     poses: Float64  # (P, 4, 4) T_world_camera
     times: StageTimes | None
+    tracked_positions: Float64 | None  # (P, 3) m, camera positions before any correction
+    graph: SubmapGraph | None  # pose graph of the back end
+    depth_distortion: DepthDistortion | None  # correction of depth
 
     @classmethod
     def read(cls, directory: Path) -> RunContents:
@@ -64,6 +74,12 @@ class RunContents:
         timestamps, poses = np.zeros(0), np.zeros((0, 4, 4))
         if path_exists(directory / TRAJECTORY):
             timestamps, poses = read_tum(directory / TRAJECTORY)
+        before = directory / TRACKED_TRAJECTORY
+        tracked = read_tum(before)[1][:, :3, 3] if path_exists(before) else None
+        if tracked is not None and len(tracked) != len(poses):
+            raise DataError(
+                f"{before}: expected {len(poses)} poses, as in {TRAJECTORY}, got {len(tracked)}; repeat the run"
+            )
         timings = directory / "timings.csv"
         return cls(
             record,
@@ -75,6 +91,9 @@ class RunContents:
             read_timings(timings)
             if path_exists(timings) and check_regular(timings).st_size > len(TIMINGS_HEADER)
             else None,
+            tracked,
+            read_pose_graph(directory / POSE_GRAPH),
+            read_depth_distortion(directory / DEPTH_DISTORTION),
         )
 
     @property

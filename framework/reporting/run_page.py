@@ -20,6 +20,7 @@ from framework.files.manifest import verified
 from framework.mapping.instance_map import FORMAT
 from framework.mapping.storage.map_file import read_format
 from framework.registry import STAGES
+from framework.reporting.back_end_section import back_end_section
 from framework.reporting.charts import (
     FLAT_HEIGHT,
     HEIGHT,
@@ -117,6 +118,7 @@ class RunReport:
             "objects": object_rows(contents, self.pictures, match_results),
             "truth": truth_section(self.check, self.why_unchecked, contents, self.pictures),
             "trajectory": self._trajectory(),
+            "back_end": back_end_section(contents, self._up),
             "progress": self._progress(),
             "times": stage_rows(contents.times) if contents.times else [],
             "times_chart": stage_areas(contents.times) if contents.times else "",
@@ -145,11 +147,10 @@ class RunReport:
         contents = self.contents
         if len(contents.poses) < 2:
             return None
-        up = self.scene.up if self.scene is not None else contents.up
         absent = {"truth"} if self.true_path is None else set()
         absent |= set() if contents.lost_frames else {"lost"}
         keys = [key for key in TOP_VIEW_KEY if key[0] not in absent]
-        whole, larger = self._top_views(np.array([0.0, 0.0, 1.0]) if up is None else up)
+        whole, larger = self._top_views()
         details = [(larger, "The path, enlarged.")] if larger else []
         if self.true_path is not None:
             frames = [contents.tracked_frames[k] for k in self.true_path.chosen]
@@ -157,13 +158,18 @@ class RunReport:
             details.append((chart, self._error_text()))
         return {"whole": whole, "text": self._path_text(), "legend": keys, "details": details}
 
-    def _top_views(self, up: Float64) -> tuple[str, str | None]:
+    @property
+    def _up(self) -> Float64:
+        """Up direction (3,) of top views in the world frame, z if unknown."""
+        up = self.scene.up if self.scene is not None else self.contents.up
+        return np.array([0.0, 0.0, 1.0]) if up is None else up
+
+    def _top_views(self) -> tuple[str, str | None]:
         """Return the top view of the path and the objects, and an enlarged view of the path, both as SVG.
 
-        The second view is None if the path is large enough in the first. `up` (3,) is the up direction in the world
-        frame.
+        The second view is None if the path is large enough in the first.
         """
-        contents = self.contents
+        contents, up = self.contents, self._up
         colors = colors_by_id(contents.objects)
         likely = set(likely_ids(contents))
         footprints = [

@@ -23,6 +23,7 @@ from framework.runs.stored_runs import (
     KEYFRAMES,
     MAP,
     MESH,
+    POSE_GRAPH,
     TRACKED_TRAJECTORY,
     TRAJECTORY,
     Record,
@@ -31,7 +32,7 @@ from framework.runs.stored_runs import (
 from framework.runtime.run_log import STAGE_ORDER
 
 # result files, which contain no run times
-COMPARED = (TRAJECTORY, TRACKED_TRAJECTORY, DEPTH_DISTORTION, INSTANCES, MESH, MAP, KEYFRAMES)
+COMPARED = (TRAJECTORY, TRACKED_TRAJECTORY, POSE_GRAPH, DEPTH_DISTORTION, INSTANCES, MESH, MAP, KEYFRAMES)
 PACKAGES = ("numba", "numpy", "onnxruntime", "opencv-python-headless", "scipy", "torch", "transformers")
 """Packages that may affect the last digits of results."""
 

@@ -39,9 +39,10 @@ from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import PoseTracker, RGBDSequence, RGBDVideo
 from framework.live_view.guarded_viewer import watched_run
 from framework.pipeline import Pipeline
+from framework.pose_graph.depth_distortion_file import write_depth_distortion
+from framework.pose_graph.graph_file import write_pose_graph
 from framework.registry import STAGES, build
 from framework.rendering.overview import write_overview
-from framework.runs.depth_distortion_file import write_depth_distortion
 from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
@@ -62,6 +63,7 @@ from framework.runs.stored_runs import (
     MESH,
     METRICS,
     PARTIAL_METRICS,
+    POSE_GRAPH,
     REPORT,
     TRACKED_TRAJECTORY,
     TRAJECTORY,
@@ -153,6 +155,7 @@ class RunRecord:
             MANIFEST,
             *MAPPED,
             TRACKED_TRAJECTORY,
+            POSE_GRAPH,
             DEPTH_DISTORTION,
             KEYFRAMES,
             DIGESTS,
@@ -166,6 +169,8 @@ class RunRecord:
         attempt(write_tum, folder / TRAJECTORY, timestamps, poses, comments)
         if result.as_tracked is not None:
             attempt(write_tum, folder / TRACKED_TRAJECTORY, *_reliable(result.as_tracked), comments)
+        if result.graph is not None:
+            attempt(write_pose_graph, folder / POSE_GRAPH, result.graph)
         if result.depth_distortion is not None:
             attempt(write_depth_distortion, folder / DEPTH_DISTORTION, result.depth_distortion)
         attempt(write_timings, folder / "timings.csv", result)

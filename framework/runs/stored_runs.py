@@ -47,6 +47,7 @@ MESH = "mesh.ply"
 INSTANCES = "instances.json"
 TRAJECTORY = "trajectory.txt"
 TRACKED_TRAJECTORY = "trajectory_tracked.txt"  # poses before any correction by the back end; optional
+POSE_GRAPH = "pose_graph.json"  # submaps and loops of the back end; optional
 REPORT = "report.html"  # written by `instancemap report`
 DEPTH_DISTORTION = "depth_distortion.json"  # correction of depth, also for runs that resume the map; optional
 KEYFRAMES = "keyframes.npz"  # keyframes of the tracker, to resume the map; optional

@@ -17,7 +17,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from framework.data import MAX_COVERAGE, Array, DelayEstimate, Frame, PointClusters, Pose
 from framework.errors import DataError, FrameError, NoPoseError
-from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer, SubmapChange
+from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer, SubmapChange, SubmapGraph
 from framework.runtime.corrected_frames import CorrectedFrames, TrackedFrame
 from framework.runtime.digests import StageDigest, digest_of
 from framework.runtime.frame_stream import steady_time
@@ -74,6 +74,7 @@ class RunResult:
     disagreeing: tuple[int, ...] | None = None  # Frame.index of the frames that contradict the map; None = not compared
     masks_omitted: int = 0  # number of masks that exceeded the limit of points of a frame
     as_tracked: Sequence[TrackedFrame] | None = None  # poses before any correction; None = no back end
+    graph: SubmapGraph | None = None  # pose graph of the back end; None = none
     depth_distortion: DepthDistortion | None = None  # correction of depth; None = none
 
     @property

@@ -573,6 +573,13 @@ class BackEndContract:
     def test_backend_without_frames_changes_nothing(self) -> None:
         assert self.plugin().finish(RoomMap()) is None
 
+    def test_backend_graph_has_all_submaps(self) -> None:
+        backend = self.plugin()
+        submaps = {0} | {change.submap for change in changes_of(backend, RoomMap())}
+        graph = backend.graph()
+        if graph is not None:
+            assert len(graph.anchors) == len(submaps)
+
 
 def changes_of(backend: BackEnd, scene: RoomMap, wrong_truth: bool = False) -> Iterator[SubmapChange]:
     """Yield the changes of a back end while the camera drifts 12 m away from the room and returns to it.

@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 
 from framework.data import Box, Camera, Detections, Float64, Frame, Instance, InstanceMesh, Pose, View
-from framework.interfaces import Viewer
+from framework.interfaces import SubmapChange, Viewer
 from framework.testing.contracts import same
 from framework.testing.corner_room import CAMERA, RoomMap, frame_at, pose_at, spheres_in
 
 FRAMES = 8  # number of frames of a test run
 LOST, SKIPPED, NOTHING_FOUND, BLIND = 2, 3, 4, 5  # indices of the special frames; see `show_run`, `frame_with_found`
+CORRECTED = 6  # index of the frame after which the map is corrected
+CHANGE = SubmapChange({0: pose_at(1)}, submap=1)
 STAGE_MS = {  # stage times of a frame, ms
     "reading": 1.0,
     "detection": 20.0,
@@ -138,7 +140,7 @@ def frame_with_found(k: int) -> tuple[Frame, Detections]:
 
 
 def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detections]], directory: Path) -> None:
-    """Show frames and their detections, as in a run. Frame LOST is lost, and frame SKIPPED is skipped."""
+    """Show frames and their detections, as in a run. Frame LOST is lost, frame SKIPPED is skipped."""
     viewer.begin_run(directory, CONFIG)
     with scene.call():
         viewer.begin(scene, "a room", directory)
@@ -148,6 +150,8 @@ def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detect
             if k == SKIPPED:
                 viewer.skip(f"frame {k} cannot be read")
             else:
+                if k == CORRECTED:
+                    viewer.correct(CHANGE, None)
                 viewer.show(frame, found, pose, stage_ms)
     with scene.call():
         viewer.end()

@@ -14,7 +14,16 @@ import numpy as np
 from framework.config.validation import check_bounds
 from framework.data import Float64, Frame, Pose
 from framework.geometry import inverse, rotation_angle
-from framework.interfaces import BackEnd, DepthCalibrator, SceneMap, SubmapChange, SubmapSurfaces
+from framework.interfaces import (
+    BackEnd,
+    ClosedLoop,
+    DepthCalibrator,
+    GraphAnchor,
+    SceneMap,
+    SubmapChange,
+    SubmapGraph,
+    SubmapSurfaces,
+)
 from framework.pose_graph.delayed_result import DelayedResult
 from framework.pose_graph.depth_calibration import DepthCalibration
 from framework.pose_graph.graph_optimization import AnchorGraph, GraphEdge, Optimized, load_optimizer, optimize
@@ -71,6 +80,7 @@ class PoseGraph(BackEnd):
     def __post_init__(self) -> None:
         check_bounds(self, min_motion=(0.0, 1.0), correction_delay=(0, 1000))
         self.loops: list[Loop] = []  # the loops of all corrections
+        self._closed: list[ClosedLoop] = []  # the same loops with their corrections
         self._graph = AnchorGraph()
         self._frames = 0  # number of frames
         self._views = 0  # number of views
@@ -115,6 +125,14 @@ class PoseGraph(BackEnd):
             else:
                 self._collect_loop(self._verification)
         return None if self._correction is None else self._corrected(self._correction)
+
+    def graph(self) -> SubmapGraph:
+        edges, submaps = self._graph.edges, self.anchors.submaps
+        return SubmapGraph(
+            tuple(GraphAnchor(next(iter(one.frames), None), one.T_world_anchor) for one in submaps),
+            tuple((edge.first, edge.second) for edge in edges if not edge.is_loop),
+            tuple(closed for loop, closed in zip(self.loops, self._closed, strict=True) if loop.edge in edges),
+        )
 
     def _divide(self, frame: Frame, T_world_camera: Float64) -> None:
         """Begin a submap, or enter another one, if the camera has left the current one."""
@@ -256,14 +274,12 @@ class PoseGraph(BackEnd):
         return SubmapChange(motions, shown, submap=self.anchors.current)
 
     def _report(self, loops: Sequence[Loop]) -> None:
-        """Log loops before the anchors move."""
-        self.loops.extend(loops)
+        """Record and log loops before the anchors move."""
         for loop in loops:
-            T_new_old = loop.correction(self.anchors.submaps)
-            T_world_anchor = self.anchors.submaps[loop.edge.second].T_world_anchor
-            step = (T_new_old @ T_world_anchor)[:3, 3] - T_world_anchor[:3, 3]
+            closed = loop.closed(self.anchors.submaps)
+            self.loops.append(loop)
+            self._closed.append(closed)
             log.info(
                 "loop closed between frames %d and %d, %.1f m: correction %.0f mm, %.1f degrees",
-                loop.earlier_frame, loop.frame, loop.path, 1e3 * np.linalg.norm(step),
-                np.degrees(rotation_angle(T_new_old[:3, :3])),
+                closed.earlier_frame, closed.frame, closed.path, closed.correction_mm, closed.correction_deg,
             )  # fmt: skip

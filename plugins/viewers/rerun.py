@@ -21,7 +21,7 @@ from uuid import uuid4
 from framework.config.validation import check_bounds, check_package, require
 from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, in_one_line
-from framework.interfaces import SceneMap, Viewer
+from framework.interfaces import SceneMap, SubmapChange, SubmapGraph, Viewer
 from framework.live_view.drawing_thread import DrawingThread
 from framework.live_view.rerun_program import HERE, open_window
 from framework.live_view.sealed_page import SealedPage
@@ -44,7 +44,8 @@ class Mode(Enum):
 class RerunViewer(Viewer):
     """Viewer of the camera path, images with masks, the mesh, object boxes and stage times.
 
-    If drawing is slower than mapping, some images are omitted. Poses, stage times and lost frames are always shown.
+    When the back end corrects the map, the path moves, and a line marks each loop. If drawing is slower than mapping,
+    some images are omitted. Poses, stage times and lost frames are always shown.
     """
 
     mode: Mode = Mode.RECORD  # output: RECORD (file), WINDOW (rerun's viewer) or BROWSER (local web page)
@@ -98,6 +99,9 @@ class RerunViewer(Viewer):
 
     def skip(self, reason: str) -> None:
         self._thread.skip(reason)
+
+    def correct(self, change: SubmapChange, graph: SubmapGraph | None) -> None:
+        self._thread.correct(change, graph)
 
     def end(self) -> None:
         self._thread.end()

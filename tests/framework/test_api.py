@@ -26,9 +26,9 @@ from framework.files.search_paths import CONF
 from framework.geometry import exp_se3
 from framework.interfaces import MapFuser
 from framework.pipeline import Pipeline
+from framework.pose_graph.depth_distortion_file import write_depth_distortion
 from framework.refinement.lifting import lift
 from framework.registry import build
-from framework.runs.depth_distortion_file import write_depth_distortion
 from framework.runs.metrics import room_metrics
 from framework.sensors.depth_distortion import NODES, DepthDistortion
 from framework.sensors.noise_models import SensorKind

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from framework.data import Detections, Frame, Pose
-from framework.interfaces import BackEnd, PoseTracker, SceneMap, SubmapChange, Viewer
+from framework.interfaces import BackEnd, PoseTracker, SceneMap, SubmapChange, SubmapGraph, Viewer
 from framework.pipeline import Pipeline
 from framework.runtime.digests import digest_of
 from plugins.backends.none import NoBackEnd
@@ -18,6 +18,7 @@ from tests.support.scenes.given_changes import (
     AS_TRACKED,
     CHANGES,
     CORRECTED,
+    GRAPH,
     LAST,
     A,
     C,
@@ -90,6 +91,16 @@ def test_pipeline_records_digest_of_changed_map(room: CornerRoom) -> None:
     after_frame_4 = [one.digest for one in result.digests if (one.frame, one.stage) == (4, "fusion")]
     assert [digests[1][1]] == after_frame_4
     assert digests[1][1] != digest_of(result.scene)
+
+
+def test_pipeline_returns_graph_and_passes_it_to_viewer(room: CornerRoom) -> None:
+    class Corrects(Viewer):
+        def correct(self, change: SubmapChange, graph: SubmapGraph | None) -> None:
+            seen.append((change, graph))
+
+    seen: list[tuple[SubmapChange, SubmapGraph | None]] = []
+    assert pipeline(viewer=Corrects()).run(room).graph is GRAPH
+    assert seen == [(CHANGES[2], GRAPH), (CHANGES[4], GRAPH), (LAST, GRAPH)]
 
 
 def test_pipeline_without_change_keeps_poses(room: CornerRoom) -> None:

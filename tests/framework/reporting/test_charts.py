@@ -13,9 +13,12 @@ from framework.reporting.charts import (
     HEIGHT,
     WIDTH,
     Footprint,
+    PlottedGraph,
     PlottedPath,
     box_corners,
+    depth_corrections,
     growth,
+    motions,
     position_errors,
     round_length,
     stage_areas,
@@ -23,6 +26,7 @@ from framework.reporting.charts import (
     top_view,
 )
 from framework.runs.timings_file import StageTimes
+from framework.sensors.depth_distortion import NODES, DepthDistortion
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -61,6 +65,32 @@ def test_top_view_projects_paths_and_lost_poses() -> None:
     [lost] = [one for one in owner.iter() if one.get("x")]
     assert [float(lost.get("x", 0)), float(lost.get("y", 0))] == pytest.approx(mine[5], abs=0.02)
     assert 0.5 < share < 1
+
+
+def test_top_view_draws_anchors_and_each_loop_once() -> None:
+    positions = circle(2.0)
+    graph = PlottedGraph(positions[[0, 20, 40]], [(0, 2), (0, 2), (1, 2)])
+    picture, _ = top_view([PlottedPath(positions)], [], [], UP, graph=graph)
+    [mine] = paths(picture, "chart-path")
+    assert [line.tolist() for line in paths(picture, "chart-loop")] == [
+        pytest.approx(mine[[0, 40]], abs=0.02), pytest.approx(mine[[20, 40]], abs=0.02)
+    ]  # fmt: skip
+    [owner] = group(picture, "chart-anchors")
+    anchors = [(float(one.get("x", 0)), float(one.get("y", 0))) for one in owner.iter() if one.get("x")]
+    np.testing.assert_allclose(anchors, mine[[0, 20, 40]], atol=0.02)
+
+
+def test_motions_are_drawn_by_frame() -> None:
+    [line] = paths(motions([0, 1, 2], np.array([0.0, 0.01, 0.02])), "chart-motions")
+    assert np.diff(line, axis=0) == pytest.approx(np.repeat(line[1:2] - line[:1], 2, axis=0), abs=0.02)
+
+
+def test_depth_corrections_have_symmetric_scale() -> None:
+    picture = depth_corrections(DepthDistortion(np.linspace(-0.002, 0.001, 63).reshape(NODES), (48, 64)), 2.0)
+    texts = {one.text for one in parsed(picture).iter() if one.text}
+    assert {"-8.0 mm", "0", "+8.0 mm"} <= texts
+    assert picture.count("data:image/png") == 2
+    assert " style=" not in picture
 
 
 def test_top_view_escapes_object_names() -> None:

@@ -16,7 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from framework.api import load_map
 from framework.files.manifest import Manifest
 from framework.files.tum_trajectory import read_tum
-from framework.runs.depth_distortion_file import read_depth_distortion, write_depth_distortion
+from framework.pose_graph.depth_distortion_file import read_depth_distortion, write_depth_distortion
+from framework.pose_graph.graph_file import read_pose_graph, write_pose_graph
 from framework.runs.instances_file import read_instances
 from framework.runs.mesh_file import read_mesh
 from framework.runs.stored_runs import read_metrics, read_yaml
@@ -26,6 +27,7 @@ from framework.tracking.keyframes import Keyframes, read_keyframes, write_keyfra
 from tests.support.recordings.damaged_files import EXAMPLES, check, damaged
 from tests.support.reported_run import write_run
 from tests.support.scenes.corner_room import CornerRoom
+from tests.support.scenes.given_changes import GRAPH
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
 TOKENS = (
@@ -51,19 +53,21 @@ READERS: dict[str, Callable[[Path], object]] = {
     "map.npz": load_map,
     "keyframes.npz": read_keyframes,
     "depth_distortion.json": read_depth_distortion,
+    "pose_graph.json": read_pose_graph,
     "manifest.json": lambda path: Manifest.read(path.parent),
 }
 
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the directory of a run with keyframes and a correction of depth."""
+    """Return the directory of a run with keyframes, a correction of depth and a pose graph."""
     directory = write_run(tmp_path_factory.mktemp("runs") / "run", frames=3)
     room, keyframes = CornerRoom(frames=3), Keyframes()
     for k in range(3):
         keyframes.add(room[k], room[k].T_world_camera)
     write_keyframes(directory / "keyframes.npz", keyframes.saved())
     write_depth_distortion(directory / "depth_distortion.json", DepthDistortion(np.full(NODES, 0.01), (72, 96)))
+    write_pose_graph(directory / "pose_graph.json", GRAPH)
     return directory
 
 

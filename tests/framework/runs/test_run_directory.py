@@ -25,6 +25,7 @@ from framework.evaluation.instances import PredictedInstances, Transfer, evaluat
 from framework.files.manifest import Manifest, RunStatus
 from framework.files.tum_trajectory import read_tum
 from framework.pipeline import Pipeline
+from framework.pose_graph.graph_file import read_pose_graph
 from framework.runs import provenance, run_directory
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
@@ -44,7 +45,7 @@ from tests.support.scenes.corner_room import (
     SphereDetector,
     pose_at,
 )
-from tests.support.scenes.given_changes import AS_TRACKED, CORRECTED, GivenChanges, RoomTracker, SubmapFuser
+from tests.support.scenes.given_changes import AS_TRACKED, CORRECTED, GRAPH, GivenChanges, RoomTracker, SubmapFuser
 
 pytestmark = pytest.mark.integration
 
@@ -262,9 +263,13 @@ def test_run_directory_of_corrected_run_has_both_trajectories(record: RunRecord,
     tracked = trajectory_metrics(replace(corrected, tracked=corrected.as_tracked))["trajectory.ate_rmse_m"]
     assert metrics["trajectory.tracked_ate_rmse_m"] == tracked
     assert tracked != metrics["trajectory.ate_rmse_m"]
-    assert "trajectory_tracked.txt" in Manifest.read(record.directory).files
+    assert {"trajectory_tracked.txt", "pose_graph.json"} <= {*Manifest.read(record.directory).files}
+    graph = read_pose_graph(record.directory / "pose_graph.json")
+    assert graph is not None
+    assert graph.loops == GRAPH.loops
     record.write(room, mapped(room))  # without a back end
     assert not (record.directory / "trajectory_tracked.txt").exists()
+    assert not (record.directory / "pose_graph.json").exists()
     assert "trajectory.tracked_ate_rmse_m" not in metrics_of(record)
 
 

@@ -242,6 +242,7 @@ class Backwards(CornerRoom):
         (BackEndContract, partial(Hiding, last=None), "test_backend_changes_only_known_submaps"),
         (BackEndContract, partial(Knowing, last=None), "test_backend_does_not_depend_on_ground_truth"),
         (BackEndContract, GivenChanges, "test_backend_without_frames_changes_nothing"),
+        (BackEndContract, partial(GivenChanges, {}, None), "test_backend_graph_has_all_submaps"),
         (FuserContract, Careless, "test_fuser_map_rejects_invalid_poses"),
         (FuserContract, Relocating, "test_fuser_does_not_depend_on_ground_truth"),
         (FuserContract, Smoothing, "test_fuser_does_not_depend_on_ground_truth"),

@@ -79,6 +79,21 @@ def test_backend_returning_camera_corrects_drift() -> None:
     assert frame == back_end.loops[-1].frame + pose_graph.EXTRACTION_DELAY + 2 * back_end.correction_delay
 
 
+def test_backend_graph_contains_loops_and_corrected_anchors() -> None:
+    back_end = PoseGraph()
+    changes(back_end)
+    graph = back_end.graph()
+    assert graph.anchors[0].first_frame == 0
+    for anchor, submap in zip(graph.anchors, back_end.anchors.submaps, strict=True):
+        np.testing.assert_array_equal(anchor.T_world_anchor, submap.T_world_anchor)
+    assert len(graph.odometry) >= len(graph.anchors) - 1
+    assert [(one.earlier_frame, one.frame, one.path) for one in graph.loops] == [
+        (one.earlier_frame, one.frame, one.path) for one in back_end.loops
+    ]
+    assert all(loop.correction_deg == pytest.approx(np.degrees(np.hypot(0.01, 0.04)), abs=0.2) for loop in graph.loops)
+    assert all(250 < loop.correction_mm < 300 for loop in graph.loops)
+
+
 def test_backend_in_one_room_changes_nothing() -> None:
     back_end, scene = PoseGraph(), HiddenSubmaps({})
     for k in range(30):

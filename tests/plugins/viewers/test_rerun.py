@@ -33,6 +33,7 @@ from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.viewers.rerun import Mode, RerunViewer
 from tests.support import registered
 from tests.support.scenes.corner_room import CAMERA, CornerRoom, GivenPose, KeepAll, SphereDetector, pose_at
+from tests.support.scenes.given_changes import GivenChanges, RoomTracker, SubmapFuser
 
 pytest.importorskip("rerun", reason="requires rerun-sdk (extra viewer)")
 from pyarrow.types import is_temporal
@@ -132,6 +133,19 @@ def test_rerun_camera_path_is_split_at_lost_frames(recorded: Path) -> None:
             pieces[entity] = list(rows(recorded, entity[1:]))[-1]["LineStrips3D:strips"][0]
     assert [len(pieces[f"/world/path/{k}"]) for k in range(2)] == [3, 1]
     np.testing.assert_allclose(pieces["/world/path/0"], [pose_at(k)[:3, 3] for k in (0, 1, 3)], atol=1e-6)
+
+
+def test_rerun_path_is_corrected_and_loops_are_drawn(tmp_path: Path) -> None:
+    viewer = RerunViewer()
+    stages: dict[str, Any] = {"tracker": RoomTracker(), "fuser": SubmapFuser(), "backend": GivenChanges()}
+    result = pipeline(viewer, **stages).run_to_any_end(CornerRoom(), tmp_path)
+    file = tmp_path / "recording.rrd"
+    corrected = [one.pose.T_world_camera[:3, 3] for one in result.tracked]
+    drawn = [list(rows(file, f"world/path/{k}"))[-1]["LineStrips3D:strips"][0] for k in range(2)]
+    for line, frames in zip(drawn, (slice(0, 3), slice(2, 6)), strict=True):
+        np.testing.assert_allclose(line, corrected[frames], atol=1e-6)
+    loops = list(rows(file, "world/loops"))[-1]["LineStrips3D:strips"]
+    np.testing.assert_allclose(loops, [[corrected[1], corrected[4]]], atol=1e-6)
 
 
 def test_rerun_mesh_equals_map_mesh(recorded: Path, tmp_path: Path) -> None:

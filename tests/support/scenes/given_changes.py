@@ -9,7 +9,15 @@ import numpy as np
 
 from framework.data import Array, Frame, Pose
 from framework.geometry import exp_se3
-from framework.interfaces import BackEnd, PoseTracker, SceneMap, SubmapChange
+from framework.interfaces import (
+    BackEnd,
+    ClosedLoop,
+    GraphAnchor,
+    PoseTracker,
+    SceneMap,
+    SubmapChange,
+    SubmapGraph,
+)
 from tests.support.scenes.corner_room import GridFuser
 
 A, B, C, D = (exp_se3(np.array(xi)) for xi in 0.1 * np.random.default_rng(0).normal(size=(4, 6)))
@@ -21,9 +29,14 @@ CORRECTED = (B @ A, B @ A, B @ A, D @ C @ A, D @ C @ A, D @ C @ A)
 """T_world_room at each frame after CHANGES and LAST."""
 
 
+GRAPH = SubmapGraph(
+    (GraphAnchor(None, np.eye(4)), GraphAnchor(2, A)), ((0, 1),), (ClosedLoop(1, 4, (0, 1), 20.5, 283.0, 0.7),)
+)
+
+
 @dataclass
 class GivenChanges(BackEnd):
-    """Back end with given changes."""
+    """Back end with given changes and a given pose graph."""
 
     changes: Mapping[int, SubmapChange] = field(default_factory=lambda: CHANGES)  # by Frame.index
     last: SubmapChange | None = field(default_factory=lambda: LAST)
@@ -33,6 +46,9 @@ class GivenChanges(BackEnd):
 
     def finish(self, scene: SceneMap) -> SubmapChange | None:
         return self.last
+
+    def graph(self) -> SubmapGraph:
+        return GRAPH
 
 
 @dataclass

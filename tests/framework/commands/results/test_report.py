@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,11 +14,13 @@ import pytest
 from framework.commands.results import report
 from framework.config import composition
 from framework.errors import DataError
+from framework.pose_graph.graph_file import write_pose_graph
 from framework.reporting import run_page
 from framework.reporting.run_page import RunReport
 from tests.support.command_call import call_command
 from tests.support.reported_run import rename_class, unverified_copy, write_run
 from tests.support.scenes.corner_room import CornerRoom
+from tests.support.scenes.given_changes import GRAPH
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
 
@@ -65,6 +68,22 @@ def test_report_of_run_is_one_reproducible_page(stored: Path, command) -> None:
         assert heading in message
     assert before.count(b"data:image/webp") > 3, "expected images of objects, mapping progress and overview.png"
     assert not re.search(rb'(src|href)="(?!data:|#)', before)
+
+
+def test_report_of_corrected_run_shows_back_end(stored: Path, command) -> None:
+    write_pose_graph(stored / "pose_graph.json", GRAPH)
+    shutil.copy(stored / "trajectory.txt", stored / "trajectory_tracked.txt")
+    assert command(stored)[0] == 0
+    message = texts((stored / "report.html").read_text())
+    assert "Back end 2 submaps, 1 loop." in message
+    assert "1 4 20.5 283 0.7" in message
+
+
+def test_report_different_number_of_tracked_poses_is_error(stored: Path, command) -> None:
+    lines = (stored / "trajectory.txt").read_text().splitlines(keepends=True)
+    (stored / "trajectory_tracked.txt").write_text("".join(lines[:-1]))
+    status, _, err = command(stored)
+    assert (status, "trajectory_tracked.txt: expected 6 poses, as in trajectory.txt, got 5" in err) == (1, True)
 
 
 def test_report_escapes_html_in_class_names(stored: Path, command) -> None:

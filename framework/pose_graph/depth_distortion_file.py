@@ -8,7 +8,7 @@ import numpy as np
 
 from framework.errors import DataError
 from framework.files.json_file import read_json, write_json
-from framework.runs.stored_runs import DEPTH_DISTORTION
+from framework.files.manifest import verified
 from framework.sensors.depth_distortion import NODES, DepthDistortion
 
 MAX_CORRECTION = 1.0  # 1/m, maximum absolute correction in a file
@@ -20,23 +20,16 @@ def write_depth_distortion(path: Path, distortion: DepthDistortion) -> None:
     write_json(path, {"width": width, "height": height, "corrections_per_m": distortion.nodes.tolist()})
 
 
-def stored_depth_distortion(run: Path) -> DepthDistortion | None:
-    """Return the correction of depth of a run; None = depth was not corrected.
+def read_depth_distortion(path: Path) -> DepthDistortion | None:
+    """Read a correction of depth; None = the file does not exist, because depth was not corrected.
 
     Raises:
         DataError: The file is invalid.
     """
-    path = run / DEPTH_DISTORTION
-    return read_depth_distortion(path) if path.exists() else None
-
-
-def read_depth_distortion(path: Path) -> DepthDistortion:
-    """Read a correction of depth.
-
-    Raises:
-        DataError: The file is missing or invalid.
-    """
-    content = read_json(path)
+    if not path.exists():
+        return None
+    with verified(path):
+        content = read_json(path)
     try:
         nodes = np.array(content["corrections_per_m"], np.float64)
         shape = int(content["height"]), int(content["width"])

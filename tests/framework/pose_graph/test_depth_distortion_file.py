@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from framework.errors import DataError
-from framework.runs.depth_distortion_file import read_depth_distortion, stored_depth_distortion, write_depth_distortion
+from framework.pose_graph.depth_distortion_file import read_depth_distortion, write_depth_distortion
 from framework.sensors.depth_distortion import NODES, DepthDistortion
 
 
@@ -17,14 +17,13 @@ def test_depth_distortion_file_is_read_as_written(tmp_path: Path) -> None:
     written = DepthDistortion(np.random.default_rng(0).normal(0, 0.01, NODES), (480, 640))
     write_depth_distortion(tmp_path / "d.json", written)
     read = read_depth_distortion(tmp_path / "d.json")
+    assert read is not None
     np.testing.assert_array_equal(read.nodes, written.nodes)
     assert read.shape == (480, 640)
 
 
 def test_depth_distortion_file_is_optional(tmp_path: Path) -> None:
-    assert stored_depth_distortion(tmp_path) is None
-    write_depth_distortion(tmp_path / "depth_distortion.json", DepthDistortion(np.zeros(NODES), (4, 4)))
-    assert stored_depth_distortion(tmp_path) is not None
+    assert read_depth_distortion(tmp_path / "d.json") is None
 
 
 @pytest.mark.parametrize(
