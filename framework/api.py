@@ -59,6 +59,7 @@ from framework.interfaces import (
     StageTimer,
     SubmapChange,
     SubmapGraph,
+    SubmapSurfaces,
     Viewer,
     untimed,
 )
@@ -119,6 +120,7 @@ __all__ = [
     "StageTimer",
     "SubmapChange",
     "SubmapGraph",
+    "SubmapSurfaces",
     "View",
     "Viewer",
     "configure_process",

@@ -30,6 +30,7 @@ from framework.data import Detections, Frame, Pose
 from framework.geometry import exp_se3
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SubmapChange
 from framework.pipeline import Pipeline
+from framework.pose_graph.depth_calibration import CalibrationView, estimated
 from framework.refinement.lifting import lift
 from framework.registry import build
 from framework.runtime.process_settings import Settings
@@ -107,6 +108,7 @@ def run_others() -> None:
             pipeline.fuser.scene.instances()
             if pipeline.fuser.has_submaps and stage == "fuser":
                 change_submaps(pipeline.fuser, video[0])
+    estimated([CalibrationView.of(video[k], np.eye(4)) for k in range(2)])
 
 
 def change_submaps(fuser: MapFuser, frame: Frame) -> None:
