@@ -20,6 +20,7 @@ from framework.pose_graph.depth_calibration import DepthCalibration
 from framework.pose_graph.graph_optimization import AnchorGraph, GraphEdge, Optimized, optimize
 from framework.pose_graph.loop_detection import Drift, Extracted, Guess, Loop, LoopDetection, QueryView, Reach
 from framework.pose_graph.loop_verification import LoopVerification, match_hidden, overlaps
+from framework.pose_graph.object_landmarks import NoLandmarks, ObjectLandmarks
 from framework.pose_graph.submap_anchors import DepthSamples, SubmapAnchors, view_separation
 
 log = logging.getLogger(__name__)
@@ -59,11 +60,13 @@ class PoseGraph(BackEnd):
     calibration: DepthCalibration = field(default_factory=DepthCalibration)
     min_motion: float = 0.01  # minimum motion of a submap's surface, m, in [0, 1]; smaller motions are omitted
     correction_delay: int = 10  # number of frames between a detected loop and the correction, in [0, 1000]
+    object_landmarks: bool = False  # landmarks of the graph are the objects that are mapped before and after the drift
 
     def __post_init__(self) -> None:
         check_bounds(self, min_motion=(0.0, 1.0), correction_delay=(0, 1000))
         self.loops: list[Loop] = []  # the loops of all corrections
         self._graph = AnchorGraph()
+        self._landmarks = ObjectLandmarks() if self.object_landmarks else NoLandmarks()
         self._frames = 0  # number of frames
         self._views = 0  # number of views
         self._T_world_view: Float64 | None = None  # tracked pose of the last view
@@ -91,6 +94,7 @@ class PoseGraph(BackEnd):
         self._divide(frame, T_world_camera)
         hidden = self._look(frame, T_world_camera)
         change = SubmapChange(corrected.motions, corrected.shown, hidden, self.anchors.current)
+        self._landmarks.observe(change, self.anchors.submaps, frame.camera, scene)
         return None if change == unchanged else change
 
     def finish(self, scene: SceneMap) -> SubmapChange | None:
@@ -191,12 +195,12 @@ class PoseGraph(BackEnd):
         self._guesses = deque(one for one in self._guesses if one.view is not view)
         loops = self.detection.agreeing(loop, self.anchors.submaps, view.T_world_camera)
         if loops:
-            self._optimize(loops)
+            self._optimize(loops, self._landmarks.edges(loops, self.anchors, view.frame.camera, scene))
 
-    def _optimize(self, loops: Sequence[Loop]) -> None:
-        """Start the optimization of the graph with additional loops."""
+    def _optimize(self, loops: Sequence[Loop], landmarks: Sequence[GraphEdge]) -> None:
+        """Start the optimization of the graph with additional loops and the edges of their landmarks."""
         self._guesses.clear()
-        self._graph.edges.extend(loop.edge for loop in loops)
+        self._graph.edges.extend([*(loop.edge for loop in loops), *landmarks])
         poses, edges = [one.T_world_anchor for one in self.anchors.submaps], list(self._graph.edges)
         due = self._frames + self.correction_delay
         self._correction = Correction(loops, len(edges), DelayedResult(partial(optimize, poses, edges), due))
