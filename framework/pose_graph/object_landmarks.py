@@ -29,7 +29,7 @@ from framework.pose_graph.submap_anchors import Submap, SubmapAnchors
 
 log = logging.getLogger(__name__)
 
-WIDTH = 160  # px, width of the views in which objects are observed
+WIDTH = 80  # px, width of the views in which objects are observed
 CELL = 0.05  # m, surface in one cell counts once, however many views it is in
 MIN_CELLS = 5  # minimum size of an object
 MAX_APART = 0.3  # m, maximum distance of two observations of one object
