@@ -49,6 +49,11 @@ class GraphEdge:
             return np.repeat(LOOP_NOISE, 3)
         return np.repeat(np.hypot(STEP_NOISE, self.path * np.array(DRIFT)), 3)
 
+    @property
+    def information(self) -> Float64:
+        """Information matrix (6, 6) of the twist in Open3D's order: rotation, translation."""
+        return np.diag(np.roll(self.deviations, 3) ** -2)
+
 
 @dataclass
 class AnchorGraph:
@@ -115,9 +120,8 @@ def optimize(poses: Sequence[Float64], edges: Sequence[GraphEdge]) -> Optimized:
     for T_world_anchor in poses:
         graph.nodes.append(registration.PoseGraphNode(T_world_anchor))
     for edge in edges:
-        information = np.diag(np.roll(edge.deviations, 3) ** -2)  # Open3D's order is rotation, translation
         graph.edges.append(
-            registration.PoseGraphEdge(edge.second, edge.first, edge.T_first_second, information, edge.is_loop)
+            registration.PoseGraphEdge(edge.second, edge.first, edge.T_first_second, edge.information, edge.is_loop)
         )
     for distance in MAX_LOOP_RESIDUALS:
         is_last = distance == MAX_LOOP_RESIDUALS[-1]

@@ -29,6 +29,7 @@ from framework.pose_graph.depth_calibration import DepthCalibration
 from framework.pose_graph.graph_optimization import AnchorGraph, GraphEdge, Optimized, load_optimizer, optimize
 from framework.pose_graph.loop_detection import Drift, Extracted, Guess, Loop, LoopDetection, QueryView, Reach
 from framework.pose_graph.loop_verification import LoopVerification, match_hidden, overlaps
+from framework.pose_graph.object_landmarks import NoLandmarks, ObjectLandmarks
 from framework.pose_graph.submap_anchors import DepthSamples, SubmapAnchors, view_separation
 
 log = logging.getLogger(__name__)
@@ -76,12 +77,14 @@ class PoseGraph(BackEnd):
     min_motion: float = 0.01  # minimum motion of a submap's surface, m, in [0, 1]; smaller motions are omitted
     # number of frames until the results of verification and of optimization in other threads are used, in [0, 1000]
     correction_delay: int = 10
+    object_landmarks: bool = False  # landmarks of the graph are the objects that are mapped before and after the drift
 
     def __post_init__(self) -> None:
         check_bounds(self, min_motion=(0.0, 1.0), correction_delay=(0, 1000))
         self.loops: list[Loop] = []  # the loops of all corrections
         self._closed: list[ClosedLoop] = []  # the same loops with their corrections
         self._graph = AnchorGraph()
+        self._landmarks = ObjectLandmarks() if self.object_landmarks else NoLandmarks()
         self._frames = 0  # number of frames
         self._views = 0  # number of views
         self._T_world_view: Float64 | None = None  # tracked pose of the last view
@@ -107,13 +110,14 @@ class PoseGraph(BackEnd):
         if self._extracted is not None and self._extracted.due <= self._frames:
             self._collect(self._extracted.get())
         if self._verification is not None and self._verification.result.due <= self._frames:
-            self._collect_loop(self._verification)
-        if self._guesses and self._verification is None and self._correction is None:
-            self._verify(self._guesses.popleft(), scene)
+            self._collect_loop(self._verification, scene)
+        if self._guesses and self._verification is None and self._correction is None and corrected is unchanged:
+            self._verify(self._guesses.popleft(), scene)  # not before the scene is corrected, too
         T_world_camera = corrected.moved(self.anchors.current, pose.T_world_camera)
         self._divide(frame, T_world_camera)
         hidden = self._look(frame, T_world_camera)
         change = SubmapChange(corrected.motions, corrected.shown, hidden, self.anchors.current)
+        self._landmarks.observe(change, self.anchors.submaps, frame.camera, scene)
         return None if change == unchanged else change
 
     def finish(self, scene: SceneMap) -> SubmapChange | None:
@@ -123,7 +127,7 @@ class PoseGraph(BackEnd):
             if self._verification is None:
                 self._verify(self._guesses.popleft(), scene)
             else:
-                self._collect_loop(self._verification)
+                self._collect_loop(self._verification, scene)
         return None if self._correction is None else self._corrected(self._correction)
 
     def graph(self) -> SubmapGraph:
@@ -237,19 +241,20 @@ class PoseGraph(BackEnd):
             frozenset(shown), view.number, guess.reach.path,
         )  # fmt: skip
 
-    def _collect_loop(self, verification: Verification) -> None:
+    def _collect_loop(self, verification: Verification, scene: SceneMap) -> None:
         """Start a correction if another loop agrees with the verified one."""
         self._verification = None
         loop = verification.result.get()
         if loop is not None:
             loops = self.detection.agreeing(loop, self.anchors.submaps, verification.view.T_world_camera)
             if loops:
-                self._optimize(loops)
+                camera = verification.view.frame.camera
+                self._optimize(loops, self._landmarks.edges(loops, self.anchors, camera, scene))
 
-    def _optimize(self, loops: Sequence[Loop]) -> None:
-        """Start the optimization of the graph with additional loops."""
+    def _optimize(self, loops: Sequence[Loop], landmarks: Sequence[GraphEdge]) -> None:
+        """Start the optimization of the graph with additional loops and the edges of their landmarks."""
         self._guesses.clear()
-        self._graph.edges.extend(loop.edge for loop in loops)
+        self._graph.edges.extend([*(loop.edge for loop in loops), *landmarks])
         poses, edges = [one.T_world_anchor for one in self.anchors.submaps], list(self._graph.edges)
         due = self._frames + self.correction_delay
         self._correction = Correction(loops, len(edges), DelayedResult(partial(optimize, poses, edges), due))

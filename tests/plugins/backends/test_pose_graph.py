@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 
 from framework.data import Camera, Frame, Pose
-from framework.geometry import exp_se3, pose_distance
+from framework.geometry import exp_se3, inverse, pose_distance, transform
 from framework.interfaces import SubmapChange
+from framework.pose_graph import object_landmarks
 from framework.pose_graph.loop_detection import LoopDetection
+from framework.pose_graph.object_landmarks import ObservedObject
+from framework.pose_graph.submap_anchors import Submap
 from plugins.backends import pose_graph
 from plugins.backends.pose_graph import PoseGraph
 from tests.support.scenes.hidden_submaps import HiddenSubmaps
@@ -140,3 +143,24 @@ def test_backend_logs_each_loop(caplog: pytest.LogCaptureFixture) -> None:
     lines = [one for one in caplog.messages if one.startswith("loop closed between frames")]
     assert len(lines) == len(back_end.loops) >= 2
     assert all("correction 2" in line and line.endswith("2.4 degrees") for line in lines)  # DRIFT
+
+
+def test_backend_object_landmarks_confirm_the_loop(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Three objects are mapped twice, before and after the drift."""
+    positions = np.array([[0.5, 0, 1], [-0.5, 0.2, 1], [0, -0.4, -1]])
+    returned = len(INSIDE) + 2 * len(OUTSIDE)  # first frame of the second visit
+
+    def observed(submap: Submap, T_world_anchor: np.ndarray, *_: object) -> list[ObservedObject]:
+        T_world_room = DRIFT if submap.frames[-1] >= returned else np.eye(4)
+        local = transform(inverse(T_world_anchor) @ T_world_room, positions)
+        return [ObservedObject(submap.number, 10 * submap.number + k, 0, p, 0.2, 9) for k, p in enumerate(local)]
+
+    monkeypatch.setattr(object_landmarks, "observed_objects", observed)
+    back_end = PoseGraph(object_landmarks=True)
+    with caplog.at_level(logging.INFO):
+        (change,) = [change for _, change in changes(back_end) if change.motions]
+    assert any("3 objects are in both" in line for line in caplog.messages)
+    T_new_old = change.motions[back_end.anchors.current]
+    assert pose_distance(T_new_old @ DRIFT @ inside(0), inside(0)) < 0.02
