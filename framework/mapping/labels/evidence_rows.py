@@ -32,7 +32,7 @@ from framework.mapping.labels.label_evidence import LARGEST_SCORE, MAX_SCORE, UN
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.packed_evidence import PackedEvidence, unpack_evidence
 from framework.mapping.voxels.integration import SeenBlocks
-from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, reserved
+from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, move_forward, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
 INSTANCE_SLOTS = 4  # number of instance slots of a voxel in compact storage
@@ -157,14 +157,25 @@ class EvidenceRows:
         find_row_bits(self.in_use(), self._row_bits)
         self._set_label_rows(has_row)
 
-    def replace(self, other: EvidenceRows) -> None:
-        """Replace the evidence with a copy of evidence of the same kind, whose blocks have the same order."""
-        self._reserve(other.row_count, other.voxel_count)
-        self._labeled[: self.row_count] = other._labeled[: self.row_count]
-        self._row_bits[: self.row_count] = other._row_bits[: self.row_count]
-        self._slots[: self.voxel_count] = other._slots[: self.voxel_count]
-        count = other.voxels.block_count
-        self.voxels.grid.label_row[:count] = other.voxels.grid.label_row[:count]
+    def keep(self, blocks: Int32) -> None:
+        """Remove the evidence of all other blocks. The blocks (N,) are ascending and have their old numbers."""
+        label_row = self.voxels.grid.label_row
+        rows = np.unique(label_row[blocks][label_row[blocks] >= 0])
+        row_numbers = np.full(self.row_count + 1, -1, np.int32)  # of each old row; the last one stands for -1
+        row_numbers[rows] = np.arange(len(rows))
+        label_row[blocks] = row_numbers[label_row[blocks]]
+        for array in (self._labeled, self._row_bits):
+            move_forward(array, rows)
+        labeled = self._labeled[: len(rows)]
+        used = np.zeros(self.voxel_count + 1, np.bool_)
+        used[labeled] = True
+        used[-1] = False  # stands for -1
+        numbers = np.cumsum(used, dtype=np.int32) - 1
+        numbers[-1] = -1
+        np.take(numbers, labeled, out=labeled, mode="wrap")
+        move_forward(self._slots, np.flatnonzero(used))
+        self.row_count, self.voxel_count = len(rows), int(np.count_nonzero(used))
+        self._lay_out()
 
     def _set_label_rows(self, has_row: Bool) -> None:
         """Number the rows of the blocks (B,) that have one, in the order of the blocks."""

@@ -28,7 +28,6 @@ class Layer(NamedTuple):
         return Layer(voxels, labels)
 
     def keep(self, blocks: Int32) -> None:
-        """Remove all other blocks, and renumber the blocks (N,) in the given order."""
-        kept = self.part(blocks)
-        self.voxels.replace(kept.voxels)
-        self.labels.replace(kept.labels)
+        """Remove all other blocks, and renumber the blocks (N,), which are ascending."""
+        self.labels.keep(blocks)
+        self.voxels.keep(blocks)

@@ -41,6 +41,7 @@ REGION_SIDE = 8  # side of a region, blocks
 REGION_BLOCKS = REGION_SIDE**3
 WEIGHT_ONE = 256  # stored weight of one observation
 TSDF_MAX = 32767  # stored value of the maximum truncation distance
+MOVED_BYTES = 2**20  # maximum size of rows that are moved at once
 FIRST_RESERVED = 1024  # initial capacity, blocks or voxels
 
 
@@ -135,13 +136,16 @@ class VoxelGrid:
             getattr(other.grid, name)[: len(blocks)] = getattr(self.grid, name)[blocks]
         return other
 
-    def replace(self, other: VoxelGrid) -> None:
-        """Replace all blocks with a copy of the blocks of another grid, without label rows."""
-        self.grid.table_keys[:] = NO_KEY
-        self.region_count = self.block_count = 0
-        self.allocate(other.grid.block_coords[: other.block_count])
-        for name in VOXEL_ARRAYS:
-            getattr(self.grid, name)[: self.block_count] = getattr(other.grid, name)[: other.block_count]
+    def keep(self, blocks: Int32) -> None:
+        """Remove all other blocks, and renumber the blocks (N,), which are ascending. Regions remain."""
+        numbers = np.full(self.block_count + 1, -1, np.int32)  # of each old block; the last one stands for -1
+        numbers[blocks] = np.arange(len(blocks))
+        grid = self.grid
+        for name in OF_BLOCKS:
+            move_forward(getattr(grid, name), blocks)
+        self.block_count = len(blocks)
+        grid.neighbors[: len(blocks)] = numbers[grid.neighbors[: len(blocks)]]
+        grid.region_blocks[: self.region_count] = numbers[grid.region_blocks[: self.region_count]]
 
     @property
     def byte_count(self) -> int:
@@ -198,6 +202,14 @@ class VoxelGrid:
             rehash(grid.table_keys, grid.table_regions, keys, regions)
             grid = grid._replace(table_keys=keys, table_regions=regions)
         self.grid = grid
+
+
+def move_forward(array: npt.NDArray[Any], rows: npt.NDArray[np.integer]) -> None:
+    """Move the ascending rows (N,) of an array to its beginning, in small parts."""
+    size = max(1, MOVED_BYTES // max(array[:1].nbytes, 1))
+    for start in range(0, len(rows), size):
+        part = rows[start : start + size]
+        array[start : start + len(part)] = array[part]
 
 
 def grown(array: npt.NDArray[Element], length: int, zeros: bool = False) -> npt.NDArray[Element]:

@@ -220,3 +220,36 @@ def test_map_without_changes_has_one_submap() -> None:
     fuse(fuser, POSES)
     assert scene_of(fuser).whole() is fuser.scene
     assert scene_of(fuser).submaps.byte_count == 0
+
+
+def test_layer_keep_equals_copy_of_the_blocks() -> None:
+    fuser = new_fuser()
+    fuse(fuser, POSES)
+    layer = scene_of(fuser).submaps.visible
+    blocks = np.flatnonzero(np.random.default_rng(0).random(layer.voxels.block_count) < 0.6).astype(np.int32)
+    copy = layer.part(blocks)
+    layer.keep(blocks)
+    kept, expected, count = layer.voxels.grid, copy.voxels.grid, len(blocks)
+    assert layer.voxels.block_count == count
+    for name in ("block_coords", "neighbors", "tsdf", "weight", "color", "solid"):
+        np.testing.assert_array_equal(getattr(kept, name)[:count], getattr(expected, name)[:count])
+    np.testing.assert_array_equal(layer.voxels.find(expected.block_coords[:count]), np.arange(count))
+    numbers = np.arange(count, dtype=np.int32)
+    voxels, other = layer.labels.voxels_of(numbers), copy.labels.voxels_of(numbers)
+    np.testing.assert_array_equal(voxels >= 0, other >= 0)
+    own, theirs = layer.labels.in_use(), copy.labels.in_use()
+    for name in ("instance_ids", "instance_value", "class_ids", "class_value"):
+        np.testing.assert_array_equal(getattr(own, name)[voxels[voxels >= 0]], getattr(theirs, name)[other[other >= 0]])
+    assert layer.labels.voxel_count == copy.labels.voxel_count
+
+
+def test_layer_after_keep_grows_again() -> None:
+    fuser = new_fuser()
+    fuse(fuser, [LEFT])
+    fuser.correct(SubmapChange(submap=1))
+    fuse(fuser, [RIGHT], 1)
+    fuser.correct(SubmapChange(hidden=frozenset({0}), submap=2))
+    fuse(fuser, [LEFT], 2)
+    grid, count = scene_of(fuser).volume.voxels.grid, scene_of(fuser).volume.voxels.block_count
+    np.testing.assert_array_equal(scene_of(fuser).volume.voxels.find(grid.block_coords[:count]), np.arange(count))
+    assert len(np.unique(grid.block_coords[:count], axis=0)) == count
