@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, Pose
@@ -125,11 +126,13 @@ class DepthCalibration(DepthCalibrator):
         if len(views) < MIN_VIEWS:
             log.info("depth is not corrected: expected at least %d views, got %d", MIN_VIEWS, len(views))
             return None
-        gain = validated_gain(views)
+        with threadpool_limits(1, "blas"):  # the last digits depend on the number of threads
+            gain = validated_gain(views)
+            nodes = estimated(views)
         if gain < self.min_gain:
             log.info("depth is not corrected: the mean squared distance in other views decreases by %.1f%%", 100 * gain)
             return None
-        found = DepthDistortion(estimated(views), self._shape)
+        found = DepthDistortion(nodes, self._shape)
         log.info(
             "depth is corrected by %.0f mm (RMS) at 2 m: the mean squared distance in other views decreases by %.0f%%",
             4e3 * found.corrections.std(), 100 * gain,
@@ -138,12 +141,15 @@ class DepthCalibration(DepthCalibrator):
 
 
 def validated_gain(views: Sequence[CalibrationView]) -> float:
-    """Return the decrease of the mean squared distance in views by the distortion of the others, fraction."""
+    """Return the decrease of the mean squared distance in views by the distortion of the others, fraction.
+
+    It is 0 if no views overlap.
+    """
     halves = views[: len(views) // 2], views[len(views) // 2 :]
     nodes = [estimated(half) for half in halves]
     before = sum(mean_squared_distance(half, np.zeros(NODES)) for half in halves)
     after = sum(mean_squared_distance(half, other) for half, other in zip(halves, reversed(nodes), strict=True))
-    return 1 - after / max(before, 1e-12)
+    return 1 - after / before if before > 0 else 0.0
 
 
 def estimated(views: Sequence[CalibrationView]) -> Float64:

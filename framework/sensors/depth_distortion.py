@@ -33,7 +33,9 @@ class DepthDistortion:
         rows, columns = (
             weights_of_nodes(size, count) for size, count in zip(self.shape, self.nodes.shape, strict=True)
         )
-        return (rows @ self.nodes @ columns.T).astype(np.float32)
+        # not a product of matrices, whose last digits depend on the number of BLAS threads
+        corrections: NDArray[np.float64] = np.einsum("vr,rc,uc->vu", rows, self.nodes, columns)
+        return corrections.astype(np.float32)
 
     def corrected(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return a corrected depth image (H, W), m, 0 = no reading. Images of another size are returned unchanged."""
