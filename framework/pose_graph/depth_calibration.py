@@ -128,8 +128,8 @@ class DepthCalibration(DepthCalibrator):
             return None
         with threadpool_limits(1, "blas"):  # the last digits depend on the number of threads
             gain = validated_gain(views)
-            nodes = estimated(views)
-        if gain < self.min_gain:
+            nodes = estimated(views) if gain >= self.min_gain else None
+        if nodes is None:
             log.info("depth is not corrected: the mean squared distance in other views decreases by %.1f%%", 100 * gain)
             return None
         found = DepthDistortion(nodes, self._shape)
