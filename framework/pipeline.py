@@ -33,7 +33,7 @@ from framework.interfaces import (
     Viewer,
 )
 from framework.live_view.guarded_viewer import GuardedViewer, watched_run
-from framework.pose_graph.calibration_stages import CalibratingBackEnd, NoObjects
+from framework.pose_graph.calibration_stages import CalibratingBackEnd, DepthOnly, NoObjects
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 from framework.registry import rebuilt
@@ -184,10 +184,8 @@ class Pipeline:
         if count == 0:
             return
         log.info("calibration of depth: mapping the first %d frames", count)
-        trial = Pipeline(
-            NoObjects(), rebuilt(self.tracker), self.refiner, rebuilt(self.fuser), self.prefetch,
-            backend=CalibratingBackEnd(calibrator),
-        )  # fmt: skip
+        trial = Pipeline(NoObjects(), rebuilt(self.tracker), self.refiner, rebuilt(self.fuser), self.prefetch)
+        trial.backend = CalibratingBackEnd(calibrator)  # also if the map cannot be corrected
         try:
             stopped_by = trial.run_to_any_end(FirstFrames(video, count)).stopped_by
         except DataError:  # no frame was mapped; the run reports the reason
@@ -436,19 +434,23 @@ class Pipeline:
 
 
 def usable_back_end(backend: BackEnd, tracker: PoseTracker, fuser: MapFuser) -> BackEnd:
-    """Return the back end, or one that changes nothing if the poses or the map cannot be corrected."""
+    """Return the back end, or one that does not change the map if the poses or the map cannot be corrected.
+
+    With given poses, depth is not calibrated either.
+    """
     if not changes_map(backend):
         return backend
     if tracker.poses_given or tracker.pose_source == "ground_truth":
-        reason = "the poses are given"
-    elif type(tracker).correct is PoseTracker.correct:
+        log.info("back end: none instead of %s, because the poses are given", type(backend).__name__)
+        return BackEnd()
+    if type(tracker).correct is PoseTracker.correct:
         reason = f"{type(tracker).__name__} cannot correct its poses"
     elif not fuser.has_submaps:
         reason = f"the map of {type(fuser).__name__} has no submaps"
     else:
         return backend
-    log.info("back end: none instead of %s, because %s", type(backend).__name__, reason)
-    return BackEnd()
+    log.info("back end: no corrections of the map by %s, because %s", type(backend).__name__, reason)
+    return DepthOnly(backend.calibrator)
 
 
 def changes_map(backend: BackEnd) -> bool:

@@ -1,4 +1,4 @@
-"""Stages of the run that precedes a run to calibrate depth: no objects, and a back end that only observes."""
+"""Stages of the run that precedes a run to calibrate depth, and the back end of a map that cannot be corrected."""
 
 from __future__ import annotations
 
@@ -26,3 +26,14 @@ class CalibratingBackEnd(BackEnd):
     def update(self, frame: Frame, pose: Pose, scene: SceneMap) -> SubmapChange | None:
         self.depth.add(frame, pose)
         return None
+
+
+@dataclass
+class DepthOnly(BackEnd):
+    """Back end that calibrates depth, but does not correct the map."""
+
+    depth: DepthCalibrator | None
+
+    @property
+    def calibrator(self) -> DepthCalibrator | None:
+        return self.depth

@@ -13,7 +13,7 @@ from framework.interfaces import BackEnd, DepthCalibrator, PoseTracker
 from framework.pipeline import Pipeline
 from framework.sensors.depth_distortion import NODES, DepthDistortion
 from framework.testing.corner_room import CAMERA
-from tests.support.scenes.corner_room import CornerRoom, KeepAll, LiveRoom, SphereDetector
+from tests.support.scenes.corner_room import CornerRoom, GridFuser, KeepAll, LiveRoom, SphereDetector
 from tests.support.scenes.given_changes import GivenChanges, RoomTracker, SubmapFuser
 
 LONGER = DepthDistortion(np.full(NODES, 0.02), CAMERA.shape)  # z + 0.02 z^2
@@ -80,6 +80,13 @@ def test_calibration_precedes_run_and_corrects_all_frames(room: CornerRoom) -> N
     expected = [float(LONGER.corrected(frame.depth).mean()) for frame in room]
     np.testing.assert_allclose(tracker.depths, expected)  # this tracker saw only the frames of the run
     assert result.frames == 6
+    assert result.depth_distortion is LONGER
+
+
+def test_calibration_precedes_run_whose_map_cannot_be_corrected(room: CornerRoom) -> None:
+    backend = Calibrating({}, last=None)
+    result = Pipeline(SphereDetector(), SeesDepth(), KeepAll(), GridFuser(), backend=backend).run(room)
+    assert backend.calibration.added == [0, 1, 2, 3]
     assert result.depth_distortion is LONGER
 
 

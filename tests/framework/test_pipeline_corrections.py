@@ -115,21 +115,27 @@ class _CannotCorrect(RoomTracker):
 
 
 @pytest.mark.parametrize(
-    ("tracker", "fuser", "reason"),
+    ("tracker", "fuser", "message"),
     [
-        (GivenPose(), SubmapFuser(), "the poses are given"),
-        (_CannotCorrect(), SubmapFuser(), "_CannotCorrect cannot correct its poses"),
-        (RoomTracker(), GridFuser(), "the map of GridFuser has no submaps"),
+        (GivenPose(), SubmapFuser(), "none instead of GivenChanges, because the poses are given"),
+        (
+            _CannotCorrect(),
+            SubmapFuser(),
+            "no corrections of the map by GivenChanges, because _CannotCorrect cannot correct its poses",
+        ),
+        (
+            RoomTracker(),
+            GridFuser(),
+            "no corrections of the map by GivenChanges, because the map of GridFuser has no submaps",
+        ),
     ],
 )
 def test_pipeline_without_correctable_stages_has_no_back_end(
-    tracker: PoseTracker, fuser: GridFuser, reason: str, room: CornerRoom, caplog: pytest.LogCaptureFixture
+    tracker: PoseTracker, fuser: GridFuser, message: str, room: CornerRoom, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
     result = pipeline(tracker, fuser).run(room)
-    assert [record.message for record in caplog.records if "back end" in record.message] == [
-        f"back end: none instead of GivenChanges, because {reason}"
-    ]
+    assert [record.message for record in caplog.records if "back end" in record.message] == [f"back end: {message}"]
     assert result.as_tracked is None
     np.testing.assert_array_equal(result.tracked[5].pose.T_world_camera, pose_at(5))
 
