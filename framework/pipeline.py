@@ -441,7 +441,6 @@ def usable_back_end(backend: BackEnd, tracker: PoseTracker, fuser: MapFuser) -> 
     if not changes_map(backend):
         return backend
     if tracker.poses_given or tracker.pose_source == "ground_truth":
-        log.info("back end: none instead of %s, because the poses are given", type(backend).__name__)
         return BackEnd()
     if type(tracker).correct is PoseTracker.correct:
         reason = f"{type(tracker).__name__} cannot correct its poses"

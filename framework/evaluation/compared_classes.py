@@ -75,7 +75,7 @@ class ComparedClasses:
         """
         block = config.get("evaluation") or {}
         if not isinstance(block, Mapping):
-            raise ConfigError(f"evaluation: expected the keys label_space and names, got {block!r:.60}")
+            raise ConfigError(f"evaluation: expected label_space, names and doubled_instances, got {block!r:.60}")
         names = block.get("names") or {}
         if not isinstance(names, Mapping):
             raise ConfigError(f"evaluation.names: expected the class of each name, got {names!r:.60}")

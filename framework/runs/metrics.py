@@ -5,22 +5,24 @@ from __future__ import annotations
 import hashlib
 import logging
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from framework.data import AnnotatedObjects, Float64, Instance, InstanceMesh, Pose, SceneTruth
+from framework.datasets.ground_truth.scene_truth import LabeledDepth
 from framework.errors import DataError
 from framework.evaluation import instances, trajectory
 from framework.evaluation.compared_classes import Compared, ComparedClasses, indices, listed
+from framework.evaluation.doubled_instances import doubled_instances, observed_labels
 from framework.evaluation.instances import PredictedInstances, Transfer
 from framework.evaluation.scannet_benchmark import BenchmarkScene, benchmark_metrics, semantic_metrics
 from framework.evaluation.truth_alignment import in_map_world
 from framework.evaluation.truth_coverage import TruthCoverage
 from framework.files.hashing import add_values
-from framework.interfaces import RGBDVideo, SceneMap
+from framework.interfaces import RGBDSequence, RGBDVideo, SceneMap
 from framework.mapping.gravity import floor_height
 from framework.runtime.corrected_frames import TrackedFrame
 from framework.runtime.run_log import STAGES, RunResult
@@ -39,6 +41,7 @@ MAIN_FIGURES = (
 )  # keys below `instances.` that are stored for both directions of the label transfer
 COVERAGE = "coverage."  # prefix of the fractions of the ground truth and of the map near each other
 CLASSES = "evaluated_classes."  # prefix of the keys about the label space of the evaluation
+VIEW_STEP = 5  # frames between two views that determine the true instances of vertices
 LABEL_SPACE, CLASS_NAMES = CLASSES + "label_space", CLASSES + "names"
 OF_FILE = CLASSES + "of_file"  # classes of a label space in a file, as JSON, because the file may change
 IGNORED = {"map": CLASSES + "ignored_in_map", "ground truth": CLASSES + "ignored_in_ground_truth"}  # keys by side
@@ -146,6 +149,33 @@ def instance_metrics(
         return count
     predictions = PredictedInstances.of_map(mesh, found, classes)
     return count | evaluation_metrics(predictions, truth, aligned, video.annotation, compared_classes)
+
+
+def doubled_metrics(video: RGBDVideo, mesh: InstanceMesh, likely: Collection[int], result: RunResult) -> Metrics:
+    """Return the number of true instances that the map contains more than once.
+
+    Every VIEW_STEP-th frame is read again. The result is empty if the frames have no true instances.
+
+    Args:
+        video: The mapped video.
+        mesh: The mesh of the map.
+        likely: The instances of the map that are counted.
+        result: The result of the pipeline.
+    """
+    if not isinstance(video, RGBDSequence) or video[result.tracked[0].position].truth is None:
+        return {}
+    true_ids = observed_labels(mesh.vertices, _labeled_views(video, result))
+    return {"map.doubled_instances": len(doubled_instances(true_ids, mesh.instance_ids, likely))}
+
+
+def _labeled_views(video: RGBDSequence, result: RunResult) -> Iterator[LabeledDepth]:
+    """Yield every VIEW_STEP-th mapped frame with its estimated pose and its true instances."""
+    for tracked in result.tracked[::VIEW_STEP]:
+        if not tracked.pose.lost:
+            frame = video[tracked.position]
+            assert frame.truth is not None
+            depth = frame.depth if result.depth_distortion is None else result.depth_distortion.corrected(frame.depth)
+            yield LabeledDepth(depth, frame.truth.instance_ids, frame.camera, tracked.pose.T_world_camera)
 
 
 def evaluation_metrics(

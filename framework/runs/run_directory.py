@@ -46,7 +46,15 @@ from framework.rendering.overview import write_overview
 from framework.runs.inputs import INPUTS, hash_of, input_hashes
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
-from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
+from framework.runs.metrics import (
+    Metrics,
+    class_name,
+    doubled_metrics,
+    instance_metrics,
+    room_metrics,
+    run_metrics,
+    trajectory_metrics,
+)
 from framework.runs.plugin_code import plugin_code
 from framework.runs.provenance import code_version, config_hash, environment, frozen_environment, leaves, parameters_of
 from framework.runs.stored_runs import (
@@ -196,6 +204,8 @@ class RunRecord:
         figures |= attempt(trajectory_metrics, result) or {}
         shown = {"sequence": video.name, **figures}
         labels = {} if found is None else likely_labels(found[1], scene.classes)
+        if found is not None and (self.config.get("evaluation") or {}).get("doubled_instances"):
+            figures |= attempt(doubled_metrics, video, found[0], labels.keys(), result) or {}
         if found is not None:
             attempt(write_overview, folder / "overview.png", found[0], labels, poses, caption(shown))
         if attempt.error is None:

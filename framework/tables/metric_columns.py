@@ -40,6 +40,7 @@ HEADS = {
     "trajectory.tracked_ate_rmse_m": "ATE before correction (m)",
     "trajectory.rpe_rmse_m": "RPE (m)",
     "map.bytes": "map (bytes)",
+    "map.doubled_instances": "doubled instances",
     "peak_rss_bytes": "peak memory (bytes)",
 }
 """Column headings by key. The function `head` also returns headings of classes and stages."""
@@ -60,9 +61,9 @@ SCENENN_NAMES = {coco: name for name, coco in SCENENN_TO_COCO.items()}
 DIRECTIONS = {
     **dict.fromkeys(("instances.count", "instances.true_count", "instances.ignored_count"), Direction.NONE),
     **dict.fromkeys(("instances", "semantic", "coverage", "fps", "fps_median"), Direction.HIGHER),
-    **dict.fromkeys(("trajectory", "stage_ms", "latency_ms", "map.bytes", "peak_rss_bytes"), Direction.LOWER),
+    **dict.fromkeys(("trajectory", "stage_ms", "latency_ms", "map.bytes", "map.doubled_instances"), Direction.LOWER),
     **dict.fromkeys(("frames_lost", "frames_skipped", "frames_dropped", "frames_disagreeing"), Direction.LOWER),
-    "masks_omitted": Direction.LOWER,
+    **dict.fromkeys(("masks_omitted", "peak_rss_bytes"), Direction.LOWER),
 }
 """Directions by prefix of the key. The longest prefix applies. Other metrics have no direction."""
 

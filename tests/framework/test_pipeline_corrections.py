@@ -115,34 +115,32 @@ class _CannotCorrect(RoomTracker):
 
 
 @pytest.mark.parametrize(
-    ("tracker", "fuser", "message"),
+    ("tracker", "fuser", "reason"),
     [
-        (GivenPose(), SubmapFuser(), "none instead of GivenChanges, because the poses are given"),
-        (
-            _CannotCorrect(),
-            SubmapFuser(),
-            "no corrections of the map by GivenChanges, because _CannotCorrect cannot correct its poses",
-        ),
-        (
-            RoomTracker(),
-            GridFuser(),
-            "no corrections of the map by GivenChanges, because the map of GridFuser has no submaps",
-        ),
+        (_CannotCorrect(), SubmapFuser(), "_CannotCorrect cannot correct its poses"),
+        (RoomTracker(), GridFuser(), "the map of GridFuser has no submaps"),
     ],
 )
-def test_pipeline_without_correctable_stages_has_no_back_end(
-    tracker: PoseTracker, fuser: GridFuser, message: str, room: CornerRoom, caplog: pytest.LogCaptureFixture
+def test_pipeline_without_correctable_stages_logs_reason(
+    tracker: PoseTracker, fuser: GridFuser, reason: str, room: CornerRoom, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
     result = pipeline(tracker, fuser).run(room)
-    assert [record.message for record in caplog.records if "back end" in record.message] == [f"back end: {message}"]
+    assert [record.message for record in caplog.records if "back end" in record.message] == [
+        f"back end: no corrections of the map by GivenChanges, because {reason}"
+    ]
     assert result.as_tracked is None
     np.testing.assert_array_equal(result.tracked[5].pose.T_world_camera, pose_at(5))
 
 
-def test_pipeline_with_null_back_end_logs_nothing(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(
+    ("fuser", "backend"), [(SubmapFuser(), None), (GridFuser(), NoBackEnd())], ids=["given poses", "no back end"]
+)
+def test_pipeline_without_need_of_corrections_logs_nothing(
+    fuser: GridFuser, backend: BackEnd | None, room: CornerRoom, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level("INFO")
-    assert pipeline(GivenPose(), GridFuser(), NoBackEnd()).run(room).as_tracked is None
+    assert pipeline(GivenPose(), fuser, backend).run(room).as_tracked is None
     assert not [record for record in caplog.records if "back end" in record.message]
 
 

@@ -136,7 +136,7 @@ def test_sweep_run_names_exclude_keys_without_effect() -> None:
     }
     for name, choice in (("table", TableChoice), ("figure", FigureChoice)):
         shown |= {f"{name}.{field.name}" for field in dataclasses.fields(choice)}
-    shown |= {"evaluation.label_space", "evaluation.names"}
+    shown |= {"evaluation.label_space", "evaluation.names", "evaluation.doubled_instances"}
     assert shown - {"viewer._target_"} == {key for key in left_out if "." in key}
     tells_runs_apart, no_key_of_the_config = {"hydra", "row", "rows", "sequences"}, {"experiment", "launcher", "out"}
     whole = {key for key in left_out if "." not in key}

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from framework.data import InstanceMesh, Pose, SceneTruth
+from framework.checking.changed_sequences import ChangedSequence
+from framework.data import Frame, InstanceMesh, Pose, SceneTruth
 from framework.errors import DataError, MapFullError
 from framework.evaluation.compared_classes import ComparedClasses
 from framework.evaluation.instances import PredictedInstances, Transfer, evaluate
@@ -29,7 +30,7 @@ from framework.pose_graph.graph_file import read_pose_graph
 from framework.runs import provenance, run_directory
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
-from framework.runs.metrics import instance_metrics, run_metrics, trajectory_metrics
+from framework.runs.metrics import doubled_metrics, instance_metrics, run_metrics, trajectory_metrics
 from framework.runs.run_directory import RunRecord, headline
 from framework.runs.stored_runs import MAPPED, read_record
 from framework.runtime.corrected_frames import TrackedFrame
@@ -42,6 +43,7 @@ from tests.support.scenes.corner_room import (
     GridFuser,
     GridMap,
     KeepAll,
+    LiveRoom,
     SphereDetector,
     pose_at,
 )
@@ -140,6 +142,27 @@ def test_metrics_contain_all_documented_keys(record: RunRecord, room: CornerRoom
     assert metrics["trajectory.ate_rmse_m"] == pytest.approx(0, abs=1e-9)
     assert (metrics["seed"], metrics["choice.detector"], metrics["choice.fuser"]) == (3, "simulated", None)
     assert metrics["peak_rss_bytes"] > 2**24
+
+
+def test_doubled_metrics_count_true_instances_of_two_objects(room: CornerRoom) -> None:
+    result = mapped(room)
+    mesh = result.scene.mesh()
+    assert doubled_metrics(room, mesh, {1, 2}, result) == {"map.doubled_instances": 0}
+    every_second = np.arange(len(mesh.vertices)) % 2 == 0
+    divided = replace(mesh, instance_ids=np.where(every_second & (mesh.instance_ids == 1), 3, mesh.instance_ids))
+    assert doubled_metrics(room, divided, {1, 2, 3}, result) == {"map.doubled_instances": 1}
+    assert doubled_metrics(room, divided, {1, 2}, result) == {"map.doubled_instances": 0}
+
+
+class _WithoutTruth(ChangedSequence):
+    def __getitem__(self, k: int) -> Frame:
+        return replace(self.sequence[k], truth=None)
+
+
+def test_doubled_metrics_are_empty_without_true_instances(room: CornerRoom) -> None:
+    result = mapped(room)
+    assert doubled_metrics(_WithoutTruth(room), result.scene.mesh(), {1, 2}, result) == {}
+    assert doubled_metrics(LiveRoom(), result.scene.mesh(), {1, 2}, result) == {}
 
 
 @pytest.mark.parametrize(("annotation", "release"), [("second", "second"), ("", None)])
