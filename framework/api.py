@@ -342,6 +342,20 @@ class Mapper(Map):
             return FrameResult(found.T_world_camera)
         return FrameResult(found.T_world_camera, new=tuple(sorted(now - before)), removed=tuple(sorted(before - now)))
 
+    def finish(self) -> None:
+        """Apply the last correction of the map. Call it after the last frame.
+
+        The back end corrects the map some frames after the camera has returned to a place. Poses that `add` returned
+        before a correction are not corrected.
+
+        Raises:
+            MapFullError: The map has reached `fuser.max_blocks`.
+        """
+        with self.lock, limited_threads(self._threads):
+            self.pipeline.finish(self._journal)
+            if self._journal.stopped_by is not None:
+                raise self._journal.stopped_by
+
     def _warn_of_ignored_pose(self) -> None:
         """Log a warning at the second pose that the tracker ignores."""
         tracker = self.pipeline.tracker

@@ -24,7 +24,7 @@ from framework.config.composition import composed
 from framework.errors import ConfigError, DataError, InstanceMapError
 from framework.files.search_paths import CONF
 from framework.geometry import exp_se3
-from framework.interfaces import MapFuser
+from framework.interfaces import BackEnd, MapFuser, SceneMap, SubmapChange
 from framework.pipeline import Pipeline
 from framework.pose_graph.depth_distortion_file import write_depth_distortion
 from framework.refinement.lifting import lift
@@ -38,7 +38,7 @@ from tests.support.failing_disk import FailingDisk, Fault
 from tests.support.scenes.analytic_scene import Scene
 from tests.support.scenes.analytic_scene import room as analytic_room
 from tests.support.scenes.corner_room import CornerRoom, pose_at
-from tests.support.scenes.given_changes import A, C, GivenChanges, RoomTracker, SubmapFuser
+from tests.support.scenes.given_changes import LAST, A, C, GivenChanges, RoomTracker, SubmapFuser
 
 pytestmark = pytest.mark.integration
 
@@ -606,8 +606,24 @@ def test_import_error_names_conflicting_framework_package(tmp_path: Path) -> Non
 def test_mapper_returns_corrected_poses(room: CornerRoom) -> None:
     mapper = Mapper(*STAGES, "detector=none")
     pipeline = mapper.pipeline
-    pipeline.tracker, pipeline.fuser, pipeline.backend = RoomTracker(), SubmapFuser(), GivenChanges()
+    fuser = SubmapFuser()
+    pipeline.tracker, pipeline.fuser, pipeline.backend = RoomTracker(), fuser, GivenChanges()
     for k, T_world_room in enumerate((np.eye(4), np.eye(4), A, A, C @ A, C @ A)):
         found = mapper.add(replace(room[k], truth=None))
         np.testing.assert_allclose(found.T_world_camera, T_world_room @ pose_at(k), atol=1e-14)
         np.testing.assert_allclose(mapper._T_world_color, found.T_world_camera, atol=1e-14)
+    assert LAST not in fuser.corrected
+    mapper.finish()
+    assert fuser.corrected[-1] == LAST
+
+
+def test_mapper_finish_raises_error_of_back_end() -> None:
+    mapper = Mapper(*STAGES, "detector=none")
+    mapper.pipeline.backend = _NoSolution()
+    with pytest.raises(ValueError, match="no solution"):
+        mapper.finish()
+
+
+class _NoSolution(BackEnd):
+    def finish(self, scene: SceneMap) -> SubmapChange | None:
+        raise ValueError("no solution")
