@@ -131,6 +131,7 @@ class InstanceTableMap(SceneMap):
         for k, evidence in self.class_evidence().items():
             record, distribution = self.table.records[k], self.table.distribution(evidence)
             class_ids[k] = int(distribution.argmax())
+            probabilities = self.table.probabilities(record, evidence)
             known[k] = partial(
                 Instance,
                 id=k,
@@ -141,6 +142,9 @@ class InstanceTableMap(SceneMap):
                 last_frame=record.last_frame,
                 embedding=None if record.embedding is None else record.embedding.mean,
                 embedding_spread=None if record.embedding is None else record.embedding.spread,
+                exists=probabilities.exists,
+                class_probability=probabilities.class_probability,
+                expected_iou=probabilities.expected_iou,
             )
 
         def create(k: int, vertices: Int32) -> Instance:
