@@ -429,7 +429,7 @@ class Instance:
 
     @property
     def probabilities(self) -> tuple[float, float]:
-        """Probabilities that it exists and that its class is right.
+        """The probabilities that it exists and that its class is right.
 
         They are the confidence and the largest class probability if they are not calibrated.
         """
