@@ -87,8 +87,8 @@ from framework.vocabulary.label_spaces import label_space_of
 
 log = logging.getLogger(__name__)
 
-# minimum probability that an instance exists (its confidence if it is not calibrated), for figures and logs; files contain
-# all instances
+# minimum probability that an instance exists (its confidence if it is not calibrated), for figures and logs; files
+# contain all instances
 LIKELY = 0.5
 
 Arguments = ParamSpec("Arguments")

@@ -35,7 +35,7 @@ from framework.mapping.instances.instance_list import InstanceTableMap
 from framework.runs.reevaluation import Truth, classes_of, read_predictions
 from framework.runs.stored_runs import MAP, read_record
 
-RIDGE = 1.0  # weight of the squared distance to the prior weights, as a number of instances
+RIDGE = 3.0  # weight of the squared distance to the prior weights, as a number of instances
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,8 @@ def _with_constant(terms: Sequence[Sequence[float]]) -> Float64:
     return np.array([[1.0, *row] for row in terms], np.float64)
 
 
-START = Calibration((0.0, 1.0, 1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.75, 0.0))
-"""Prior of the generic calibration, in which score, detection rate and scaled evidence are probabilities."""
+START = Calibration((0.0, 1.0, 0.0), (0.0, 1.0, 0.0), (0.75, 0.0))
+"""Prior of the generic calibration, in which the confidence and the scaled evidence are probabilities."""
 
 
 def learn(known: Sequence[Sample], prior: Calibration = START) -> Calibration:

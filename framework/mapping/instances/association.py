@@ -12,7 +12,7 @@ time, so that their number does not grow in a known place.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations
@@ -194,29 +194,25 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min
     for k in np.flatnonzero(instance_ids):
         score, embedding = float(scores[k]), embeddings.get(int(k))
         table.observe(int(instance_ids[k]), class_evidence[k], score, matches.frame_index, embedding)
-    in_view = set(matches.overlaps.instance_ids[matches.overlaps.visible >= min_pixels].tolist())
-    table.see(in_view | set(instance_ids[instance_ids > 0].tolist()), matches.frame_index)
-    _observe_views(table, matches, min_pixels)
+    visible = matches.overlaps.instance_ids[matches.overlaps.visible >= min_pixels]
+    in_view = set(visible.tolist()) | set(instance_ids[instance_ids > 0].tolist())
+    table.see(in_view, matches.frame_index)
+    _observe_views(table, matches, in_view, min_pixels)
 
 
-def _observe_views(table: InstanceTable, matches: Matches, min_pixels: int) -> None:
-    """Add a frame to the statistics of the views of the instances."""
+def _observe_views(table: InstanceTable, matches: Matches, in_view: Set[int], min_pixels: int) -> None:
+    """Add a frame to the statistics of the views of the instances in view."""
     overlaps, instance_ids = matches.overlaps, matches.instance_ids
     outlines, centers = overlaps.over_union(min_pixels), cluster_centers(matches.clusters)
     columns = {k: column for column, k in enumerate(overlaps.instance_ids.tolist())}
     for cluster in np.flatnonzero(instance_ids).tolist():
         viewing = table.records[int(instance_ids[cluster])].viewing
         if (column := columns.get(int(instance_ids[cluster]))) is not None:
-            viewing.detect(float(overlaps.visible[column]), float(outlines[cluster, column]))
+            viewing.detect(float(outlines[cluster, column]))
         if np.isfinite(centers[cluster]).all():
             viewing.locate(tuple(centers[cluster].tolist()))
-    detected, camera = set(instance_ids.tolist()), tuple(matches.camera_center.tolist())
-    for column in np.flatnonzero(overlaps.visible >= min_pixels).tolist():
-        k = int(overlaps.instance_ids[column])
-        if k not in detected:
-            table.records[k].viewing.miss(float(overlaps.visible[column]))
-            table.records[k].viewing.see(camera)
-    for k in sorted(detected - {0}):
+    camera = tuple(matches.camera_center.tolist())
+    for k in in_view:
         table.records[k].viewing.see(camera)
 
 

@@ -18,16 +18,17 @@ from framework.files.json_file import read_json
 EDGE = 0.01  # probabilities are limited to [EDGE, 1 - EDGE] before their logit
 NO_OUTLINE = 0.5  # outline agreement of an instance that was detected only once
 MIN_IOU = 0.5  # minimum IoU of an instance that exists
+MANY = 100  # number of observations above which more have no effect
 MAX_WEIGHT = 100.0  # maximum absolute value of a weight
 
 
 class Features(NamedTuple):
     """The statistics of an instance that its probabilities depend on."""
 
-    score: float  # mean score of its detections
-    rate: float  # frames with a detection / frames with a detection or with an expected but missing detection
-    outline: float  # mean IoU of a detection and the visible instance
+    confidence: float  # mean score of its detections times its detection rate in frames with the instance in view
     observations: int  # number of frames with a detection
+    score: float  # mean score of its detections
+    outline: float  # mean IoU of a detection and the visible instance
     class_probability: float  # probability of the most likely class, with the evidence scaled to the number of views
 
 
@@ -47,12 +48,12 @@ class Calibration:
     detectors without a calibration of their own.
     """
 
-    exists: tuple[float, ...] = (0.0, 1.0, 1.0, 0.0, 0.0)  # constant and weights of `existence_terms`
+    exists: tuple[float, ...] = (0.0, 1.0, 0.0)  # constant and weights of `existence_terms`
     class_probability: tuple[float, ...] = (0.0, 1.0, 0.0)  # constant and weights of `class_terms`
     expected_iou: tuple[float, ...] = (0.75, 0.0)  # constant and weights of `iou_terms`
 
     def __post_init__(self) -> None:
-        for name, count in (("exists", 5), ("class_probability", 3), ("expected_iou", 2)):
+        for name, count in (("exists", 3), ("class_probability", 3), ("expected_iou", 2)):
             weights = getattr(self, name)
             if len(weights) != count or not all(abs(weight) <= MAX_WEIGHT for weight in weights):  # rejects NaN
                 raise DataError(
@@ -92,12 +93,7 @@ class Calibration:
 
 def existence_terms(features: Features) -> tuple[float, ...]:
     """Return the terms of the log-odds that an instance exists."""
-    return (
-        logit(features.score),
-        logit(features.rate),
-        logit(features.outline),
-        math.log(max(features.observations, 1)),
-    )
+    return logit(features.confidence), math.log(min(max(features.observations, 1), MANY))
 
 
 def class_terms(features: Features) -> tuple[float, ...]:

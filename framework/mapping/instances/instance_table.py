@@ -137,10 +137,14 @@ class InstanceRecord:
         return len(self.in_view)
 
     @property
+    def mean_score(self) -> float:
+        """Mean score of its detections."""
+        return self.score_sum / max(self.detections, 1)
+
+    @property
     def confidence(self) -> float:
         """Mean detection score times the detection rate in frames with the instance in view, in [0, 1]."""
-        mean_score = self.score_sum / max(self.detections, 1)
-        return mean_score * self.observations / max(self.visible, self.observations, 1)
+        return self.mean_score * self.observations / max(self.visible, self.observations, 1)
 
     def features(self, class_probability: float) -> Features:
         """Return the statistics for the calibrated probabilities.
@@ -150,10 +154,10 @@ class InstanceRecord:
         """
         outline = self.viewing.outline
         return Features(
-            score=self.score_sum / max(self.detections, 1),
-            rate=(self.observations + 1) / (self.observations + self.viewing.missed + 2),  # with a uniform prior
-            outline=NO_OUTLINE if outline is None else outline,
+            confidence=self.confidence,
             observations=self.observations,
+            score=self.mean_score,
+            outline=NO_OUTLINE if outline is None else outline,
             class_probability=class_probability,
         )
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 NEW_ANGLE = math.radians(10.0)  # change of the viewing direction between two views, rad
 NEW_RATIO = 1.25  # ratio of the viewing distances of two views
-EXPECTED_SIZE = 0.5  # minimum visible size of an expected detection, as a fraction of the mean size when detected
 
 Point = tuple[float, float, float]
 
@@ -21,9 +20,7 @@ class Viewing:
     """
 
     views: int = 0  # number of views
-    missed: int = 0  # number of frames with an expected but missing detection
-    sized: int = 0  # number of detections of the instance while it was visible in the map
-    pixel_sum: float = 0.0  # sum of its visible pixels in these detections
+    outlines: int = 0  # number of detections of the instance while it was visible in the map
     outline_sum: float = 0.0  # sum of the IoUs of detection and visible instance in these detections
     centered: int = 0  # number of detections with points
     center_sum: Point = (0.0, 0.0, 0.0)  # sum of the centers of these detections, m
@@ -32,23 +29,12 @@ class Viewing:
     @property
     def outline(self) -> float | None:
         """Mean IoU of a detection and the visible instance, or None if unknown."""
-        return self.outline_sum / self.sized if self.sized else None
+        return self.outline_sum / self.outlines if self.outlines else None
 
-    def detect(self, pixels: float, outline: float) -> None:
-        """Add a detection of the instance while it was visible.
-
-        Args:
-            pixels: The number of visible pixels of the instance.
-            outline: The IoU of the detection and the visible instance, in pixels.
-        """
-        self.sized += 1
-        self.pixel_sum += pixels
+    def detect(self, outline: float) -> None:
+        """Add a detection, given its IoU with the visible instance, in pixels."""
+        self.outlines += 1
         self.outline_sum += outline
-
-    def miss(self, pixels: float) -> None:
-        """Add a frame without a detection. It is expected if the instance is large enough."""
-        if self.sized and pixels * self.sized >= EXPECTED_SIZE * self.pixel_sum:
-            self.missed += 1
 
     def locate(self, center: Point) -> None:
         """Add the center of a detection in the world frame, m."""
@@ -80,9 +66,7 @@ class Viewing:
     def merge(self, other: Viewing) -> None:
         """Add the sums of another instance. Views of both count once."""
         self.views = max(self.views, other.views)
-        self.missed = min(self.missed, other.missed)
-        self.sized += other.sized
-        self.pixel_sum += other.pixel_sum
+        self.outlines += other.outlines
         self.outline_sum += other.outline_sum
         self.centered += other.centered
         self.center_sum = _plus(self.center_sum, other.center_sum)

@@ -355,13 +355,11 @@ def _record(entry: MapHeader, table: InstanceTable, class_evidence: Float64) -> 
 
 def _viewing(entry: MapHeader) -> Viewing:
     """Return the statistics of the views of an instance."""
-    sized = entry.whole("sized")
+    outlines = entry.whole("outlines")
     return Viewing(
         views=entry.whole("views"),
-        missed=entry.whole("missed"),
-        sized=sized,
-        pixel_sum=entry.number("pixel_sum", (0.0, MAX_EVIDENCE)),
-        outline_sum=entry.number("outline_sum", (0.0, float(sized))),
+        outlines=outlines,
+        outline_sum=entry.number("outline_sum", (0.0, float(outlines))),
         centered=entry.whole("centered"),
         center_sum=_point(entry, "center_sum"),
         camera=None if entry.values.get("camera") is None else _point(entry, "camera"),

@@ -14,27 +14,27 @@ from framework.errors import DataError
 from framework.mapping.instances.calibration import Calibration, Features, logit
 from framework.mapping.instances.instance_table import InstanceTable
 
-EVEN = Features(score=0.5, rate=0.5, outline=0.5, observations=1, class_probability=0.5)
+EVEN = Features(confidence=0.5, observations=1, score=0.5, outline=0.5, class_probability=0.5)
 
 
 def test_probabilities_match_manual_result():
-    calibration = Calibration((0.5, 1.0, 2.0, 3.0, 4.0), (-1.0, 2.0, 0.0), (0.6, 0.2))
-    found = calibration.probabilities(EVEN._replace(score=0.8, observations=3, class_probability=0.9))
+    calibration = Calibration((0.5, 1.0, 4.0), (-1.0, 2.0, 0.0), (0.6, 0.2))
+    found = calibration.probabilities(EVEN._replace(confidence=0.8, observations=3, class_probability=0.9))
     assert found.exists == pytest.approx(1 / (1 + math.exp(-(0.5 + math.log(4) + 4 * math.log(3)))))
     assert found.class_probability == pytest.approx(1 / (1 + math.exp(1 - 2 * math.log(9))))
     assert found.expected_iou == pytest.approx(0.7)
 
 
 def test_probabilities_of_extreme_features_are_finite():
-    extreme = Features(score=0.0, rate=1.0, outline=0.0, observations=10**6, class_probability=1.0)
-    found = Calibration((100.0,) * 5, (100.0,) * 3, (100.0,) * 2).probabilities(extreme)
+    extreme = Features(confidence=1.0, observations=10**6, score=0.0, outline=0.0, class_probability=1.0)
+    found = Calibration((100.0,) * 3, (100.0,) * 3, (100.0,) * 2).probabilities(extreme)
     assert all(0.0 <= value <= 1.0 for value in found)
     assert (logit(0.0), logit(1.0)) == pytest.approx((math.log(0.01 / 0.99), math.log(0.99 / 0.01)))
 
 
 def test_calibration_file_round_trip_is_exact(tmp_path: Path):
     path = tmp_path / "net.calibration.json"
-    calibration = Calibration(exists=(0.1, 0.2, 0.3, 0.4, 0.5))
+    calibration = Calibration(exists=(0.1, 0.2, 0.3))
     path.write_text(json.dumps(asdict(calibration)))
     assert Calibration.read(path) == calibration
 
@@ -42,8 +42,8 @@ def test_calibration_file_round_trip_is_exact(tmp_path: Path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"exists": [0.0]}, "calibration.exists: expected 5 numbers"),
-        ({"exists": [0.0, 1.0, 2.0, 3.0, 1e9]}, "calibration.exists: expected 5 numbers"),
+        ({"exists": [0.0]}, "calibration.exists: expected 3 numbers"),
+        ({"exists": [0.0, 1.0, 1e9]}, "calibration.exists: expected 3 numbers"),
         ({"class_probability": ["a", 1, 2]}, "class_probability: expected a list of numbers"),
         ({"other": [1.0]}, "expected the keys exists, class_probability, expected_iou"),
     ],

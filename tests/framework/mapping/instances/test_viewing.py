@@ -40,30 +40,19 @@ def test_views_of_slow_motion_add_up():
     assert 8 <= seen_from(*path) <= 10
 
 
-def test_missing_detection_counts_only_where_expected():
-    viewing = Viewing()
-    viewing.miss(500.0)
-    assert viewing.missed == 0, "expected no miss before the first detection"
-    viewing.detect(1000.0, 0.8)
-    viewing.miss(400.0)
-    assert viewing.missed == 0, "expected no miss of an instance that is mostly hidden"
-    viewing.miss(600.0)
-    assert viewing.missed == 1
-
-
 def test_outline_is_mean_of_detections():
     viewing = Viewing()
     assert viewing.outline is None
-    viewing.detect(100.0, 0.5)
-    viewing.detect(100.0, 0.8)
+    viewing.detect(0.5)
+    viewing.detect(0.8)
     assert viewing.outline == pytest.approx(0.65)
 
 
 def test_merged_viewing_adds_detections():
     one, other = Viewing(), Viewing()
-    one.detect(100.0, 0.5)
-    other.detect(300.0, 0.9)
+    one.detect(0.5)
+    other.detect(0.9)
     other.locate(CENTER)
     other.see((0.0, 0.0, 0.0))
     one.merge(other)
-    assert one == Viewing(1, 0, 2, 400.0, 1.4, 1, CENTER, (0.0, 0.0, 0.0))
+    assert one == Viewing(1, 2, 1.4, 1, CENTER, (0.0, 0.0, 0.0))
