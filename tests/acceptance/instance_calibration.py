@@ -1,18 +1,23 @@
 """Calibration of instance probabilities: measurement, and learning from runs with ground truth.
 
-Learn the calibration of a detector from completed runs, and write its file:
-
-    python -m tests.acceptance.instance_calibration learn plugins/detectors/NAME.calibration.json RUN_DIR...
-
-Print the calibration of scenes that it has not seen (leave one scene out). The runs of one network are in one folder:
+Each run directory is named NETWORK.SCENE. Print the calibration on scenes that it has not seen (leave one scene out):
 
     python -m tests.acceptance.instance_calibration check RUN_DIR...
+
+Learn the calibration of all networks together, and that of each network, which is written to
+plugins/detectors/NETWORK.calibration.json:
+
+    python -m tests.acceptance.instance_calibration learn RUN_DIR...
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import functools
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +26,10 @@ from scipy.special import expit
 
 from framework.api import load_scene
 from framework.data import Float64
+from framework.detection.calibration_files import LEARNED, SUFFIX
 from framework.evaluation.calibration import Forecasts
 from framework.evaluation.instances import judge_class_agnostic
+from framework.files.json_file import write_json
 from framework.mapping.instances.calibration import (
     Calibration,
     Features,
@@ -34,8 +41,32 @@ from framework.mapping.instances.calibration import (
 from framework.mapping.instances.instance_list import InstanceTableMap
 from framework.runs.reevaluation import Truth, classes_of, read_predictions
 from framework.runs.stored_runs import MAP, read_record
+from tests.acceptance.runner import CHECKOUT
 
-RIDGE = 3.0  # weight of the squared distance to the prior weights, as a number of instances
+SHARED = CHECKOUT.parent / "shared"
+FREIBURG = SHARED / "data" / "tum_fr1_rpy_a"
+SCENES = {
+    "replica_floor2": ("dataset=rgbd_folder", f"dataset.root={SHARED / 'data' / 'replica_floor2'}"),
+    "redkitchen": ("dataset=rgbd_folder", f"dataset.root={SHARED / 'data' / 'redkitchen'}"),
+    "scene0000_00": (
+        "dataset=scannet",
+        f"dataset.root={SHARED / 'data' / 'scannet_scene0000'}",
+        "dataset.scene=scene0000_00",
+    ),
+    "freiburg1_rpy": (
+        "dataset=tum_rgbd",
+        f"dataset.root={FREIBURG / 'rgbd_dataset_freiburg1_rpy'}",
+        f"dataset.ground_truth={FREIBURG / 'annotation' / 'mesh.ply'}",
+    ),
+}
+DETECTORS = {
+    "maskrcnn2go_int8": ("detector=maskrcnn2go",),
+    "yolo11n_seg": (
+        "detector=onnx_segmentation",
+        f"detector.weights={SHARED / 'weights' / 'yolo11n_seg' / 'yolo11n_seg.onnx'}",
+    ),
+}
+RIDGE = 3.0  # weight of the squared distance to the prior weights
 
 
 @dataclass(frozen=True)
@@ -63,11 +94,7 @@ def samples(directory: Path) -> Iterator[Sample]:
         one, table = scene.table.records[key], scene.table
         features = one.features(table.discounted_class_probability(one, evidence[key]))
         today = one.confidence, float(table.distribution(evidence[key]).max())
-        yield Sample(scene_name(directory), features, today, exists, right, iou)
-
-
-def scene_name(directory: Path) -> str:
-    return directory.name.partition(".")[2] or directory.name
+        yield Sample(directory.name.partition(".")[2], features, today, exists, right, iou)
 
 
 def logistic(terms: Sequence[Sequence[float]], outcomes: Sequence[bool], prior: Sequence[float]) -> tuple[float, ...]:
@@ -148,3 +175,101 @@ def forecasts(pairs: Iterable[tuple[Sample, tuple[float, float]]]) -> dict[str, 
         "exists": Forecasts.of((values[0], one.exists) for one, values in listed),
         "class": Forecasts.of((values[1], one.class_is_right) for one, values in listed if one.exists),
     }
+
+
+def samples_by_network(directories: Iterable[Path]) -> dict[str, list[Sample]]:
+    """Return the samples of each network from its completed runs, which are named NETWORK.SCENE."""
+    found: dict[str, list[Sample]] = {}
+    for directory in directories:
+        found.setdefault(directory.name.partition(".")[0], []).extend(samples(directory))
+    return found
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The forecasts of one event without calibration, and those of a calibration that has not seen the scene."""
+
+    today: Forecasts
+    calibrated: Forecasts
+
+    def row(self, name: str) -> str:
+        """Return a row of a Markdown table with ECE, Brier score and AUROC, each with its bootstrap interval."""
+        cells = [name, str(len(self.today))]
+        for metric in (Forecasts.ece, Forecasts.brier, Forecasts.auroc):
+            cells += [_with_interval(one, metric) for one in (self.today, self.calibrated)]
+        low, high = self.calibrated.paired_interval(self.today, lambda new, old: new.brier() - old.brier())
+        difference = self.calibrated.brier() - self.today.brier()
+        cells += [f"{difference:+.3f} ({low:+.3f} to {high:+.3f})", f"{self.calibrated.ece_if_calibrated():.3f}"]
+        return f"| {' | '.join(cells)} |"
+
+
+HEADER = (
+    "| event | n | ECE today | ECE | Brier today | Brier | AUROC today | AUROC | change of Brier "
+    "| ECE if calibrated |\n"
+    "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+)
+
+
+def _with_interval(one: Forecasts, metric: Callable[[Forecasts], float]) -> str:
+    low, high = one.interval(metric)
+    return f"{metric(one):.3f} ({low:.3f} to {high:.3f})"
+
+
+def comparisons(pairs: Iterable[tuple[Sample, Probabilities]]) -> dict[str, Comparison]:
+    """Return the comparison of each event, given the calibrated probabilities of each sample."""
+    listed = list(pairs)
+    today = forecasts((one, one.today) for one, _ in listed)
+    calibrated = forecasts((one, (found.exists, found.class_probability)) for one, found in listed)
+    return {event: Comparison(today[event], calibrated[event]) for event in today}
+
+
+def iou_error(pairs: Iterable[tuple[Sample, Probabilities]]) -> float:
+    """Return the mean absolute error of the expected IoU of the instances that exist."""
+    return float(np.mean([abs(found.expected_iou - one.iou) for one, found in pairs if one.exists]))
+
+
+@functools.cache
+def unseen_scenes() -> dict[str, Comparison]:
+    """Map the real scenes with each network and given poses, and return the comparison of each event over all runs."""
+    with tempfile.TemporaryDirectory() as folder:
+        directories = []
+        for network, detector in DETECTORS.items():
+            for scene, dataset in SCENES.items():
+                directories.append(Path(folder, f"{network}.{scene}"))
+                overrides = [*dataset, *detector, "tracker=ground_truth", "detection_cache=read_write"]
+                command = [sys.executable, "-m", "framework", *overrides, f"hydra.run.dir={directories[-1]}"]
+                subprocess.run(command, cwd=CHECKOUT, check=True)
+        return check(directories)
+
+
+def check(directories: Iterable[Path]) -> dict[str, Comparison]:
+    """Print the calibration on unseen scenes, in total and for each network, and return the total."""
+    runs = samples_by_network(directories)
+    pairs = leave_one_scene_out(runs)
+    total = comparisons(pairs)
+    print(HEADER)
+    for event, comparison in total.items():
+        print(comparison.row(event))
+    for network, known in runs.items():
+        own = {id(one) for one in known}
+        for event, comparison in comparisons(pair for pair in pairs if id(pair[0]) in own).items():
+            print(comparison.row(f"{event}, {network}"))
+    print(f"mean absolute error of the expected IoU: {iou_error(pairs):.3f}", flush=True)
+    return total
+
+
+def learn_all(directories: Iterable[Path]) -> None:
+    """Print the calibration of all networks together, and write that of each network."""
+    runs = samples_by_network(directories)
+    generic = learn([one for known in runs.values() for one in known])
+    print(rounded(generic))
+    for network, known in runs.items():
+        write_json(LEARNED / f"{network}{SUFFIX}", asdict(rounded(learn(known, generic))))
+
+
+def rounded(calibration: Calibration) -> Calibration:
+    return Calibration(**{name: tuple(round(one, 3) for one in values) for name, values in asdict(calibration).items()})
+
+
+if __name__ == "__main__":
+    {"check": check, "learn": learn_all}[sys.argv[1]](map(Path, sys.argv[2:]))
