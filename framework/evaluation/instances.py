@@ -260,8 +260,17 @@ def judge(
     return judged, {key: name for key, name, counts in counted if counts and key not in found}
 
 
+def forecasts(predictions: PredictedInstances, truth: SceneTruth) -> dict[str, Forecasts]:
+    """Return the forecasts of existence and of the class, by event; see `InstanceEvaluation.forecasts`."""
+    overlaps = _Overlaps.between(predictions, truth, Transfer.TO_TRUTH, MAX_DISTANCE, MIN_POINTS)
+    return overlaps.forecasts(predictions.probabilities)
+
+
 def judge_class_agnostic(predictions: PredictedInstances, truth: SceneTruth) -> dict[int, tuple[bool, bool, float]]:
-    """Return for each prediction that is not ignored: exists, class is right, IoU. See `Forecasts`."""
+    """Return (exists, class is right, IoU) of each prediction that is not ignored, by id.
+
+    They are defined in framework/evaluation/calibration.py.
+    """
     overlaps = _Overlaps.between(predictions, truth, Transfer.TO_TRUTH, MAX_DISTANCE, MIN_POINTS)
     return {key: (exists, right, iou) for key, exists, right, iou in overlaps.class_agnostic()}
 
