@@ -281,7 +281,7 @@ def reliability(forecasts: Mapping[str, Forecasts]) -> str:
 def reliability_figure(forecasts: Mapping[str, Forecasts], background: str = "none") -> Figure:
     """Return a figure with a reliability diagram for each event, by title.
 
-    The area of a dot is proportional to the number of instances in the bin, which is shown next to it.
+    Each dot is a bin with its number of instances. Dots on the diagonal are calibrated.
     """
     figure = Figure((WIDTH / 72, RELIABILITY_HEIGHT / 72), dpi=72, facecolor=background)
     inner = WIDTH / len(forecasts) - LEFT - RIGHT
@@ -292,15 +292,18 @@ def reliability_figure(forecasts: Mapping[str, Forecasts], background: str = "no
         axes = figure.add_axes(bounds, facecolor="none")
         axes.plot([0, 1], [0, 1], color=COLORS["faint"], linewidth=1, gid=f"chart-ideal-{k}")
         for one_bin in one.reliability():
-            point, size = (one_bin.mean_probability, one_bin.frequency), (DOT_PX + 40 * one_bin.count / len(one)) ** 2
-            axes.scatter(*point, s=size, color=COLORS["accent"], alpha=0.5, linewidth=0, clip_on=False)
-            axes.annotate(str(one_bin.count), point, color=COLORS["ink"], fontsize=TEXT_PX, ha="center", va="center")
-        axes.set(xlim=(0, 1), ylim=(0, 1), xticks=(0, 0.5, 1), yticks=(0, 0.5, 1))
+            point = one_bin.mean_probability, one_bin.frequency
+            size = DOT_PX**2 * (1 + 9 * one_bin.count / len(one))
+            axes.scatter(*point, s=size, color=COLORS["accent"], alpha=0.4, linewidth=0, zorder=3)
+            axes.annotate(
+                str(one_bin.count), point, color=COLORS["ink"], fontsize=TEXT_PX, ha="center", va="center", zorder=4
+            )
+        axes.set(xlim=(-0.08, 1.08), ylim=(-0.08, 1.08), xticks=(0, 0.5, 1), yticks=(0, 0.5, 1))
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[["left", "bottom"]].set_color(COLORS["line"])
         axes.tick_params(length=0, labelsize=TEXT_PX, labelcolor=COLORS["faint"])
         axes.set_xlabel("mean probability", loc="right", fontsize=TEXT_PX, color=COLORS["faint"])
-        heading = f"{title}: fraction of {len(one)} (ECE {one.ece():.2f})"
+        heading = f"{title}: fraction, n = {len(one)}, ECE {one.ece():.2f}"
         axes.set_title(heading, loc="left", fontsize=TEXT_PX, color=COLORS["faint"])
     return figure
 

@@ -1,10 +1,11 @@
 """Calibration of instance probabilities: measurement, and learning from runs with ground truth.
 
-Each run directory is named NETWORK.SCENE. Print the calibration on scenes that it has not seen (leave one scene out):
+Each run directory is named NETWORK.SCENE. This command prints the calibration on scenes that it has not seen (leave one
+scene out), and draws the reliability diagrams of docs/results/calibration.md:
 
     python -m tests.acceptance.instance_calibration check RUN_DIR...
 
-Learn the calibration of all networks together, and that of each network, which is written to
+This command learns the calibration of all networks together, and that of each network, which it writes to
 plugins/detectors/NETWORK.calibration.json:
 
     python -m tests.acceptance.instance_calibration learn RUN_DIR...
@@ -39,6 +40,7 @@ from framework.mapping.instances.calibration import (
     iou_terms,
 )
 from framework.mapping.instances.instance_list import InstanceTableMap
+from framework.reporting.charts import reliability_figure
 from framework.runs.reevaluation import Truth, classes_of, read_predictions
 from framework.runs.stored_runs import MAP, read_record
 from tests.acceptance.runner import CHECKOUT
@@ -66,6 +68,7 @@ DETECTORS = {
         f"detector.weights={SHARED / 'weights' / 'yolo11n_seg' / 'yolo11n_seg.onnx'}",
     ),
 }
+FIGURES = CHECKOUT / "docs" / "results"
 RIDGE = 3.0  # weight of the squared distance to the prior weights
 
 
@@ -243,7 +246,7 @@ def unseen_scenes() -> dict[str, Comparison]:
 
 
 def check(directories: Iterable[Path]) -> dict[str, Comparison]:
-    """Print the calibration on unseen scenes, in total and for each network, and return the total."""
+    """Print the calibration on unseen scenes, also for each network, and return the total."""
     runs = samples_by_network(directories)
     pairs = leave_one_scene_out(runs)
     total = comparisons(pairs)
@@ -256,6 +259,15 @@ def check(directories: Iterable[Path]) -> dict[str, Comparison]:
             print(comparison.row(f"{event}, {network}"))
     print(f"mean absolute error of the expected IoU: {iou_error(pairs):.3f}", flush=True)
     return total
+
+
+def check_and_draw(directories: Iterable[Path]) -> None:
+    """Print the calibration on unseen scenes, and draw its reliability diagrams with and without calibration."""
+    total = check(directories)
+    named = {"Exists": total["exists"], "Class is right": total["class"]}
+    for name in ("today", "calibrated"):
+        figure = reliability_figure({title: getattr(one, name) for title, one in named.items()}, background="white")
+        figure.savefig(FIGURES / f"calibration_{name}.png", dpi=144)
 
 
 def learn_all(directories: Iterable[Path]) -> None:
@@ -272,4 +284,4 @@ def rounded(calibration: Calibration) -> Calibration:
 
 
 if __name__ == "__main__":
-    {"check": check, "learn": learn_all}[sys.argv[1]](map(Path, sys.argv[2:]))
+    {"check": check_and_draw, "learn": learn_all}[sys.argv[1]](map(Path, sys.argv[2:]))
