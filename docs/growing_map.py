@@ -50,7 +50,7 @@ def main() -> None:
         if not pose.lost:
             poses.append(pose.T_world_camera)
         if k % FRAME_INTERVAL == FRAME_INTERVAL - 1 or k == len(sequence) - 1:
-            likely = [key for key, found in scene.instances().items() if found.confidence >= LIKELY]
+            likely = [key for key, found in scene.instances().items() if found.probabilities[0] >= LIKELY]
             maps.append((scene.mesh(), likely))
 
     if not poses:

@@ -423,6 +423,22 @@ class Instance:
     obb: Box  # oriented bounding box in the world frame
     embedding: Float32 | None = None  # (D,) unit vector in the map's `embedding_space`; None = no embedding
     embedding_spread: float | None = None  # in [0, 1], 1 - |mean of the unit vectors|: 0 = all equal
+    exists: float | None = None  # probability that it is an object, i.e. matches one at IoU 0.5; None = not calibrated
+    class_probability: float | None = None  # probability that its most probable class is right, if it exists
+    expected_iou: float | None = None  # expected IoU of its surface with that of the object, if it exists
+
+    @property
+    def probabilities(self) -> tuple[float, float]:
+        """The probabilities that it exists and that its class is right.
+
+        They are the confidence and the largest class probability if they are not calibrated.
+        """
+        return (
+            self.confidence if self.exists is None else self.exists,
+            float(self.class_probabilities.max(initial=0.0))
+            if self.class_probability is None
+            else self.class_probability,
+        )
 
 
 @dataclass(frozen=True)

@@ -147,6 +147,7 @@ class Detector(ABC):
     classes: tuple[str, ...]  # names of the columns of Detections.class_probabilities; set by the constructor
     concurrent: bool = False  # True = threads may call `detect` at the same time; each call uses about one core
     domain: str = ""  # `RGBDVideo.domain` that the detector was trained for; "" = any
+    calibration: Path | None = None  # file with the calibration of the instances; None = generic calibration
 
     @abstractmethod
     def detect(self, frame: Frame) -> Detections:
@@ -456,7 +457,7 @@ class SubmapSurfaces(ABC):
 class SceneMap(ABC):
     """The map of a fuser.
 
-    Implement `classes` and the six abstract members. Override the other nine members to provide more data or a faster
+    Implement `classes` and the six abstract members. Override the other ten members to provide more data or a faster
     implementation.
     """
 
@@ -483,6 +484,9 @@ class SceneMap(ABC):
         The default is a CRC-32 of the statistics.
         """
         return zlib.crc32(repr(self.statistics).encode())
+
+    def calibrate(self, calibration: Path | None) -> None:  # noqa: B027  # optional
+        """Set `Detector.calibration`, which is called before the first frame. By default, it is ignored."""
 
     def instance_ids(self) -> frozenset[int]:
         """Return the ids of the objects in the map. A `Mapper` calls it before and after each frame."""

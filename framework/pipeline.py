@@ -84,6 +84,7 @@ class Pipeline:
         if self.prefetch < 0:
             raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}; set it to 0")
         check_label_space(self.detector.classes)
+        self.fuser.scene.calibrate(self.detector.calibration)
         self.viewer = GuardedViewer(self.viewer)
         self.backend = usable_back_end(self.backend, self.tracker, self.fuser)
         self.color_to_depth = ColorToDepth(delay=None)

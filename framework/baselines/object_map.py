@@ -42,7 +42,7 @@ from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 from framework.sensors.noise_models import SensorKind
 
-FORMAT = "object_volumes 5"  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = "object_volumes 6"  # format of the map file; increment it when the meaning of the contents changes
 OBJECT = "object_"  # prefix of the names of the arrays with the concatenated volumes of all objects
 
 Part = tuple[Float32, Int32, UInt8, Int32]

@@ -27,7 +27,7 @@ from framework.mapping.storage.map_file import (
 )
 from framework.sensors.noise_models import SensorKind
 
-FORMAT = "open3d_vbg 6"  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = "open3d_vbg 7"  # format of the map file; increment it when the meaning of the contents changes
 
 
 class Open3DMap(InstanceTableMap):

@@ -25,6 +25,7 @@ class DetectorOfMap(Detector):
 
     def __post_init__(self) -> None:
         self.concurrent, self.domain = self.detector.concurrent, self.detector.domain
+        self.calibration = self.detector.calibration
         self.reads = fields_read(self.detector)
         self._columns = [self.classes.index(name) for name in self.detector.classes]
 

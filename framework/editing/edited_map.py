@@ -145,7 +145,8 @@ class EditedMap:
             key = next(one for one in count(1) if one not in self._used)
             self._used.add(key)
             record = table.records[edit.id]
-            table.add(replace(record, id=key, observed_in=copy(record.observed_in), in_view=copy(record.in_view)))
+            copies = {name: copy(getattr(record, name)) for name in ("observed_in", "in_view", "viewing")}
+            table.add(replace(record, id=key, **copies))
             self._assign(voxels[voxel_parts == number], key)
             new.append(key)
         return new

@@ -17,8 +17,8 @@ far from the ground truth.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
@@ -27,6 +27,7 @@ from scipy.spatial import cKDTree
 
 from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh, Int32, Int64, SceneTruth
 from framework.errors import DataError
+from framework.evaluation.calibration import Forecasts, calibration_metrics
 
 MAX_DISTANCE = 0.05  # m, maximum distance of the nearest neighbor for the label transfer
 MIN_POINTS = 100  # minimum number of points of an evaluated ground-truth instance
@@ -49,6 +50,8 @@ class PredictedInstances:
     ids: Int64  # (K,) every instance of the map, including instances without points
     confidences: Float64  # (K,) in [0, 1]
     class_names: tuple[str, ...]  # (K,) most probable classes
+    # probabilities that an instance exists and that its class is right, by id; empty = unknown
+    probabilities: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         counts = {name: len(getattr(self, name)) for name in ("ids", "confidences", "class_names")}
@@ -77,11 +80,17 @@ class PredictedInstances:
         """
         ids = sorted(instances)
         names = [classes[int(instances[key].class_probabilities.argmax())] for key in ids]
-        return cls.on_mesh(mesh, ids, [instances[key].confidence for key in ids], names)
+        probabilities = {key: one.probabilities for key, one in instances.items()}
+        return cls.on_mesh(mesh, ids, [instances[key].confidence for key in ids], names, probabilities)
 
     @classmethod
     def on_mesh(
-        cls, mesh: InstanceMesh, ids: Sequence[int], confidences: Sequence[float], class_names: Sequence[str]
+        cls,
+        mesh: InstanceMesh,
+        ids: Sequence[int],
+        confidences: Sequence[float],
+        class_names: Sequence[str],
+        probabilities: Mapping[int, tuple[float, float]] | None = None,
     ) -> PredictedInstances:
         """Return the instances of a mesh with the given ids. Vertices of other instances get the id 0."""
         listed = np.array(ids, np.int64)
@@ -91,6 +100,7 @@ class PredictedInstances:
             ids=listed,
             confidences=np.array(confidences, np.float64),
             class_names=tuple(class_names),
+            probabilities=probabilities or {},
         )
 
 
@@ -141,6 +151,7 @@ class InstanceEvaluation:
     overall: Score | None  # at IoU 0.5, over all classes; matches have the same class
     best_ious: Mapping[int, float]  # evaluated ground-truth instance -> best IoU with a prediction
     best_ids: Mapping[int, int]  # evaluated ground-truth instance -> prediction with the best IoU, 0 = none
+    forecasts: Mapping[str, Forecasts]  # probabilities that instances exist, and that their class is right
 
     def ap(self, threshold: float) -> float:
         """Return the AP at one IoU threshold, averaged over classes, or NaN without ground truth."""
@@ -161,6 +172,9 @@ class InstanceEvaluation:
         - `pq50`: panoptic quality at IoU 0.5, averaged over classes.
         - `true_count`: number of evaluated ground-truth instances, also for each class.
         - `ignored_count`: number of ignored predictions at IoU 0.5.
+        - `ece.<event>`, `brier.<event>` and `auroc.<event>`: calibration (see framework/evaluation/calibration.py). The
+          event is `exists` or `class`.
+        - `calibration_count.<event>`: number of instances in these metrics.
         """
         if self.overall is None:
             return {}
@@ -184,6 +198,8 @@ class InstanceEvaluation:
             flat[f"instances.ap25.{name}"] = self.by_class[0.25][name].ap
             flat[f"instances.ap.{name}"] = float(np.mean([self.by_class[t][name].ap for t in IOU_THRESHOLDS]))
             flat[f"instances.true_count.{name}"] = score.truths
+        for event, forecasts in self.forecasts.items():
+            flat |= calibration_metrics(forecasts, event)
         return flat
 
 
@@ -219,7 +235,8 @@ def evaluate(
             agnostic[threshold] = overlaps.score(threshold, everything, overlaps.evaluated, allowed)
     overall = overlaps.score(0.5, everything, overlaps.evaluated, same_class) if names else None
     best_ious, best_ids = overlaps.best()
-    return InstanceEvaluation(by_class, agnostic, overall, best_ious, best_ids)
+    forecasts = overlaps.forecasts(predictions.probabilities) if names and predictions.probabilities else {}
+    return InstanceEvaluation(by_class, agnostic, overall, best_ious, best_ids, forecasts)
 
 
 def judge(
@@ -241,6 +258,21 @@ def judge(
     found = {one.truth_id for one in judged if one.outcome is Outcome.RIGHT}
     counted = zip(overlaps.truth_ids.tolist(), overlaps.truth_classes, overlaps.evaluated, strict=True)
     return judged, {key: name for key, name, counts in counted if counts and key not in found}
+
+
+def forecasts(predictions: PredictedInstances, truth: SceneTruth) -> dict[str, Forecasts]:
+    """Return the forecasts of existence and of the class, by event; see `InstanceEvaluation.forecasts`."""
+    overlaps = _Overlaps.between(predictions, truth, Transfer.TO_TRUTH, MAX_DISTANCE, MIN_POINTS)
+    return overlaps.forecasts(predictions.probabilities)
+
+
+def judge_class_agnostic(predictions: PredictedInstances, truth: SceneTruth) -> dict[int, tuple[bool, bool, float]]:
+    """Return (exists, class is right, IoU) of each prediction that is not ignored, by id.
+
+    They are defined in framework/evaluation/calibration.py.
+    """
+    overlaps = _Overlaps.between(predictions, truth, Transfer.TO_TRUTH, MAX_DISTANCE, MIN_POINTS)
+    return {key: (exists, right, iou) for key, exists, right, iou in overlaps.class_agnostic()}
 
 
 IGNORED, NO_MATCH = -2, -1  # results of a prediction without a matched ground-truth instance
@@ -331,6 +363,27 @@ class _Overlaps:
             else:
                 found.append((k, IGNORED if unknown[k] else NO_MATCH))
         return found
+
+    def class_agnostic(self) -> Iterator[tuple[int, bool, bool, float]]:
+        """Yield (id, exists, class is right, IoU) for each prediction that is not ignored.
+
+        The IoU is that with the matched ground-truth instance, otherwise the largest one.
+        """
+        allowed = np.broadcast_to(self.evaluated, self.iou.shape)
+        for k, match in self.matches(0.5, np.ones(len(self.iou), np.bool_), allowed):
+            if match != IGNORED:
+                exists = match >= 0
+                right = exists and self.predicted_classes[k] == self.truth_classes[match]
+                iou = self.iou[k, match] if exists else self.iou[k].max(initial=0.0)
+                yield int(self.predicted_ids[k]), exists, bool(right), float(iou)
+
+    def forecasts(self, probabilities: Mapping[int, tuple[float, float]]) -> dict[str, Forecasts]:
+        """Return the forecasts of existence and of the class, given both probabilities of each prediction."""
+        judged = list(self.class_agnostic())
+        return {
+            "exists": Forecasts.of((probabilities[key][0], exists) for key, exists, _, _ in judged),
+            "class": Forecasts.of((probabilities[key][1], right) for key, exists, right, _ in judged if exists),
+        }
 
     def match_result(self, k: int, match: int, threshold: float) -> MatchResult:
         """Return the result of prediction `k`, given its match and the IoU threshold."""

@@ -28,7 +28,6 @@ from framework.exporting.usd import Collision, check_usd, write_usd
 from framework.files.atomic_write import atomic_write
 from framework.geometry import transform
 from framework.runs.mesh_file import write_mesh
-from framework.runs.run_directory import LIKELY
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +58,7 @@ class Chosen:
     """Options of an export."""
 
     objects: Sequence[str] = ()  # ids or classes; () = the whole room
-    min_confidence: float = LIKELY  # minimum confidence of an object, in [0, 1]
+    min_confidence: float = 0.3  # minimum confidence of an object, in [0, 1]
     triangles: int | None = None  # maximum triangle count of the scene and of each object file, >= 4; None = no limit
     coloring: Coloring = Coloring.APPEARANCE  # vertex colors
     collision: Collision = Collision.HULL  # collision shape of objects in USD files

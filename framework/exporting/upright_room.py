@@ -178,7 +178,7 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
         one.id: order[np.searchsorted(ids, one.id) : np.searchsorted(ids, one.id, side="right")] for one in instances
     }
     seen = sorted((one for one in instances if len(owned[one.id])), key=lambda one: one.id)
-    likely = {one.id for one in seen if one.confidence >= LIKELY}
+    likely = {one.id for one in seen if one.existence >= LIKELY}
     centers = {one.id: mesh.vertices[owned[one.id]].mean(axis=0).astype(np.float64) for one in seen}
     colors = object_colors(centers, likely)
     of_class = class_colors([(one.class_name, one.confidence) for one in seen])

@@ -40,7 +40,7 @@ from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VOLUME_ARRAYS, TsdfV
 from framework.mapping.voxels.voxel_grid import MAX_BLOCKS
 from framework.sensors.noise_models import SensorKind
 
-FORMAT = 9  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = 10  # format of the map file; increment it when the meaning of the contents changes
 SAVED_ARRAYS = (*VOLUME_ARRAYS, *PackedEvidence._fields, CLASS_EVIDENCE)
 LARGEST_SCALE = 2**40  # maximum score_scale of a map file (quantized class score for evidence of 1)
 

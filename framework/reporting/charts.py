@@ -21,12 +21,14 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from scipy.spatial import ConvexHull, QhullError
 
 from framework.data import Box, Float64
+from framework.evaluation.calibration import Forecasts
 from framework.figures.stage_times import WINDOW, running_median
 from framework.runs.timings_file import StageTimes
 from framework.runtime.run_log import STAGE_ORDER
 from framework.sensors.depth_distortion import DepthDistortion
 
 WIDTH, HEIGHT, FLAT_HEIGHT, TIMES_HEIGHT, GROWTH_HEIGHT = 560.0, 380.0, 180.0, 240.0, 390.0  # px
+RELIABILITY_HEIGHT = 260.0  # px
 DEPTH_HEIGHT, SCALE_PX, IMAGE_STEP = 200.0, 16.0, 4  # px: height of a depth image, its color scale, and pixel step
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 40.0  # px, margins around the axes
 TEXT_PX, DOT_PX = 12.0, 10.0  # font size, and diameter of the dots at the ends of a path
@@ -269,6 +271,41 @@ def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int]
     counts.yaxis.set_major_locator(MaxNLocator(4, integer=True))
     counts.tick_params(length=0, labelsize=TEXT_PX, labelcolor=COLORS["accent"])
     return _svg(figure, "Visible surface and detected objects by frame")
+
+
+def reliability(forecasts: Mapping[str, Forecasts]) -> str:
+    """Draw a reliability diagram for each event, by title, and return the SVG element."""
+    return _svg(reliability_figure(forecasts), "Reliability of the probabilities")
+
+
+def reliability_figure(forecasts: Mapping[str, Forecasts], background: str = "none") -> Figure:
+    """Return a figure with a reliability diagram for each event, by title.
+
+    Each dot is a bin with its number of instances. Dots on the diagonal are calibrated.
+    """
+    figure = Figure((WIDTH / 72, RELIABILITY_HEIGHT / 72), dpi=72, facecolor=background)
+    inner = WIDTH / len(forecasts) - LEFT - RIGHT
+    for k, (title, one) in enumerate(forecasts.items()):
+        left = k * (inner + LEFT + RIGHT) + LEFT
+        tall = RELIABILITY_HEIGHT - TOP - BOTTOM
+        bounds = left / WIDTH, BOTTOM / RELIABILITY_HEIGHT, inner / WIDTH, tall / RELIABILITY_HEIGHT
+        axes = figure.add_axes(bounds, facecolor="none")
+        axes.plot([0, 1], [0, 1], color=COLORS["faint"], linewidth=1, gid=f"chart-ideal-{k}")
+        for one_bin in one.reliability():
+            point = one_bin.mean_probability, one_bin.frequency
+            size = DOT_PX**2 * (1 + 9 * one_bin.count / len(one))
+            axes.scatter(*point, s=size, color=COLORS["accent"], alpha=0.4, linewidth=0, zorder=3)
+            axes.annotate(
+                str(one_bin.count), point, color=COLORS["ink"], fontsize=TEXT_PX, ha="center", va="center", zorder=4
+            )
+        axes.set(xlim=(-0.08, 1.08), ylim=(-0.08, 1.08), xticks=(0, 0.5, 1), yticks=(0, 0.5, 1))
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[["left", "bottom"]].set_color(COLORS["line"])
+        axes.tick_params(length=0, labelsize=TEXT_PX, labelcolor=COLORS["faint"])
+        axes.set_xlabel("mean probability", loc="right", fontsize=TEXT_PX, color=COLORS["faint"])
+        heading = f"{title}: fraction, n = {len(one)}, ECE {one.ece():.2f}"
+        axes.set_title(heading, loc="left", fontsize=TEXT_PX, color=COLORS["faint"])
+    return figure
 
 
 def round_length(longest: float) -> float:

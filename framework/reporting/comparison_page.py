@@ -204,10 +204,10 @@ class Comparison:
         return Table("times", "Stage times", "Median, ms", rows)
 
     def _objects(self) -> Table:
-        counts = [Counter(one.class_name for one in run.objects if one.confidence >= LIKELY) for run in self.runs]
+        counts = [Counter(one.class_name for one in run.objects if one.existence >= LIKELY) for run in self.runs]
         names = sorted({name for one in counts for name in one}, key=lambda name: (-max(c[name] for c in counts), name))
         rows = [TableRow(name, compared([float(one[name]) for one in counts], 0, 0)) for name in names]
-        return Table("objects", "Objects by class", "Class", rows, f"With a confidence of at least {LIKELY}.")
+        return Table("objects", "Objects by class", "Class", rows, f"With a probability of at least {LIKELY}.")
 
 
 def compared(values: Sequence[float | None], digits: int, better: int) -> list[Cell]:

@@ -151,14 +151,14 @@ class MapScene:
 
 
 def likely_ids(contents: RunContents) -> list[int]:
-    """Return the ids of the objects with a confidence of at least LIKELY, in ascending order."""
-    return [one.id for one in contents.objects if one.confidence >= LIKELY]
+    """Return the ids of the objects that probably exist, in ascending order."""
+    return [one.id for one in contents.objects if one.existence >= LIKELY]
 
 
 def colors_by_id(objects: tuple[StoredInstance, ...]) -> dict[int, UInt8]:
     """Return the RGB color (3,) of each object by id. Objects without vertices are gray."""
     positions = {one.id: one.centroid for one in objects if one.centroid is not None}
-    colors = object_colors(positions, {one.id for one in objects if one.confidence >= LIKELY})
+    colors = object_colors(positions, {one.id for one in objects if one.existence >= LIKELY})
     return {one.id: colors.get(one.id, np.array((150, 150, 150), np.uint8)) for one in objects}
 
 

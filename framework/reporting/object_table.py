@@ -37,7 +37,7 @@ class ObjectRow:
 def object_rows(
     contents: RunContents, pictures: Mapping[int, Picture], match_results: Mapping[int, MatchResult]
 ) -> list[ObjectRow]:
-    """Return the rows of the object table, most confident object first.
+    """Return the rows of the object table, most probable object first.
 
     Args:
         contents: Outputs of the run.
@@ -46,7 +46,7 @@ def object_rows(
     """
     colors = colors_by_id(contents.objects)
     rows = []
-    for one in sorted(contents.objects, key=lambda one: (-one.confidence, one.id)):
+    for one in sorted(contents.objects, key=lambda one: (-one.existence, -one.confidence, one.id)):
         match_result = match_results.get(one.id)
         rows.append(
             ObjectRow(
@@ -76,6 +76,8 @@ def object_data(
         "id": one.id,
         "class": one.class_name,
         "confidence": one.confidence,
+        "exists": one.existence,
+        "calibrated": [] if one.exists is None else _calibrated(one),
         "color": color,
         "probabilities": [[name, round(probability, 4)] for name, probability in likeliest],
         "size": f"{_size(one, contents.up)} cm",
@@ -87,6 +89,12 @@ def object_data(
         "source": picture.source if picture else "",
         "truth": _truth(match_result) + (f", IoU {match_result.iou:.2f}" if match_result and match_result.iou else ""),
     }
+
+
+def _calibrated(one: StoredInstance) -> list[tuple[str, str]]:
+    """Return the names and values of the calibrated numbers of an object that are known, as text."""
+    named = {"Exists": one.exists, "Class is right": one.class_probability, "Expected IoU": one.expected_iou}
+    return [(name, f"{value:.2f}") for name, value in named.items() if value is not None]
 
 
 def _size(one: StoredInstance, up: Float64 | None) -> str:

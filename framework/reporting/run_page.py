@@ -240,7 +240,7 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
     if (fps := known("fps")) is not None:
         found.append(("Frames per second", f"{fps:.1f}", "/s", "all stages"))
     if (count := known("instances.count")) is not None:
-        found.append(("Objects", str(len(likely_ids(contents))), "", f"of {count:.0f}; confidence ≥ {LIKELY}"))
+        found.append(("Objects", str(len(likely_ids(contents))), "", f"of {count:.0f}; probability ≥ {LIKELY}"))
     if space := metrics.get("label_space"):
         found.append(("Label space", str(space), "", ""))
     if (ap50 := known("instances.ap50")) is not None:

@@ -12,14 +12,17 @@ from typing import Any
 import numpy as np
 
 from framework.data import SceneTruth, UInt8
+from framework.evaluation.calibration import Forecasts
 from framework.evaluation.instances import (
     MAX_DISTANCE,
     MatchResult,
     Outcome,
     PredictedInstances,
+    forecasts,
     judge,
     transfer_labels,
 )
+from framework.reporting.charts import reliability
 from framework.reporting.map_scene import MapScene
 from framework.reporting.pictures import Photographer, Picture
 from framework.reporting.run_contents import RunContents
@@ -77,6 +80,7 @@ class TruthCheck:
 
     match_results: Mapping[int, MatchResult]  # by object id
     missed: list[Card]
+    forecasts: Mapping[str, Forecasts]  # probabilities of the objects, by event
 
     @classmethod
     def of(
@@ -96,6 +100,7 @@ class TruthCheck:
             [one.id for one in objects],
             [one.confidence for one in objects],
             [one.class_name for one in objects],
+            {one.id: one.probabilities for one in objects},
         )
         compared = classes_of(contents.record).compare(predictions, truth)
         judged, missed = judge(compared.predictions, compared.truth)
@@ -114,7 +119,13 @@ class TruthCheck:
             note = "not detected" if nearest is None else f"best overlap: IoU {nearest.iou:.2f}"
             picture = pictures.get(key)
             cards.append(Card(name, "", note if picture else "not mapped", picture, nearest.id if nearest else None))
-        return cls({one.id: one for one in judged}, cards)
+        return cls({one.id: one for one in judged}, cards, forecasts(compared.predictions, compared.truth))
+
+    def reliability(self) -> str:
+        """Return the reliability diagrams as SVG, or "" without evaluated objects."""
+        named = {"Exists": self.forecasts["exists"], "Class is right": self.forecasts["class"]}
+        known = {name: one for name, one in named.items() if len(one)}
+        return reliability(known) if known else ""
 
     def galleries(self, contents: RunContents, pictures: Mapping[int, Picture]) -> list[Gallery]:
         cards = {outcome: list[Card]() for outcome in GROUPS}
@@ -155,6 +166,7 @@ def truth_section(
         "label_space": metrics.get(LABEL_SPACE),
         "ignored": ignored_names(metrics),
         "unchecked": "" if check else why_unchecked or "the run has no mesh",
+        "reliability": check.reliability() if check else "",
         "galleries": check.galleries(contents, pictures) if check else [],
     }
 

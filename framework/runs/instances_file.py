@@ -38,6 +38,20 @@ class StoredInstance:
     vertices: int  # number of mesh vertices
     centroid: Float64 | None  # (3,) of its vertices; None = no vertices
     obb: Box
+    exists: float | None = None  # probability that it exists; None = not calibrated
+    class_probability: float | None = None  # probability that its class is right, if it exists
+    expected_iou: float | None = None  # expected IoU with the object, if it exists
+
+    @property
+    def existence(self) -> float:
+        """Probability that it exists, or its confidence if it is not calibrated."""
+        return self.confidence if self.exists is None else self.exists
+
+    @property
+    def probabilities(self) -> tuple[float, float]:
+        """The probabilities that it exists and that its class is right, as `Instance.probabilities`."""
+        largest = max(self.class_probabilities.values(), default=0.0)
+        return self.existence, largest if self.class_probability is None else self.class_probability
 
     @property
     def probability(self) -> float | None:
@@ -56,6 +70,9 @@ def write_instances(
                 "id": instance.id,
                 "class": class_name(instance, classes),
                 "confidence": float(instance.confidence),  # not rounded, to avoid equal values
+                "exists": instance.exists,
+                "class_probability": instance.class_probability,
+                "expected_iou": instance.expected_iou,
                 # shortest decimal form of each float32: 0.9, not 0.8999999761581421
                 "class_probabilities": {
                     name: float(str(value)) for name, value in zip(classes, instance.class_probabilities, strict=True)
@@ -118,6 +135,10 @@ def _stored(where: str, entry: Any) -> StoredInstance:
             extent=_array(where, box, "extent", (3,)),
             rotation=_array(where, box, "rotation", (3, 3)),
         ),
+        **{
+            name: None if entry.get(name) is None else _fraction(where, entry, name)  # older files lack them
+            for name in ("exists", "class_probability", "expected_iou")
+        },
     )
 
 

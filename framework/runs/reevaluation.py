@@ -202,6 +202,7 @@ def read_predictions(record: Record) -> PredictedInstances:
         [instance.id for instance in instances],
         [instance.confidence for instance in instances],
         [instance.class_name for instance in instances],
+        {instance.id: instance.probabilities for instance in instances},
     )
 
 

@@ -87,7 +87,9 @@ from framework.vocabulary.label_spaces import label_space_of
 
 log = logging.getLogger(__name__)
 
-LIKELY = 0.3  # minimum confidence of instances in figures and log messages; files contain all instances
+# minimum probability that an instance exists (its confidence if it is not calibrated), for figures and logs; files
+# contain all instances
+LIKELY = 0.5
 
 Arguments = ParamSpec("Arguments")
 Made = TypeVar("Made")
@@ -253,7 +255,7 @@ class RunRecord:
         likely = Counter(name for name, _ in labels.values())
         counted = ", ".join(f"{count} {name}" for name, count in likely.most_common()) or "no likely instance"
         unlikely = int(figures.get("instances.count") or 0) - len(labels)
-        rest = f"; {unlikely} with a confidence below {LIKELY} are only in the files" if unlikely else ""
+        rest = f"; {unlikely} with a probability below {LIKELY} are only in the files" if unlikely else ""
         log.info("objects: %s%s", counted, rest)
         written = [name for name in ("overview.png", "mesh.ply", "instances.json") if (run.folder / name).exists()]
         if written:  # one line: directories of sweep jobs have long names
@@ -392,7 +394,7 @@ def likely_labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -
     return {
         key: (class_name(instance, classes) or "object", instance.confidence)
         for key, instance in instances.items()
-        if instance.confidence >= LIKELY
+        if instance.probabilities[0] >= LIKELY
     }
 
 

@@ -19,6 +19,7 @@ from framework.config.validation import (
     require,
 )
 from framework.data import Detections, Float32, Frame, Int32
+from framework.detection.calibration_files import calibration_of
 from framework.detection.mask_rcnn.checkpoint import domain_of_network, read_network
 from framework.detection.mask_rcnn.network import fuse_batch_norms, propose, select
 from framework.detection.mask_rcnn.published_weights import find_network
@@ -75,6 +76,7 @@ class MaskRCNNDetector(Detector):
             self.weights = find_network(self.weights)
             network = read_network(self.weights)
             self.domain = domain_of_network(self.weights)
+            self.calibration = calibration_of(self.weights)
         architecture = network.architecture
         self.classes = architecture.classes
         self._short_side = self.short_side or architecture.short_side

@@ -26,6 +26,7 @@ from framework.config.validation import (
     require,
 )
 from framework.data import Detections, Float32, Frame, Int32
+from framework.detection.calibration_files import calibration_of
 from framework.detection.mask_rcnn.network import propose, select
 from framework.detection.mask_rcnn.roi_align import roi_align
 from framework.detection.masks.binary_masks import paste_masks, without_duplicates
@@ -97,6 +98,7 @@ class MaskRCNN2Go(Detector):
         require(self.short_side <= self.long_side <= LONGEST_SIDE, "detector.long_side", self.long_side, allowed)
         self._device = torch_device(self.device)
         self.classes = COCO
+        self.calibration = calibration_of(self.weights)
         graph, tensors, spacings = _read_network(_find_weights(self.weights))
         tensors = {name: tensor.to(self._device) for name, tensor in tensors.items()}
         self._anchors: Float32 = tensors.pop("anchor").cpu().numpy()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from framework.config.validation import MAX_DETECTIONS, check_count, check_intervals, require
 from framework.data import Detections, Frame
+from framework.detection.calibration_files import calibration_of
 from framework.detection.candidates import spread_rest
 from framework.detection.instance_output import InstanceLayout, recognize_instances
 from framework.detection.masks.binary_masks import without_duplicates
@@ -77,6 +78,7 @@ class OnnxSegmentation(Detector):
         self._labels = read_labels(self.label_space)
         self._meaning = to_class_names(self._labels, self.class_names)
         self.classes = self._meaning.classes
+        self.calibration = calibration_of(self.weights)
         self._network = ImageNetwork(self)
         self._layout = self._detect_layout()
         self._log_classes()

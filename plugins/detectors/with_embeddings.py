@@ -46,6 +46,7 @@ class WithEmbeddings(Detector):
         )
         self._model = ImageTextModel(self.model, self.revision, self.device, self.half_precision)
         self.classes, self.domain = self.detector.classes, self.detector.domain
+        self.calibration = self.detector.calibration
         self.reads = tuple(
             dict.fromkeys((*fields_read(self.detector), "color", *(["index"] if self.frame_interval > 1 else [])))
         )

@@ -67,7 +67,7 @@ class ObjectVolumes(MapFuser):
         require_pixels_inside(clusters, frame.depth.shape)
         with timer("association"):
             overlaps = self._look_up(frame, pose.T_world_camera, clusters)
-            matches = self._associate(overlaps, clusters, frame)
+            matches = self._associate(overlaps, clusters, frame, pose.T_world_camera[:3, 3])
         with timer("integration"):
             masks = _masks(clusters, matches.instance_ids, frame.depth.shape)
             self.scene.integrate(frame, pose.T_world_camera, masks, self.hashing.near)
@@ -83,7 +83,7 @@ class ObjectVolumes(MapFuser):
         seen = self.scene.instances_seen(frame.camera, T_world_camera, frame.depth, stride)
         return count_overlaps(points, seen, stride)
 
-    def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Matches:
+    def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame, camera_center: Float64) -> Matches:
         """Match each cluster with the object with the largest overlap, and create objects for other clusters."""
         ratios = overlaps.by(self.overlap_rule, self.create_points)
         ratios[~self._agree(clusters, overlaps.instance_ids)] = 0
@@ -94,7 +94,7 @@ class ObjectVolumes(MapFuser):
         may_create = (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
         for k in np.flatnonzero((instance_ids == 0) & may_create):
             instance_ids[k] = self.scene.create(frame.index)
-        return Matches(frame.index, clusters, overlaps, instance_ids)
+        return Matches(frame.index, clusters, overlaps, instance_ids, camera_center)
 
     def _agree(self, clusters: PointClusters, instance_ids: Int32) -> Bool:
         """Return a Boolean array (N, M), True where the classes of a cluster and an object allow a match."""

@@ -16,6 +16,7 @@ from typing import Any
 from framework.tables.statistics import bootstrap_interval
 from tests.acceptance import changing_scenes, depth_calibration, long_run, recording_checks
 from tests.acceptance.buildings import files_that_depend_on_threads, five_rooms, second_round
+from tests.acceptance.instance_calibration import unseen_scenes
 from tests.acceptance.large_map import measure_large_map
 from tests.acceptance.loops import counted_loops
 from tests.acceptance.runner import CHECKOUT, Measured, measurement
@@ -270,6 +271,31 @@ def building_second_round() -> Measured:
 @measurement("0 result files differ between one and two threads, building of 5 rooms", *PIPELINE)
 def building_threads() -> Measured:
     return counted(files_that_depend_on_threads())
+
+
+UNSEEN = "leave one scene out, 4 real scenes with 2 networks"
+
+
+@measurement(f"ECE of existence <= 0.1, {UNSEEN}", *PIPELINE)
+def calibration_of_existence() -> Measured:
+    value = unseen_scenes()["exists"].calibrated.ece()
+    return value, value <= 0.1
+
+
+@measurement(f"ECE of the class <= 0.1, {UNSEEN}", *PIPELINE)
+def calibration_of_class() -> Measured:
+    value = unseen_scenes()["class"].calibrated.ece()
+    return value, value <= 0.1
+
+
+@measurement(f"0 events with a higher Brier score or a lower AUROC than without calibration, {UNSEEN}", *PIPELINE)
+def calibration_of_each_event() -> Measured:
+    worse = [
+        event
+        for event, one in unseen_scenes().items()
+        if one.calibrated.brier() >= one.today.brier() or one.calibrated.auroc() < one.today.auroc()
+    ]
+    return counted(worse)
 
 
 @measurement("slowest query <= 10 ms, unchanged map of 20 rooms, 1 cm", *PIPELINE)

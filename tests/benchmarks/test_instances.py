@@ -36,7 +36,9 @@ def test_associate_ten_masks_speed(benchmark, mapped) -> None:
     def associate() -> None:
         points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = fuser.association.look_up(fuser.scene, frame, pose, points)
-        matches = fuser.association.associate(fuser.scene.table, overlaps, clusters, frame.index)
+        matches = fuser.association.associate(
+            fuser.scene.table, overlaps, clusters, frame.index, pose.T_world_camera[:3, 3]
+        )
         fuser.association.merge(fuser.scene, matches)
 
     benchmark(associate)
@@ -47,7 +49,9 @@ def test_write_labels_of_ten_masks_speed(benchmark, mapped) -> None:
     fuser, frame, pose, clusters = mapped
     points = list_points_by_pixel(clusters, frame.depth.shape)
     overlaps = fuser.association.look_up(fuser.scene, frame, pose, points)
-    matches = fuser.association.associate(fuser.scene.table, overlaps, clusters, frame.index)
+    matches = fuser.association.associate(
+        fuser.scene.table, overlaps, clusters, frame.index, pose.T_world_camera[:3, 3]
+    )
     seen = fuser.voxels.integrate(fuser.scene, frame, pose)
 
     def write_labels() -> None:

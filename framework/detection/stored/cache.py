@@ -81,6 +81,7 @@ class CachedDetector(Detector):
     mode: CacheMode = CacheMode.READ_WRITE
 
     def __post_init__(self) -> None:
+        self.calibration = self.detector.calibration
         self.classes, self.domain, self.reads = self.detector.classes, self.detector.domain, fields_read(self.detector)
         if unknown := set(self.reads) - set(FRAME_FIELDS):
             raise ConfigError(

@@ -12,7 +12,7 @@ time, so that their number does not grow in a known place.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations
@@ -31,6 +31,7 @@ from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixe
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
 VOTES_ACROSS = 320  # approximate number of voting pixels per image row; more take longer without improving the result
+CENTER_POINTS = 20_000  # approximate number of points of a frame for the centers of its clusters
 MIN_PAIRS = 1024  # number of pairs with votes up to which those of removed instances are kept
 
 
@@ -169,6 +170,7 @@ class Matches:
     clusters: PointClusters
     overlaps: Overlaps  # overlaps with the instances of the map before this frame
     instance_ids: Int32  # (N,) id of an existing or a new instance of each cluster, 0 = none
+    camera_center: Float64  # (3,) m, in the world frame
 
 
 def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min_pixels: int) -> None:
@@ -192,8 +194,36 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min
     for k in np.flatnonzero(instance_ids):
         score, embedding = float(scores[k]), embeddings.get(int(k))
         table.observe(int(instance_ids[k]), class_evidence[k], score, matches.frame_index, embedding)
-    in_view = set(matches.overlaps.instance_ids[matches.overlaps.visible >= min_pixels].tolist())
-    table.see(in_view | set(instance_ids[instance_ids > 0].tolist()), matches.frame_index)
+    visible = matches.overlaps.instance_ids[matches.overlaps.visible >= min_pixels]
+    in_view = set(visible.tolist()) | set(instance_ids[instance_ids > 0].tolist())
+    table.see(in_view, matches.frame_index)
+    _observe_views(table, matches, in_view, min_pixels)
+
+
+def _observe_views(table: InstanceTable, matches: Matches, in_view: Set[int], min_pixels: int) -> None:
+    """Add a frame to the statistics of the views of the instances in view."""
+    overlaps, instance_ids = matches.overlaps, matches.instance_ids
+    outlines, centers = overlaps.over_union(min_pixels), cluster_centers(matches.clusters)
+    columns = {k: column for column, k in enumerate(overlaps.instance_ids.tolist())}
+    for cluster in np.flatnonzero(instance_ids).tolist():
+        viewing = table.records[int(instance_ids[cluster])].viewing
+        if (column := columns.get(int(instance_ids[cluster]))) is not None:
+            viewing.detect(float(outlines[cluster, column]))
+        if np.isfinite(centers[cluster]).all():
+            viewing.locate(tuple(centers[cluster].tolist()))
+    camera = tuple(matches.camera_center.tolist())
+    for k in in_view:
+        table.records[k].viewing.see(camera)
+
+
+def cluster_centers(clusters: PointClusters) -> Float64:
+    """Return the mean (N, 3) of a sample of the points of each cluster, m. It is NaN for clusters without points."""
+    step = max(1, len(clusters.points_world) // CENTER_POINTS)
+    points, cluster = clusters.points_world[::step].astype(np.float64), clusters.cluster[::step]
+    points, cluster = points[cluster >= 0], cluster[cluster >= 0]
+    count = np.bincount(cluster, minlength=len(clusters))
+    sums = np.stack([np.bincount(cluster, points[:, axis], len(clusters)) for axis in range(3)], axis=1)
+    return np.asarray(sums / np.where(count, count, np.nan)[:, None])
 
 
 def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding]:
@@ -256,7 +286,7 @@ class Association:
         """Return the clusters at each pixel, and their matches with existing and new instances."""
         points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = self.look_up(scene, frame, pose, points)
-        return points, self.associate(scene.table, overlaps, clusters, frame.index)
+        return points, self.associate(scene.table, overlaps, clusters, frame.index, pose.T_world_camera[:3, 3])
 
     def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, points: PixelLists) -> Overlaps:
         """Return the overlaps of the clusters with the instances of the map."""
@@ -266,7 +296,14 @@ class Association:
             return count_overlaps(points, np.ascontiguousarray(view.instance_ids[::stride, ::stride]), stride)
         return count_overlaps(points, scene.instances_seen(frame, pose.T_world_camera, stride), stride)
 
-    def associate(self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, frame_index: int) -> Matches:
+    def associate(
+        self,
+        table: InstanceTable,
+        overlaps: Overlaps,
+        clusters: PointClusters,
+        frame_index: int,
+        camera_center: Float64,
+    ) -> Matches:
         """Match clusters with instances, and create instances for unmatched clusters.
 
         A cluster creates an instance only if it meets `create_score` and `create_points`.
@@ -283,7 +320,7 @@ class Association:
             may_create &= ~allowed.any(axis=1)
         for k in np.flatnonzero(may_create):
             instance_ids[k] = table.create(len(clusters.classes), frame_index).id
-        return Matches(frame_index, clusters, overlaps, instance_ids)
+        return Matches(frame_index, clusters, overlaps, instance_ids, camera_center)
 
     def _agree(self, table: InstanceTable, clusters: PointClusters, instance_ids: Int32) -> Bool:
         """Return a Boolean array (N, M), True where the class distributions allow a match."""

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property, lru_cache, partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from framework.config.validation import check_bounds
 from framework.data import Bool, Box, Float32, Float64, Instance, InstanceMesh, Int32
 from framework.interfaces import SceneMap
 from framework.mapping.instances.association import agreed_classes
+from framework.mapping.instances.calibration import Calibration
 from framework.mapping.instances.instance_table import InstanceRecord, InstanceTable
 from framework.mapping.storage.map_header import MapHeader
 
@@ -99,6 +101,14 @@ class InstanceTableMap(SceneMap):
     def digest(self) -> int:
         return zlib.crc32(_checksum(self.instance_ids()).to_bytes(4, "little"), super().digest())
 
+    def calibrate(self, calibration: Path | None) -> None:
+        """Set the calibration of the instances.
+
+        Raises:
+            DataError: The file is missing or invalid.
+        """
+        self.table.calibration = Calibration() if calibration is None else Calibration.read(calibration)
+
     def instance_ids(self) -> frozenset[int]:
         return self.table.confirmed(self.confirmation)
 
@@ -131,6 +141,7 @@ class InstanceTableMap(SceneMap):
         for k, evidence in self.class_evidence().items():
             record, distribution = self.table.records[k], self.table.distribution(evidence)
             class_ids[k] = int(distribution.argmax())
+            probabilities = self.table.probabilities(record, evidence)
             known[k] = partial(
                 Instance,
                 id=k,
@@ -141,6 +152,9 @@ class InstanceTableMap(SceneMap):
                 last_frame=record.last_frame,
                 embedding=None if record.embedding is None else record.embedding.mean,
                 embedding_spread=None if record.embedding is None else record.embedding.spread,
+                exists=probabilities.exists,
+                class_probability=probabilities.class_probability,
+                expected_iou=probabilities.expected_iou,
             )
 
         def create(k: int, vertices: Int32) -> Instance:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from struct import Struct
 from typing import Protocol
@@ -11,7 +12,9 @@ from typing import Protocol
 import numpy as np
 
 from framework.data import Bool, Float32, Float64, Int32
+from framework.mapping.instances.calibration import NO_OUTLINE, Calibration, Features, Probabilities
 from framework.mapping.instances.object_embedding import ObjectEmbedding, added
+from framework.mapping.instances.viewing import Viewing
 from framework.mapping.labels.label_evidence import UNSEEN
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.runtime.spooled_list import Spool
@@ -121,6 +124,7 @@ class InstanceRecord:
     score_sum: float = 0.0  # sum of the scores of its detections
     detections: int = 0  # number of detections
     embedding: ObjectEmbedding | None = None  # sum of the embeddings of its detections, None = no embedding
+    viewing: Viewing = field(default_factory=Viewing)  # statistics of its views
 
     @property
     def observations(self) -> int:
@@ -133,10 +137,29 @@ class InstanceRecord:
         return len(self.in_view)
 
     @property
+    def mean_score(self) -> float:
+        """Mean score of its detections."""
+        return self.score_sum / max(self.detections, 1)
+
+    @property
     def confidence(self) -> float:
         """Mean detection score times the detection rate in frames with the instance in view, in [0, 1]."""
-        mean_score = self.score_sum / max(self.detections, 1)
-        return mean_score * self.observations / max(self.visible, self.observations, 1)
+        return self.mean_score * self.observations / max(self.visible, self.observations, 1)
+
+    def features(self, class_probability: float) -> Features:
+        """Return the statistics for the calibrated probabilities.
+
+        Args:
+            class_probability: The probability of the most likely class, with discounted evidence.
+        """
+        outline = self.viewing.outline
+        return Features(
+            confidence=self.confidence,
+            observations=self.observations,
+            score=self.mean_score,
+            outline=NO_OUTLINE if outline is None else outline,
+            class_probability=class_probability,
+        )
 
 
 class InstanceTable:
@@ -163,6 +186,7 @@ class InstanceTable:
         self.combine = combine
         self.logarithmic = logarithmic
         self.embedding_space = ""  # space of the embeddings of the instances; "" = no embeddings
+        self.calibration = Calibration()  # of the detector
 
     def create(self, classes: int, frame_index: int) -> InstanceRecord:
         """Create an instance without observations.
@@ -211,6 +235,7 @@ class InstanceTable:
                     last_frame=last_frame,
                     observed_in=frames[0],
                     in_view=frames[1],
+                    viewing=copy(record.viewing),
                 )
             )
         since = self.frames_detected - other.frames_detected
@@ -323,6 +348,7 @@ class InstanceTable:
         a.score_sum += b.score_sum
         a.detections += b.detections
         a.embedding = added(a.embedding, b.embedding)
+        a.viewing.merge(b.viewing)
         a.first_frame = min(a.first_frame, b.first_frame)
         a.last_frame = max(a.last_frame, b.last_frame)
 
@@ -341,6 +367,25 @@ class InstanceTable:
         likelihood = np.exp(evidence - evidence.max()) if self.logarithmic else evidence
         total = likelihood.sum()
         return np.asarray(likelihood / total if total > 0 else np.full_like(evidence, 1 / len(evidence)), np.float32)
+
+    def probabilities(self, record: InstanceRecord, evidence: Float64) -> Probabilities:
+        """Return the calibrated probabilities of an instance.
+
+        Args:
+            record: The history of the instance.
+            evidence: The class evidence (C,) that determines its class.
+        """
+        return self.calibration.probabilities(record.features(self.discounted_class_probability(record, evidence)))
+
+    def discounted_class_probability(self, record: InstanceRecord, evidence: Float64) -> float:
+        """Return the probability of the most likely class, with the log-likelihoods scaled to the number of views.
+
+        Votes are not scaled, because their sum does not saturate.
+        """
+        if self.logarithmic:
+            views = record.viewing.views * record.observations / max(record.visible, record.observations, 1)
+            evidence = evidence * min(1.0, max(views, 1.0) / max(record.detections, 1))
+        return float(self.distribution(evidence).max(initial=0.0))
 
     def class_ids(self) -> Int32:
         """Return the most likely class (last id + 1,) of each instance, indexed by id, -1 = no such instance."""

@@ -10,6 +10,7 @@ import struct
 import zipfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,10 @@ from framework.files.atomic_write import atomic_write, check_regular
 from framework.files.json_file import parse_json
 from framework.files.manifest import verified
 from framework.files.search_paths import usable_path
+from framework.mapping.instances.calibration import Calibration
 from framework.mapping.instances.instance_table import PAGE, FrameSet, InstanceRecord, InstanceTable
 from framework.mapping.instances.object_embedding import ARRAYS, SPACE, embedding_arrays, read_embeddings
+from framework.mapping.instances.viewing import Point, Viewing
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.storage.map_file_kernels import find_unknown
 from framework.mapping.storage.map_header import LARGEST_COUNT, MapHeader, whole
@@ -254,6 +257,7 @@ def plain_table(table: InstanceTable) -> dict[str, Any]:
         "combine": table.combine.name,
         "logarithmic": table.logarithmic,
         "last_id": table.last_id,
+        "calibration": asdict(table.calibration),
         "tentative": [[k, table.frames_detected - frame] for k, frame in table.tentative.items()],
         **space,
         "instances": [_plain_record(record) for record in table.records.values()],
@@ -265,6 +269,7 @@ def _plain_record(record: InstanceRecord) -> dict[str, Any]:
         **vars(record),
         "observed_in": _plain_frames(record.observed_in),
         "in_view": _plain_frames(record.in_view),
+        "viewing": asdict(record.viewing),
     }
     del plain["class_evidence"], plain["embedding"]
     return plain
@@ -300,6 +305,7 @@ def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> Insta
     """
     table = InstanceTable(plain.option("combine", Combine), plain.flag("logarithmic"))
     table.last_id = plain.whole("last_id", 0, LARGEST_ID)
+    table.calibration = Calibration.of(plain.part("calibration").values, f"{plain.name}.calibration")
     entries, evidence = list(plain.parts("instances")), arrays[CLASS_EVIDENCE]
     check_array(CLASS_EVIDENCE, evidence, (len(entries), classes), np.float64)
     if len(entries) and not classes:
@@ -343,7 +349,34 @@ def _record(entry: MapHeader, table: InstanceTable, class_evidence: Float64) -> 
         in_view=table.frame_set(_pages(entry.part("in_view"))),
         score_sum=entry.number("score_sum", (0.0, float(entry.whole("detections")))),
         detections=entry.whole("detections"),
+        viewing=_viewing(entry.part("viewing")),
     )
+
+
+def _viewing(entry: MapHeader) -> Viewing:
+    """Return the statistics of the views of an instance."""
+    outlines = entry.whole("outlines")
+    return Viewing(
+        views=entry.whole("views"),
+        outlines=outlines,
+        outline_sum=entry.number("outline_sum", (0.0, float(outlines))),
+        centered=entry.whole("centered"),
+        center_sum=_point(entry, "center_sum"),
+        camera=None if entry.values.get("camera") is None else _point(entry, "camera"),
+    )
+
+
+def _point(entry: MapHeader, name: str) -> Point:
+    """Return three numbers.
+
+    Raises:
+        DataError: The value is no list of three numbers.
+    """
+    match entry.values.get(name):
+        case [int() | float() as x, int() | float() as y, int() | float() as z] if np.isfinite([x, y, z]).all():
+            return float(x), float(y), float(z)
+        case other:
+            raise DataError(f"{entry.name}.{name}: expected three numbers, got {other!r:.60}")
 
 
 def _pages(entry: MapHeader) -> dict[int, int]:

@@ -151,10 +151,10 @@ class Page {
     if (!this.table) return;
     const words = byId("search").value.trim().toLowerCase();
     const shown = this.table.filter(words, this.confidence);
-    const likely = this.table.rows.filter((row) => Number(row.dataset.confidence) >= this.confidence).length;
+    const likely = this.table.rows.filter((row) => Number(row.dataset.exists) >= this.confidence).length;
     byId("count").textContent = words
       ? `${shown} of ${this.table.rows.length} objects`
-      : `${likely} objects with a confidence of at least ${this.confidence.toFixed(2)}; the other rows are dimmed`;
+      : `${likely} objects with a probability of at least ${this.confidence.toFixed(2)}; the other rows are dimmed`;
   }
 
   /** Returns the objects of the map as recorded or, in the editing mode, after the edits. */
@@ -224,6 +224,7 @@ class Page {
     ]);
     if (bars.length) parts.push(made("h4", "", "Class probabilities"), made("div", "bars", ...bars));
     const facts = [
+      ...object.calibrated,
       ["Confidence", object.confidence.toFixed(2)],
       ["Size", object.size],
       ["Position", object.place],
@@ -240,13 +241,13 @@ class Page {
 
   legend() {
     const objects = this.shown().filter((one) => (one.owner || one.id) === one.id); // without objects merged into others
-    const likely = objects.filter((one) => isLikely(one, this.confidence)).sort((a, b) => b.confidence - a.confidence);
+    const likely = objects.filter((one) => isLikely(one, this.confidence)).sort((a, b) => b.exists - a.exists);
     const classes = this.viewer && this.viewer.view === "class";
     const entries = classes ? [...new Map(likely.map((one) => [one.class, one])).values()] : likely;
     byId("legend").replaceChildren(...entries.map((one) => {
       const count = likely.filter((other) => other.class === one.class).length;
       const button = made("button", "", swatch(classes ? one.classColor : one.color), made("span", "", one.class),
-        made("span", "", classes ? String(count) : one.confidence.toFixed(2)));
+        made("span", "", classes ? String(count) : one.exists.toFixed(2)));
       button.type = "button";
       button.addEventListener("click", () => this.choose(one.id, { fly: true }));
       return button;

@@ -40,13 +40,13 @@ class ObjectTable {
     this.body.append(...this.rows);
   }
 
-  /** Hides rows that do not match the search text, and dims rows below the confidence. Returns the number of shown rows. */
-  filter(words, confidence) {
+  /** Hides rows that do not match the search text, and dims rows below the probability. Returns the number of shown rows. */
+  filter(words, probability) {
     let shown = 0;
     for (const row of this.rows) {
       const found = row.dataset.words.includes(words) || row.dataset.id === words;
       row.hidden = !found;
-      row.classList.toggle("unlikely", Number(row.dataset.confidence) < confidence);
+      row.classList.toggle("unlikely", Number(row.dataset.exists) < probability);
       shown += found;
     }
     return shown;

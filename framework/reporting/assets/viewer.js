@@ -282,8 +282,8 @@ class MapViewer {
   }
 }
 
-/** Returns true for objects with a minimum confidence. Edited objects are always likely, deleted ones never. */
-function isLikely(object, least) { return !object.deleted && (object.edited || object.confidence >= least); }
+/** Returns true for objects with a minimum probability. Edited objects are always likely, deleted ones never. */
+function isLikely(object, least) { return !object.deleted && (object.edited || object.exists >= least); }
 
 function centroid(geometry) {
   const positions = geometry.getAttribute("position");

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from framework.data import Box
+from framework.evaluation.calibration import Forecasts
 from framework.reporting.charts import (
     HEIGHT,
     WIDTH,
@@ -20,6 +21,7 @@ from framework.reporting.charts import (
     growth,
     motions,
     position_errors,
+    reliability,
     round_length,
     stage_areas,
     stage_rows,
@@ -83,6 +85,13 @@ def test_top_view_draws_anchors_and_each_loop_once() -> None:
 def test_motions_are_drawn_by_frame() -> None:
     [line] = paths(motions([0, 1, 2], np.array([0.0, 0.01, 0.02])), "chart-motions")
     assert np.diff(line, axis=0) == pytest.approx(np.repeat(line[1:2] - line[:1], 2, axis=0), abs=0.02)
+
+
+def test_reliability_shows_count_of_each_bin() -> None:
+    picture = reliability({"Exists": Forecasts.of([(0.05, False), (0.55, True), (0.58, False), (1.0, True)])})
+    assert picture.startswith("<svg")
+    assert "Exists: fraction, n = 4, ECE" in picture
+    assert [picture.count(f">{number}</text>") for number in (1, 2)] == [2, 1], "number of events of the three bins"
 
 
 def test_depth_corrections_have_symmetric_scale() -> None:

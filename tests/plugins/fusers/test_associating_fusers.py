@@ -237,7 +237,7 @@ def test_association_votes_of_removed_instances_are_bounded() -> None:
     overlaps = Overlaps(*np.zeros((3, 0), np.int32), np.zeros((0, 0), np.int32), np.zeros((1, 1), np.int32), 1)
     for k in range(5 * MIN_PAIRS):
         ids = [table.create(1, k).id for _ in range(2)]
-        association.merge(scene, Matches(k, clusters, overlaps, np.int32(ids)))
+        association.merge(scene, Matches(k, clusters, overlaps, np.int32(ids), np.zeros(3)))
         for instance_id in ids:
             table.remove(instance_id)
     assert len(association._merge_votes) <= MIN_PAIRS + 1
