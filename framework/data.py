@@ -23,6 +23,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from numbers import Integral, Real
 from typing import cast
 
@@ -425,6 +426,16 @@ class Instance:
     embedding_spread: float | None = None  # in [0, 1], 1 - |mean of the unit vectors|: 0 = all equal
 
 
+class Structure(IntEnum):
+    """Parts of a building in a map, which belong to no instance, except for furniture fronts."""
+
+    NONE = 0
+    FLOOR = 1
+    WALL = 2
+    CEILING = 3
+    FRONT = 4  # large vertical front of furniture, such as a cupboard; it may belong to an instance
+
+
 @dataclass(frozen=True)
 class InstanceMesh:
     """The surface of a map as a mesh with labeled vertices."""
@@ -435,6 +446,7 @@ class InstanceMesh:
     instance_ids: Int32  # (V,), 0 = no instance
     class_ids: Int32  # (V,) index into `classes`, -1 = no class
     classes: tuple[str, ...]
+    structure: UInt8 | None = None  # (V,) `Structure` of each vertex; None = not determined
 
     def __post_init__(self) -> None:
         v = len(self.vertices)
@@ -443,6 +455,8 @@ class InstanceMesh:
         check_array("InstanceMesh.colors", self.colors, (v, 3), np.uint8)
         check_array("InstanceMesh.instance_ids", self.instance_ids, (v,), np.int32)
         check_array("InstanceMesh.class_ids", self.class_ids, (v,), np.int32)
+        if self.structure is not None:
+            check_array("InstanceMesh.structure", self.structure, (v,), np.uint8)
 
     def of(self, instance: Instance) -> InstanceMesh:
         """Return the mesh of an instance: its vertices, in order, and the triangles between them."""
@@ -468,6 +482,7 @@ class InstanceMesh:
             self.instance_ids[vertices],
             self.class_ids[vertices],
             self.classes,
+            None if self.structure is None else self.structure[vertices],
         )
 
 
