@@ -527,11 +527,14 @@ class SceneTruth:
     classes: tuple[str, ...] | None = None  # all annotated classes; None = unknown
     trajectory: ReferenceTrajectory | None = None  # None = all maps share the world frame of the points
     annotated: AnnotatedObjects | None = None  # None = class_names are the names of the annotation
+    structure: UInt8 | None = None  # (V,) true `Structure` of each point, without FRONT; None = unknown
 
     def __post_init__(self) -> None:
         v = len(self.points_world)
         check_array("SceneTruth.points_world", self.points_world, (v, 3), np.float32)
         check_array("SceneTruth.instance_ids", self.instance_ids, (v,), np.int32)
+        if self.structure is not None:
+            check_array("SceneTruth.structure", self.structure, (v,), np.uint8)
 
 
 def check_rigid(name: str, T: Float64) -> None:

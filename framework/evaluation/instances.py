@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh, Int32, Int64, SceneTruth
+from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh, Int32, Int64, SceneTruth, UInt8
 from framework.errors import DataError
 
 MAX_DISTANCE = 0.05  # m, maximum distance of the nearest neighbor for the label transfer
@@ -49,6 +49,7 @@ class PredictedInstances:
     ids: Int64  # (K,) every instance of the map, including instances without points
     confidences: Float64  # (K,) in [0, 1]
     class_names: tuple[str, ...]  # (K,) most probable classes
+    structure: UInt8 | None = None  # (V,) `Structure`; None = not determined
 
     def __post_init__(self) -> None:
         counts = {name: len(getattr(self, name)) for name in ("ids", "confidences", "class_names")}
@@ -91,6 +92,7 @@ class PredictedInstances:
             ids=listed,
             confidences=np.array(confidences, np.float64),
             class_names=tuple(class_names),
+            structure=mesh.structure,
         )
 
 
