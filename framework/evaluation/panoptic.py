@@ -42,12 +42,14 @@ class PanopticEvaluation:
 
     things: Mapping[str, ClassQuality]
     stuff: Mapping[str, ClassQuality]
+    building_in_instances: float = 0.0  # fraction of the true points of floor and walls with a predicted instance
 
     def metrics(self) -> dict[str, float]:
         """Return the metrics by their names in metrics.json; empty without things or without stuff.
 
         - `panoptic.pq`, `pq_things` and `pq_stuff`: mean over all classes, the classes of things, and of stuff.
         - `panoptic.pq.<class>`: panoptic quality of a class of stuff.
+        - `panoptic.building_in_instances`: fraction of the true points of floor and walls with a predicted instance.
         """
         things, stuff = ([found.pq for found in classes.values()] for classes in (self.things, self.stuff))
         if not things or not stuff:
@@ -57,6 +59,7 @@ class PanopticEvaluation:
             "panoptic.pq_things": float(np.mean(things)),
             "panoptic.pq_stuff": float(np.mean(stuff)),
             **{f"panoptic.pq.{name}": found.pq for name, found in self.stuff.items()},
+            "panoptic.building_in_instances": self.building_in_instances,
         }
 
 
@@ -117,7 +120,8 @@ def _matched(
                      for p in rows.tolist()], np.bool_).reshape(overlap.shape)  # fmt: skip
     iou = np.where(same, overlap / np.maximum(union, 1), 0.0)
     matches = iou > MATCH
-    result = PanopticEvaluation({}, {})
+    building = np.isin(true, (-Structure.FLOOR, -Structure.WALL))
+    result = PanopticEvaluation({}, {}, float((predicted[building] > 0).mean()) if building.any() else 0.0)
 
     def of_class(segment: int, name: str) -> ClassQuality:
         classes: dict[str, ClassQuality] = result.stuff if segment < 0 else result.things  # type: ignore[assignment]

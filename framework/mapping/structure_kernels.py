@@ -7,7 +7,7 @@ from numba import prange
 
 from framework.compilation.kernel_cache import njit
 
-OBLIQUE = np.float32(0.5)  # minimum dot product of the normals of a plane and of a vertex next to an edge of the plane
+OBLIQUE = np.float32(0.1)  # minimum dot product of the normals of a plane and of a vertex next to an edge of the plane
 ALIGNED = np.float32(np.cos(np.radians(35.0)))  # minimum dot product of the normals of a plane and of its vertices
 
 

@@ -97,3 +97,12 @@ def test_panoptic_metrics_without_structure_are_empty() -> None:
     truth = SceneTruth(line(200), np.ones(200, np.int32), {1: "chair"})
     found = predicted([1] * 200, [0] * 200, ("chair",))
     assert evaluate_panoptic(found, truth).metrics() == {}
+
+
+def test_panoptic_counts_building_in_instances(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("framework.evaluation.panoptic.MIN_POINTS", 1)
+    truth = true([1] * 4 + [0] * 12, [0] * 4 + [FLOOR] * 4 + [WALL] * 4 + [CEILING] * 4, {1: "chair"})
+    found = predicted(
+        [1] * 6 + [0] * 8 + [1] * 2, [0] * 6 + [FLOOR] * 2 + [WALL] * 4 + [CEILING] * 2 + [0] * 2, ("chair",)
+    )
+    assert evaluate_panoptic(found, truth).metrics()["panoptic.building_in_instances"] == 2 / 8
