@@ -23,6 +23,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from numbers import Integral, Real
 from typing import cast
 
@@ -441,6 +442,16 @@ class Instance:
         )
 
 
+class Structure(IntEnum):
+    """Parts of a building in a map, which belong to no instance, except for furniture fronts."""
+
+    NONE = 0
+    FLOOR = 1
+    WALL = 2
+    CEILING = 3
+    FRONT = 4  # large vertical front of furniture, such as a cupboard; it may belong to an instance
+
+
 @dataclass(frozen=True)
 class InstanceMesh:
     """The surface of a map as a mesh with labeled vertices."""
@@ -451,6 +462,7 @@ class InstanceMesh:
     instance_ids: Int32  # (V,), 0 = no instance
     class_ids: Int32  # (V,) index into `classes`, -1 = no class
     classes: tuple[str, ...]
+    structure: UInt8 | None = None  # (V,) `Structure` of each vertex; None = not determined
 
     def __post_init__(self) -> None:
         v = len(self.vertices)
@@ -459,6 +471,8 @@ class InstanceMesh:
         check_array("InstanceMesh.colors", self.colors, (v, 3), np.uint8)
         check_array("InstanceMesh.instance_ids", self.instance_ids, (v,), np.int32)
         check_array("InstanceMesh.class_ids", self.class_ids, (v,), np.int32)
+        if self.structure is not None:
+            check_array("InstanceMesh.structure", self.structure, (v,), np.uint8)
 
     def of(self, instance: Instance) -> InstanceMesh:
         """Return the mesh of an instance: its vertices, in order, and the triangles between them."""
@@ -484,6 +498,7 @@ class InstanceMesh:
             self.instance_ids[vertices],
             self.class_ids[vertices],
             self.classes,
+            None if self.structure is None else self.structure[vertices],
         )
 
 
@@ -528,11 +543,14 @@ class SceneTruth:
     classes: tuple[str, ...] | None = None  # all annotated classes; None = unknown
     trajectory: ReferenceTrajectory | None = None  # None = all maps share the world frame of the points
     annotated: AnnotatedObjects | None = None  # None = class_names are the names of the annotation
+    structure: UInt8 | None = None  # (V,) true `Structure` of each point, without FRONT; None = unknown
 
     def __post_init__(self) -> None:
         v = len(self.points_world)
         check_array("SceneTruth.points_world", self.points_world, (v, 3), np.float32)
         check_array("SceneTruth.instance_ids", self.instance_ids, (v,), np.int32)
+        if self.structure is not None:
+            check_array("SceneTruth.structure", self.structure, (v,), np.uint8)
 
 
 def check_rigid(name: str, T: Float64) -> None:

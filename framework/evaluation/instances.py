@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh, Int32, Int64, SceneTruth
+from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh, Int32, Int64, SceneTruth, UInt8
 from framework.errors import DataError
 from framework.evaluation.calibration import Forecasts, calibration_metrics
 
@@ -52,6 +52,7 @@ class PredictedInstances:
     class_names: tuple[str, ...]  # (K,) most probable classes
     # probabilities that an instance exists and that its class is right, by id; empty = unknown
     probabilities: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    structure: UInt8 | None = None  # (V,) `Structure`; None = not determined
 
     def __post_init__(self) -> None:
         counts = {name: len(getattr(self, name)) for name in ("ids", "confidences", "class_names")}
@@ -101,6 +102,7 @@ class PredictedInstances:
             confidences=np.array(confidences, np.float64),
             class_names=tuple(class_names),
             probabilities=probabilities or {},
+            structure=mesh.structure,
         )
 
 

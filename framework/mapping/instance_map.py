@@ -8,7 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View, check_label_space
+from framework.data import (
+    Bool,
+    Camera,
+    Float32,
+    Float64,
+    Frame,
+    InstanceMesh,
+    Int32,
+    Structure,
+    SurfaceView,
+    View,
+    check_label_space,
+)
 from framework.errors import DataError
 from framework.interfaces import Gravity, MapStatistics, SubmapChange, SubmapSurfaces
 from framework.mapping.instances.association import Association, agreed_classes
@@ -29,6 +41,7 @@ from framework.mapping.storage.map_file import (
     table_of,
     write_map,
 )
+from framework.mapping.structure import VertexStructure, is_building, separate_instances
 from framework.mapping.submaps.layer import Layer
 from framework.mapping.submaps.resampling import resampled
 from framework.mapping.submaps.submaps import Submaps, remaining
@@ -39,6 +52,7 @@ from framework.mapping.voxels.raycasting import render, tiles_around
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VOLUME_ARRAYS, TsdfVolume
 from framework.mapping.voxels.voxel_grid import MAX_BLOCKS
 from framework.sensors.noise_models import SensorKind
+from framework.vocabulary.flat_objects import is_flat
 
 FORMAT = 10  # format of the map file; increment it when the meaning of the contents changes
 SAVED_ARRAYS = (*VOLUME_ARRAYS, *PackedEvidence._fields, CLASS_EVIDENCE)
@@ -67,6 +81,7 @@ class InstanceMap(InstanceTableMap):
         self.instance_class = instance_class
         self.listed = ListedInstances()
         self.vertex_labels = VertexLabels()
+        self._structure = VertexStructure()
         self._merged: set[int] = set()  # instances that were merged into others since the last mesh
         self.submaps = Submaps(volume, labels, self.table)
         self._changes = 0  # number of changes to submaps or labels
@@ -291,10 +306,22 @@ class InstanceMap(InstanceTableMap):
         changed[self.labels.blocks_with(relabeled)] = True
         self._merged = set()
         labels = self.vertex_labels.update(grid, self.labels.evidence, counts, surface, starts, changed)
-        too_small = self.confirmation.too_small(labels.instance_ids, self.volume.voxel_size)
-        instance_ids = np.where(too_small, np.int32(0), labels.instance_ids)
-        class_ids = np.where(too_small, np.int32(-1), labels.class_ids)
-        return InstanceMesh(surface.vertices, surface.triangles, labels.colors, instance_ids, class_ids, self.classes)
+        structure = self._structure.of(surface, self.volume.gravity().up)
+        instance_ids = separate_instances(labels.instance_ids, structure, self._flat_instances())
+        too_small = self.confirmation.too_small(instance_ids, self.volume.voxel_size)
+        instance_ids = np.where(too_small, np.int32(0), instance_ids)
+        class_ids = np.where(instance_ids == labels.instance_ids, labels.class_ids, np.int32(-1))
+        structure = np.where((instance_ids > 0) & is_building(structure), np.uint8(Structure.NONE), structure)
+        return InstanceMesh(
+            surface.vertices, surface.triangles, labels.colors, instance_ids, class_ids, self.classes, structure
+        )
+
+    def _flat_instances(self) -> Bool:
+        """Return a Boolean array (last id + 1,), True for instances that can lie flat on a floor or a wall."""
+        flat = np.zeros(self.table.last_id + 1, np.bool_)
+        for k, (class_id, _) in self.most_likely_classes().items():
+            flat[k] = is_flat(self.classes[class_id])
+        return flat
 
     def gravity(self) -> Gravity:
         return self.whole().volume.gravity()

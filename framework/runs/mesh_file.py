@@ -8,7 +8,7 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 
-from framework.data import Array, InstanceMesh
+from framework.data import Array, InstanceMesh, Structure
 from framework.errors import DataError
 from framework.files.manifest import verified
 from framework.files.ply import read_ply, write_ply
@@ -18,6 +18,7 @@ CHANNELS = ("red", "green", "blue")
 TYPES = {**dict.fromkeys(CHANNELS, np.uint8), "instance": np.int32, "class": np.int32}
 """Types of the vertex properties other than the position."""
 
+STRUCTURE = "structure"  # optional vertex property, uint8
 SAFE = "".join(chr(code) for code in range(32, 127) if chr(code) not in ",%")  # not escaped in class names
 CLASSES = "classes "  # prefix of the comments with the class names
 LONGEST_LIST = 1000  # maximum number of characters of the names in a comment; Open3D aborts for lines of 1,024 bytes
@@ -26,9 +27,10 @@ LONGEST_LIST = 1000  # maximum number of characters of the names in a comment; O
 def write_mesh(path: Path, mesh: InstanceMesh, comments: Sequence[str] = ()) -> None:
     """Write a mesh to a binary PLY file.
 
-    Each vertex has a position in m, a color, an instance id and a class. The class is an index into the class names in
-    the header, where commas and characters outside of ASCII are escaped as in URLs. Long lists of names are split into
-    several comments. Vertices without an instance have the id 0, and vertices without a class have the index -1.
+    Each vertex has a position in m, a color, an instance id and a class, and its `Structure` if it is determined. The
+    class is an index into the class names in the header, where commas and characters outside of ASCII are escaped as in
+    URLs. Long lists of names are split into several comments. Vertices without an instance have the id 0, and vertices
+    without a class have the index -1.
     `comments` are added to the header.
     """
     properties: dict[str, Array] = {
@@ -36,6 +38,10 @@ def write_mesh(path: Path, mesh: InstanceMesh, comments: Sequence[str] = ()) -> 
         "instance": mesh.instance_ids,
         "class": mesh.class_ids,
     }
+    if mesh.structure is not None:
+        properties[STRUCTURE] = mesh.structure
+        kinds = ", ".join(f"{kind.value} = {kind.name.lower()}" for kind in Structure)
+        comments = (*comments, f"InstanceMap; structure: {kinds}")
     comments = (
         *comments,
         "InstanceMap; meters; instance 0 = none; class -1 = none, else an index into:",
@@ -59,6 +65,12 @@ def read_mesh(path: Path) -> InstanceMesh:
                 f"{path}: expected {np.dtype(kind)} for the vertex property {name!r}, got {got}; "
                 "use the mesh.ply of a run"
             )
+    structure = ply.properties.get(STRUCTURE)
+    if structure is not None and (structure.dtype != np.uint8 or structure.max(initial=0) > max(Structure)):
+        raise DataError(
+            f"{path}: expected uint8 values of at most {max(Structure)} for the vertex property {STRUCTURE!r}, got "
+            f"{structure.dtype} values of up to {structure.max()}; use the mesh.ply of a run"
+        )
     classes = listed_classes(ply.comments)
     if classes is None:
         raise DataError(f"{path}: expected a line 'comment {CLASSES}...', got none; use the mesh.ply of a run")
@@ -69,6 +81,7 @@ def read_mesh(path: Path) -> InstanceMesh:
         instance_ids=ply.properties["instance"].astype(np.int32),
         class_ids=ply.properties["class"].astype(np.int32),
         classes=classes,
+        structure=None if structure is None else structure.astype(np.uint8),
     )
 
 

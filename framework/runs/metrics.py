@@ -18,6 +18,7 @@ from framework.evaluation import instances, trajectory
 from framework.evaluation.compared_classes import Compared, ComparedClasses, indices, listed
 from framework.evaluation.doubled_instances import doubled_instances, observed_labels
 from framework.evaluation.instances import PredictedInstances, Transfer
+from framework.evaluation.panoptic import evaluate_panoptic
 from framework.evaluation.scannet_benchmark import BenchmarkScene, benchmark_metrics, semantic_metrics
 from framework.evaluation.truth_alignment import in_map_world
 from framework.evaluation.truth_coverage import TruthCoverage
@@ -231,6 +232,7 @@ def evaluated(
     metrics: Metrics = {
         **figures,
         **of_map,
+        **evaluate_panoptic(compared.predictions, compared.truth).metrics(),
         **of_scannet,
         **{f"{COVERAGE}{name}": value for name, value in asdict(coverage).items()},
         LABEL_SPACE: compared_classes.label_space,
@@ -283,7 +285,7 @@ def ignored_names(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def is_evaluation(key: str) -> bool:
     """Return True for the key of a metric from `evaluation_metrics`."""
-    prefixes = ("instances.", "semantic.", COVERAGE, CLASSES)
+    prefixes = ("instances.", "panoptic.", "semantic.", COVERAGE, CLASSES)
     return key in ("annotation_release", TRUTH, ANNOTATED) or (key.startswith(prefixes) and key != "instances.count")
 
 

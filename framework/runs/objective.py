@@ -17,6 +17,7 @@ OF_GROUND_TRUTH = (
     "instances.ap",
     "instances.scannet.",
     "instances.mean_iou",
+    "panoptic.",
     "semantic.",
     "trajectory.",
 )  # prefixes of metrics

@@ -68,6 +68,7 @@ CHOICE = "choice."  # prefix of the chosen options in metrics.json
 GROUPS = (*STAGES, "preset", "sequences")  # config groups whose chosen option is stored
 FIGURES = (
     "instances.",
+    "panoptic.",
     "semantic.",
     "trajectory.",
     "stage_ms.",

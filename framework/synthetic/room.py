@@ -11,7 +11,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from framework.data import Float64
+from framework.data import Float64, SceneTruth, Structure
 from framework.synthetic import paints
 from framework.synthetic.furniture import clutter, fixtures, groups, seating
 from framework.synthetic.furniture.groups import Group, single
@@ -23,6 +23,7 @@ from framework.synthetic.paints import Material, Texture
 from framework.synthetic.surfaces import Surfaces, assemble
 
 HEIGHT = 2.55  # m, height of the ceiling
+ON_PLANE = 0.01  # m, maximum distance of points of the floor and the ceiling from their planes
 DOORWAY = (0.9, 2.05)  # m, width and height of a doorway
 NO_DOORWAYS: Mapping[int, Sequence[float]] = {}
 WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear RGB colors of lamps and of daylight
@@ -77,6 +78,15 @@ def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, st
     pieces = [*layout.pieces, globe_lamp]
     objects = ((0, shell_of(layout.width, layout.depth, rng)), *enumerate(pieces, start=1))
     return Room(layout, objects, tuple(lamps_of(pieces)), assemble(objects))
+
+
+def shell_structure(truth: SceneTruth) -> SceneTruth:
+    """Return the ground truth of a synthetic scene with the structure of its shell, which has the instance id 0."""
+    z = truth.points_world[:, 2]
+    of_shell = np.full(len(z), Structure.WALL, np.uint8)
+    of_shell[z < ON_PLANE] = Structure.FLOOR
+    of_shell[z > HEIGHT - ON_PLANE] = Structure.CEILING
+    return replace(truth, structure=np.where(truth.instance_ids == 0, of_shell, np.uint8(Structure.NONE)))
 
 
 def furniture_groups(kind: RoomKind, rng: Rng) -> list[Group]:

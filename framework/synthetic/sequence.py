@@ -20,7 +20,7 @@ from framework.sensors.noise_models import SensorChoice, SensorKind
 from framework.synthetic.dynamics import Dynamics, MovingObject, in_front, opening_door, walking_person
 from framework.synthetic.renderer import Renderer, Rendering, cast_ids
 from framework.synthetic.rgbd_camera import DepthSensor, noisy_color
-from framework.synthetic.room import RoomKind, furnish
+from framework.synthetic.room import RoomKind, furnish, shell_structure
 from framework.synthetic.surfaces import Surfaces, assemble
 from framework.synthetic.walk import FRAME_RATE, plan_path
 
@@ -160,7 +160,8 @@ class Synthetic(RGBDSequence):
         """Return labeled surface points, fused from the exact depth of selected frames."""
         every = max(1, -(-len(self._chosen) // TRUTH_VIEWS))
         chosen = sorted({*self._chosen[::every], self._chosen[-1]})
-        return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.ground_truth_spacing)
+        views = (self._exact(index) for index in chosen)
+        return shell_structure(fuse_scene_truth(views, self.class_names, self.ground_truth_spacing))
 
     def _exact(self, index: int) -> LabeledDepth:
         T_world_camera = self._pose(index)

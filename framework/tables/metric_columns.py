@@ -32,6 +32,9 @@ HEADS = {
         f"instances.scannet.{key}": f"{name} (ScanNet)"
         for key, name in (("ap", "AP"), ("ap50", "AP50"), ("ap25", "AP25"))
     },
+    "panoptic.pq": "PQ",
+    "panoptic.pq_things": "PQ (things)",
+    "panoptic.pq_stuff": "PQ (stuff)",
     "semantic.miou": "mIoU",
     "fps": "Hz",
     "fps_median": "Hz (median)",
@@ -60,7 +63,7 @@ SCENENN_NAMES = {coco: name for name, coco in SCENENN_TO_COCO.items()}
 
 DIRECTIONS = {
     **dict.fromkeys(("instances.count", "instances.true_count", "instances.ignored_count"), Direction.NONE),
-    **dict.fromkeys(("instances", "semantic", "coverage", "fps", "fps_median"), Direction.HIGHER),
+    **dict.fromkeys(("instances", "panoptic", "semantic", "coverage", "fps", "fps_median"), Direction.HIGHER),
     **dict.fromkeys(("trajectory", "stage_ms", "latency_ms", "map.bytes", "map.doubled_instances"), Direction.LOWER),
     **dict.fromkeys(("frames_lost", "frames_skipped", "frames_dropped", "frames_disagreeing"), Direction.LOWER),
     **dict.fromkeys(("masks_omitted", "peak_rss_bytes"), Direction.LOWER),

@@ -19,6 +19,7 @@ from framework.tables.statistics import ALPHA
 
 OF_RESULTS = (
     "instances.",
+    "panoptic.",
     "semantic.",
     "trajectory.",
     "map.",

@@ -316,6 +316,34 @@ def large_map_loading() -> Measured:
     return value, value <= 3
 
 
+ROOMS = (("room0", "STUDIO"), ("room1", "OFFICE"), ("room2", "BEDROOM"))
+SMALL_ROOM = ("dataset=synthetic", "dataset.stride=4", "dataset.width=320", "dataset.height=240")
+
+
+def structure_of_room(scene: str, kind: str, refiner: str) -> dict[str, Any]:
+    """Map a synthetic room with given poses and the detector of rendered rooms, and return the metrics."""
+    chosen = (f"dataset.scene={scene}", f"dataset.kind={kind}", f"refiner={refiner}")
+    return mapped(*SMALL_ROOM, *chosen, "fuser.voxel_size=0.02", "tracker=ground_truth", "detection_cache=read_write")
+
+
+@measurement("<= 1% of true wall and floor points in instances, 3 synthetic rooms, every refiner", *PIPELINE)
+def building_in_instances() -> Measured:
+    refiners = sorted(path.stem for path in (CHECKOUT / "conf" / "refiner").glob("*.yaml"))
+    values = {
+        (scene, refiner): 100 * structure_of_room(scene, kind, refiner)["panoptic.building_in_instances"]
+        for refiner in refiners
+        for scene, kind in ROOMS
+    }
+    print(values, flush=True)
+    return max(values.values()), max(values.values()) <= 1
+
+
+@measurement("panoptic quality of stuff >= 0.9, smallest of 3 synthetic rooms", *PIPELINE)
+def stuff_quality() -> Measured:
+    value = min(structure_of_room(scene, kind, "chain")["panoptic.pq_stuff"] for scene, kind in ROOMS)
+    return value, value >= 0.9
+
+
 @measurement("exit status 0, 30 kills", *PIPELINE, "tests/framework/commands/running")
 def random_kills() -> Measured:
     return failures("tests/framework/commands/running/test_random_kills.py", INSTANCEMAP_KILLS="30")

@@ -8,7 +8,20 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from framework.data import AnnotatedObjects, Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
+import numpy as np
+
+from framework.data import (
+    AnnotatedObjects,
+    Camera,
+    DeferredTruth,
+    Float32,
+    Float64,
+    FrameTruth,
+    Int32,
+    SceneTruth,
+    Structure,
+    UInt8,
+)
 from framework.errors import NoPoseError
 from framework.files.hashing import add_array, path_hash
 from framework.rendering import rasterizer
@@ -29,7 +42,12 @@ class LabeledMesh:
     def scene_truth(self) -> SceneTruth:
         """Return the vertices as ground-truth points."""
         return SceneTruth(
-            self.vertices, self.instance_ids, dict(self.class_names), self.classes, annotated=self.annotated
+            self.vertices,
+            self.instance_ids,
+            dict(self.class_names),
+            self.classes,
+            annotated=self.annotated,
+            structure=None if self.annotated is None else _annotated_structure(self.annotated),
         )
 
     def seen_by(self, camera: Camera, T_world_camera: Float64) -> FrameTruth:
@@ -61,6 +79,15 @@ class LabeledMesh:
         for source in (__file__, rasterizer.__file__):
             digest.update(path_hash(Path(source)).encode())
         return digest.hexdigest()
+
+
+def _annotated_structure(annotated: AnnotatedObjects) -> UInt8 | None:
+    """Return the `Structure` (V,) of annotated floors, walls and ceilings, or None if there are none."""
+    structure = np.zeros(len(annotated.instance_ids), np.uint8)
+    for kind in (Structure.FLOOR, Structure.WALL, Structure.CEILING):
+        ids = [key for key, name in annotated.own_names.items() if name is not None and name.upper() == kind.name]
+        structure[np.isin(annotated.instance_ids, ids)] = kind
+    return structure if structure.any() else None
 
 
 def unseen(camera: Camera, why: str) -> FrameTruth:

@@ -21,6 +21,7 @@ from framework.synthetic.buildings.building_tour import plan_tour
 from framework.synthetic.buildings.rendering_cache import RenderingCache
 from framework.synthetic.renderer import Renderer, Rendering
 from framework.synthetic.rgbd_camera import DepthSensor, blurred, device_distortion, noisy_color
+from framework.synthetic.room import shell_structure
 from framework.synthetic.sequence import FOCAL_LENGTH, MAX_FRAMES, MAX_SIDE
 from framework.synthetic.walk import FRAME_RATE
 
@@ -124,7 +125,8 @@ class SyntheticBuilding(RGBDSequence):
     def scene_truth(self) -> SceneTruth:
         """Return labeled surface points, fused from the exact depth of selected frames."""
         chosen = sorted({*self._chosen[::TRUTH_STEP], self._chosen[-1]})
-        return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.ground_truth_spacing)
+        views = (self._exact(index) for index in chosen)
+        return shell_structure(fuse_scene_truth(views, self.class_names, self.ground_truth_spacing))
 
     def _exact(self, index: int) -> LabeledDepth:
         T_world_camera = self.tour.pose(index)

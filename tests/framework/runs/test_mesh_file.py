@@ -30,15 +30,16 @@ TETRAHEDRON = InstanceMesh(
     [
         TETRAHEDRON,
         GridMap().mesh(),
+        replace(TETRAHEDRON, structure=np.array([0, 1, 2, 4], np.uint8)),
         replace(TETRAHEDRON, classes=()),
         replace(TETRAHEDRON, classes=("sofa, couch", "50% palette", "Hubwagen für Paletten")),
     ],
-    ids=["some", "empty", "no classes", "encoded classes"],
+    ids=["some", "empty", "structure", "no classes", "encoded classes"],
 )
 def test_mesh_file_round_trip_is_exact(tmp_path: Path, mesh: InstanceMesh) -> None:
     write_mesh(tmp_path / "mesh.ply", mesh)
     read = read_mesh(tmp_path / "mesh.ply")
-    for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
+    for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids", "structure"):
         np.testing.assert_array_equal(getattr(read, name), getattr(mesh, name))
     assert read.classes == mesh.classes
 
@@ -61,6 +62,7 @@ def test_read_mesh_foreign_ply_raises_one_line_error(tmp_path: Path) -> None:
             "expected int32 for the vertex property 'class', got float32",
         ),
         (labels, ("classes chair",), "expected uint8 for the vertex property 'red', got none"),
+        (shades | labels | {"structure": np.full(4, 9, np.uint8)}, ("classes chair",), "uint8 values of at most 4"),
         (shades | labels, (), "expected a line 'comment classes ...', got none"),
     ]:
         write_ply(path, mesh.vertices, mesh.triangles, properties, comments)
