@@ -23,6 +23,7 @@ from framework.explanation.observation import FrameObservation
 
 MIN_IOU = 0.5  # IoU threshold of the evaluation
 MIN_DETECTION_RATE = 0.1  # minimum fraction of the frames with an object in which it is detected
+MIN_FOREIGN = 0.1  # minimum fraction of the points of an instance on an object that can determine its class
 SPLIT_FRACTION = 0.25  # minimum fraction of the points of an object that each part of a split object has
 
 
@@ -353,6 +354,10 @@ def _cause_of_class(key: int, class_name: str, figures: StageFigures, classes: S
     if next(iter(found), "") != class_name:
         unknown = "" if class_name in classes else f"; the detector has no class {class_name}"
         return Cause.DETECTION, counts + unknown
+    points = figures.objects_of_instance
+    other = next((k for k in points if k not in (0, key) and points[k] >= MIN_FOREIGN * sum(points.values())), 0)
+    if other:
+        return Cause.ASSOCIATION, f"{counts}; instance {figures.instance} has the class of object {other}"
     return Cause.FUSION, f"{counts}, but instance {figures.best_instance} has another class"
 
 

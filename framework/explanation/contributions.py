@@ -65,30 +65,19 @@ class Contributions:
         return {stage.value: self.stages[stage] for stage in STAGES} | {REST: self.rest}
 
 
-def distinct(replaced: frozenset[Stage], given: frozenset[Stage] = frozenset()) -> frozenset[Stage]:
-    """Return the smallest set of replaced stages with the same results.
-
-    Refiners do not change the exact masks of the true detections.
-
-    Args:
-        replaced: The stages that the ground truth replaces.
-        given: The stages of the run that are the ground truth.
-    """
-    if Stage.DETECTION in replaced | given:
-        given |= {Stage.REFINEMENT}
-    return replaced - given
-
-
-def distinct_sets(given: frozenset[Stage] = frozenset()) -> list[frozenset[Stage]]:
-    """Return the sets of replaced stages with different results, the empty set first."""
-    sets = [frozenset(chosen) for size in range(len(STAGES) + 1) for chosen in combinations(STAGES, size)]
-    return list(dict.fromkeys(distinct(one, given) for one in sets))
+def sets_of(stages: Sequence[Stage]) -> list[frozenset[Stage]]:
+    """Return all sets of stages, smallest first."""
+    return [frozenset(chosen) for size in range(len(stages) + 1) for chosen in combinations(stages, size)]
 
 
 def losses_of(
     loss: Callable[[frozenset[Stage]], float], given: frozenset[Stage] = frozenset()
 ) -> dict[frozenset[Stage], float]:
-    """Return the loss for each set of replaced stages. `loss` is called once for each set of `distinct_sets`."""
-    known = {replaced: loss(replaced) for replaced in distinct_sets(given)}
-    sets = [frozenset(chosen) for size in range(len(STAGES) + 1) for chosen in combinations(STAGES, size)]
-    return {replaced: known[distinct(replaced, given)] for replaced in sets}
+    """Return the loss for each set of stages that the ground truth replaces.
+
+    Args:
+        loss: The loss for a set of replaced stages; called once for each set without `given`.
+        given: The stages of the run that are the ground truth.
+    """
+    known = {replaced: loss(replaced) for replaced in sets_of([one for one in STAGES if one not in given])}
+    return {replaced: known[replaced - given] for replaced in sets_of(STAGES)}

@@ -13,7 +13,7 @@ from framework.evaluation.compared_classes import ComparedClasses
 from framework.evaluation.instances import PredictedInstances
 from framework.evaluation.truth_alignment import in_map_world, map_alignment
 from framework.explanation.causes import FalseInstance, ObjectExplanation, explain_objects
-from framework.explanation.contributions import Contributions, Stage, distinct_sets, losses_of
+from framework.explanation.contributions import STAGES, Contributions, Stage, losses_of
 from framework.explanation.observation import Observer
 from framework.geometry import inverse
 from framework.interfaces import RGBDSequence
@@ -50,7 +50,7 @@ class Replays:
     @property
     def count(self) -> int:
         """Number of replays for the contributions, including the first."""
-        return len(distinct_sets(self.given))
+        return int(2 ** (len(STAGES) - len(self.given)))
 
     def explain(self, with_contributions: bool = True) -> Explanation:
         """Replay the run, and return its explanation.

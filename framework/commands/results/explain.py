@@ -26,12 +26,15 @@ log = logging.getLogger(__name__)
 
 DIFFERENCE = 1e-6  # difference of the metric between a run and its replay above which a warning is logged
 
+GROUPS = {"detection": "detector", "tracking": "tracker", "refinement": "refiner"}  # config group by stage
+TRUE_ASSOCIATION = "GROUND_TRUTH"
+
 
 def main() -> None:
     """Run the command `instancemap explain`."""
     parser = argparse.ArgumentParser(
         description="Explain which stage lost each missed, wrong or split object of a run and caused each false "
-        "instance, and how much each stage contributes to the loss. The sequence is mapped again, up to 12 times, with "
+        "instance, and how much each stage contributes to the loss. The sequence is mapped again, up to 16 times, with "
         "stages replaced by the ground truth; networks run once. The frames need ground-truth instances."
     )
     parser.add_argument("run", metavar="RUN", nargs="+", type=Path, help="run directory, or folder of run directories")
@@ -109,25 +112,32 @@ def pipeline_of(config: Mapping[str, Any], cache: str, replaced: frozenset[Stage
 
 
 def with_truth(config: Mapping[str, Any], replaced: frozenset[Stage]) -> DictConfig:
-    """Return the config of a run without viewer, in which the ground truth replaces stages."""
+    """Return the config of a run without viewer, in which the ground truth replaces stages.
+
+    The refiner also processes the masks of the true detector, so that its errors are not attributed to the detector.
+    """
     from framework.config.composition import composed
     from framework.explanation.contributions import Stage
 
-    options = {Stage.DETECTION: "detector", Stage.TRACKING: "tracker", Stage.REFINEMENT: "refiner"}
-    groups = [options[stage] for stage in options if stage in replaced]
+    groups = [GROUPS[stage] for stage in GROUPS if Stage(stage) in replaced]
     truth = composed("viewer=none", *(f"{group}=ground_truth" for group in groups))
     chosen = OmegaConf.create(dict(config) | {group: truth[group] for group in ("viewer", *groups)})
+    if Stage.DETECTION in replaced:
+        chosen.detector.exact = False
     if Stage.ASSOCIATION in replaced:
-        chosen.fuser.association = "GROUND_TRUTH"
+        chosen.fuser.association = TRUE_ASSOCIATION
     return chosen
 
 
 def given_stages(config: Mapping[str, Any]) -> frozenset[Stage]:
     """Return the stages of a run that are the ground truth."""
-    from framework.explanation.contributions import STAGES
+    from framework.explanation.contributions import Stage
 
-    estimated = with_truth(config, frozenset())
-    return frozenset(stage for stage in STAGES if with_truth(config, frozenset({stage})) == estimated)
+    truth = with_truth(config, frozenset(Stage))
+    given = {Stage(stage) for stage, group in GROUPS.items() if config[group]["_target_"] == truth[group]["_target_"]}
+    if config["fuser"].get("association") == TRUE_ASSOCIATION:
+        given.add(Stage.ASSOCIATION)
+    return frozenset(given)
 
 
 def lines(explanation: Explanation, with_found: bool) -> list[str]:
