@@ -43,21 +43,30 @@ def main() -> None:
     parser.add_argument("--all", action="store_true", help="also list found objects and ignored objects")
     once = "map the sequence once: list causes, but no contributions of the stages"
     parser.add_argument("--causes-only", action="store_true", help=once)
+    figure = "figure of the contributions with one bar per run; written with the suffixes .png and .pdf"
+    parser.add_argument("--figure", metavar="FILE", type=Path, help=figure)
     parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
         from framework.explanation.contributions import Contributions
 
         records = [record for root in parsed.run for record in completed_runs(root)[0]]
-        found: list[Contributions] = []
+        found: dict[str, Contributions] = {}
         for record in records:
             explanation = explain_run(record, parsed.metric, not parsed.causes_only)
             print(f"{record.directory}:")
             print("\n".join(lines(explanation, parsed.all)), flush=True)
             if explanation.contributions is not None:
-                found.append(explanation.contributions)
+                name = record.directory.name
+                found[str(record.directory) if name in found else name] = explanation.contributions
         if len(found) > 1:
-            print(f"mean of {len(found)} runs:\n" + "\n".join(contribution_lines(Contributions.mean(found))))
+            print(
+                "\n".join((f"mean of {len(found)} runs:", *contribution_lines(Contributions.mean([*found.values()]))))
+            )
+        if parsed.figure is not None and found:
+            from framework.figures.contribution_figure import contribution_figure
+
+            print(*contribution_figure(found).write(parsed.figure), sep="\n")
 
 
 def explain_run(record: Record, metric: str = "instances.ap50", with_contributions: bool = True) -> Explanation:
@@ -68,7 +77,7 @@ def explain_run(record: Record, metric: str = "instances.ap50", with_contributio
     """
     from framework.evaluation.compared_classes import ComparedClasses
     from framework.explanation.replay import Replays
-    from framework.explanation.stored_explanation import EXPLANATION, write_explanation
+    from framework.explanation.stored_explanation import write_explanation
     from framework.interfaces import RGBDSequence, RGBDVideo
     from framework.registry import build
     from framework.runtime.process_settings import Settings
@@ -91,7 +100,7 @@ def explain_run(record: Record, metric: str = "instances.ap50", with_contributio
     if stored is None or abs(stored - value) > DIFFERENCE:
         message = "%s: expected %s = %s (as in the run) in the replay, got %s; run `instancemap reproduce`"
         log.warning(message, record.directory, metric, stored, value)
-    write_explanation(record.directory / EXPLANATION, explanation)
+    write_explanation(record.directory, explanation)
     return explanation
 
 

@@ -48,7 +48,7 @@ def test_explain_run_without_errors_finds_all_objects(without_fault: FaultTest) 
         hide(1),
         halve(2, CornerRoom(frames=6).scene_truth()),  # type: ignore[arg-type]  # not None
         merge(1, 2),
-        jump(1, (0.0, 0.0, 0.07)),
+        jump(1, (0.2, 0.2, 0.0)),
     ],
     ids=lambda fault: fault.stage.value,
 )
