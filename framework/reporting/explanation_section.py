@@ -35,9 +35,7 @@ def explanation_section(contents: RunContents, source: RunSource) -> dict[str, A
     contributions = stored.contributions
     return {
         "outdated": "",
-        "rows": [
-            (one, pictures.get(one.id) if one.state != "false" else None) for one in (*stored.lost, *stored.false)
-        ],
+        "rows": [*((one, pictures.get(one.id)) for one in stored.lost), *((one, None) for one in stored.false)],
         "bar": "" if contributions is None else contribution_bar(contributions),
         "contributions": [] if contributions is None else list(contributions.named().items()),
         "metric": "" if contributions is None else contributions.metric,
@@ -45,7 +43,10 @@ def explanation_section(contents: RunContents, source: RunSource) -> dict[str, A
 
 
 def lost_objects(stored: StoredExplanation, contents: RunContents, source: RunSource) -> Mapping[int, Picture]:
-    """Return an image of each lost object in the frame that shows the cause, by id; frames without a pose are omitted."""
+    """Return an image of each lost object in the frame that shows the cause, by id.
+
+    Lost frames have no image.
+    """
     numbers = {frame: k for k, frame in enumerate(contents.tracked_frames)}
     pictures = {}
     for one in stored.lost:
