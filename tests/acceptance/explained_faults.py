@@ -10,14 +10,18 @@ from functools import cache, partial
 
 from framework.commands.results.explain import pipeline_of
 from framework.config.composition import composed, resolved
+from framework.data import Frame, SceneTruth
 from framework.explanation.replay import Explanation
 from framework.interfaces import RGBDSequence, RGBDVideo
 from framework.registry import build
 from tests.support.stage_faults import Fault, FaultTest, halve, hide, jump, merge
 
 SCENES = ("room0", "room1", "room2")
-SETTINGS = ("dataset=synthetic", "dataset.frames=60", "dataset.width=320", "dataset.height=240", "tracker=ground_truth")
-JUMP = 10, (0.2, 0.2, 0.0)  # first frame and motion, m
+SETTINGS = (
+    *("dataset=synthetic", "dataset.frames=60", "dataset.stride=3", "dataset.width=320", "dataset.height=240"),
+    *("detector=simulated_yolo11n", "tracker=ground_truth", "fuser.voxel_size=0.02"),
+)
+JUMP = 6, (0.2, 0.2, 0.0)  # first frame and motion, m
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,26 @@ def explained(test: FaultTest, scene: str, fault: Fault) -> ExplainedFault:
     return ExplainedFault(scene, fault.stage.value, test.lost(explanation), fault.objects, fraction, rest)
 
 
+@dataclass
+class Recorded(RGBDSequence):
+    """The frames of a sequence in memory, so that they are rendered only once."""
+
+    sequence: RGBDSequence
+
+    def __post_init__(self) -> None:
+        self.name, self.camera, self.domain = self.sequence.name, self.sequence.camera, self.sequence.domain
+        self.frames, self.truth = list(self.sequence), self.sequence.scene_truth()
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, k: int) -> Frame:
+        return self.frames[k]
+
+    def scene_truth(self) -> SceneTruth | None:
+        return self.truth
+
+
 @contextmanager
 def fault_test(scene: str) -> Iterator[FaultTest]:
     """Yield the run of a scene without faults. Its detections are cached until the context ends."""
@@ -73,4 +97,4 @@ def fault_test(scene: str) -> Iterator[FaultTest]:
     video = build(RGBDVideo, config.dataset)
     assert isinstance(video, RGBDSequence)
     with tempfile.TemporaryDirectory() as detections:
-        yield FaultTest(video, partial(pipeline_of, resolved(config), detections))
+        yield FaultTest(Recorded(video), partial(pipeline_of, resolved(config), detections))
