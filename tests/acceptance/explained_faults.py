@@ -21,6 +21,7 @@ SETTINGS = (
     *("dataset=synthetic", "dataset.frames=60", "dataset.stride=3", "dataset.width=320", "dataset.height=240"),
     *("detector=simulated_yolo11n", "tracker=ground_truth", "fuser.voxel_size=0.02"),
 )
+METRIC = "instances.mean_iou"  # unlike AP50 of a class, it does not couple the objects of a class
 JUMP = 6, (0.2, 0.2, 0.0)  # first frame and motion, m
 
 
@@ -97,4 +98,4 @@ def fault_test(scene: str) -> Iterator[FaultTest]:
     video = build(RGBDVideo, config.dataset)
     assert isinstance(video, RGBDSequence)
     with tempfile.TemporaryDirectory() as detections:
-        yield FaultTest(Recorded(video), partial(pipeline_of, resolved(config), detections))
+        yield FaultTest(Recorded(video), partial(pipeline_of, resolved(config), detections), METRIC)
