@@ -33,6 +33,7 @@ COMMANDS = {
     "query": 'rank the objects of a run by a text query: "a red chair"',
     "import-map": "convert the map of another system to a run directory, as a row of tables",
     "evaluate": "re-evaluate stored runs without re-running them",
+    "explain": "list the stage that lost each object of a run, and each stage's contribution to the loss",
     "detect": "write the detections of a sequence to a COCO results file",
     "show-refinement": "draw the masks of a frame before and after refinement",
     "compile": "compile the kernels in advance, once per installation",
@@ -50,7 +51,7 @@ FOLDERS = {
     "running": ("run", "detect", "show-refinement"),
     "results": (
         *("tables", "figures", "raycast", "report", "diff", "edit", "merge", "export", "query"),
-        *("import-map", "evaluate", "verify", "bundle", "reproduce"),
+        *("import-map", "evaluate", "verify", "bundle", "reproduce", "explain"),
     ),
     "recordings": ("import", "check", "synthesize", "convert-oni"),
     "installation": ("compile", "doctor", "plugins", "new-plugin", "train-detector", "convert-weights"),

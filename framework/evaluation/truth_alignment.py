@@ -29,9 +29,20 @@ def in_map_world(truth: SceneTruth, timestamps: Float64, poses: Float64) -> Scen
     Raises:
         DataError: The two trajectories have no common time.
     """
+    T_map_truth = map_alignment(truth, timestamps, poses)
+    if T_map_truth is None:
+        return truth
+    return replace(truth, points_world=transform(T_map_truth, truth.points_world), trajectory=None)
+
+
+def map_alignment(truth: SceneTruth, timestamps: Float64, poses: Float64) -> Float64 | None:
+    """Return the pose T_map_truth (4, 4) of the ground truth in a map, None = both share one world frame.
+
+    The rule, the arguments and the errors are those of `in_map_world`.
+    """
     reference = truth.trajectory
     if reference is None:
-        return truth
+        return None
     at = reference.at(timestamps)
     common = at >= 0
     if not common.any():
@@ -41,6 +52,5 @@ def in_map_world(truth: SceneTruth, timestamps: Float64, poses: Float64) -> Scen
         )
     T_truth_camera, T_map_camera = reference.T_world_camera[at[common]], poses[common]
     if reference.given and np.allclose(T_truth_camera[0], T_map_camera[0], rtol=0, atol=SAME_POSE):
-        return truth
-    T_map_truth = align(T_truth_camera, T_map_camera)
-    return replace(truth, points_world=transform(T_map_truth, truth.points_world), trajectory=None)
+        return None
+    return align(T_truth_camera, T_map_camera)

@@ -22,6 +22,8 @@ from scipy.spatial import ConvexHull, QhullError
 
 from framework.data import Box, Float64
 from framework.evaluation.calibration import Forecasts
+from framework.explanation.contributions import Contributions
+from framework.figures.contribution_figure import draw_bars
 from framework.figures.stage_times import WINDOW, running_median
 from framework.runs.timings_file import StageTimes
 from framework.runtime.run_log import STAGE_ORDER
@@ -29,6 +31,7 @@ from framework.sensors.depth_distortion import DepthDistortion
 
 WIDTH, HEIGHT, FLAT_HEIGHT, TIMES_HEIGHT, GROWTH_HEIGHT = 560.0, 380.0, 180.0, 240.0, 390.0  # px
 RELIABILITY_HEIGHT = 260.0  # px
+BAR_HEIGHT = 80.0  # px, height of the contributions to the loss
 DEPTH_HEIGHT, SCALE_PX, IMAGE_STEP = 200.0, 16.0, 4  # px: height of a depth image, its color scale, and pixel step
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 40.0  # px, margins around the axes
 TEXT_PX, DOT_PX = 12.0, 10.0  # font size, and diameter of the dots at the ends of a path
@@ -245,6 +248,18 @@ def stage_areas(times: StageTimes) -> str:
             area.set_gid(f"chart-stage-{stage}")
         axes.set_ylim(0, max(float(np.percentile(np.sum(layers, axis=0), 98)) * 1.2, 1e-3))
     return _svg(figure, "Stage times by frame")
+
+
+def contribution_bar(contributions: Contributions) -> str:
+    """Draw the contributions to the loss as a stacked bar, and return its SVG element."""
+    figure = Figure((WIDTH / 72, BAR_HEIGHT / 72), dpi=72, facecolor="none")
+    axes = figure.add_axes((0.02, 0.45, 0.96, 0.5), facecolor="none")
+    draw_bars(axes, {"": contributions}, [0.0], 1.0)
+    axes.spines[:].set_visible(False)
+    axes.set_yticks([])
+    axes.tick_params(length=0, labelsize=TEXT_PX, labelcolor=COLORS["faint"])
+    axes.set_xlabel(f"loss (1 - {contributions.metric})", loc="right", fontsize=TEXT_PX, color=COLORS["faint"])
+    return _svg(figure, "Contributions to the loss")
 
 
 def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int], last_frame: int) -> str:

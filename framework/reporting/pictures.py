@@ -58,7 +58,7 @@ class Photographer:
             ids = self._rasterizer.draw(self._camera, self._poses[k]).nearest(self._mesh.triangles, labels)
             for key in sorted(key for key, pose in best.items() if pose == k):
                 if (mask := ids == key).any():
-                    crop = _crop(image, mask, colors[key], scale)
+                    crop = cropped(image, mask, colors[key], scale)
                     taken[key] = Picture(webp_url(Image.fromarray(crop), QUALITY), source)
         return taken
 
@@ -72,7 +72,7 @@ class Photographer:
         return LitView(self._surface, self._camera, self._poses[k]).in_colors(self._mesh.colors), "map"
 
 
-def _crop(image: UInt8, mask: Bool, color: UInt8, scale: float) -> UInt8:
+def cropped(image: UInt8, mask: Bool, color: UInt8, scale: float) -> UInt8:
     """Return the part of an image around an object, with the outline of the object.
 
     Args:

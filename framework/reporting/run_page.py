@@ -33,6 +33,7 @@ from framework.reporting.charts import (
     stage_rows,
     top_view,
 )
+from framework.reporting.explanation_section import explanation_section
 from framework.reporting.map_scene import MapScene, colors_by_id, hex_color, likely_ids
 from framework.reporting.markup import page
 from framework.reporting.object_table import object_data, object_rows
@@ -117,6 +118,7 @@ class RunReport:
             "checked": self.check is not None,
             "objects": object_rows(contents, self.pictures, match_results),
             "truth": truth_section(self.check, self.why_unchecked, contents, self.pictures),
+            "explanation": explanation_section(contents, self.source),
             "trajectory": self._trajectory(),
             "back_end": back_end_section(contents, self._up),
             "progress": self._progress(),

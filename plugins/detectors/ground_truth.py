@@ -25,6 +25,7 @@ class GroundTruthDetector(Detector):
     # minimum number of pixels of a detected instance, >= 1; 64 is about the limit of real detectors
     min_pixels: int = 64
     label_space: str = "coco"  # class names: a label space such as coco, or a text file with one name per line
+    exact: bool = True  # True = refiners do not change the masks
 
     def __post_init__(self) -> None:
         require(self.min_pixels >= 1, "detector.min_pixels", self.min_pixels, "at least 1 px")
@@ -38,5 +39,5 @@ class GroundTruthDetector(Detector):
             scores=np.ones(len(truth), np.float32),
             class_probabilities=np.eye(len(self.classes), dtype=np.float32)[truth.class_ids],
             classes=self.classes,
-            exact=True,
+            exact=self.exact,
         )

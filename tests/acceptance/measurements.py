@@ -16,6 +16,7 @@ from typing import Any
 from framework.tables.statistics import bootstrap_interval
 from tests.acceptance import changing_scenes, depth_calibration, long_run, recording_checks
 from tests.acceptance.buildings import files_that_depend_on_threads, five_rooms, second_round
+from tests.acceptance.explained_faults import explained_faults
 from tests.acceptance.instance_calibration import unseen_scenes
 from tests.acceptance.large_map import measure_large_map
 from tests.acceptance.loops import counted_loops
@@ -296,6 +297,25 @@ def calibration_of_each_event() -> Measured:
         if one.calibrated.brier() >= one.today.brier() or one.calibrated.auroc() < one.today.auroc()
     ]
     return counted(worse)
+
+
+@measurement("0 faults whose stage is not the cause of all objects they lose, 4 faults in 3 rooms", *PIPELINE, "tests")
+def faults_without_cause() -> Measured:
+    return counted(str(one) for one in explained_faults() if not one.named)
+
+
+@measurement(
+    "smallest fraction of the additional loss of the faulty stage >= 0.8, 4 faults in 3 rooms", *PIPELINE, "tests"
+)
+def loss_of_faulty_stage() -> Measured:
+    value = min(one.fraction for one in explained_faults())
+    return value, value >= 0.8
+
+
+@measurement("largest difference of the contributions from the loss <= 1e-9, 4 faults in 3 rooms", *PIPELINE, "tests")
+def sum_of_contributions() -> Measured:
+    value = max(one.rest for one in explained_faults())
+    return value, value <= 1e-9
 
 
 @measurement("slowest query <= 10 ms, unchanged map of 20 rooms, 1 cm", *PIPELINE)

@@ -30,7 +30,7 @@ LAYERS = [
     ["pipeline"],
     ["evaluation"],
     ["runs", "training"],
-    ["queries"],
+    ["queries", "explanation"],
     ["tables", "figures", "exporting", "editing"],
     ["reporting"],
     ["api"],

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import combinations
 from typing import Protocol
@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose, View, check_label_space
+from framework.detection.true_instances import true_objects
 from framework.errors import DataError
 from framework.mapping.instances.association_kernels import count_votes
 from framework.mapping.instances.instance_table import Condition, InstanceTable
@@ -40,6 +41,7 @@ class InstanceSource(Enum):
 
     SURFACE_LOOKUP = "voxels at the measured surface"
     RAYCAST = "object indices of the map, ray-cast from the pose of the frame"
+    GROUND_TRUTH = "true object of each cluster, an upper bound of association accuracy"
 
 
 class OverlapRule(Enum):
@@ -241,8 +243,8 @@ def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding
 class Association:
     """Association of clusters with instances, and merging of instances that are parts of one object."""
 
-    # source of the instances that clusters are compared with: SURFACE_LOOKUP (voxels at the depth readings) or RAYCAST
-    # (rendered view)
+    # source of the instances that clusters are compared with: SURFACE_LOOKUP (voxels at the depth readings), RAYCAST
+    # (rendered view) or GROUND_TRUTH (true object of each cluster, an upper bound)
     association: InstanceSource = InstanceSource.SURFACE_LOOKUP
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # denominator of the overlap
@@ -281,12 +283,19 @@ class Association:
         )
         self._merge_votes: Counter[tuple[int, int]] = Counter()  # votes by pair of instances; see merge_frames
         self._max_pairs = MIN_PAIRS
+        self._instance_of: dict[int, int] = {}  # instance by true object, for GROUND_TRUTH
+        self.matches: Matches | None = None  # of the last frame; None = no frame
 
     def match(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> tuple[PixelLists, Matches]:
         """Return the clusters at each pixel, and their matches with existing and new instances."""
         points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = self.look_up(scene, frame, pose, points)
-        return points, self.associate(scene.table, overlaps, clusters, frame.index, pose.T_world_camera[:3, 3])
+        center = pose.T_world_camera[:3, 3]
+        if self.association is InstanceSource.GROUND_TRUTH:
+            self.matches = self.associate_objects(scene.table, overlaps, clusters, frame, center)
+        else:
+            self.matches = self.associate(scene.table, overlaps, clusters, frame.index, center)
+        return points, self.matches
 
     def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, points: PixelLists) -> Overlaps:
         """Return the overlaps of the clusters with the instances of the map."""
@@ -313,14 +322,40 @@ class Association:
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
         match = match_one_to_one(allowed, overlaps.over_union(self.create_points))
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
-        may_create = (
-            (instance_ids == 0) & (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
-        )
+        may_create = (instance_ids == 0) & self._may_create(clusters, overlaps)
         if not self.split_instances:
             may_create &= ~allowed.any(axis=1)
         for k in np.flatnonzero(may_create):
             instance_ids[k] = table.create(len(clusters.classes), frame_index).id
         return Matches(frame_index, clusters, overlaps, instance_ids, camera_center)
+
+    def associate_objects(
+        self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, frame: Frame, camera_center: Float64
+    ) -> Matches:
+        """Match clusters with the instances of their true objects, and create the missing instances.
+
+        Clusters without a true object are matched with each other by `associate`.
+        """
+        objects = true_objects(clusters, frame)
+        of_objects = {key: k for key, k in self._instance_of.items() if k in table.records}
+        without_object = replace(
+            overlaps,
+            votes=np.where(
+                (objects[:, None] > 0) | np.isin(overlaps.instance_ids, list(of_objects.values())), 0, overlaps.votes
+            ).astype(np.int32),
+            sizes=np.where(objects > 0, 0, overlaps.sizes).astype(np.int32),
+        )
+        matches = self.associate(table, without_object, clusters, frame.index, camera_center)
+        for k in np.flatnonzero(objects):
+            if int(objects[k]) not in of_objects and self._may_create(clusters, overlaps)[k]:
+                of_objects[int(objects[k])] = table.create(len(clusters.classes), matches.frame_index).id
+            matches.instance_ids[k] = of_objects.get(int(objects[k]), 0)
+        self._instance_of = of_objects
+        return replace(matches, overlaps=overlaps)
+
+    def _may_create(self, clusters: PointClusters, overlaps: Overlaps) -> Bool:
+        """Return a Boolean array (N,), True for clusters that may create an instance."""
+        return np.asarray((clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points))
 
     def _agree(self, table: InstanceTable, clusters: PointClusters, instance_ids: Int32) -> Bool:
         """Return a Boolean array (N, M), True where the class distributions allow a match."""

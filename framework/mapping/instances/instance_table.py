@@ -185,6 +185,7 @@ class InstanceTable:
         self._offset = 0  # offset of the frame indices of this sequence
         self.combine = combine
         self.logarithmic = logarithmic
+        self.merged: dict[int, int] = {}  # remaining instance of each merge since the map was loaded
         self.embedding_space = ""  # space of the embeddings of the instances; "" = no embeddings
         self.calibration = Calibration()  # of the detector
 
@@ -340,6 +341,7 @@ class InstanceTable:
         """Add the history of instance `dropped` to `kept`, and remove `dropped`. The caller moves its voxels."""
         a, b = self.records[kept], self.records[dropped]
         self.remove(dropped)
+        self.merged[dropped] = kept
         self._detected(kept)
         earlier, later = (a, b) if a.last_frame <= b.last_frame else (b, a)
         a.class_evidence = _combined(earlier.class_evidence, later.class_evidence, self.combine)

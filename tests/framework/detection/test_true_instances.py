@@ -32,9 +32,7 @@ def test_true_instances_without_visible_instance_are_empty():
 
 
 def test_true_instances_missing_truth_or_unknown_class_raises():
-    with pytest.raises(
-        DataError, match="frame 7: expected instance ground truth for this detector, got none"
-    ) as caught:
+    with pytest.raises(DataError, match="frame 7: expected instance ground truth, got none") as caught:
         true_instances(frame_with(None), ("tv",))
     assert not isinstance(caught.value, FrameError)
     ids = np.ones((6, 8), np.int32)
