@@ -36,6 +36,9 @@ class MapHeader:
             raise DataError(f"{name}: expected a JSON object, got {found!r:.60}")
         return cls(found, name)
 
+    def has(self, key: str) -> bool:
+        return key in self.values
+
     def part(self, key: str) -> MapHeader:
         """Return a nested JSON object."""
         return MapHeader.of(self._value(key), f"{self.name}.{key}")
