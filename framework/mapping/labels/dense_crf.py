@@ -182,9 +182,9 @@ class DenseCrf:
         return np.asarray(((coords[:, 2] * size[1] + coords[:, 1]) * size[0] + coords[:, 0]) * 6 + faces)
 
 
-def _near(points: Float32, chosen: Bool, distance: float) -> Int64:
-    """Return the indices of the points (V, 3) in the cubes of chosen points, and next to them. `distance` is a side, m."""
-    cubes = np.floor(points / distance).astype(np.int64)
+def _near(points: Float32, chosen: Bool, side: float) -> Int64:
+    """Return the indices of the points (V, 3) in the cubes of chosen points and next to them. `side` is in m."""
+    cubes = np.floor(points / side).astype(np.int64)
     cubes -= cubes.min(axis=0, initial=0) - 1
     size = cubes.max(axis=0, initial=0) + 2
     steps = np.array([size[1] * size[2], size[2], 1])
