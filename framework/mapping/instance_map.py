@@ -28,6 +28,7 @@ from framework.mapping.instances.association_kernels import look_up_instances
 from framework.mapping.instances.instance_list import Confirmation, InstanceClass, InstanceTableMap, ListedInstances
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.instances.object_embedding import agreed_space
+from framework.mapping.labels.dense_crf import DenseCrf
 from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
 from framework.mapping.labels.packed_evidence import PackedEvidence, checked_evidence, pack_evidence
 from framework.mapping.labels.vertex_labels import VertexLabels
@@ -72,6 +73,7 @@ class InstanceMap(InstanceTableMap):
         logarithmic: bool,  # True = the evidence consists of log-likelihoods
         confirmation: Confirmation,
         instance_class: InstanceClass = InstanceClass.DETECTIONS,
+        crf: DenseCrf | None = None,  # smoothing of the instances in the mesh; None = off
     ) -> None:
         self.classes: tuple[str, ...] = ()
         self.volume = volume
@@ -79,6 +81,7 @@ class InstanceMap(InstanceTableMap):
         self.table = InstanceTable(labels.combine, logarithmic)
         self.confirmation = confirmation
         self.instance_class = instance_class
+        self.crf = crf or DenseCrf()
         self.listed = ListedInstances()
         self.vertex_labels = VertexLabels()
         self._structure = VertexStructure()
@@ -258,7 +261,8 @@ class InstanceMap(InstanceTableMap):
         if self._whole is None or self._whole[0] != self._state():
             volume = self.volume.like(MAX_BLOCKS)
             labels = self.labels.like(volume.voxels)
-            whole = InstanceMap(volume, labels, self.table.logarithmic, self.confirmation, self.instance_class)
+            logarithmic, confirmation = self.table.logarithmic, self.confirmation
+            whole = InstanceMap(volume, labels, logarithmic, confirmation, self.instance_class, self.crf)
             whole.classes, whole.table = self.classes, self.table
             self.submaps.fuse_into(Layer(volume.voxels, labels))
             volume.voxels.max_blocks = max(self.volume.voxels.max_blocks, volume.voxels.block_count)
@@ -306,8 +310,12 @@ class InstanceMap(InstanceTableMap):
         changed[self.labels.blocks_with(relabeled)] = True
         self._merged = set()
         labels = self.vertex_labels.update(grid, self.labels.evidence, counts, surface, starts, changed)
+        best_classes = self._best_classes()
+        if self.crf.crf_weight > 0:
+            labels = self.crf.smoothed(grid, self.labels.evidence, counts, surface, labels, best_classes)
         structure = self._structure.of(surface, self.volume.gravity().up)
-        instance_ids = separate_instances(labels.instance_ids, structure, self._flat_instances())
+        flat = np.array([k >= 0 and is_flat(self.classes[k]) for k in best_classes], np.bool_)
+        instance_ids = separate_instances(labels.instance_ids, structure, flat)
         too_small = self.confirmation.too_small(instance_ids, self.volume.voxel_size)
         instance_ids = np.where(too_small, np.int32(0), instance_ids)
         class_ids = np.where(instance_ids == labels.instance_ids, labels.class_ids, np.int32(-1))
@@ -316,12 +324,12 @@ class InstanceMap(InstanceTableMap):
             surface.vertices, surface.triangles, labels.colors, instance_ids, class_ids, self.classes, structure
         )
 
-    def _flat_instances(self) -> Bool:
-        """Return a Boolean array (last id + 1,), True for instances that can lie flat on a floor or a wall."""
-        flat = np.zeros(self.table.last_id + 1, np.bool_)
+    def _best_classes(self) -> Int32:
+        """Return the most likely class (last id + 1,) of each confirmed instance, -1 = none."""
+        best = np.full(self.table.last_id + 1, -1, np.int32)
         for k, (class_id, _) in self.most_likely_classes().items():
-            flat[k] = is_flat(self.classes[class_id])
-        return flat
+            best[k] = class_id
+        return best
 
     def gravity(self) -> Gravity:
         return self.whole().volume.gravity()
@@ -338,6 +346,7 @@ class InstanceMap(InstanceTableMap):
             "storage": self.labels.storage.name,
             "score_scale": self.labels.score_scale,
             "instance_class": self.instance_class.name,
+            "crf": asdict(self.crf),
             "classes": self.classes,
             "evicted": self.labels.evicted,
             "table": plain_table(self.table),
@@ -355,7 +364,8 @@ class InstanceMap(InstanceTableMap):
             labels = EvidenceRows(volume.voxels, table.combine, storage, header.whole("score_scale", 1, LARGEST_SCALE))
             confirmation = Confirmation.of(header.part("confirmation"))
             instance_class = header.option("instance_class", InstanceClass)
-            scene = cls(volume, labels, table.logarithmic, confirmation, instance_class)
+            crf = DenseCrf.of(header.part("crf"))
+            scene = cls(volume, labels, table.logarithmic, confirmation, instance_class, crf)
             scene.begin(classes)
             packed = checked_evidence(arrays, scene.labels.evidence, scene.labels.max_instance_slots)
             check_known("class_ids", packed.class_ids, range(1, len(classes) + 1))

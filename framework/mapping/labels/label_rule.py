@@ -15,6 +15,7 @@ from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instances.association import Matches, class_agreement
 from framework.mapping.instances.instance_list import Confirmation, InstanceClass
 from framework.mapping.instances.instance_table import InstanceTable
+from framework.mapping.labels.dense_crf import DenseCrf
 from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
 from framework.mapping.labels.label_evidence import (
     LARGEST_SCORE,
@@ -89,6 +90,7 @@ class LabeledVoxels:
     instance_class: InstanceClass = InstanceClass.DETECTIONS
     # labels stored per voxel: COMPACT (top few labels) or EXACT (all labels, for comparison)
     storage: Storage = Storage.COMPACT
+    crf: DenseCrf = field(default_factory=DenseCrf)
 
     def __post_init__(self) -> None:
         check_bounds(self, occlusion_area_ratio=(0.0, 1.0), support_overlap=(0.0, 1.0))
@@ -97,7 +99,7 @@ class LabeledVoxels:
         """Return an empty map for the given label rule."""
         volume = self.hashing.new_volume()
         labels = EvidenceRows(volume.voxels, rule.combine, self.storage, rule.quantization(self.storage))
-        return InstanceMap(volume, labels, rule.logarithmic, self.confirmation, self.instance_class)
+        return InstanceMap(volume, labels, rule.logarithmic, self.confirmation, self.instance_class, self.crf)
 
     def continued(self, scene: SceneMap, rule: LabelRule) -> InstanceMap:
         """Return the stored map, prepared for new frames.
@@ -125,6 +127,7 @@ class LabeledVoxels:
             )
         scene.confirmation = self.confirmation
         scene.instance_class = self.instance_class
+        scene.crf = self.crf
         scene.volume.voxels.max_blocks = self.hashing.max_blocks
         scene.volume.changed(NO_BLOCKS)
         scene.table.begin_recording()

@@ -14,6 +14,7 @@ from framework.data import Detections, Frame, Instance, Pose
 from framework.errors import DataError
 from framework.mapping.instance_map import FORMAT, InstanceMap
 from framework.mapping.instances.instance_list import oriented_box
+from framework.mapping.labels.dense_crf import DenseCrf
 from framework.refinement.lifting import lift
 from framework.registry import assemble
 from framework.testing.contracts import same
@@ -55,6 +56,20 @@ def test_instance_map_mesh_lies_on_true_surface(scene_map: InstanceMap) -> None:
     distance = room().distance(mesh.vertices.astype(np.float64))
     assert np.median(distance) < 0.1 * scene_map.volume.voxel_size
     assert np.quantile(distance, 0.95) < 0.5 * scene_map.volume.voxel_size
+
+
+def test_instance_map_with_crf_is_smoothed_also_after_loading(tmp_path: Path) -> None:
+    fuser = mapped(room(), frames=4)
+    before = fuser.scene.mesh()
+    fuser.scene.crf = DenseCrf(crf_weight=5.0)
+    fuser.scene.relabel()
+    smoothed = fuser.scene.mesh()
+    changed = smoothed.instance_ids != before.instance_ids
+    assert 0 < changed.mean() < 0.05
+    np.testing.assert_array_equal(smoothed.class_ids[~changed], before.class_ids[~changed])
+    assert (smoothed.class_ids[changed] == np.where(smoothed.instance_ids[changed] > 0, 0, -1)).all()
+    fuser.scene.save(tmp_path / "map.npz")
+    assert same(InstanceMap.load(tmp_path / "map.npz").mesh(), smoothed)
 
 
 def test_instance_map_triangles_face_camera(scene_map: InstanceMap) -> None:
