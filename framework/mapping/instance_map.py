@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import (
-    Bool,
     Camera,
     Float32,
     Float64,

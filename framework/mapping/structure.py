@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from framework.data import Bool, Float32, Float64, Int32, Structure, UInt8
 from framework.mapping.structure_kernels import find_near_samples, label_plane_vertices, sum_normals
@@ -84,7 +85,8 @@ def structure_of(vertices: Float32, triangles: Int32, up: Float64) -> UInt8:
     """
     normals = np.zeros_like(vertices)
     sum_normals(vertices, triangles, normals)
-    found = room_planes(Samples.of(vertices, normals), up)
+    with threadpool_limits(1, "blas"):  # the last digits depend on the number of threads
+        found = room_planes(Samples.of(vertices, normals), up)
     plane_of_vertex = np.zeros(len(vertices), np.int32)
     label_plane_vertices(
         vertices, normals, found.planes.astype(np.float32), found.along.astype(np.float32), found.columns,
