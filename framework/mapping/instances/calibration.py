@@ -18,7 +18,7 @@ from framework.files.json_file import read_json
 EDGE = 0.01  # probabilities are limited to [EDGE, 1 - EDGE] before their logit
 NO_OUTLINE = 0.5  # outline agreement of an instance that was detected only once
 MIN_IOU = 0.5  # minimum IoU of an instance that exists
-MANY = 100  # number of observations above which more have no effect
+MANY = 30  # number of observations above which more have no effect, so that long sequences are no extrapolation
 MAX_WEIGHT = 100.0  # maximum absolute value of a weight
 
 
@@ -48,7 +48,7 @@ class Calibration:
     detectors without a calibration of their own.
     """
 
-    exists: tuple[float, ...] = (-0.881, 1.489, 0.483)  # constant and weights of `existence_terms`
+    exists: tuple[float, ...] = (-0.598, 1.517, 0.438)  # constant and weights of `existence_terms`
     class_probability: tuple[float, ...] = (-0.119, 0.919, 0.591)  # constant and weights of `class_terms`
     expected_iou: tuple[float, ...] = (0.684, 0.036)  # constant and weights of `iou_terms`
 
