@@ -13,6 +13,9 @@ import pytest
 from framework.errors import DataError
 from framework.mapping.instances.calibration import Calibration, Features, logit
 from framework.mapping.instances.instance_table import InstanceTable
+from framework.mapping.instances.viewing import Viewing
+from framework.mapping.storage.map_file import plain_table, table_arrays, table_of
+from framework.mapping.storage.map_header import MapHeader
 
 EVEN = Features(confidence=0.5, observations=1, score=0.5, outline=0.5, class_probability=0.5)
 
@@ -82,3 +85,26 @@ def test_class_evidence_of_many_views_counts_each_detection_once():
 
 def test_class_votes_are_not_discounted():
     assert observed(frames=1000, views=1, logarithmic=False) == pytest.approx(0.6)
+
+
+def test_map_file_keeps_calibration_and_views():
+    table = InstanceTable()
+    record = table.create(2, 0)
+    table.observe(record.id, np.log(np.array([0.6, 0.4])), 0.8, 0)
+    record.viewing = Viewing(3, 2, 1.5, 1, (0.0, 1.0, 2.0), (0.5, 0.0, 0.0))
+    table.calibration = Calibration(exists=(0.1, 0.2, 0.3))
+    header = MapHeader.of(json.loads(json.dumps(plain_table(table))))
+    again = table_of(header, 2, table_arrays(table, 2))
+    assert (again.calibration, again.records[1].viewing) == (table.calibration, record.viewing)
+    assert again.probabilities(again.records[1], record.class_evidence) == table.probabilities(
+        record, record.class_evidence
+    )
+
+
+def test_map_file_with_invalid_views_raises():
+    table = InstanceTable()
+    table.create(2, 0)
+    plain = plain_table(table)
+    plain["instances"][0]["viewing"]["camera"] = [0.0, 1.0]
+    with pytest.raises(DataError, match=r"viewing\.camera: expected three numbers, got"):
+        table_of(MapHeader.of(json.loads(json.dumps(plain))), 2, table_arrays(table, 2))
