@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from framework.detection.calibration_files import LEARNED, calibration_of
-from framework.mapping.instances.calibration import Calibration
+from framework.mapping.instances.instance_calibration import InstanceCalibration
 
 
 def test_calibration_next_to_weights_is_found_first(tmp_path: Path) -> None:
@@ -22,4 +22,4 @@ def test_network_without_calibration_has_none(tmp_path: Path) -> None:
 def test_calibrations_of_this_project_are_valid() -> None:
     paths = sorted(LEARNED.glob("*.calibration.json"))
     assert [path.name.partition(".")[0] for path in paths] == ["maskrcnn2go_int8", "yolo11n_seg"]
-    assert len({Calibration.read(path) for path in paths} | {Calibration()}) == 3
+    assert len({InstanceCalibration.read(path) for path in paths} | {InstanceCalibration()}) == 3
