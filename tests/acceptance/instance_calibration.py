@@ -31,10 +31,10 @@ from framework.detection.calibration_files import LEARNED, SUFFIX
 from framework.evaluation.calibration import Forecasts
 from framework.evaluation.instances import judge_class_agnostic
 from framework.files.json_file import write_json
-from framework.mapping.instances.calibration import (
-    Calibration,
-    Features,
-    Probabilities,
+from framework.mapping.instances.instance_calibration import (
+    InstanceCalibration,
+    InstanceFeatures,
+    InstanceProbabilities,
     class_terms,
     existence_terms,
     iou_terms,
@@ -77,7 +77,7 @@ class Sample:
     """An instance of a run with its comparison with the ground truth."""
 
     scene: str
-    features: Features
+    features: InstanceFeatures
     today: tuple[float, float]  # confidence and largest class probability, without calibration
     exists: bool
     class_is_right: bool
@@ -134,14 +134,14 @@ def _with_constant(terms: Sequence[Sequence[float]]) -> Float64:
     return np.array([[1.0, *row] for row in terms], np.float64)
 
 
-START = Calibration((0.0, 1.0, 0.0), (0.0, 1.0, 0.0), (0.75, 0.0))
+START = InstanceCalibration((0.0, 1.0, 0.0), (0.0, 1.0, 0.0), (0.75, 0.0))
 """Prior of the generic calibration, in which the confidence and the scaled evidence are probabilities."""
 
 
-def learn(known: Sequence[Sample], prior: Calibration = START) -> Calibration:
+def learn(known: Sequence[Sample], prior: InstanceCalibration = START) -> InstanceCalibration:
     """Return the calibration that fits the samples, given a prior."""
     existing = [one for one in known if one.exists]
-    return Calibration(
+    return InstanceCalibration(
         exists=logistic([existence_terms(one.features) for one in known], [one.exists for one in known], prior.exists),
         class_probability=logistic(
             [class_terms(one.features) for one in existing],
@@ -154,7 +154,7 @@ def learn(known: Sequence[Sample], prior: Calibration = START) -> Calibration:
     )
 
 
-def leave_one_scene_out(runs: Mapping[str, Sequence[Sample]]) -> list[tuple[Sample, Probabilities]]:
+def leave_one_scene_out(runs: Mapping[str, Sequence[Sample]]) -> list[tuple[Sample, InstanceProbabilities]]:
     """Return each sample with the probabilities of a calibration that has not seen its scene with any network.
 
     Args:
@@ -218,7 +218,7 @@ def _with_interval(one: Forecasts, metric: Callable[[Forecasts], float]) -> str:
     return f"{metric(one):.3f} ({low:.3f} to {high:.3f})"
 
 
-def comparisons(pairs: Iterable[tuple[Sample, Probabilities]]) -> dict[str, Comparison]:
+def comparisons(pairs: Iterable[tuple[Sample, InstanceProbabilities]]) -> dict[str, Comparison]:
     """Return the comparison of each event, given the calibrated probabilities of each sample."""
     listed = list(pairs)
     today = forecasts((one, one.today) for one, _ in listed)
@@ -226,7 +226,7 @@ def comparisons(pairs: Iterable[tuple[Sample, Probabilities]]) -> dict[str, Comp
     return {event: Comparison(today[event], calibrated[event]) for event in today}
 
 
-def iou_error(pairs: Iterable[tuple[Sample, Probabilities]]) -> float:
+def iou_error(pairs: Iterable[tuple[Sample, InstanceProbabilities]]) -> float:
     """Return the mean absolute error of the expected IoU of the instances that exist."""
     return float(np.mean([abs(found.expected_iou - one.iou) for one, found in pairs if one.exists]))
 
@@ -279,8 +279,10 @@ def learn_all(directories: Iterable[Path]) -> None:
         write_json(LEARNED / f"{network}{SUFFIX}", asdict(rounded(learn(known, generic))))
 
 
-def rounded(calibration: Calibration) -> Calibration:
-    return Calibration(**{name: tuple(round(one, 3) for one in values) for name, values in asdict(calibration).items()})
+def rounded(calibration: InstanceCalibration) -> InstanceCalibration:
+    return InstanceCalibration(
+        **{name: tuple(round(one, 3) for one in values) for name, values in asdict(calibration).items()}
+    )
 
 
 if __name__ == "__main__":

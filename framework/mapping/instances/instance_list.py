@@ -16,7 +16,7 @@ from framework.config.validation import check_bounds
 from framework.data import Bool, Box, Float32, Float64, Instance, InstanceMesh, Int32
 from framework.interfaces import SceneMap
 from framework.mapping.instances.association import agreed_classes
-from framework.mapping.instances.calibration import Calibration
+from framework.mapping.instances.instance_calibration import InstanceCalibration
 from framework.mapping.instances.instance_table import InstanceRecord, InstanceTable
 from framework.mapping.storage.map_header import MapHeader
 
@@ -107,7 +107,7 @@ class InstanceTableMap(SceneMap):
         Raises:
             DataError: The file is missing or invalid.
         """
-        self.table.calibration = Calibration() if calibration is None else Calibration.read(calibration)
+        self.table.calibration = InstanceCalibration() if calibration is None else InstanceCalibration.read(calibration)
 
     def instance_ids(self) -> frozenset[int]:
         return self.table.confirmed(self.confirmation)

@@ -12,7 +12,12 @@ from typing import Protocol
 import numpy as np
 
 from framework.data import Bool, Float32, Float64, Int32
-from framework.mapping.instances.calibration import NO_OUTLINE, Calibration, Features, Probabilities
+from framework.mapping.instances.instance_calibration import (
+    NO_OUTLINE,
+    InstanceCalibration,
+    InstanceFeatures,
+    InstanceProbabilities,
+)
 from framework.mapping.instances.object_embedding import ObjectEmbedding, added
 from framework.mapping.instances.viewing import Viewing
 from framework.mapping.labels.label_evidence import UNSEEN
@@ -146,14 +151,14 @@ class InstanceRecord:
         """Mean detection score times the detection rate in frames with the instance in view, in [0, 1]."""
         return self.mean_score * self.observations / max(self.visible, self.observations, 1)
 
-    def features(self, class_probability: float) -> Features:
+    def features(self, class_probability: float) -> InstanceFeatures:
         """Return the statistics for the calibrated probabilities.
 
         Args:
             class_probability: The probability of the most likely class, with discounted evidence.
         """
         outline = self.viewing.outline
-        return Features(
+        return InstanceFeatures(
             confidence=self.confidence,
             observations=self.observations,
             score=self.mean_score,
@@ -187,7 +192,7 @@ class InstanceTable:
         self.logarithmic = logarithmic
         self.merged: dict[int, int] = {}  # remaining instance of each merge since the map was loaded
         self.embedding_space = ""  # space of the embeddings of the instances; "" = no embeddings
-        self.calibration = Calibration()  # of the detector
+        self.calibration = InstanceCalibration()  # of the detector
 
     def create(self, classes: int, frame_index: int) -> InstanceRecord:
         """Create an instance without observations.
@@ -370,7 +375,7 @@ class InstanceTable:
         total = likelihood.sum()
         return np.asarray(likelihood / total if total > 0 else np.full_like(evidence, 1 / len(evidence)), np.float32)
 
-    def probabilities(self, record: InstanceRecord, evidence: Float64) -> Probabilities:
+    def probabilities(self, record: InstanceRecord, evidence: Float64) -> InstanceProbabilities:
         """Return the calibrated probabilities of an instance.
 
         Args:

@@ -22,7 +22,7 @@ from framework.files.atomic_write import atomic_write, check_regular
 from framework.files.json_file import parse_json
 from framework.files.manifest import verified
 from framework.files.search_paths import usable_path
-from framework.mapping.instances.calibration import Calibration
+from framework.mapping.instances.instance_calibration import InstanceCalibration
 from framework.mapping.instances.instance_table import PAGE, FrameSet, InstanceRecord, InstanceTable
 from framework.mapping.instances.object_embedding import ARRAYS, SPACE, embedding_arrays, read_embeddings
 from framework.mapping.instances.viewing import Point, Viewing
@@ -305,7 +305,7 @@ def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> Insta
     """
     table = InstanceTable(plain.option("combine", Combine), plain.flag("logarithmic"))
     table.last_id = plain.whole("last_id", 0, LARGEST_ID)
-    table.calibration = Calibration.of(plain.part("calibration").values, f"{plain.name}.calibration")
+    table.calibration = InstanceCalibration.of(plain.part("calibration").values, f"{plain.name}.calibration")
     entries, evidence = list(plain.parts("instances")), arrays[CLASS_EVIDENCE]
     check_array(CLASS_EVIDENCE, evidence, (len(entries), classes), np.float64)
     if len(entries) and not classes:

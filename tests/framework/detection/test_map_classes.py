@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -25,6 +27,12 @@ def test_new_classes_of_map_have_probability_zero() -> None:
 def test_detector_of_map_without_new_classes_is_unchanged(classes: tuple[str, ...]) -> None:
     detector = SphereDetector()
     assert with_classes_of_map(detector, classes) is detector
+
+
+def test_detector_of_map_keeps_calibration(tmp_path: Path) -> None:
+    detector = SphereDetector()
+    detector.calibration = tmp_path / "net.calibration.json"
+    assert with_classes_of_map(detector, (*CLASSES, "forklift")).calibration == detector.calibration
 
 
 def test_map_without_class_of_detector_is_error() -> None:

@@ -383,3 +383,21 @@ def test_judge_outcomes_match_evaluation_counts():
     counts = [sum(one.outcome is outcome for one in judged) for outcome in (Outcome.RIGHT, Outcome.IGNORED)]
     assert counts == [overall.true_positives, overall.ignored]
     assert overall.truths - overall.true_positives == len(missed)
+
+
+def test_forecasts_match_objects_of_any_class():
+    """Of four predictions, two match an object, one of them with its class, one is wrong and one is ignored."""
+    truth = scene([(1, 100), (2, 100), (3, 100), (0, 100)], {1: "chair", 2: "bed", 3: None})
+    claims = {11: ("chair", 0.9), 12: ("sofa", 0.8), 13: ("lamp", 0.7), 14: ("cup", 0.6)}
+    predicted = prediction(truth, [(11, 100), (12, 100), (13, 100), (14, 100)], claims)
+    assert evaluate(predicted, truth).forecasts == {}, "expected no forecasts without probabilities"
+    probabilities = {11: (0.95, 0.5), 12: (0.85, 0.4), 13: (0.75, 0.3), 14: (0.65, 0.2)}
+    found = evaluate(replace(predicted, probabilities=probabilities), truth)
+    exists, right = found.forecasts["exists"], found.forecasts["class"]
+    assert (exists.probabilities.tolist(), exists.outcomes.tolist()) == ([0.95, 0.85, 0.65], [True, True, False])
+    assert (right.probabilities.tolist(), right.outcomes.tolist()) == ([0.5, 0.4], [True, False])
+    metrics = found.metrics()
+    assert metrics["instances.calibration_count.exists"] == 3
+    assert metrics["instances.ece.exists"] == pytest.approx((0.05 + 0.15 + 0.65) / 3)
+    assert metrics["instances.brier.class"] == pytest.approx((0.25 + 0.16) / 2)
+    assert metrics["instances.auroc.exists"] == 1.0

@@ -90,7 +90,7 @@ def test_motions_are_drawn_by_frame() -> None:
 def test_reliability_shows_count_of_each_bin() -> None:
     picture = reliability({"Exists": Forecasts.of([(0.05, False), (0.55, True), (0.58, False), (1.0, True)])})
     assert picture.startswith("<svg")
-    assert "Exists: fraction, n = 4, ECE" in picture
+    assert "Exists: n = 4, ECE" in picture
     assert [picture.count(f">{number}</text>") for number in (1, 2)] == [2, 1], "number of events of the three bins"
 
 

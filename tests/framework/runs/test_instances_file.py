@@ -17,6 +17,7 @@ from framework.evaluation.instances import PredictedInstances
 from framework.pipeline import Pipeline
 from framework.runs import instances_file
 from framework.runs.instances_file import read_instances, write_instances
+from framework.runs.run_directory import likely_labels
 from tests.support.scenes.corner_room import CLASSES, CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector
 
 BOX = {"center": [1, 2, 3], "extent": [0.5, 0.5, 1], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
@@ -188,3 +189,21 @@ def test_instances_schema_rejects_invalid_entries(tmp_path: Path, damage: dict[s
     jsonschema.validate([entry], SCHEMA)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate([entry | damage], SCHEMA)
+
+
+def test_instances_file_keeps_calibrated_probabilities(tmp_path: Path) -> None:
+    scene = mapped()
+    mesh, found = scene.mesh(), dict(scene.instances())
+    key = min(found)
+    found[key] = replace(found[key], confidence=0.2, exists=0.75, class_probability=0.5, expected_iou=0.625)
+    write_instances(tmp_path / "instances.json", mesh, found, CLASSES)
+    stored = {one.id: one for one in read_instances(tmp_path / "instances.json")}
+    assert stored[key].probabilities == found[key].probabilities == (0.75, 0.5)
+    assert (stored[key].existence, stored[key].expected_iou) == (0.75, 0.625)
+    assert key in likely_labels(found, CLASSES), "expected a label despite the low confidence"
+
+
+def test_instances_file_without_calibration_uses_confidence(tmp_path: Path) -> None:
+    (tmp_path / "instances.json").write_text(json.dumps([ENTRY]))  # as written by older versions
+    (one,) = read_instances(tmp_path / "instances.json")
+    assert (one.exists, one.existence, one.probabilities) == (None, 0.5, (0.5, 0.75))

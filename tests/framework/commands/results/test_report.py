@@ -63,7 +63,7 @@ def test_report_of_run_is_one_reproducible_page(stored: Path, command) -> None:
     metrics = json.loads((stored / "metrics.json").read_text())
     assert "corner_room" in message
     assert f"AP50 {metrics['instances.ap50']:.2f}" in message
-    assert f"of {metrics['instances.count']}; confidence ≥ 0.3" in message
+    assert f"of {metrics['instances.count']}; probability ≥ 0.5" in message
     for heading in ("Map", "Objects", "Ground truth", "Trajectory", "Mapping progress", "Stage times", "Provenance"):
         assert heading in message
     assert before.count(b"data:image/webp") > 3, "expected images of objects, mapping progress and overview.png"

@@ -18,11 +18,11 @@ from framework.files.json_file import read_json
 EDGE = 0.01  # probabilities are limited to [EDGE, 1 - EDGE] before their logit
 NO_OUTLINE = 0.5  # outline agreement of an instance that was detected only once
 MIN_IOU = 0.5  # minimum IoU of an instance that exists
-MANY = 100  # number of observations above which more have no effect
+MANY = 30  # number of observations above which more have no effect, so that long sequences are no extrapolation
 MAX_WEIGHT = 100.0  # maximum absolute value of a weight
 
 
-class Features(NamedTuple):
+class InstanceFeatures(NamedTuple):
     """The statistics of an instance that its probabilities depend on."""
 
     confidence: float  # mean score of its detections times its detection rate in frames with the instance in view
@@ -32,7 +32,7 @@ class Features(NamedTuple):
     class_probability: float  # probability of the most likely class, with the evidence scaled to the number of views
 
 
-class Probabilities(NamedTuple):
+class InstanceProbabilities(NamedTuple):
     """The calibrated probabilities of an instance."""
 
     exists: float  # probability that it matches an object at IoU 0.5
@@ -41,14 +41,14 @@ class Probabilities(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Calibration:
+class InstanceCalibration:
     """Weights of logistic models of existence and class, and of a linear model of the IoU.
 
     The defaults were learned for several networks together (see docs/results/calibration.md). They are used for
     detectors without a calibration of their own.
     """
 
-    exists: tuple[float, ...] = (-0.881, 1.489, 0.483)  # constant and weights of `existence_terms`
+    exists: tuple[float, ...] = (-0.598, 1.517, 0.438)  # constant and weights of `existence_terms`
     class_probability: tuple[float, ...] = (-0.119, 0.919, 0.591)  # constant and weights of `class_terms`
     expected_iou: tuple[float, ...] = (0.684, 0.036)  # constant and weights of `iou_terms`
 
@@ -62,7 +62,7 @@ class Calibration:
                 )
 
     @classmethod
-    def of(cls, found: object, where: object = "calibration") -> Calibration:
+    def of(cls, found: object, where: object = "calibration") -> InstanceCalibration:
         """Return the calibration for a JSON object.
 
         Raises:
@@ -73,7 +73,7 @@ class Calibration:
         return cls(**{name: _numbers(f"{where}: {name}", values) for name, values in found.items()})
 
     @classmethod
-    def read(cls, path: Path) -> Calibration:
+    def read(cls, path: Path) -> InstanceCalibration:
         """Read the calibration of a detector.
 
         Raises:
@@ -81,27 +81,27 @@ class Calibration:
         """
         return cls.of(read_json(path), path)
 
-    def probabilities(self, features: Features) -> Probabilities:
+    def probabilities(self, features: InstanceFeatures) -> InstanceProbabilities:
         """Return the probabilities of an instance."""
         iou = _sum(self.expected_iou, iou_terms(features))
-        return Probabilities(
+        return InstanceProbabilities(
             exists=_logistic(_sum(self.exists, existence_terms(features))),
             class_probability=_logistic(_sum(self.class_probability, class_terms(features))),
             expected_iou=min(max(iou, MIN_IOU), 1.0),
         )
 
 
-def existence_terms(features: Features) -> tuple[float, ...]:
+def existence_terms(features: InstanceFeatures) -> tuple[float, ...]:
     """Return the terms of the log-odds that an instance exists."""
     return logit(features.confidence), math.log(min(max(features.observations, 1), MANY))
 
 
-def class_terms(features: Features) -> tuple[float, ...]:
+def class_terms(features: InstanceFeatures) -> tuple[float, ...]:
     """Return the terms of the log-odds that the class of an instance is right."""
     return logit(features.class_probability), logit(features.score)
 
 
-def iou_terms(features: Features) -> tuple[float, ...]:
+def iou_terms(features: InstanceFeatures) -> tuple[float, ...]:
     """Return the terms of the expected IoU of an instance."""
     return (features.outline,)
 
