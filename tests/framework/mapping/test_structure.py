@@ -75,7 +75,7 @@ def test_structure_of_noisy_room_is_complete() -> None:
         assert room.agreement(structure, kind) > 0.9, kind
 
 
-def test_structure_below_upper_storey_is_floor_of_both() -> None:
+def test_structure_below_upper_story_is_floor_of_both() -> None:
     room = furnished().add(5 * X - 3 * Z, 1.2 * X, Y, FLOOR).add(5 * X - 3 * Z, Y, 3 * Z, WALL)
     assert room.agreement(room.structure(), FLOOR) > 0.95
 
