@@ -53,10 +53,11 @@ class RoomPlanes:
 
 
 class VertexStructure:
-    """The structure of the vertices of a surface, which is computed again only for another surface."""
+    """The structure of the vertices of a surface, which is computed again only for another surface or up direction."""
 
     def __init__(self) -> None:
         self._surface: UnlabeledMesh | None = None
+        self._up: bytes | None = None
         self._structure: UInt8 = np.zeros(0, np.uint8)
 
     def __reduce__(self) -> tuple[type[VertexStructure], tuple[()]]:
@@ -65,10 +66,13 @@ class VertexStructure:
     def of(self, surface: UnlabeledMesh, up: Float64 | None) -> UInt8:
         """Return the `Structure` (V,) of each vertex, which is NONE for all vertices if `up` is None.
 
-        `up` (3,), a unit vector, depends on the surface alone.
+        Args:
+            surface: The surface.
+            up: The up direction (3,), a unit vector in the world frame; None = unknown.
         """
-        if surface is not self._surface:
-            self._surface = surface
+        up_bytes = None if up is None else up.tobytes()
+        if surface is not self._surface or up_bytes != self._up:
+            self._surface, self._up = surface, up_bytes
             self._structure = np.zeros(len(surface.vertices), np.uint8)
             if up is not None:
                 self._structure = structure_of(surface.vertices, surface.triangles, up)
@@ -183,7 +187,8 @@ def find_planes(samples: Samples, up: Float64) -> tuple[Float64, Bool]:
     find_near_samples(samples.points, samples.normals, proposals, SEARCH, PARALLEL, votes)
     free = np.ones(len(samples.points), np.bool_)
     minimum = np.where(proposals[:, :3] @ up < -LEVEL, MIN_CEILING_AREA, MIN_AREA)
-    planes, inliers = [], []
+    planes: list[Float64] = []
+    inliers: list[Bool] = []
     while len(proposals) and len(planes) < MAX_PLANES:
         visible = votes @ (areas * free) / minimum
         best = int(visible.argmax())
@@ -194,7 +199,7 @@ def find_planes(samples: Samples, up: Float64) -> tuple[Float64, Bool]:
             votes[best] = 0
             continue
         free &= ~(own | (votes[best] > 0))
-        if samples.areas[own].sum() >= minimum[best] and _is_level_or_upright(plane[:3] @ up):
+        if samples.areas[own].sum() >= minimum[best] and _is_level_or_upright(float(plane[:3] @ up)):
             planes.append(plane)
             inliers.append(own)
     count = len(planes)
@@ -260,9 +265,9 @@ def classify(planes: Float64, inliers: Bool, samples: Samples, up: Float64) -> t
             kinds[k] = Structure.FLOOR
     floors = np.flatnonzero(kinds == Structure.FLOOR)
     floor = middle[max(floors, key=lambda k: samples.areas[inliers[k]].sum())] if len(floors) else None
-    for k in range(len(planes)):
+    for k in np.flatnonzero(cosines < -LEVEL):
         above = samples.areas[heights > middle[k] + CLEARANCE].sum()
-        if cosines[k] < -LEVEL and above <= BEYOND * total and (floor is None or middle[k] > floor + MIN_CEILING):
+        if above <= BEYOND * total and (floor is None or middle[k] > floor + MIN_CEILING):
             kinds[k] = Structure.CEILING
     low, high = np.quantile(heights, (0.005, 0.995)) if len(heights) else (0.0, 0.0)
     enough = float(min((low if floor is None else floor) + MIN_WALL_TOP, high - TOP))

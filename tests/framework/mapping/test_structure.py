@@ -104,6 +104,14 @@ def test_vertex_structure_of_new_surface_is_computed() -> None:
     assert room.agreement(structure.of(UnlabeledMesh(*room.mesh(np.eye(3)), np.zeros(0, np.int32)), Z), FLOOR) > 0.95
 
 
+def test_vertex_structure_of_new_up_direction_is_computed() -> None:
+    surface = UnlabeledMesh(*furnished().mesh(np.eye(3)), np.zeros(0, np.int32))
+    structure = VertexStructure()
+    upright = structure.of(surface, Z)
+    assert not np.array_equal(structure.of(surface, X), upright)
+    np.testing.assert_array_equal(structure.of(surface, Z), upright)
+
+
 def test_separate_instances_removes_points_on_structure() -> None:
     structure = np.array([WALL, FLOOR, CEILING, FRONT, NONE, NONE], np.uint8)
     ids = np.array([1, 1, 1, 1, 1, 0], np.int32)
