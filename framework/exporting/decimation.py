@@ -110,6 +110,7 @@ def _collapsed(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
         mesh.instance_ids[nearest],
         mesh.class_ids[nearest],
         mesh.classes,
+        None if mesh.structure is None else mesh.structure[nearest],
     )
 
 
@@ -141,7 +142,9 @@ def _relabeled(model: Any, mesh: InstanceMesh) -> InstanceMesh:
     nearest = _nearest(mesh.vertices, kept)
     colors = np.rint(255 * np.clip(np.asarray(model.vertex_colors), 0, 1)).astype(np.uint8).reshape(-1, 3)
     triangles = np.asarray(model.triangles).astype(np.int32).reshape(-1, 3)
-    return InstanceMesh(kept, triangles, colors, mesh.instance_ids[nearest], mesh.class_ids[nearest], mesh.classes)
+    structure = None if mesh.structure is None else mesh.structure[nearest]
+    ids, class_ids = mesh.instance_ids[nearest], mesh.class_ids[nearest]
+    return InstanceMesh(kept, triangles, colors, ids, class_ids, mesh.classes, structure)
 
 
 def _nearest(points: Float32 | Float64, queries: Float32 | Float64) -> Int64:
@@ -168,6 +171,7 @@ def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> In
         mesh.instance_ids[kept],
         mesh.class_ids[kept],
         mesh.classes,
+        None if mesh.structure is None else mesh.structure[kept],
     )
 
 
@@ -181,6 +185,7 @@ def corners_of(mesh: InstanceMesh, triangles: Bool) -> Bool:
 def joined(meshes: Sequence[InstanceMesh]) -> InstanceMesh:
     """Concatenate one or more meshes with the same classes."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    structure = [mesh.structure for mesh in meshes if mesh.structure is not None]
     return InstanceMesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.triangles + start for mesh, start in zip(meshes, starts, strict=True)]).astype(np.int32),
@@ -188,4 +193,5 @@ def joined(meshes: Sequence[InstanceMesh]) -> InstanceMesh:
         np.concatenate([mesh.instance_ids for mesh in meshes]),
         np.concatenate([mesh.class_ids for mesh in meshes]),
         meshes[0].classes,
+        np.concatenate(structure) if len(structure) == len(meshes) else None,
     )

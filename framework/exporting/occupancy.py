@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from framework.data import Bool, Float64, Int32, Int64, UInt8
+from framework.data import Bool, Float64, Int32, Int64, Structure, UInt8
 from framework.datasets.frames.world_offset import origin_comments
 from framework.errors import DataError
 from framework.exporting.upright_room import SurfacePoints, UprightRoom, surface_points
@@ -140,13 +140,15 @@ def looked_through(room: UprightRoom, places: Float64) -> Bool:
 def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
     """Return the mask (C,) of the cells with walls, given the cell (P,) of each point.
 
-    A wall is a vertical surface with a height of at least WALL_SPAN that is not part of an object.
+    A wall is a part of a wall of the map, or another vertical surface with a height of at least WALL_SPAN that is
+    neither part of an object nor a furniture front.
     """
-    chosen = found.upright & (found.owner == 0)
+    chosen = found.upright & (found.owner == 0) & (found.structure != Structure.FRONT)
     step = np.floor(found.points[chosen, 2] / LEVEL_STEP).astype(np.int64)
     lowest, highest = step.min(initial=0), step.max(initial=0)
     filled = np.unique(number[chosen] * (highest - lowest + 1) + step - lowest) // (highest - lowest + 1)
-    return np.asarray(np.bincount(filled, minlength=cells) * LEVEL_STEP >= WALL_SPAN)
+    of_map = np.bincount(number[found.structure == Structure.WALL], minlength=cells) > 0
+    return np.asarray((np.bincount(filled, minlength=cells) * LEVEL_STEP >= WALL_SPAN) | of_map)
 
 
 def _highest(found: SurfacePoints, number: Int64, cells: int) -> Int32:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from framework.data import Bool, Box, Float32, Float64, InstanceMesh, Int32, Int64, UInt8
+from framework.data import Bool, Box, Float32, Float64, InstanceMesh, Int32, Int64, Structure, UInt8
 from framework.datasets.frames.world_offset import stored_origin
 from framework.errors import DataError
 from framework.files.atomic_write import path_exists
@@ -285,6 +285,7 @@ class SurfacePoints:
     points: Float32  # (P, 3) m, in the room frame
     normal_z: Float32  # (P,) z component of the unit normal
     owner: Int32  # (P,) id of the object that contains the whole triangle, 0 = none
+    structure: UInt8  # (P,) `Structure` of the whole triangle, NONE if it is not determined
 
     @property
     def level(self) -> Bool:
@@ -322,6 +323,8 @@ def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
         owner[one.vertices] = one.id
     ids = owner[triangles]
     of_triangle = np.where((ids == ids[:, :1]).all(axis=1), ids[:, 0], 0).astype(np.int32)
+    kinds = np.zeros_like(triangles, np.uint8) if room.mesh.structure is None else room.mesh.structure[triangles]
+    kind = np.where((kinds == kinds[:, :1]).all(axis=1), kinds[:, 0], np.uint8(Structure.NONE))
     points, chosen = [], []
     for n in np.unique(cuts).astype(np.int64).tolist():
         these = np.flatnonzero(cuts == n)
@@ -333,6 +336,7 @@ def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
         np.concatenate(points).astype(np.float32) if points else np.zeros((0, 3), np.float32),
         normal_z[which],
         of_triangle[which],
+        kind[which],
     )
 
 

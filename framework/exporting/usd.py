@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from framework.data import Float32, Int32, UInt8
+from framework.data import Float32, InstanceMesh, Int32, Structure, UInt8
 from framework.errors import DataError
 from framework.exporting.object_meshes import Coloring, Part, linear, part_colors
 from framework.files.atomic_write import atomic_write
@@ -97,8 +97,27 @@ def _add_rest(stage: Any, part: Part, colors: UInt8) -> None:
         return
     mesh = _add_mesh(stage, f"/World/{part.name}", part.mesh.vertices, part.mesh.triangles)
     _color(mesh, colors)
+    _add_structure(mesh, part.mesh)
     UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
     UsdPhysics.MeshCollisionAPI.Apply(mesh.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.none)
+
+
+def _add_structure(mesh: Any, labeled: InstanceMesh) -> None:
+    """Add a subset of the faces of each kind of structure, such as `floor`, with its name as semantic label."""
+    from pxr import UsdGeom, UsdSemantics, Vt
+
+    if labeled.structure is None:
+        return
+    kinds = labeled.structure[labeled.triangles]
+    same = (kinds == kinds[:, :1]).all(axis=1)
+    for kind in Structure:
+        faces = np.flatnonzero(same & (kinds[:, 0] == kind)).astype(np.int32)
+        if kind is Structure.NONE or not len(faces):
+            continue
+        name = kind.name.lower()
+        indices = Vt.IntArray.FromNumpy(faces)
+        subset = UsdGeom.Subset.CreateGeomSubset(mesh, name, UsdGeom.Tokens.face, indices, "structure")
+        UsdSemantics.LabelsAPI.Apply(subset.GetPrim(), "class").CreateLabelsAttr(Vt.TokenArray([name]))
 
 
 def _add_object(stage: Any, part: Part, colors: UInt8, collision: Collision) -> None:

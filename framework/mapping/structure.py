@@ -28,11 +28,12 @@ PARALLEL = np.cos(np.radians(20.0))  # minimum dot product of the normals of a p
 LEVEL = np.cos(np.radians(10.0))  # minimum dot product of up and the normal of a horizontal plane
 UPRIGHT = np.sin(np.radians(8.0))  # maximum dot product of up and the normal of a vertical plane
 MIN_AREA = 0.6  # m^2, minimum visible area of a plane
+MIN_CEILING_AREA = 0.2  # m^2, minimum visible area of a plane that faces down; cameras see little of ceilings
 MAX_PLANES = 60  # maximum number of planes
 BEYOND = 0.02  # maximum fraction of the surface area below the floor, above the ceiling
 CLEARANCE = 0.1  # m, minimum distance of surface below the floor or above the ceiling
-MIN_STOREY = 4.0  # m^2, minimum visible area of a floor above stairs or another lower storey
-LOWER_STOREY = 0.2  # maximum visible area of lower floors, as a fraction of the area of a floor
+MIN_STORY = 4.0  # m^2, minimum visible area of a floor above stairs or another lower story
+LOWER_STORY = 0.2  # maximum visible area of lower floors, as a fraction of the area of a floor
 MIN_WALL_TOP = 1.7  # m, minimum height of the upper end of a wall above the floor
 MIN_WALL_HEIGHT = 0.6  # m, minimum height of the visible part of a wall
 TOP = 0.25  # m, maximum distance of the upper end of a wall from the upper end of the map, where the map is low
@@ -53,10 +54,11 @@ class RoomPlanes:
 
 
 class VertexStructure:
-    """The structure of the vertices of a surface, which is computed again only for another surface."""
+    """The structure of the vertices of a surface, which is computed again only for another surface or up direction."""
 
     def __init__(self) -> None:
         self._surface: UnlabeledMesh | None = None
+        self._up: bytes | None = None
         self._structure: UInt8 = np.zeros(0, np.uint8)
 
     def __reduce__(self) -> tuple[type[VertexStructure], tuple[()]]:
@@ -65,10 +67,13 @@ class VertexStructure:
     def of(self, surface: UnlabeledMesh, up: Float64 | None) -> UInt8:
         """Return the `Structure` (V,) of each vertex, which is NONE for all vertices if `up` is None.
 
-        `up` (3,), a unit vector, depends on the surface alone.
+        Args:
+            surface: The surface.
+            up: The up direction (3,), a unit vector in the world frame; None = unknown.
         """
-        if surface is not self._surface:
-            self._surface = surface
+        up_bytes = None if up is None else up.tobytes()
+        if surface is not self._surface or up_bytes != self._up:
+            self._surface, self._up = surface, up_bytes
             self._structure = np.zeros(len(surface.vertices), np.uint8)
             if up is not None:
                 self._structure = structure_of(surface.vertices, surface.triangles, up)
@@ -183,18 +188,20 @@ def find_planes(samples: Samples, up: Float64) -> tuple[Float64, Bool]:
     votes = np.zeros((len(proposals), len(samples.points)), np.float32)
     find_near_samples(samples.points, samples.normals, proposals, SEARCH, PARALLEL, votes)
     free = np.ones(len(samples.points), np.bool_)
-    planes, inliers = [], []
+    minimum = np.where(proposals[:, :3] @ up < -LEVEL, MIN_CEILING_AREA, MIN_AREA)
+    planes: list[Float64] = []
+    inliers: list[Bool] = []
     while len(proposals) and len(planes) < MAX_PLANES:
-        visible = votes @ (areas * free)
+        visible = votes @ (areas * free) / minimum
         best = int(visible.argmax())
-        if visible[best] < MIN_AREA:
+        if visible[best] < 1:
             break
         plane, own = _refined(proposals[best], samples, free)
         if not own.any():
             votes[best] = 0
             continue
         free &= ~(own | (votes[best] > 0))
-        if samples.areas[own].sum() >= MIN_AREA and _is_level_or_upright(plane[:3] @ up):
+        if samples.areas[own].sum() >= minimum[best] and _is_level_or_upright(float(plane[:3] @ up)):
             planes.append(plane)
             inliers.append(own)
     count = len(planes)
@@ -256,13 +263,13 @@ def classify(planes: Float64, inliers: Bool, samples: Samples, up: Float64) -> t
         below = heights < middle[k] - CLEARANCE
         is_lowest = samples.areas[below].sum() <= BEYOND * total
         area = samples.areas[inliers[k]].sum()
-        if is_lowest or (area >= MIN_STOREY and samples.areas[below & faces_up].sum() <= LOWER_STOREY * area):
+        if is_lowest or (area >= MIN_STORY and samples.areas[below & faces_up].sum() <= LOWER_STORY * area):
             kinds[k] = Structure.FLOOR
     floors = np.flatnonzero(kinds == Structure.FLOOR)
     floor = middle[max(floors, key=lambda k: samples.areas[inliers[k]].sum())] if len(floors) else None
-    for k in range(len(planes)):
+    for k in np.flatnonzero(cosines < -LEVEL):
         above = samples.areas[heights > middle[k] + CLEARANCE].sum()
-        if cosines[k] < -LEVEL and above <= BEYOND * total and (floor is None or middle[k] > floor + MIN_CEILING):
+        if above <= BEYOND * total and (floor is None or middle[k] > floor + MIN_CEILING):
             kinds[k] = Structure.CEILING
     low, high = np.quantile(heights, (0.005, 0.995)) if len(heights) else (0.0, 0.0)
     enough = float(min((low if floor is None else floor) + MIN_WALL_TOP, high - TOP))

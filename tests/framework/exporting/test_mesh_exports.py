@@ -15,7 +15,7 @@ import trimesh
 from PIL import ImageColor
 from scipy.spatial.transform import Rotation
 
-from framework.data import Box
+from framework.data import Box, Structure
 from framework.errors import DataError
 from framework.exporting.decimation import decimated
 from framework.exporting.exports import PREDICTIONS, Chosen, ExportFormat, export
@@ -254,6 +254,27 @@ def test_usd_stage_has_semantics_and_collision_shapes(run: Path, tmp_path: Path)
         np.array(corner) for corner in (bound.ComputeAlignedRange().GetMin(), bound.ComputeAlignedRange().GetMax())
     )
     np.testing.assert_allclose((low, high), ((-0.1, -0.1, 0), (0.1, 0.1, 0.2)), atol=1e-5)
+
+
+def test_usd_room_has_subset_of_each_structure(tmp_path: Path) -> None:
+    from pxr import Usd, UsdGeom, UsdSemantics
+
+    run = ExportedRoom().write(tmp_path / "run")
+    mesh = read_mesh(run / "mesh.ply")
+    heights = mesh.vertices[:, 2]
+    structure = np.select([heights < 0.01, heights > 2.49], [Structure.FLOOR, Structure.CEILING], Structure.NONE)
+    write_mesh(run / "mesh.ply", replace(mesh, structure=structure.astype(np.uint8)))
+    export(run, [ExportFormat.USD], tmp_path)
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    room = UsdGeom.Mesh(stage.GetPrimAtPath("/World/room"))
+    points, corners = np.array(room.GetPointsAttr().Get()), np.array(room.GetFaceVertexIndicesAttr().Get())
+    subsets = UsdGeom.Subset.GetAllGeomSubsets(room)
+    assert sorted(one.GetPrim().GetName() for one in subsets) == ["ceiling", "floor"]
+    for one in subsets:
+        name = one.GetPrim().GetName()
+        assert UsdSemantics.LabelsAPI(one.GetPrim(), "class").GetLabelsAttr().Get() == [name]
+        used = points[corners.reshape(-1, 3)[np.array(one.GetIndicesAttr().Get())].ravel()]
+        np.testing.assert_allclose(used[:, 2], 0 if name == "floor" else 2.5, atol=1e-4)
 
 
 def test_usd_export_without_usd_core_error_names_extra(

@@ -12,6 +12,7 @@ import pytest
 import yaml
 from PIL import Image
 
+from framework.data import Structure
 from framework.errors import DataError
 from framework.exporting import occupancy, scene_graph
 from framework.exporting.exports import Chosen, ExportFormat, export
@@ -382,3 +383,20 @@ def test_plan_parameters_out_of_range_raise(room: UprightRoom, monkeypatch: pyte
     monkeypatch.setattr(occupancy, "MAX_CELLS", 100)
     with pytest.raises(DataError, match=r"plan: expected at most .* cells, got 43 x 33 cells"):
         plan(room, RESOLUTION, 1.0)
+
+
+def test_plan_without_furniture_fronts_has_no_wall_there(room: UprightRoom, low: Plan) -> None:
+    heights = room.mesh.vertices[:, 2]
+    structure = np.where((heights > 0.01) & (heights < 2.49), np.uint8(Structure.FRONT), np.uint8(0))
+    fronts = replace(room, mesh=replace(room.mesh, structure=structure))
+    assert low.wall.any()
+    assert not plan(fronts, RESOLUTION, 0.5).wall.any()
+
+
+def test_plan_wall_of_map_may_be_low(room: UprightRoom) -> None:
+    low_part = room.mesh.vertices[:, 2] < 0.3
+    triangles = room.mesh.triangles[low_part[room.mesh.triangles].all(axis=1)]
+    mesh = replace(room.mesh, triangles=triangles)
+    walls = replace(mesh, structure=np.full(len(low_part), Structure.WALL, np.uint8))
+    assert not plan(replace(room, mesh=mesh), RESOLUTION, 0.5).wall.any()
+    assert plan(replace(room, mesh=walls), RESOLUTION, 0.5).wall.any()

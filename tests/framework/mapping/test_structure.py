@@ -75,7 +75,7 @@ def test_structure_of_noisy_room_is_complete() -> None:
         assert room.agreement(structure, kind) > 0.9, kind
 
 
-def test_structure_below_upper_storey_is_floor_of_both() -> None:
+def test_structure_below_upper_story_is_floor_of_both() -> None:
     room = furnished().add(5 * X - 3 * Z, 1.2 * X, Y, FLOOR).add(5 * X - 3 * Z, Y, 3 * Z, WALL)
     assert room.agreement(room.structure(), FLOOR) > 0.95
 
@@ -102,6 +102,14 @@ def test_vertex_structure_of_new_surface_is_computed() -> None:
     empty = UnlabeledMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros(0, np.int32))
     assert len(structure.of(empty, Z)) == 0
     assert room.agreement(structure.of(UnlabeledMesh(*room.mesh(np.eye(3)), np.zeros(0, np.int32)), Z), FLOOR) > 0.95
+
+
+def test_vertex_structure_of_new_up_direction_is_computed() -> None:
+    surface = UnlabeledMesh(*furnished().mesh(np.eye(3)), np.zeros(0, np.int32))
+    structure = VertexStructure()
+    upright = structure.of(surface, Z)
+    assert not np.array_equal(structure.of(surface, X), upright)
+    np.testing.assert_array_equal(structure.of(surface, Z), upright)
 
 
 def test_separate_instances_removes_points_on_structure() -> None:
