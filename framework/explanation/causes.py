@@ -1,8 +1,8 @@
 """Causes of lost objects and of false instances.
 
-For each true object, the points of its clusters are counted after each stage, over all frames in which it was detected.
-Their IoU with the visible readings of the object shows how much of the object was left after the stage. The cause of a
-lost object is the first stage, in the order of the pipeline, after which this IoU is below the threshold of the
+For each true object, an IoU is estimated after each stage, from its clusters in all frames in which it is detected. It
+shows how much of the object is left. Fusion outvotes errors in few frames, so medians over frames are used. The cause
+of a lost object is the first stage, in the order of the pipeline, after which this IoU is below the threshold of the
 evaluation.
 """
 
@@ -60,25 +60,25 @@ class StageFigures:
     frames_detected: int  # number of these frames with a cluster of the object
     detected_classes: Mapping[str, int]  # number of its clusters by class
     masks_of_others: Mapping[int, int]  # number of frames with most of it in the mask of another object, by object
-    iou_detection: float
+    iou_detection: float  # median IoU of the best mask, over the frames in which it is detected
     # tracking
     frames_lost: int  # number of frames with the object and a lost pose
     displacement: float  # m, median displacement of the object by pose errors; NaN = unknown
     largest_displacement: float  # m
-    iou_tracking: float  # without the frames in which it is displaced by more than MAX_DISTANCE
+    iou_tracking: float  # times the fraction of its readings in frames that displace it by at most MAX_DISTANCE
     # refinement
     points: int  # number of points of its clusters on it, before refinement
     removed: float  # fraction of these points that the refiner removed
     foreign: float  # fraction of the points of its refined clusters that are not on it
-    iou_refinement: float
+    iou_refinement: float  # same product, with refined masks
     # association
     first_detected: int  # Frame.index of its first cluster, -1 = none
     first_matched: int  # Frame.index of its first cluster with an instance, -1 = none
     largest_cluster: int  # number of points of its largest refined cluster
     instance: int  # instance of the map with most of it, 0 = none
-    instances: Mapping[int, int]  # number of refined points on it by instance; 0 = without an instance
+    instances: Mapping[int, int]  # number of points of its refined clusters by instance; 0 = without an instance
     objects_of_instance: Mapping[int, int]  # number of points of `instance` by true object; 0 = on no object
-    iou_association: float
+    iou_association: float  # times the IoU of the points of its clusters with those of the clusters of `instance`
     # fusion
     confirmed: bool  # True = `instance` is in the results
     labels: Mapping[int, float]  # fraction of its true points by instance in the map; 0 = none
@@ -211,18 +211,16 @@ def figures_of(
     """
     seen, detected = views.seen, views.detected
     good, fused = detected & views.in_place, detected & ~views.lost
-    visible, foreign = int(views.visible[detected].sum()), int(views.lifted_foreign[detected].sum())
     refined, refined_foreign = int(views.refined[good].sum()), int(views.refined_foreign[good].sum())
-    instances, in_place = Counter[int](), Counter[int]()
-    for k in np.flatnonzero(detected):
-        instances.update(views.matched[k])
-        in_place.update(views.matched[k] if good[k] else {})
-    ious = {
-        k: count / (visible + matched[k].points.total() - min(instances[k], visible))
-        for k, count in in_place.items()
+    instances = sum((views.matched[k] for k in np.flatnonzero(detected)), Counter[int]())
+    parts = {  # IoU of the points of its clusters with the points of the clusters of an instance
+        k: count / (instances.total() + matched[k].cluster_points.total() - matched[k].cluster_points[key])
+        for k, count in instances.items()
         if k
     }
-    instance = max(ious, key=lambda k: (ious[k], -k), default=0)
+    instance = max(parts, key=lambda k: (parts[k], -k), default=0)
+    in_place = _ratio(views.visible[good].sum(), views.visible[detected].sum())
+    iou_lifted, iou_refined = _median(views.lifted_iou[detected]), _median(views.refined_iou[fused])
     known = views.displacement[detected & np.isfinite(views.displacement)]
     has_instance = np.array([any(points) for points in views.matched], np.bool_)
     return StageFigures(
@@ -231,22 +229,22 @@ def figures_of(
         frames_detected=int((seen & detected).sum()),
         detected_classes={classes[k]: count for k, count in views.classes.most_common()},
         masks_of_others=dict(Counter(views.covering[seen & (views.covering > 0)].tolist()).most_common()),
-        iou_detection=_ratio(views.lifted[detected].sum(), visible + foreign),
+        iou_detection=iou_lifted,
         frames_lost=int((views.lost & seen).sum()),
         displacement=float(np.median(known)) if len(known) else float("nan"),
         largest_displacement=float(known.max()) if len(known) else float("nan"),
-        iou_tracking=_ratio(views.lifted[good].sum(), visible + foreign),
+        iou_tracking=in_place * iou_lifted,
         points=int(views.lifted.sum()),
         removed=1 - _ratio(views.refined[fused].sum(), views.lifted[fused].sum()) if fused.any() else 0.0,
         foreign=_ratio(refined_foreign, refined + refined_foreign),
-        iou_refinement=_ratio(refined, visible + refined_foreign),
+        iou_refinement=in_place * iou_refined,
         first_detected=_first(views.frames[detected]),
         first_matched=_first(views.frames[has_instance]),
         largest_cluster=int(views.largest.max(initial=0)),
         instance=instance,
         instances=dict(instances.most_common()),
         objects_of_instance=dict(matched[instance].points.most_common()) if instance else {},
-        iou_association=ious.get(instance, 0.0),
+        iou_association=in_place * iou_refined * parts.get(instance, 0.0),
         confirmed=instance in surface.listed,
         labels=surface.labels_of(key),
         best_instance=surface.best_ids.get(key, 0),
@@ -405,6 +403,10 @@ def _cause_of_false(own: InstancePoints, objects: Mapping[int, ObjectExplanation
 
 def _first(frames: Sequence[int] | np.ndarray) -> int:
     return int(frames[0]) if len(frames) else -1
+
+
+def _median(values: Float64) -> float:
+    return float(np.median(values)) if len(values) else 0.0
 
 
 def _ratio(part: float, whole: float) -> float:

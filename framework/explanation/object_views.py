@@ -29,9 +29,11 @@ class ObjectViews:
     lifted_foreign: Int64  # (F,) number of their other points
     refined: Int64  # (F,) after refinement
     refined_foreign: Int64  # (F,)
+    lifted_iou: Float64  # (F,) largest IoU of one of its clusters with its readings, before refinement
+    refined_iou: Float64  # (F,) after refinement
     largest: Int64  # (F,) number of points of its largest refined cluster
     covering: Int32  # (F,) another object in whose mask most of it is, 0 = none
-    matched: tuple[Counter[int], ...]  # (F,) number of refined points on it by instance; 0 = no instance
+    matched: tuple[Counter[int], ...]  # (F,) number of points of its refined clusters by instance; 0 = no instance
     classes: Counter[int]  # number of its clusters by class
 
     @property
@@ -59,6 +61,7 @@ class ObjectViews:
         """Return the views of an object. The arguments are explained at `explain_objects`."""
         rows: list[tuple[int, ...]] = []
         displacements: list[float] = []
+        ious: list[tuple[float, float]] = []
         matched: list[Counter[int]] = []
         classes = Counter[int]()
         for frame in frames:
@@ -78,7 +81,8 @@ class ObjectViews:
                 )
             )
             displacements.append(displacement(frame.centers_camera[column], motions.get(frame.index)))
-            matched.append(points_of_instances(frame.instance_ids[own], refined[:, column + 1], merged))
+            ious.append((best_iou(lifted, column + 1, visible), best_iou(refined, column + 1, visible)))
+            matched.append(points_of_instances(frame.instance_ids[own], refined.sum(axis=1), merged))
             classes.update(frame.class_ids[own].tolist())
         columns = np.array(rows, np.int64).reshape(-1, 10).T
         return cls(
@@ -91,6 +95,8 @@ class ObjectViews:
             lifted_foreign=columns[5],
             refined=columns[6],
             refined_foreign=columns[7],
+            lifted_iou=np.array(ious, np.float64).reshape(-1, 2)[:, 0],
+            refined_iou=np.array(ious, np.float64).reshape(-1, 2)[:, 1],
             largest=columns[8],
             covering=columns[9].astype(np.int32),
             matched=tuple(matched),
@@ -102,6 +108,12 @@ def column_of(frame: FrameObservation, key: int) -> int:
     """Return the position of an object in the arrays of a frame, -1 = not visible."""
     column = int(np.searchsorted(frame.truth_ids, key))
     return column if column < len(frame.truth_ids) and frame.truth_ids[column] == key else -1
+
+
+def best_iou(counts: Int64, column: int, visible: int) -> float:
+    """Return the largest IoU of N clusters with an object, given its column in their `counts` (N, 1 + T)."""
+    ious = counts[:, column] / np.maximum(visible + counts.sum(axis=1) - counts[:, column], 1)
+    return float(ious.max(initial=0.0))
 
 
 def covering_object(frame: FrameObservation, column: int) -> int:
@@ -146,6 +158,7 @@ class InstancePoints:
     observations: int  # number of frames
     clusters: Counter[int]  # number of clusters by true object; 0 = on no object
     points: Counter[int]  # number of refined points by true object; 0 = on no object
+    cluster_points: Counter[int]  # number of refined points by the true object of their cluster; 0 = none
     lifted: Counter[int]  # number of points on the object of the cluster before refinement, by true object
     visible: Counter[int]  # number of readings on the object of the cluster in these frames, by true object
 
@@ -158,7 +171,8 @@ class InstancePoints:
 def instance_points(instance_id: int, frames: Sequence[FrameObservation], merged: Mapping[int, int]) -> InstancePoints:
     """Return the clusters that were matched with an instance, or with an instance that was merged into it."""
     observations = 0
-    clusters, points, lifted, visible = Counter[int](), Counter[int](), Counter[int](), Counter[int]()
+    clusters, points, cluster_points = Counter[int](), Counter[int](), Counter[int]()
+    lifted, visible = Counter[int](), Counter[int]()
     members = {k for k in merged if remaining(k, merged) == instance_id} | {instance_id}
     for frame in frames:
         chosen = np.isin(frame.instance_ids, list(members))
@@ -168,8 +182,11 @@ def instance_points(instance_id: int, frames: Sequence[FrameObservation], merged
         clusters.update(frame.objects[chosen].tolist())
         counts = frame.refined[chosen].sum(axis=0)
         points.update(dict(zip([0, *frame.truth_ids.tolist()], counts.tolist(), strict=True)))
+        sizes = frame.refined[chosen].sum(axis=1).tolist()
+        for key, size in zip(frame.objects[chosen].tolist(), sizes, strict=True):
+            cluster_points[key] += size
         for key in {*frame.objects[chosen].tolist()} - {0}:
             column = column_of(frame, key)
             lifted[key] += int(frame.lifted[chosen & (frame.objects == key), column + 1].sum())
             visible[key] += int(frame.visible[column])
-    return InstancePoints(observations, clusters, +points, lifted, visible)
+    return InstancePoints(observations, clusters, +points, cluster_points, lifted, visible)

@@ -109,13 +109,13 @@ def test_explain_uncovered_object_names_evaluation() -> None:
     assert [one.cause for one in objects.values()] == [Cause.EVALUATION, Cause.EVALUATION]
 
 
-def test_explain_split_object_names_association() -> None:
+def test_explain_object_in_two_masks_names_detection() -> None:
     parts = replace(
         FRAME, class_ids=np.int32([0, 0]), objects=np.int32([1, 1]), lifted=np.int64([[0, 95, 0], [0, 95, 0]]),
         refined=np.int64([[0, 90, 0], [0, 90, 0]]),
     )  # fmt: skip
     objects, _ = explained(parts, {1: {7: 90, 8: 90}})
-    assert (objects[1].state, objects[1].cause) == (State.SPLIT, Cause.ASSOCIATION)
+    assert (objects[1].state, objects[1].cause) == (State.SPLIT, Cause.DETECTION)
 
 
 def test_explain_wrong_class_names_detection() -> None:
