@@ -142,7 +142,7 @@ def room_planes(samples: SurfaceSamples, up: Float64) -> RoomPlanes:
     """Return the planes of a surface that are structure.
 
     Args:
-        samples: SurfaceSamples of the surface.
+        samples: Samples of the surface.
         up: The up direction (3,), a unit vector.
     """
     planes, inliers = find_planes(samples, up)
@@ -178,7 +178,7 @@ def find_planes(samples: SurfaceSamples, up: Float64) -> tuple[Float64, Bool]:
     """Return the large horizontal and vertical planes (K, 4) of a surface, and their samples (K, N).
 
     Args:
-        samples: SurfaceSamples of the surface.
+        samples: Samples of the surface.
         up: The up direction (3,), a unit vector.
     """
     proposals = _proposals(samples, up)
@@ -249,7 +249,7 @@ def classify(planes: Float64, inliers: Bool, samples: SurfaceSamples, up: Float6
     Args:
         planes: The planes (K, 4).
         inliers: The samples (K, N) of each plane.
-        samples: SurfaceSamples of the surface.
+        samples: Samples of the surface.
         up: The up direction (3,), a unit vector.
     """
     kinds = np.full(len(planes), Structure.NONE, np.uint8)
