@@ -110,7 +110,7 @@ def _matched(
         true_classes: The class of each evaluated ground-truth instance.
     """
     kinds = {-int(kind): kind.name.lower() for kind in STUFF}
-    predicted_names, true_names = predicted_classes | kinds, true_classes | kinds
+    predicted_names, true_names = {**predicted_classes, **kinds}, {**true_classes, **kinds}
     rows, columns = (np.array(sorted(set(np.unique(of).tolist()) & of_class.keys()), np.int64) for of, of_class in (
         (predicted, predicted_names), (true, true_names)))  # fmt: skip
     points = contingency(predicted, true, rows, columns)

@@ -91,7 +91,7 @@ def structure_of(vertices: Float32, triangles: Int32, up: Float64) -> UInt8:
     normals = np.zeros_like(vertices)
     sum_normals(vertices, triangles, normals)
     with threadpool_limits(1, "blas"):  # the last digits depend on the number of threads
-        found = room_planes(Samples.of(vertices, normals), up)
+        found = room_planes(SurfaceSamples.of(vertices, normals), up)
     plane_of_vertex = np.zeros(len(vertices), np.int32)
     label_plane_vertices(
         vertices, normals, found.planes.astype(np.float32), found.along.astype(np.float32), found.columns,
@@ -123,7 +123,7 @@ def is_building(structure: UInt8) -> Bool:
 
 
 @dataclass(frozen=True)
-class Samples:
+class SurfaceSamples:
     """N vertices of a surface."""
 
     points: Float64  # (N, 3) m
@@ -131,7 +131,7 @@ class Samples:
     areas: Float64  # (N,) m^2
 
     @classmethod
-    def of(cls, vertices: Float32, normals: Float32) -> Samples:
+    def of(cls, vertices: Float32, normals: Float32) -> SurfaceSamples:
         """Return evenly selected vertices. The length of a normal is six times the area of its vertex."""
         step = max(1, len(vertices) // SAMPLED)
         points, chosen = vertices[::step].astype(np.float64), normals[::step].astype(np.float64)
@@ -140,7 +140,7 @@ class Samples:
         return cls(points[real], chosen[real] / lengths[real, None], lengths[real] * step / 6)
 
 
-def room_planes(samples: Samples, up: Float64) -> RoomPlanes:
+def room_planes(samples: SurfaceSamples, up: Float64) -> RoomPlanes:
     """Return the planes of a surface that are structure.
 
     Args:
@@ -176,7 +176,7 @@ def _columns(plane: Float64, points: Float64, up: Float64, enough: float) -> tup
     return np.append(axis, start), high | np.roll(high, 1) | np.roll(high, -1)
 
 
-def find_planes(samples: Samples, up: Float64) -> tuple[Float64, Bool]:
+def find_planes(samples: SurfaceSamples, up: Float64) -> tuple[Float64, Bool]:
     """Return the large horizontal and vertical planes (K, 4) of a surface, and their samples (K, N).
 
     Args:
@@ -212,7 +212,7 @@ def _is_level_or_upright(cosine: float) -> bool:
     return bool(abs(cosine) > LEVEL or abs(cosine) < UPRIGHT)
 
 
-def _proposals(samples: Samples, up: Float64) -> Float64:
+def _proposals(samples: SurfaceSamples, up: Float64) -> Float64:
     """Return the mean plane (P, 4) of the samples of each part of the surface that are about horizontal or vertical."""
     cosines = samples.normals @ up
     chosen = np.flatnonzero((np.abs(cosines) > PARALLEL) | (np.abs(cosines) < np.sqrt(1 - PARALLEL**2)))
@@ -229,7 +229,7 @@ def _proposals(samples: Samples, up: Float64) -> Float64:
     return proposals[np.sort(first)]
 
 
-def _refined(plane: Float64, samples: Samples, free: Bool) -> tuple[Float64, Bool]:
+def _refined(plane: Float64, samples: SurfaceSamples, free: Bool) -> tuple[Float64, Bool]:
     """Fit a plane (4,) to the free samples near it, and return it with a mask (N,) of its samples."""
     for reach in (SEARCH, SEARCH, REACH, REACH):
         own = free & (np.abs(samples.points @ plane[:3] - plane[3]) < reach)
@@ -245,7 +245,7 @@ def _refined(plane: Float64, samples: Samples, free: Bool) -> tuple[Float64, Boo
     return plane, own
 
 
-def classify(planes: Float64, inliers: Bool, samples: Samples, up: Float64) -> tuple[UInt8, float]:
+def classify(planes: Float64, inliers: Bool, samples: SurfaceSamples, up: Float64) -> tuple[UInt8, float]:
     """Return the `Structure` (K,) of planes, and the minimum height of the upper end of walls in the world frame, m.
 
     Args:
@@ -284,7 +284,7 @@ def classify(planes: Float64, inliers: Bool, samples: Samples, up: Float64) -> t
     return kinds, enough
 
 
-def _is_front(front: Float64, own: Bool, wall: Float64, others: Bool, samples: Samples, up: Float64) -> bool:
+def _is_front(front: Float64, own: Bool, wall: Float64, others: Bool, samples: SurfaceSamples, up: Float64) -> bool:
     """Return True if a vertical plane is in front of a wall that extends to both of its sides."""
     if front[:3] @ wall[:3] < PARALLEL:
         return False

@@ -286,15 +286,16 @@ def test_fuser_instance_with_few_visible_pixels_is_not_counted(new_fuser: NewFus
 
 @pytest.mark.parametrize("voxel_size", [0.01, 0.02, 0.04])
 def test_fuser_min_area_does_not_depend_on_voxel_size(new_fuser: NewFuser, voxel_size: float) -> None:
-    """The object is a poster of known area on a wall."""
+    """The object is a poster of known area on a slanted surface, which is not a wall."""
     depth, poster = 1.5, np.zeros(CAMERA.shape, np.bool_)
     poster[30:90, 40:120] = True
     area = poster.sum() * depth**2 / (CAMERA.fx * CAMERA.fy)
-    wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -depth)])
+    surface = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -depth)])
     for share, count in ((0.9, 1), (1.1, 0)):
         fuser = new_fuser(voxel_size=voxel_size, min_area=share * area)
         for k in range(3):
-            fuse_masks(fuser, wall.frame(np.eye(4), k), [poster], [0.9])
+            frame = dataclasses.replace(surface.frame(np.eye(4), k), up=np.array([0.0, -1.0, -1.0]) / np.sqrt(2))
+            fuse_masks(fuser, frame, [poster], [0.9])
         assert len(fuser.scene.instances()) == count
         assert len(fuser.scene.instance_ids()) == 1, "expected one instance id for any min_area"
 
