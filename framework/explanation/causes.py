@@ -1,9 +1,9 @@
 """Causes of lost objects and of false instances.
 
-For each true object, an IoU is estimated after each stage, from its clusters in all frames in which it is detected. It
-shows how much of the object is left. Fusion outvotes errors in few frames, so medians over frames are used. The cause
-of a lost object is the first stage, in the order of the pipeline, after which this IoU is below the threshold of the
-evaluation.
+For each true object, the part that is left after each stage is estimated from its clusters in all frames in which it is
+detected: its coverage by masks, and the IoU after refinement. Fusion outvotes errors in few frames, so medians over
+frames are used. The cause of a lost object is the first stage, in the order of the pipeline, after which this value is
+below the IoU threshold of the evaluation.
 """
 
 from __future__ import annotations
@@ -60,17 +60,19 @@ class StageFigures:
     frames_detected: int  # number of these frames with a cluster of the object
     detected_classes: Mapping[str, int]  # number of its clusters by class
     masks_of_others: Mapping[int, int]  # number of frames with most of it in the mask of another object, by object
-    iou_detection: float  # median IoU of the best mask, over the frames in which it is detected
+    coverage: float  # median fraction of its readings in its best mask, over the frames in which it is detected
     # tracking
     frames_lost: int  # number of frames with the object and a lost pose
     displacement: float  # m, median displacement of the object by pose errors; NaN = unknown
     largest_displacement: float  # m
-    iou_tracking: float  # times the fraction of its readings in frames that displace it by at most MAX_DISTANCE
+    coverage_in_place: (
+        float  # coverage times the fraction of its readings in frames that displace it by at most MAX_DISTANCE
+    )
     # refinement
     points: int  # number of points of its clusters on it, before refinement
     removed: float  # fraction of these points that the refiner removed
     foreign: float  # fraction of the points of its refined clusters that are not on it
-    iou_refinement: float  # same product, with refined masks
+    iou_refinement: float  # this fraction times the median IoU of its best refined mask
     # association
     first_detected: int  # Frame.index of its first cluster, -1 = none
     first_matched: int  # Frame.index of its first cluster with an instance, -1 = none
@@ -220,7 +222,7 @@ def figures_of(
     }
     instance = max(parts, key=lambda k: (parts[k], -k), default=0)
     in_place = _ratio(views.visible[good].sum(), views.visible[detected].sum())
-    iou_lifted, iou_refined = _median(views.lifted_iou[detected]), _median(views.refined_iou[fused])
+    coverage, iou_refined = _median(views.coverage[detected]), _median(views.refined_iou[fused])
     known = views.displacement[detected & np.isfinite(views.displacement)]
     has_instance = np.array([any(points) for points in views.matched], np.bool_)
     return StageFigures(
@@ -229,11 +231,11 @@ def figures_of(
         frames_detected=int((seen & detected).sum()),
         detected_classes={classes[k]: count for k, count in views.classes.most_common()},
         masks_of_others=dict(Counter(views.covering[seen & (views.covering > 0)].tolist()).most_common()),
-        iou_detection=iou_lifted,
+        coverage=coverage,
         frames_lost=int((views.lost & seen).sum()),
         displacement=float(np.median(known)) if len(known) else float("nan"),
         largest_displacement=float(known.max()) if len(known) else float("nan"),
-        iou_tracking=in_place * iou_lifted,
+        coverage_in_place=in_place * coverage,
         points=int(views.lifted.sum()),
         removed=1 - _ratio(views.refined[fused].sum(), views.lifted[fused].sum()) if fused.any() else 0.0,
         foreign=_ratio(refined_foreign, refined + refined_foreign),
@@ -283,13 +285,13 @@ def cause_of(
 
 
 def _not_detected(figures: StageFigures) -> bool:
-    return figures.frames_detected < MIN_DETECTION_RATE * figures.frames_seen or figures.iou_detection < MIN_IOU
+    return figures.frames_detected < MIN_DETECTION_RATE * figures.frames_seen or figures.coverage < MIN_IOU
 
 
 def _detection_reason(_: int, figures: StageFigures) -> str:
     inside = [f"; inside the mask of object {k} in {n} frames" for k, n in figures.masks_of_others.items()]
     counts = f"detected in {figures.frames_detected} of {figures.frames_seen} frames"
-    return f"{counts}, IoU of the masks {figures.iou_detection:.2f}{inside[0] if inside else ''}"
+    return f"{counts}, masks cover {figures.coverage:.0%}{inside[0] if inside else ''}"
 
 
 def _tracking_reason(_: int, figures: StageFigures) -> str:
@@ -302,12 +304,21 @@ def _refinement_reason(_: int, figures: StageFigures) -> str:
     return f"{figures.removed:.0%} of its points removed; {figures.foreign:.0%} of the remaining points are not on it"
 
 
+def _other_objects(figures: StageFigures) -> list[int]:
+    """Return the objects other than the main one that have much of the instance."""
+    points = figures.objects_of_instance
+    others = [k for k in list(points)[1:] if k]
+    return [k for k in others if points[k] >= MIN_FOREIGN * sum(points.values())]
+
+
 def _association_reason(key: int, figures: StageFigures) -> str:
     if not figures.instance:
         return f"no instance was created; its largest cluster has {figures.largest_cluster} points"
     main = next(iter(figures.objects_of_instance))
     if main not in (0, key):
         return f"absorbed by instance {figures.instance}, most of which is on object {main}"
+    if others := _other_objects(figures):
+        return f"instance {figures.instance} is also on object {others[0]}"
     total = sum(figures.instances.values())
     parts = ", ".join(f"{k or 'none'} {count / total:.0%}" for k, count in list(figures.instances.items())[:4])
     late = figures.first_matched - figures.first_detected
@@ -330,9 +341,10 @@ RULES: tuple[Rule, ...] = (
         lambda _, one: f"never seen with {MIN_PIXELS} px; largest view {one.largest_view} px",
     ),
     (Cause.DETECTION, _not_detected, _detection_reason),
-    (Cause.TRACKING, lambda one: one.iou_tracking < MIN_IOU, _tracking_reason),
+    (Cause.TRACKING, lambda one: one.coverage_in_place < MIN_IOU, _tracking_reason),
     (Cause.REFINEMENT, lambda one: one.iou_refinement < MIN_IOU, _refinement_reason),
     (Cause.ASSOCIATION, lambda one: one.iou_association < MIN_IOU, _association_reason),
+    (Cause.ASSOCIATION, lambda one: bool(_other_objects(one)), _association_reason),
     (Cause.FUSION, lambda one: not one.confirmed, lambda _, one: f"instance {one.instance} was not confirmed"),
     (
         Cause.EVALUATION,

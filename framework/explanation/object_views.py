@@ -29,8 +29,8 @@ class ObjectViews:
     lifted_foreign: Int64  # (F,) number of their other points
     refined: Int64  # (F,) after refinement
     refined_foreign: Int64  # (F,)
-    lifted_iou: Float64  # (F,) largest IoU of one of its clusters with its readings, before refinement
-    refined_iou: Float64  # (F,) after refinement
+    coverage: Float64  # (F,) largest fraction of its readings in one of its clusters, before refinement
+    refined_iou: Float64  # (F,) largest IoU of one of its refined clusters with its readings
     largest: Int64  # (F,) number of points of its largest refined cluster
     covering: Int32  # (F,) another object in whose mask most of it is, 0 = none
     matched: tuple[Counter[int], ...]  # (F,) number of points of its refined clusters by instance; 0 = no instance
@@ -81,7 +81,8 @@ class ObjectViews:
                 )
             )
             displacements.append(displacement(frame.centers_camera[column], motions.get(frame.index)))
-            ious.append((best_iou(lifted, column + 1, visible), best_iou(refined, column + 1, visible)))
+            coverage = float((lifted[:, column + 1] / max(visible, 1)).max(initial=0.0))
+            ious.append((min(coverage, 1.0), best_iou(refined, column + 1, visible)))
             matched.append(points_of_instances(frame.instance_ids[own], refined.sum(axis=1), merged))
             classes.update(frame.class_ids[own].tolist())
         columns = np.array(rows, np.int64).reshape(-1, 10).T
@@ -95,7 +96,7 @@ class ObjectViews:
             lifted_foreign=columns[5],
             refined=columns[6],
             refined_foreign=columns[7],
-            lifted_iou=np.array(ious, np.float64).reshape(-1, 2)[:, 0],
+            coverage=np.array(ious, np.float64).reshape(-1, 2)[:, 0],
             refined_iou=np.array(ious, np.float64).reshape(-1, 2)[:, 1],
             largest=columns[8],
             covering=columns[9].astype(np.int32),
