@@ -50,9 +50,9 @@ class PredictedInstances:
     ids: Int64  # (K,) every instance of the map, including instances without points
     confidences: Float64  # (K,) in [0, 1]
     class_names: tuple[str, ...]  # (K,) most probable classes
+    structure: UInt8 | None = None  # (V,) `Structure`; None = not determined
     # probabilities that an instance exists and that its class is right, by id; empty = unknown
     probabilities: Mapping[int, tuple[float, float]] = field(default_factory=dict)
-    structure: UInt8 | None = None  # (V,) `Structure`; None = not determined
 
     def __post_init__(self) -> None:
         counts = {name: len(getattr(self, name)) for name in ("ids", "confidences", "class_names")}

@@ -343,7 +343,7 @@ def test_open3d_vbg_damaged_or_foreign_file_raises(mapped: Open3DMap, tmp_path: 
         with pytest.raises(DataError, match=r"map\.npz"):
             Open3DMap.load(path)
     BayesianTsdf().scene.save(path)
-    with pytest.raises(DataError, match=f"expected map format open3d_vbg 6, got {FORMAT}"):
+    with pytest.raises(DataError, match=f"expected map format open3d_vbg 7, got {FORMAT}"):
         Open3DMap.load(path)
     with pytest.raises(DataError, match=r"none\.npz"):
         Open3DMap.load(tmp_path / "none.npz")
