@@ -29,6 +29,7 @@ from framework.data import (
     InstanceMesh,
     PointClusters,
     Pose,
+    Structure,
     UInt8,
     View,
 )
@@ -118,6 +119,7 @@ __all__ = [
     "SceneMap",
     "SensorKind",
     "StageTimer",
+    "Structure",
     "SubmapChange",
     "SubmapGraph",
     "SubmapSurfaces",

@@ -118,6 +118,7 @@ class MapScene:
                     "id": one.id,
                     "class": one.class_name,
                     "confidence": one.confidence,
+                    "exists": one.existence,
                     "color": hex_color(colors[one.id]),
                     "classColor": hex_color(of_class[one.class_name]),
                 }

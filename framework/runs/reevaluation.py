@@ -191,7 +191,7 @@ class Reevaluation:
 
 
 def read_predictions(record: Record) -> PredictedInstances:
-    """Return the instances of a stored run for evaluation.
+    """Return the instances of a stored run for evaluation. The probabilities of imported maps are unknown.
 
     Raises:
         DataError: The mesh or the instances are missing, invalid or from different runs.
@@ -202,7 +202,7 @@ def read_predictions(record: Record) -> PredictedInstances:
         [instance.id for instance in instances],
         [instance.confidence for instance in instances],
         [instance.class_name for instance in instances],
-        {instance.id: instance.probabilities for instance in instances},
+        {} if record.is_imported else {instance.id: instance.probabilities for instance in instances},
     )
 
 

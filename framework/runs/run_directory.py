@@ -390,9 +390,9 @@ def _from_here(path: Path) -> Path:
 
 
 def likely_labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -> dict[int, tuple[str, float]]:
-    """Return the class name and the confidence of each likely instance, by id."""
+    """Return the class name and the probability of existence of each likely instance, by id."""
     return {
-        key: (class_name(instance, classes) or "object", instance.confidence)
+        key: (class_name(instance, classes) or "object", instance.probabilities[0])
         for key, instance in instances.items()
         if instance.probabilities[0] >= LIKELY
     }

@@ -264,6 +264,7 @@ FAULTY = {
     "query": ["old", "a red chair"],
     "import-map": ["nowhere.ply", "new"],
     "evaluate": ["old"],
+    "explain": ["nowhere"],
     "detect": ["dataset=synthetic", "detector=simulated"],
     "show-refinement": ["dataset=synthetic", "detector=simulated"],
     "compile": ["nothing"],

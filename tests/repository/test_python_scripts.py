@@ -23,6 +23,7 @@ PRINTED = {
     "Give the poses of another system": r"\(\d+, 3\)",
     "Ask for objects": r"\d+ \w+( \w+)? 0\.\d\d \[(.|\n)*\d\.\d\d by names: \d+ tv \w+ \[",
     "Which is nearest": r"\w",
+    "Find the floor": r"\d+ vertices on the floor",
     "What is at this pixel": r"\w",
     "Look at the map from elsewhere": r"\[\d+",
     "Take one object out": "",

@@ -74,8 +74,15 @@ class MergingAssociation(Association):
         self.frame = frame
         return super().match(scene, frame, pose, clusters)  # type: ignore[arg-type]
 
-    def associate(self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, frame_index: int) -> Matches:
-        matches = super().associate(table, overlaps, clusters, frame_index)
+    def associate(
+        self,
+        table: InstanceTable,
+        overlaps: Overlaps,
+        clusters: PointClusters,
+        frame_index: int,
+        camera_center: Float64,
+    ) -> Matches:
+        matches = super().associate(table, overlaps, clusters, frame_index, camera_center)
         assert self.frame is not None
         both = np.isin(true_objects(clusters, self.frame), self.merged) & (matches.instance_ids > 0)
         if both.any():

@@ -65,7 +65,10 @@ def metrics_of(directory: Path) -> dict[str, Any]:
 
 
 def scores(directory: Path) -> dict[str, float]:
-    return {key: value for key, value in metrics_of(directory).items() if key.startswith("instances.")}
+    """Return the metrics of the instances, without those of calibrated probabilities, which imported maps do not have."""
+    calibrated = ("instances.ece.", "instances.brier.", "instances.auroc.", "instances.calibration_count.")
+    metrics = metrics_of(directory)
+    return {key: metrics[key] for key in metrics if key.startswith("instances.") and not key.startswith(calibrated)}
 
 
 def external_ply(run: Path, path: Path) -> Path:
