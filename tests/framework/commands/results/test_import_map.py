@@ -65,7 +65,7 @@ def metrics_of(directory: Path) -> dict[str, Any]:
 
 
 def scores(directory: Path) -> dict[str, float]:
-    """Return the metrics of the instances, without those of calibrated probabilities, which imported maps do not have."""
+    """Return the metrics of the instances, without calibration, because imported maps have no probabilities."""
     calibrated = ("instances.ece.", "instances.brier.", "instances.auroc.", "instances.calibration_count.")
     metrics = metrics_of(directory)
     return {key: metrics[key] for key in metrics if key.startswith("instances.") and not key.startswith(calibrated)}
