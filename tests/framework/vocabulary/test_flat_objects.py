@@ -7,9 +7,7 @@ import pytest
 from framework.vocabulary.flat_objects import is_flat
 
 
-@pytest.mark.parametrize(
-    "name", ["tv", "Picture", "office_door", "floor mat", "books", "wall art", "refrigerator"]
-)
+@pytest.mark.parametrize("name", ["tv", "Picture", "office_door", "floor mat", "books", "wall art", "refrigerator"])
 def test_is_flat_of_flat_object_is_true(name: str) -> None:
     assert is_flat(name)
 
