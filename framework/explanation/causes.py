@@ -65,9 +65,8 @@ class StageFigures:
     frames_lost: int  # number of frames with the object and a lost pose
     displacement: float  # m, median displacement of the object by pose errors; NaN = unknown
     largest_displacement: float  # m
-    coverage_in_place: (
-        float  # coverage times the fraction of its readings in frames that displace it by at most MAX_DISTANCE
-    )
+    # coverage times the fraction of its readings in frames that displace it by at most MAX_DISTANCE
+    coverage_in_place: float
     # refinement
     points: int  # number of points of its clusters on it, before refinement
     removed: float  # fraction of these points that the refiner removed

@@ -12,6 +12,7 @@ from framework.data import Bool, Float64, Int32, Int64
 from framework.evaluation.instances import MAX_DISTANCE
 from framework.explanation.observation import FrameObservation
 from framework.geometry import transform
+from framework.mapping.submaps.submaps import remaining
 
 MIN_PIXELS = 64  # minimum number of readings on an object that is seen; about the limit of real detectors
 
@@ -143,13 +144,6 @@ def points_of_instances(instance_ids: Int32, counts: Int64, merged: Mapping[int,
     for instance_id, count in zip(instance_ids.tolist(), counts.tolist(), strict=True):
         found[remaining(instance_id, merged)] += count
     return +found  # without instances that have no points
-
-
-def remaining(instance_id: int, merged: Mapping[int, int]) -> int:
-    """Return the instance into which an instance was merged, or its own id."""
-    while instance_id in merged:
-        instance_id = merged[instance_id]
-    return instance_id
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ class Pairs(NamedTuple):
 
     @classmethod
     def within(cls, points: Float32, distance: float) -> Pairs:
-        """Return the pairs of points (N, 3) within a distance, m."""
+        """Return the pairs of points (N, 3) within a distance."""
         i, j = cKDTree(points).query_pairs(distance, output_type="ndarray").astype(np.int32).T
         both = np.concatenate([i, j]), np.concatenate([j, i])
         table = coo_array((np.ones(len(both[0]), np.bool_), both), shape=(len(points), len(points))).tocsr()
@@ -172,7 +172,7 @@ class DenseCrf:
             q, free = free, q
         return scales, q
 
-    def _cells(self, vertices: Float32, normals: Float32) -> Int32:
+    def _cells(self, vertices: Float32, normals: Float32) -> Int64:
         """Return a number (V,) for the cell of each vertex: cubes, divided by the main direction of the normal."""
         coords = np.floor(vertices * (CELLS / self.crf_position)).astype(np.int64)
         coords -= coords.min(axis=0, initial=0)
