@@ -564,7 +564,7 @@ def export(
         up: The up direction (3,) in the world frame; None = the up direction of the run.
         floor: The floor height along the up direction, m; None = the floor height of the run, or unknown if `up` is
             given.
-        choices: min_confidence, triangles, coloring, collision, resolution, robot_height, label_space, points; see
+        choices: min_probability, triangles, coloring, collision, resolution, robot_height, label_space, points; see
             `instancemap export --help`.
 
     Returns:

@@ -409,6 +409,9 @@ class Box:
     rotation: Float64  # (3, 3)
 
 
+LIKELY = 0.5  # minimum probability that an instance exists, for figures and logs; files contain all instances
+
+
 @dataclass(frozen=True)
 class Instance:
     """One object of the map."""

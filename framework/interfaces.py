@@ -493,12 +493,12 @@ class SceneMap(ABC):
         return frozenset(self.instances())
 
     def most_likely_classes(self) -> Mapping[int, tuple[int, float]]:
-        """Return the most likely class of each object (an index into `classes`) and its confidence, by id.
+        """Return the most likely class of each object (an index into `classes`) and its probability to exist, by id.
 
         Viewers call it about once per second.
         """
         found = self.instances().values()
-        return {one.id: (int(one.class_probabilities.argmax()), one.confidence) for one in found}
+        return {one.id: (int(one.class_probabilities.argmax()), one.probabilities[0]) for one in found}
 
     def gravity(self) -> Gravity:
         """Return the direction of gravity in the world frame."""

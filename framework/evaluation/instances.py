@@ -25,7 +25,19 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh, Int32, Int64, SceneTruth, UInt8
+from framework.data import (
+    LIKELY,
+    Array,
+    Bool,
+    Float32,
+    Float64,
+    Instance,
+    InstanceMesh,
+    Int32,
+    Int64,
+    SceneTruth,
+    UInt8,
+)
 from framework.errors import DataError
 from framework.evaluation.calibration import Forecasts, calibration_metrics
 
@@ -118,6 +130,18 @@ class Score:
     matched_iou: float  # sum of the IoUs of the true positives
 
     @property
+    def precision(self) -> float:
+        return self.true_positives / max(self.true_positives + self.false_positives, 1)
+
+    @property
+    def recall(self) -> float:
+        return self.true_positives / self.truths
+
+    @property
+    def f1(self) -> float:
+        return 2 * self.true_positives / (self.true_positives + self.false_positives + self.truths)
+
+    @property
     def panoptic_quality(self) -> float:
         """Panoptic quality (Kirillov et al. 2019)."""
         missed = self.truths - self.true_positives
@@ -151,6 +175,7 @@ class InstanceEvaluation:
     by_class: Mapping[float, Mapping[str, Score]]  # IoU threshold -> class with a ground-truth instance -> score
     agnostic: Mapping[float, Score]  # IoU threshold -> class-agnostic score
     overall: Score | None  # at IoU 0.5, over all classes; matches have the same class
+    likely: Score | None  # as `overall`, of the likely predictions; None = unknown probabilities
     best_ious: Mapping[int, float]  # evaluated ground-truth instance -> best IoU with a prediction
     best_ids: Mapping[int, int]  # evaluated ground-truth instance -> prediction with the best IoU, 0 = none
     forecasts: Mapping[str, Forecasts]  # probabilities that instances exist, and that their class is right
@@ -171,6 +196,7 @@ class InstanceEvaluation:
         - `ap50_agnostic` and `ap25_agnostic`: class-agnostic AP.
         - `mean_iou`: mean of the best IoU of each ground-truth instance with a prediction of any class.
         - `precision50`, `recall50` and `f1_50`: at IoU 0.5, over all predictions and ground-truth instances.
+        - `likely.precision50`, `likely.recall50` and `likely.f1_50`: over predictions with `exists` >= LIKELY.
         - `pq50`: panoptic quality at IoU 0.5, averaged over classes.
         - `true_count`: number of evaluated ground-truth instances, also for each class.
         - `ignored_count`: number of ignored predictions at IoU 0.5.
@@ -180,7 +206,6 @@ class InstanceEvaluation:
         """
         if self.overall is None:
             return {}
-        tp, fp, truths = self.overall.true_positives, self.overall.false_positives, self.overall.truths
         flat = {
             "instances.ap50": self.ap(0.5),
             "instances.ap25": self.ap(0.25),
@@ -188,13 +213,17 @@ class InstanceEvaluation:
             "instances.ap50_agnostic": self.agnostic[0.5].ap,
             "instances.ap25_agnostic": self.agnostic[0.25].ap,
             "instances.mean_iou": float(np.mean(list(self.best_ious.values()))),
-            "instances.precision50": tp / max(tp + fp, 1),
-            "instances.recall50": tp / truths,
-            "instances.f1_50": 2 * tp / (tp + fp + truths),
+            "instances.precision50": self.overall.precision,
+            "instances.recall50": self.overall.recall,
+            "instances.f1_50": self.overall.f1,
             "instances.pq50": float(np.mean([score.panoptic_quality for score in self.by_class[0.5].values()])),
-            "instances.true_count": truths,
+            "instances.true_count": self.overall.truths,
             "instances.ignored_count": self.overall.ignored,
         }
+        if self.likely is not None:
+            flat["instances.likely.precision50"] = self.likely.precision
+            flat["instances.likely.recall50"] = self.likely.recall
+            flat["instances.likely.f1_50"] = self.likely.f1
         for name, score in self.by_class[0.5].items():
             flat[f"instances.ap50.{name}"] = score.ap
             flat[f"instances.ap25.{name}"] = self.by_class[0.25][name].ap
@@ -237,8 +266,12 @@ def evaluate(
             agnostic[threshold] = overlaps.score(threshold, everything, overlaps.evaluated, allowed)
     overall = overlaps.score(0.5, everything, overlaps.evaluated, same_class) if names else None
     best_ious, best_ids = overlaps.best()
-    forecasts = overlaps.forecasts(predictions.probabilities) if names and predictions.probabilities else {}
-    return InstanceEvaluation(by_class, agnostic, overall, best_ious, best_ids, forecasts)
+    forecasts, likely = {}, None
+    if names and (known := predictions.probabilities):
+        forecasts = overlaps.forecasts(known)
+        shown = np.array([known[int(key)][0] >= LIKELY for key in overlaps.predicted_ids], np.bool_)
+        likely = overlaps.score(0.5, shown, overlaps.evaluated, same_class)
+    return InstanceEvaluation(by_class, agnostic, overall, likely, best_ious, best_ids, forecasts)
 
 
 def judge(

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 
 from framework.config.validation import require
-from framework.data import InstanceMesh
+from framework.data import LIKELY, InstanceMesh
 from framework.datasets.frames.world_offset import origin_comments
 from framework.errors import ConfigError, DataError
 from framework.exporting.benchmark_predictions import BenchmarkPredictions
@@ -58,7 +58,7 @@ class Chosen:
     """Options of an export."""
 
     objects: Sequence[str] = ()  # ids or classes; () = the whole room
-    min_confidence: float = 0.3  # minimum confidence of an object, in [0, 1]
+    min_probability: float = LIKELY  # minimum probability that an object exists, in [0, 1]
     triangles: int | None = None  # maximum triangle count of the scene and of each object file, >= 4; None = no limit
     coloring: Coloring = Coloring.APPEARANCE  # vertex colors
     collision: Collision = Collision.HULL  # collision shape of objects in USD files
@@ -68,7 +68,7 @@ class Chosen:
     points: Path | str | None = None  # PLY or NPY file with the points of predictions; None = ground-truth points
 
     def __post_init__(self) -> None:
-        for name, low, high in (("min_confidence", 0.0, 1.0), ("resolution", 0.01, 1.0), ("robot_height", 0.1, 3.0)):
+        for name, low, high in (("min_probability", 0.0, 1.0), ("resolution", 0.01, 1.0), ("robot_height", 0.1, 3.0)):
             value = getattr(self, name)
             require(low <= value <= high, name, value, f"a value in [{low:g}, {high:g}]")
         if self.triangles is not None and self.triangles < 4:
@@ -148,7 +148,7 @@ def export(
         return written
     room = read_room(run, up, floor)
     _check_known(run, room, formats)
-    room = room.chosen(chosen.objects, chosen.min_confidence)
+    room = room.chosen(chosen.objects, chosen.min_probability)
     directory.mkdir(parents=True, exist_ok=True)
     for comment in origin_comments(room.origin):
         log.info("%s", comment)

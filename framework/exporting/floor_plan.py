@@ -209,6 +209,7 @@ def _feature(room: UprightRoom, one: RoomObject) -> dict[str, Any]:
             "class": one.class_name,
             "probability": one.probability,
             "confidence": one.confidence,
+            "exists": one.existence,
             "base": round(one.base, DIGITS),
             "top": round(one.top, DIGITS),
             "box": np.round(one.footprint, DIGITS).tolist(),

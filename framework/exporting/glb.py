@@ -90,6 +90,7 @@ def extras(part: Part) -> dict[str, Any]:
         "label_space": label_space_of(part.mesh.classes),
         "probability": one.probability,
         "confidence": one.confidence,
+        "exists": one.existence,
     }
 
 

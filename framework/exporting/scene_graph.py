@@ -50,6 +50,7 @@ def _object_node(one: RoomObject) -> dict[str, Any]:
         "class": one.class_name,
         "probability": one.probability,
         "confidence": one.confidence,
+        "exists": one.existence,
         "obb": {
             "center": np.round(one.box.center, DIGITS).tolist(),
             "extent": np.round(one.box.extent, DIGITS).tolist(),

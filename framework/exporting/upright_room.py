@@ -19,7 +19,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from framework.data import Bool, Box, Float32, Float64, InstanceMesh, Int32, Int64, Structure, UInt8
+from framework.data import LIKELY, Bool, Box, Float32, Float64, InstanceMesh, Int32, Int64, Structure, UInt8
 from framework.datasets.frames.world_offset import stored_origin
 from framework.errors import DataError
 from framework.files.atomic_write import path_exists
@@ -30,7 +30,6 @@ from framework.rendering.palette import class_colors, object_colors
 from framework.rendering.surface import Surface
 from framework.runs.instances_file import StoredInstance
 from framework.runs.mesh_file import read_mesh
-from framework.runs.run_directory import LIKELY
 from framework.runs.stored_map import read_labeled_mesh
 from framework.runs.stored_runs import INSTANCES, MESH, TRAJECTORY, read_metrics
 
@@ -51,6 +50,7 @@ class RoomObject:
     id: int
     class_name: str
     confidence: float  # in [0, 1]
+    existence: float  # probability that the object exists, in [0, 1]
     probability: float | None  # of the class, in [0, 1]; None = unknown
     vertices: Int32  # (M,) indices into the room's mesh, M > 0, without small components
     box: Box  # upright, in the room frame
@@ -97,17 +97,17 @@ class UprightRoom:
     def surface(self) -> Surface:
         return Surface(self.mesh.vertices, self.mesh.triangles)
 
-    def chosen(self, selection: Sequence[str], min_confidence: float) -> UprightRoom:
+    def chosen(self, selection: Sequence[str], min_probability: float) -> UprightRoom:
         """Return the room with only the selected objects.
 
         Args:
             selection: Ids or classes of the objects; () = all objects.
-            min_confidence: Minimum confidence of objects that are not selected by id, in [0, 1].
+            min_probability: Minimum probability that an object exists, in [0, 1]; ignored for objects selected by id.
 
         Raises:
-            DataError: An id or class is unknown, or all objects of a class are below the minimum confidence.
+            DataError: An id or class is unknown, or all objects of a class are below the minimum probability.
         """
-        likely = [one for one in self.objects if one.confidence >= min_confidence]
+        likely = [one for one in self.objects if one.existence >= min_probability]
         if not selection:
             return replace(self, objects=tuple(likely))
         found: dict[int, RoomObject] = {}
@@ -116,12 +116,12 @@ class UprightRoom:
             by_class = [one for one in self.objects if one.class_name == word]
             if not by_id and not by_class:
                 raise DataError(f"object: expected an id or class of this run, got {word!r}{_hint(word, self.objects)}")
-            of_class = [one for one in by_class if one.confidence >= min_confidence]
+            of_class = [one for one in by_class if one.existence >= min_probability]
             if not by_id and not of_class:
-                best = max(one.confidence for one in by_class)
+                best = max(one.existence for one in by_class)
                 raise DataError(
-                    f"object: expected a confidence >= {min_confidence:g} for {word!r}, got at most {best:.2f}; "
-                    "lower min_confidence"
+                    f"object: expected a probability >= {min_probability:g} for {word!r}, got at most {best:.2f}; "
+                    "lower min_probability"
                 )
             found |= {one.id: one for one in (*by_id, *of_class)}
         return replace(self, objects=tuple(found[key] for key in sorted(found)))
@@ -194,6 +194,7 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
                     errors="backslashreplace"
                 ).decode(),  # the name may contain invalid Unicode
                 confidence=one.confidence,
+                existence=one.existence,
                 probability=one.probability,
                 vertices=own,
                 box=facing(upright_box(mesh.vertices[own], UP)),

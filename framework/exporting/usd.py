@@ -133,6 +133,7 @@ def _add_object(stage: Any, part: Part, colors: UInt8, collision: Collision) -> 
     prim.SetCustomDataByKey("instancemap:id", one.id)
     prim.SetCustomDataByKey("instancemap:label_space", label_space_of(part.mesh.classes))
     prim.SetCustomDataByKey("instancemap:confidence", one.confidence)
+    prim.SetCustomDataByKey("instancemap:exists", one.existence)
     if one.probability is not None:
         prim.SetCustomDataByKey("instancemap:probability", one.probability)
     UsdPhysics.RigidBodyAPI.Apply(prim).CreateRigidBodyEnabledAttr(False)

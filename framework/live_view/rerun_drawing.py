@@ -41,12 +41,19 @@ class RerunDrawing:
     """Drawing into a rerun recording stream. The parameters are described in `RerunViewer`."""
 
     def __init__(
-        self, recording: rr.RecordingStream, stride: int, jpeg_quality: int, region: float, min_confidence: float
+        self,
+        recording: rr.RecordingStream,
+        stride: int,
+        jpeg_quality: int,
+        region: float,
+        min_probability: float,
+        min_score: float,
     ) -> None:
         import rerun
 
         self._rr, self._recording = rerun, recording
-        self._stride, self._jpeg_quality, self._min_confidence = stride, jpeg_quality, min_confidence
+        self._stride, self._jpeg_quality = stride, jpeg_quality
+        self._min_probability, self._min_score = min_probability, min_score
         self._regions, self._colors = MeshRegions(region), InstanceColors()
         self._label_space: str | None = None  # of the map; None = not yet drawn
         self._first_s: float | None = None  # timestamp of the first frame
@@ -83,7 +90,7 @@ class RerunDrawing:
         self._set_time(snapshot.index, snapshot.timestamp)
         if snapshot.up is not None:
             self._turn(snapshot.up)
-        shown = {key: of for key, of in snapshot.objects.items() if of[1] >= self._min_confidence}
+        shown = {key: of for key, of in snapshot.objects.items() if of[1] >= self._min_probability}
         mesh = snapshot.mesh
         if self._label_space is None:
             self._label_space = label_space_of(mesh.classes)
@@ -188,7 +195,7 @@ class RerunDrawing:
         for mask, number in zip(found.masks[::-1, ::stride, ::stride], numbers[::-1], strict=True):
             image[mask] = number  # the best detection is drawn last
         self._recording.log(at.MASKS, self._rr.SegmentationImage(image, opacity=MASK_OPACITY))
-        named = np.flatnonzero(found.scores >= self._min_confidence).tolist()
+        named = np.flatnonzero(found.scores >= self._min_score).tolist()
         classes = found.class_probabilities.argmax(axis=1)
         labels = [f"{found.classes[classes[k]]} {found.scores[k]:.2f}" for k in named]
         colors = [self._colors.get(int(ids[k]), UNKNOWN_COLOR) for k in named]
@@ -234,12 +241,12 @@ class RerunDrawing:
                 self._recording.log(entity, self._rr.Clear(recursive=False))
 
     def _draw_boxes(
-        self, members: Mapping[int, Int32], confidences: Mapping[int, float], snapshot: MapSnapshot
+        self, members: Mapping[int, Int32], probabilities: Mapping[int, float], snapshot: MapSnapshot
     ) -> None:
         boxes = [box_around(snapshot.mesh.vertices[of], snapshot.up) for of in members.values()]
         centers, colors = [box.center for box in boxes], [self._colors[key] for key in members]
         turned = [Rotation.from_matrix(box.rotation).as_quat() for box in boxes]
-        labels = [f"{self._names[key]} {confidences[key]:.2f}" for key in members]
+        labels = [f"{self._names[key]} {probabilities[key]:.2f}" for key in members]
         drawn = self._rr.Boxes3D(
             centers=centers,
             sizes=[box.extent for box in boxes],

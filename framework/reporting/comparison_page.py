@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from framework.data import LIKELY
 from framework.registry import STAGES
 from framework.reporting.charts import RUN_COLORS, RUN_WIDTHS, PlottedPath, stage_rows, top_view
 from framework.reporting.map_scene import MapScene
@@ -20,7 +21,6 @@ from framework.reporting.run_source import Footage
 from framework.reporting.visibility import NOT_CAMERA
 from framework.runs.metrics import LABEL_SPACE
 from framework.runs.provenance import leaves
-from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
 MAX_MAPS = 6  # maximum number of maps in the page; their total size has the limit of a single map

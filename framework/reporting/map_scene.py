@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from framework.data import Camera, Float64, InstanceMesh, Int32, UInt8
+from framework.data import LIKELY, Camera, Float64, InstanceMesh, Int32, UInt8
 from framework.exporting.decimation import with_finer_objects
 from framework.rendering.lit_view import LitView
 from framework.rendering.palette import class_colors, object_colors
@@ -26,7 +26,6 @@ from framework.reporting.run_source import Footage
 from framework.reporting.scene_glb import MAX_BYTES, MAX_TRIANGLES, light_enough, scene_glb
 from framework.reporting.visibility import Sightings, sightings, spread_out
 from framework.runs.instances_file import StoredInstance
-from framework.runs.run_directory import LIKELY
 
 VIEW_WIDTH, VIEW_HEIGHT = 960, 640  # px, size of the initial view; the viewer uses only its aspect ratio
 PATH_POINTS = 400  # maximum number of points of the camera path

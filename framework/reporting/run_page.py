@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from framework.data import Float64
+from framework.data import LIKELY, Float64
 from framework.editing.edited_run import EDITS, default_directory
 from framework.errors import DataError, FrameError
 from framework.files.image_files import read_color
@@ -43,7 +43,6 @@ from framework.reporting.run_source import Footage, RunSource, TruePath
 from framework.reporting.truth_section import TruthCheck, truth_section
 from framework.reporting.visibility import NOT_CAMERA, spread_out
 from framework.runs.provenance import leaves
-from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import MAP, is_number
 
 OVERVIEW_WIDTH = 1400  # px, of the image for browsers without WebGL

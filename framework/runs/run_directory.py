@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from framework.compilation.catalog import compile_for_run
 from framework.config.composition import one_line, resolved
 from framework.config.validation import checked_path
-from framework.data import Float64, Instance
+from framework.data import LIKELY, Float64, Instance
 from framework.datasets.frames.sequence_reader import Recording
 from framework.datasets.frames.world_offset import ORIGIN, as_setting, as_text, origin_comments, stored_origin
 from framework.detection.stored.cache import cache_metrics
@@ -86,10 +86,6 @@ from framework.tracking.keyframes import write_keyframes
 from framework.vocabulary.label_spaces import label_space_of
 
 log = logging.getLogger(__name__)
-
-# minimum probability that an instance exists (its confidence if it is not calibrated), for figures and logs; files
-# contain all instances
-LIKELY = 0.5
 
 Arguments = ParamSpec("Arguments")
 Made = TypeVar("Made")

@@ -56,8 +56,8 @@ class RerunViewer(Viewer):
     stride: int = 2  # step between the logged pixels of an image, px, in [1, 16]
     jpeg_quality: int = 75  # JPEG quality of the images, in [1, 100]
     region_size: float = 1.0  # side of the cubic regions in which the mesh is updated, m, in [0.1, 1000]
-    # minimum confidence of displayed objects and minimum score of labeled detections, in [0, 1]
-    min_confidence: float = 0.3
+    min_probability: float = 0.5  # minimum probability that a displayed object exists, in [0, 1]
+    min_score: float = 0.3  # minimum score of labeled detections, in [0, 1]
     # maximum viewer memory in the modes WINDOW and BROWSER, e.g. 2GB or 25% of system memory; the oldest data is
     # dropped first
     memory_limit: str = "2GB"
@@ -72,7 +72,8 @@ class RerunViewer(Viewer):
             stride=(1, 16),
             jpeg_quality=(1, 100),
             region_size=(0.1, 1000.0),
-            min_confidence=(0.0, 1.0),
+            min_probability=(0.0, 1.0),
+            min_score=(0.0, 1.0),
             port=(1024, 65535),
             web_port=(1024, 65535),
         )
@@ -91,7 +92,9 @@ class RerunViewer(Viewer):
         recording = rr.RecordingStream("instancemap", recording_id=uuid4(), batcher_config=batches)
         recording.set_sinks(*self._sinks(rr, directory), default_blueprint=layout())
         recording.send_recording_name(video)
-        drawing = RerunDrawing(recording, self.stride, self.jpeg_quality, self.region_size, self.min_confidence)
+        drawing = RerunDrawing(
+            recording, self.stride, self.jpeg_quality, self.region_size, self.min_probability, self.min_score
+        )
         self._thread = DrawingThread(scene, drawing, self.frame_interval, self.mesh_interval)
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:

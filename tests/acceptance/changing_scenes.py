@@ -26,7 +26,7 @@ from tests.acceptance.runner import CHECKOUT
 
 CLOSE = 0.02  # m, maximum distance of a vertex of the person
 APART = 0.02  # m, minimum distance of a vertex from all surfaces of the room, such as the floor under the person
-LIKELY = 0.5  # minimum confidence of a likely instance
+LIKELY = 0.5  # minimum probability of a likely instance
 ROOM = {"kind": RoomKind.STUDIO, "seed": 0}  # the defaults of dataset=synthetic
 PARTS = 10  # number of parts of a sequence whose trajectories are compared
 

@@ -26,8 +26,8 @@ def main() -> None:
     add("--out", metavar="DIR", type=Path, help="output folder; default: RUN/export")
     only = "id or class of the exported objects; repeatable; default: all objects"
     add("--object", metavar="OBJECT", action="append", default=[], help=only)
-    least = "minimum confidence of exported objects, in [0, 1]; ignored for explicit ids; default: 0.3"
-    add("--min-confidence", metavar="P", type=float, default=0.3, help=least)
+    least = "minimum probability that an exported object exists, in [0, 1]; ignored for explicit ids; default: 0.5"
+    add("--min-probability", metavar="P", type=float, default=0.5, help=least)
     up = "up direction in the world frame; default: up direction of the run"
     add("--up", metavar=("X", "Y", "Z"), nargs=3, type=float, help=up)
     floor = "floor height along the up direction, m; default: floor height of the run, or unknown with --up"
@@ -57,7 +57,7 @@ def main() -> None:
 
         chosen = Chosen.named(
             parsed.object,
-            min_confidence=parsed.min_confidence,
+            min_probability=parsed.min_probability,
             triangles=parsed.triangles,
             coloring=parsed.colors,
             collision=parsed.collision,

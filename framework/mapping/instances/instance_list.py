@@ -113,8 +113,11 @@ class InstanceTableMap(SceneMap):
         return self.table.confirmed(self.confirmation)
 
     def most_likely_classes(self) -> Mapping[int, tuple[int, float]]:
-        evidence = self.class_evidence()
-        return {k: (int(evidence[k].argmax()), self.table.records[k].confidence) for k in evidence}
+        records = self.table.records
+        return {
+            k: (int(evidence.argmax()), self.table.probabilities(records[k], evidence).exists)
+            for k, evidence in self.class_evidence().items()
+        }
 
     def class_evidence(self) -> dict[int, Float64]:
         """Return the class evidence (C,) of each confirmed instance by id, from its detections."""

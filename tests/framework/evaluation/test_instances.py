@@ -278,6 +278,18 @@ def test_evaluate_three_predictions_match_manual_result():
         assert metrics[f"instances.{name}"] == pytest.approx(value), name
 
 
+def test_evaluate_likely_metrics_ignore_unlikely():
+    """Of three predictions, 11 (correct) and 12 (duplicate) are likely, and 13 (correct) is not."""
+    truth = scene([(1, 120), (2, 100)], {1: "chair", 2: "chair"})
+    claims = {11: ("chair", 0.9), 12: ("chair", 0.9), 13: ("chair", 0.9)}
+    predicted = prediction(truth, [(11, 70), (12, 50), (13, 100)], claims)
+    assert "instances.likely.f1_50" not in evaluate(predicted, truth).metrics()
+    known = {11: (0.5, 0.9), 12: (0.8, 0.9), 13: (0.49, 0.9)}
+    metrics = evaluate(replace(predicted, probabilities=known), truth).metrics()
+    for name in ("precision50", "recall50", "f1_50"):
+        assert metrics[f"instances.likely.{name}"] == pytest.approx(1 / 2), name
+
+
 def test_evaluate_ranks_equal_confidences_by_id():
     """Predictions 11 and 12 cover 50 and 70 of the 120 points of a chair.
 

@@ -157,9 +157,8 @@ def test_export_facing_aligns_box_with_room_x_axis(degrees: float, yaw: float, s
 def test_glb_nodes_have_object_metadata(room: UprightRoom) -> None:
     found = header(glb(parts(room)))
     extras = {node["name"]: node.get("extras") for node in found["nodes"]}
-    probability = pytest.approx(0.9)
-    expected = {"id": 2, "class": "cube", "label_space": "own classes", "probability": probability, "confidence": 0.8}
-    assert extras["cube_2"] == expected
+    names = {"id": 2, "class": "cube", "label_space": "own classes"}
+    assert extras["cube_2"] == names | {"probability": pytest.approx(0.9), "confidence": 0.8, "exists": 0.8}
     assert not extras["room"]
     assert found["asset"]["version"] == "2.0"
     assert found["extensionsUsed"] == ["KHR_materials_unlit"]
@@ -457,11 +456,11 @@ def test_export_invalid_selection_raises(run: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="object: expected an id or class of this run, got 'cub'; did you mean 'cube'"):
         export(run, [ExportFormat.GLB], tmp_path, Chosen(("cub",)))
     with pytest.raises(DataError, match=r"object: expected a confidence >= 0.9 for 'cube', got at most 0.80"):
-        export(run, [ExportFormat.GLB], tmp_path, Chosen(("cube",), min_confidence=0.9))
-    assert export(run, [ExportFormat.GLB], tmp_path, Chosen(("2",), min_confidence=0.9)) == [
+        export(run, [ExportFormat.GLB], tmp_path, Chosen(("cube",), min_probability=0.99))
+    assert export(run, [ExportFormat.GLB], tmp_path, Chosen(("2",), min_probability=0.99)) == [
         tmp_path / "objects/cube_2.glb"
     ]
-    assert export(run, [ExportFormat.GLB], tmp_path, Chosen(min_confidence=0.9)) == [tmp_path / "scene.glb"]
+    assert export(run, [ExportFormat.GLB], tmp_path, Chosen(min_probability=0.99)) == [tmp_path / "scene.glb"]
     with pytest.raises(DataError, match="triangles: expected at least 4, got 0"):
         Chosen(triangles=0)
 

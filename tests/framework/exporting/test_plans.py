@@ -377,7 +377,7 @@ def test_plan_export_without_up_or_floor_raises(tmp_path: Path, caplog: pytest.L
 
 
 def test_plan_parameters_out_of_range_raise(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
-    for wrong in ({"resolution": 0.0}, {"robot_height": 9.0}, {"min_confidence": float("nan")}):
+    for wrong in ({"resolution": 0.0}, {"robot_height": 9.0}, {"min_probability": float("nan")}):
         with pytest.raises(Exception, match=f"{next(iter(wrong))}"):
             Chosen(**wrong)
     monkeypatch.setattr(occupancy, "MAX_CELLS", 100)

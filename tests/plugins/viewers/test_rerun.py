@@ -96,7 +96,7 @@ def entities(file: Path) -> set[str]:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the recording of six frames. Frame 2 is unreadable, and frame 4 is lost."""
     directory = tmp_path_factory.mktemp("run")
-    viewer = RerunViewer(frame_interval=1, stride=1, mesh_interval=0.1, min_confidence=0.1)
+    viewer = RerunViewer(frame_interval=1, stride=1, mesh_interval=0.1, min_probability=0.0, min_score=0.1)
     pipeline(viewer).run_to_any_end(CornerRoom(unreadable=2), directory)
     return directory / "recording.rrd"
 

@@ -81,7 +81,7 @@ def test_export_invalid_arguments_exit_with_status_2(
         (("--to", "glb", "--triangles", "1"), "triangles: expected at least 4, got 1"),
         (("--to", "floorplan", "--resolution", "0"), "resolution"),
         (("--to", "floorplan", "--robot-height", "nan"), "robot_height"),
-        (("--to", "glb", "--min-confidence", "2"), "min_confidence"),
+        (("--to", "glb", "--min-probability", "2"), "min_probability"),
         (("--to", "glb", "--up", "0", "nan", "1"), "up: expected a nonzero direction of 3 finite numbers"),
         (("--to", "glb", "--floor", "nan"), "expected a floor height in [-10000, 10000] m, got nan"),
         (("--to", "glb", "--out", "/dev/null"), "/dev/null"),
