@@ -19,7 +19,7 @@ from framework.data import Float64
 from framework.geometry import adjoint, inverse
 from framework.tracking.alignment import NormalEquations
 
-CORRELATED = 16.0  # number of points with a common error, from the errors of tracked poses (docs/results/halls.md)
+CORRELATED = 16.0  # number of points with a common error, from the errors of tracked poses (docs/results/tracking.md)
 MIN_VARIANCE = 1e-18  # minimum variance of a motion, m^2 and rad^2, for data without noise
 
 

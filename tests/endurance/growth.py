@@ -118,26 +118,26 @@ def lost_frames(blocks: Sequence[Block]) -> Measured:
 
 BOUNDS = (
     Bound(
-        "heap", "bytes per frame", 500, "decreases over time; below 50 bytes after 20,000 frames (`long_run_growth`)",
+        "heap", "bytes per frame", 500, "decreases to below 50 bytes (`long_run_growth`)",
         growth(lambda block: block.heap),
     ),
     Bound(
-        "map", "% per 1,000 frames", 5, "sensor noise adds blocks at depth edges, fewer in each visit",
+        "map", "% per 1,000 frames", 5, "sensor noise adds blocks at depth edges",
         growth(lambda block: block.map_bytes, 1000, relative=True),
     ),
     Bound(
-        "processor time", "% per 1,000 frames", 5, "noise of the medians, about 3 %",
+        "processor time", "% per 1,000 frames", 5, "noise of about 3 %",
         growth(lambda block: block.relative_time, 1000, relative=True),
     ),
     Bound(
-        "confirmed instances", "per 1,000 frames", 10, "equal images repeat detection errors, which confirms them",
+        "confirmed instances", "per 1,000 frames", 10, "equal images repeat detection errors",
         growth(lambda block: block.confirmed, 1000),
     ),
     Bound(
-        "tentative instances", "per 1,000 frames", 50, "new ones replace expired ones; the noise is about 20",
+        "tentative instances", "per 1,000 frames", 50, "noise of about 20",
         growth(lambda block: block.tentative, 1000),
     ),
-    Bound("drift", "mm", 5, "half of the smallest usual voxel, 1 cm", drift_increase),
+    Bound("drift", "mm", 5, "half of a voxel of 1 cm", drift_increase),
     Bound("lost frames", "frames", 0, "the place is known", lost_frames),
 )  # fmt: skip
 """The bounds of the endurance run."""
