@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import combinations
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +28,7 @@ from framework.detection.true_instances import true_objects
 from framework.errors import DataError
 from framework.mapping.instances.association_kernels import count_votes
 from framework.mapping.instances.instance_table import Condition, InstanceTable
+from framework.mapping.instances.learned_association import WEIGHTS, AssociationScorer, pairs_of
 from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed_space
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
@@ -42,6 +44,7 @@ class InstanceSource(Enum):
     SURFACE_LOOKUP = "voxels at the measured surface"
     RAYCAST = "object indices of the map, ray-cast from the pose of the frame"
     GROUND_TRUTH = "true object of each cluster, an upper bound of association accuracy"
+    LEARNED = "voxels at the measured surface, matched by a network instead of the overlap"
 
 
 class OverlapRule(Enum):
@@ -131,6 +134,19 @@ def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int3
             match[row] = column
             taken[column] = True
     return match
+
+
+def match_best(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int32:
+    """Return the allowed column (N,) with the largest preference of each row, -1 = none. Rows can share a column.
+
+    Args:
+        allowed: A Boolean array (N, M), True for pairs that can match.
+        preference: The preference (N, M) of each pair.
+    """
+    if not allowed.size:
+        return np.full(len(allowed), -1, np.int32)
+    best = np.where(allowed, preference, -np.inf).argmax(axis=1)
+    return np.where(allowed.any(axis=1), best, -1).astype(np.int32)
 
 
 def vote_stride(camera: Camera) -> int:
@@ -244,8 +260,10 @@ class Association:
     """Association of clusters with instances, and merging of instances that are parts of one object."""
 
     # source of the instances that clusters are compared with: SURFACE_LOOKUP (voxels at the depth readings), RAYCAST
-    # (rendered view) or GROUND_TRUTH (true object of each cluster, an upper bound)
+    # (rendered view), GROUND_TRUTH (true object of each cluster, an upper bound) or LEARNED (voxels at the depth
+    # readings, matched by a network instead of min_overlap and overlap_rule)
     association: InstanceSource = InstanceSource.SURFACE_LOOKUP
+    association_weights: Path = WEIGHTS  # weights file of the network of LEARNED
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # denominator of the overlap
     # minimum Bhattacharyya coefficient of the class distributions of a cluster and an instance to match, in [0, 1]; 0 =
@@ -283,6 +301,8 @@ class Association:
         )
         self._merge_votes: Counter[tuple[int, int]] = Counter()  # votes by pair of instances; see merge_frames
         self._max_pairs = MIN_PAIRS
+        is_learned = self.association is InstanceSource.LEARNED
+        self._scorer = AssociationScorer.load(self.association_weights) if is_learned else None  # None = overlap
         self._instance_of: dict[int, int] = {}  # instance by true object, for GROUND_TRUTH
         self.matches: Matches | None = None  # of the last frame; None = no frame
 
@@ -318,9 +338,15 @@ class Association:
         A cluster creates an instance only if it meets `create_score` and `create_points`.
         """
         frame_index = table.number_of(frame_index)
-        allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
+        if self._scorer is None:
+            allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
+            preference = overlaps.over_union(self.create_points)
+        else:
+            preference = self._scorer.scores(pairs_of(table, overlaps, clusters, frame_index), overlaps.votes.shape)
+            allowed = preference > 0
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
-        match = match_one_to_one(allowed, overlaps.over_union(self.create_points))
+        one_to_one = self._scorer is None or self.split_instances
+        match = match_one_to_one(allowed, preference) if one_to_one else match_best(allowed, preference)
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
         may_create = (instance_ids == 0) & self._may_create(clusters, overlaps)
         if not self.split_instances:
