@@ -14,7 +14,7 @@ from framework.data import Bool, Float64, Frame, Int32, Int64, PointClusters, Po
 from framework.detection.true_instances import true_objects
 from framework.interfaces import BackEnd, ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
 from framework.mapping.instances.association import Association, LabeledMap, Matches
-from framework.mapping.instances.learned_association import Pairs, pairs_of
+from framework.mapping.instances.learned_association import CandidatePairs, pairs_of
 from framework.mapping.labels.pixel_lists import PixelLists
 from framework.pipeline import Pipeline
 from framework.registry import build
@@ -43,7 +43,7 @@ class Sample:
     detections of this object. Clusters of no object belong to a new instance or to an instance of no object.
     """
 
-    pairs: Pairs
+    pairs: CandidatePairs
     shape: tuple[int, int]  # number of clusters and of instances
     is_correct: Bool  # (P,) True = the pair is a correct decision for its cluster
     new_is_correct: Bool  # (N,) True = a new instance is a correct decision
@@ -81,7 +81,7 @@ class RecordingAssociation(Association):
                 self._detections[instance][true_object] += 1
         return points, matches
 
-    def _sample(self, pairs: Pairs, matches: Matches, objects: Int32) -> Sample:
+    def _sample(self, pairs: CandidatePairs, matches: Matches, objects: Int32) -> Sample:
         ids = matches.overlaps.instance_ids.tolist()
         counts = [self._detections[k] for k in ids]
         main = [max(sorted(one), key=one.__getitem__, default=0) for one in counts]

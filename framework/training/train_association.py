@@ -18,9 +18,9 @@ from safetensors.numpy import save_file
 from torch import Tensor
 from tqdm import tqdm
 
-from framework.data import Float32, Float64
+from framework.data import Bool, Float32, Float64
 from framework.files.atomic_write import atomic_write
-from framework.mapping.instances.association import match_one_to_one
+from framework.mapping.instances.association import Association, match_best
 from framework.mapping.instances.learned_association import FEATURES, AssociationScorer, shapes
 from framework.training.association_samples import Sample, record_room, stacked
 
@@ -39,10 +39,11 @@ class Quality:
     """Accuracy and mean log-loss of the decisions on held-out rooms."""
 
     decisions: int
-    accuracy: float  # of the network after one-to-one matching
-    accuracy_of_rule: float  # of the default rule
+    accuracy: float  # of the network
+    accuracy_of_rule: float  # of the default rule, which is one to one
+    accuracy_of_shared_rule: float  # of the default rule if clusters can share an instance
     log_loss: float
-    log_loss_of_rule: float  # of the default rule, whose error rate is known
+    log_loss_of_rule: float  # of the default rule if clusters can share an instance, given its error rate
 
 
 def initial_weights(seed: int) -> dict[str, Tensor]:
@@ -114,27 +115,38 @@ def fit(samples: Sequence[Sample], seed: int, epochs: int = EPOCHS) -> dict[str,
     return {name: weight.detach().numpy() for name, weight in weights.items()}
 
 
-def error_rate(samples: Sequence[Sample]) -> float:
-    """Return the fraction of wrong decisions of the rule that the samples were recorded with."""
+def rule(sample: Sample) -> tuple[Bool, Float64]:
+    """Return the pairs (N, M) that the default rule allows, and their IoUs, which it prefers."""
+    cluster, instance, features = sample.pairs.clusters, sample.pairs.instances, sample.pairs.features
+    allowed, iou = np.zeros(sample.shape, np.bool_), np.zeros(sample.shape)
+    allowed[cluster, instance] = features[:, :2].max(axis=1) > Association.min_overlap  # relative to the smaller
+    iou[cluster, instance] = features[:, 2]
+    return allowed, iou
+
+
+def recorded_accuracy(samples: Sequence[Sample]) -> float:
+    """Return the accuracy of the rule that the samples were recorded with."""
     right, count = np.sum([sample.accuracy(sample.chosen) for sample in samples], axis=0)
-    return 1 - float(right) / float(count)
+    return float(right) / float(count)
 
 
 def quality(scorer: AssociationScorer, samples: Sequence[Sample]) -> Quality:
     """Return the quality of the network and of the rule that the samples were recorded with."""
-    counts = np.zeros(2, np.int64)
+    counts, shared = np.zeros(2, np.int64), 0
     losses: list[Float64] = []
     for sample in samples:
         score = scorer.scores(sample.pairs, sample.shape)
-        counts += sample.accuracy(match_one_to_one(score > 0, score))
+        counts += sample.accuracy(match_best(score > 0, score))
+        shared += sample.accuracy(match_best(*rule(sample)))[0]
         _, cluster, _, is_correct, new_is_correct = tensors([sample])
         of_pair = torch.from_numpy(score[sample.pairs.clusters, sample.pairs.instances])
         losses.append(log_losses(of_pair.float(), cluster, is_correct, new_is_correct).numpy())
-    wrong = error_rate(samples)
+    wrong = 1 - float(shared / counts[1])
     return Quality(
         decisions=int(counts[1]),
         accuracy=float(counts[0] / counts[1]),
-        accuracy_of_rule=1 - wrong,
+        accuracy_of_rule=recorded_accuracy(samples),
+        accuracy_of_shared_rule=1 - wrong,
         log_loss=float(np.concatenate(losses).mean()),
         log_loss_of_rule=float(-np.log(1 - wrong) * (1 - wrong) - np.log(wrong) * wrong) if 0 < wrong < 1 else 0.0,
     )

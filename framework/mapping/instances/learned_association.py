@@ -13,7 +13,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import safetensors
@@ -23,9 +22,7 @@ from framework.data import Float64, Int64, PointClusters
 from framework.errors import DataError, in_one_line
 from framework.files.search_paths import candidates
 from framework.mapping.instances.instance_table import InstanceTable
-
-if TYPE_CHECKING:
-    from framework.mapping.instances.association import Overlaps
+from framework.mapping.instances.overlaps import Overlaps
 
 WEIGHTS = Path("framework/mapping/instances/learned_association.safetensors")
 WIDTH = 32  # number of hidden features
@@ -69,7 +66,7 @@ def shapes(width: int = WIDTH) -> dict[str, tuple[int, ...]]:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class CandidatePairs:
     """The P pairs of a cluster and a visible instance that share pixels, sorted by cluster, then by instance."""
 
     clusters: Int64  # (P,) index of the cluster
@@ -77,7 +74,7 @@ class Pairs:
     features: Float64  # (P, F)
 
 
-def pairs_of(table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, frame_index: int) -> Pairs:
+def pairs_of(table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, frame_index: int) -> CandidatePairs:
     """Return the pairs of a frame with their features.
 
     Args:
@@ -88,7 +85,7 @@ def pairs_of(table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, 
     """
     n, m = np.nonzero(overlaps.votes)
     if not len(n):
-        return Pairs(n, m, np.zeros((0, len(FEATURES))))
+        return CandidatePairs(n, m, np.zeros((0, len(FEATURES))))
     records = [table.records[k] for k in overlaps.instance_ids.tolist()]
     known = np.stack([table.class_probabilities(record) for record in records]).astype(np.float64)
     found = clusters.class_probabilities.astype(np.float64)
@@ -113,7 +110,7 @@ def pairs_of(table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, 
         np.log1p(overlaps.sizes[n]) / 10,
         np.log1p(overlaps.visible[m]) / 10,
         distance,
-        np.minimum(distance / np.maximum(extents[n], 0.01), 5.0) / 5,
+        np.minimum(distance / np.fmax(extents[n], 0.01), 5.0) / 5,
         np.sqrt(found[n] * known[m]).sum(axis=1),
         (found[n] * known[m]).sum(axis=1),
         clusters.scores[n].astype(np.float64),
@@ -122,7 +119,7 @@ def pairs_of(table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, 
         of_instance([np.log1p(record.observations) / 5 for record in records]),
         of_instance([np.log1p(max(frame_index - record.last_frame, 0)) / 5 for record in records]),
     ]
-    return Pairs(n, m, np.stack(columns, axis=1))
+    return CandidatePairs(n, m, np.stack(columns, axis=1))
 
 
 def _center(center_sum: tuple[float, float, float], count: int) -> tuple[float, ...]:
@@ -193,7 +190,7 @@ class AssociationScorer:
                 raise DataError(f"{where}: {name}: expected finite weights, got NaN or infinity")
         return cls({name: tensors[name].astype(np.float64) for name in shapes()})
 
-    def scores(self, pairs: Pairs, shape: tuple[int, int]) -> Float64:
+    def scores(self, pairs: CandidatePairs, shape: tuple[int, int]) -> Float64:
         """Return the log-odds (N, M) of each pair against a new instance, -inf for pairs without shared pixels.
 
         Args:

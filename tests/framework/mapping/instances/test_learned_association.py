@@ -17,16 +17,16 @@ from safetensors.numpy import save_file
 from framework.data import PointClusters
 from framework.errors import DataError
 from framework.files.search_paths import PROJECT_ROOT
-from framework.mapping.instances.association import Overlaps
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.instances.learned_association import (
     FEATURES,
     WEIGHTS,
     AssociationScorer,
-    Pairs,
+    CandidatePairs,
     pairs_of,
     shapes,
 )
+from framework.mapping.instances.overlaps import Overlaps
 
 MAX_BYTES = 1_000_000
 
@@ -127,10 +127,10 @@ def test_pair_features_of_cluster_without_points_are_finite() -> None:
     assert np.isfinite(pairs_of(random_table(rng, [1]), random_overlaps(rng, 2, [1]), clusters, 9).features).all()
 
 
-def random_pairs(seed: int) -> tuple[Pairs, tuple[int, int]]:
+def random_pairs(seed: int) -> tuple[CandidatePairs, tuple[int, int]]:
     rng = np.random.default_rng(seed)
     n, m = np.nonzero(rng.uniform(size=(6, 5)) < 0.6)
-    return Pairs(n, m, rng.uniform(size=(len(n), len(FEATURES)))), (6, 5)
+    return CandidatePairs(n, m, rng.uniform(size=(len(n), len(FEATURES)))), (6, 5)
 
 
 def test_scorer_is_invariant_to_order_of_instances() -> None:
@@ -141,6 +141,7 @@ def test_scorer_is_invariant_to_order_of_instances() -> None:
     assert np.allclose(scorer.scores(replace(pairs, instances=order[pairs.instances]), shape)[:, order], scores)
 
 
+@pytest.mark.integration
 def test_scorer_does_not_depend_on_number_of_threads() -> None:
     code = (
         "import hashlib\nfrom tests.framework.mapping.instances.test_learned_association import *\n"
