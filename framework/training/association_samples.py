@@ -47,19 +47,18 @@ class Sample:
     shape: tuple[int, int]  # number of clusters and of instances
     is_correct: Bool  # (P,) True = the pair is a correct decision for its cluster
     new_is_correct: Bool  # (N,) True = a new instance is a correct decision
-    chosen: Int32  # (N,) instance that the rule of the run chose, an index as in `pairs`; -1 = new or none
 
     @property
     def decided(self) -> Int64:
         """The clusters with pairs. The others have no decision."""
         return np.unique(self.pairs.clusters)
 
-    def accuracy(self, chosen: Int32) -> tuple[int, int]:
-        """Return the number of correct decisions and the number of decisions, given the chosen instance (N,)."""
+    def correct_decisions(self, chosen: Int32) -> int:
+        """Return the number of correct decisions, given the chosen instance (N,) of each cluster, -1 = new."""
         allowed = np.zeros(self.shape, np.bool_)
         allowed[self.pairs.clusters, self.pairs.instances] = self.is_correct
         right = np.column_stack([allowed, self.new_is_correct])[np.arange(len(chosen)), chosen]  # -1 = last column
-        return int(right[self.decided].sum()), len(self.decided)
+        return int(right[self.decided].sum())
 
 
 class RecordingAssociation(Association):
@@ -94,13 +93,11 @@ class RecordingAssociation(Association):
         of_object = objects[pairs.clusters] > 0
         is_correct = same & (~of_object | (observed[pairs.instances] == most[pairs.clusters]))
         has_instance = np.bincount(pairs.clusters[same], minlength=len(objects)) > 0
-        position = {k: column for column, k in enumerate(ids)}
         return Sample(
             pairs=pairs,
             shape=(len(objects), len(ids)),
             is_correct=is_correct,
             new_is_correct=(objects == 0) | ~has_instance,
-            chosen=np.array([position.get(k, -1) for k in matches.instance_ids.tolist()], np.int32),
         )
 
 

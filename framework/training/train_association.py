@@ -18,9 +18,9 @@ from safetensors.numpy import save_file
 from torch import Tensor
 from tqdm import tqdm
 
-from framework.data import Bool, Float32, Float64
+from framework.data import Bool, Float32, Float64, Int32
 from framework.files.atomic_write import atomic_write
-from framework.mapping.instances.association import Association, match_best
+from framework.mapping.instances.association import Association, match_one_to_one
 from framework.mapping.instances.learned_association import FEATURES, AssociationScorer, shapes
 from framework.training.association_samples import Sample, record_room, stacked
 
@@ -36,14 +36,19 @@ DROPPED = 0.1  # probability that a feature is 0 in all pairs of a step, so that
 
 @dataclass(frozen=True)
 class Quality:
-    """Accuracy and mean log-loss of the decisions on held-out rooms."""
+    """Accuracy and mean log-loss of the decisions on held-out rooms, for the network and the default rule.
+
+    Before matching, each cluster has its best decision. After one-to-one matching, one of two clusters of an object is
+    wrong, because it creates another instance.
+    """
 
     decisions: int
-    accuracy: float  # of the network
-    accuracy_of_rule: float  # of the default rule, which is one to one
-    accuracy_of_shared_rule: float  # of the default rule if clusters can share an instance
+    accuracy: float  # of the network before matching
+    accuracy_of_rule: float  # of the rule before matching
+    matched_accuracy: float  # of the network after one-to-one matching
+    matched_accuracy_of_rule: float  # of the rule after one-to-one matching
     log_loss: float
-    log_loss_of_rule: float  # of the default rule if clusters can share an instance, given its error rate
+    log_loss_of_rule: float  # of the rule before matching, given its error rate
 
 
 def initial_weights(seed: int) -> dict[str, Tensor]:
@@ -124,31 +129,40 @@ def rule(sample: Sample) -> tuple[Bool, Float64]:
     return allowed, iou
 
 
-def recorded_accuracy(samples: Sequence[Sample]) -> float:
-    """Return the accuracy of the rule that the samples were recorded with."""
-    right, count = np.sum([sample.accuracy(sample.chosen) for sample in samples], axis=0)
-    return float(right) / float(count)
+def match_best(allowed: Bool, preference: Float64) -> Int32:
+    """Return the allowed column (N,) with the largest preference of each row, -1 = none. Rows can share a column.
+
+    Args:
+        allowed: A Boolean array (N, M), True for pairs that can match.
+        preference: The preference (N, M) of each pair.
+    """
+    if not allowed.size:
+        return np.full(len(allowed), -1, np.int32)
+    best = np.where(allowed, preference, -np.inf).argmax(axis=1)
+    return np.where(allowed.any(axis=1), best, -1).astype(np.int32)
 
 
 def quality(scorer: AssociationScorer, samples: Sequence[Sample]) -> Quality:
-    """Return the quality of the network and of the rule that the samples were recorded with."""
-    counts, shared = np.zeros(2, np.int64), 0
+    """Return the quality of the network and of the default rule."""
+    right, count = np.zeros(4, np.int64), 0
     losses: list[Float64] = []
     for sample in samples:
         score = scorer.scores(sample.pairs, sample.shape)
-        counts += sample.accuracy(match_best(score > 0, score))
-        shared += sample.accuracy(match_best(*rule(sample)))[0]
+        choices = [
+            match(*given) for match in (match_best, match_one_to_one) for given in ((score > 0, score), rule(sample))
+        ]
+        right += [sample.correct_decisions(chosen) for chosen in choices]
+        count += len(sample.decided)
         _, cluster, _, is_correct, new_is_correct = tensors([sample])
         of_pair = torch.from_numpy(score[sample.pairs.clusters, sample.pairs.instances])
         losses.append(log_losses(of_pair.float(), cluster, is_correct, new_is_correct).numpy())
-    wrong = 1 - float(shared / counts[1])
+    accuracies = [float(one) / count for one in right]
+    p = min(max(accuracies[1], 1e-6), 1 - 1e-6)
     return Quality(
-        decisions=int(counts[1]),
-        accuracy=float(counts[0] / counts[1]),
-        accuracy_of_rule=recorded_accuracy(samples),
-        accuracy_of_shared_rule=1 - wrong,
+        count,
+        *accuracies,
         log_loss=float(np.concatenate(losses).mean()),
-        log_loss_of_rule=float(-np.log(1 - wrong) * (1 - wrong) - np.log(wrong) * wrong) if 0 < wrong < 1 else 0.0,
+        log_loss_of_rule=float(-p * np.log(p) - (1 - p) * np.log(1 - p)),
     )
 
 

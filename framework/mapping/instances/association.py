@@ -5,9 +5,9 @@ the measured surface or in a ray-cast view. The ray-cast view is our interpretat
 
 A cluster and an instance can match if their overlap is large enough. By default, the overlap is relative to the smaller
 of the two, so that a part of an object matches the whole. Matching is one to one, in order of decreasing IoU. The
-learned association instead matches each cluster with its best instance, so that two parts of an object match one
-instance. An unmatched cluster creates a new instance. Most instances of false detections stay tentative. They are
-removed after some time, so that their number does not grow in a known place.
+learned association replaces overlap and IoU by the log-odds of a match. An unmatched cluster creates a new instance.
+Most instances of false detections stay tentative. They are removed after some time, so that their number does not grow
+in a known place.
 """
 
 from __future__ import annotations
@@ -71,19 +71,6 @@ def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int3
             match[row] = column
             taken[column] = True
     return match
-
-
-def match_best(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int32:
-    """Return the allowed column (N,) with the largest preference of each row, -1 = none. Rows can share a column.
-
-    Args:
-        allowed: A Boolean array (N, M), True for pairs that can match.
-        preference: The preference (N, M) of each pair.
-    """
-    if not allowed.size:
-        return np.full(len(allowed), -1, np.int32)
-    best = np.where(allowed, preference, -np.inf).argmax(axis=1)
-    return np.where(allowed.any(axis=1), best, -1).astype(np.int32)
 
 
 def vote_stride(camera: Camera) -> int:
@@ -198,7 +185,7 @@ class Association:
 
     # source of the instances that clusters are compared with: SURFACE_LOOKUP (voxels at the depth readings), RAYCAST
     # (rendered view), GROUND_TRUTH (true object of each cluster, an upper bound) or LEARNED (voxels at the depth
-    # readings; a network replaces min_overlap, overlap_rule and split_instances)
+    # readings; a network replaces min_overlap and overlap_rule)
     association: InstanceSource = InstanceSource.SURFACE_LOOKUP
     association_weights: Path = WEIGHTS  # weights file of the network of LEARNED
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
@@ -282,7 +269,7 @@ class Association:
             preference = self._scorer.scores(pairs_of(table, overlaps, clusters, frame_index), overlaps.votes.shape)
             allowed = preference > 0
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
-        match = (match_one_to_one if self._scorer is None else match_best)(allowed, preference)
+        match = match_one_to_one(allowed, preference)
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
         may_create = (instance_ids == 0) & self._may_create(clusters, overlaps)
         if not self.split_instances:

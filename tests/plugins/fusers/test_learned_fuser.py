@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from framework.data import Detections, Int32, Pose
 from framework.errors import DataError
 from framework.interfaces import MapFuser
-from framework.mapping.instances.association import InstanceSource, match_best
+from framework.mapping.instances.association import InstanceSource
 from framework.refinement.lifting import lift
 from framework.registry import assemble
 from framework.testing.contracts import FuserContract
@@ -53,24 +52,6 @@ def test_learned_association_creates_instance_of_new_object() -> None:
     found = spheres_in(frame_at(0))
     assert matched(fuser, 0, without_first(found)).tolist() == [1]
     assert matched(fuser, 1, spheres_in(frame_at(1))).tolist() == [2, 1]
-
-
-def test_learned_association_matches_parts_with_one_instance() -> None:
-    fuser = new_fuser()
-    for k in range(3):
-        matched(fuser, k, spheres_in(frame_at(k)))
-    found = spheres_in(frame_at(3))
-    rows = np.arange(found.masks.shape[1])[:, None]
-    middle = int(np.flatnonzero(found.masks[0].any(axis=1)).mean())
-    halves = replace(found, masks=np.stack([found.masks[0] & (rows < middle), found.masks[0] & (rows >= middle)]))
-    assert matched(fuser, 3, halves).tolist() == [1, 1]
-
-
-def test_match_best_allows_shared_columns() -> None:
-    preference = np.array([[0.3, 0.9], [0.1, 0.8], [0.7, 0.2]])
-    assert match_best(preference > 0.25, preference).tolist() == [1, 1, 0]
-    assert match_best(preference > 0.85, preference).tolist() == [1, -1, -1]
-    assert match_best(np.zeros((2, 0), np.bool_), np.zeros((2, 0))).tolist() == [-1, -1]
 
 
 def test_learned_association_missing_weights_raises() -> None:
