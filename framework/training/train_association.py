@@ -1,7 +1,7 @@
 """Training of the learned association on synthetic rooms with simulated detectors.
 
 `python -m framework.training.train_association OUT` writes OUT, a file for `fuser.association_weights`, and reports
-accuracy and log-loss on held-out rooms. It takes about 15 minutes on one core. Equal seeds give equal weights.
+accuracy and log-loss on held-out rooms. It takes about 20 minutes on one core. Equal seeds give equal weights.
 """
 
 from __future__ import annotations
