@@ -159,8 +159,11 @@ def quality(scorer: AssociationScorer, samples: Sequence[Sample]) -> Quality:
     accuracies = [float(one) / count for one in right]
     p = min(max(accuracies[1], 1e-6), 1 - 1e-6)
     return Quality(
-        count,
-        *accuracies,
+        decisions=count,
+        accuracy=accuracies[0],
+        accuracy_of_rule=accuracies[1],
+        matched_accuracy=accuracies[2],
+        matched_accuracy_of_rule=accuracies[3],
         log_loss=float(np.concatenate(losses).mean()),
         log_loss_of_rule=float(-p * np.log(p) - (1 - p) * np.log(1 - p)),
     )
