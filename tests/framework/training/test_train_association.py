@@ -70,6 +70,7 @@ def _tensors(samples: list[Sample]) -> list[torch.Tensor]:
     return [torch.from_numpy(features).float(), torch.from_numpy(cluster), torch.from_numpy(instance)]
 
 
+@pytest.mark.integration
 def test_fit_is_reproducible() -> None:
     samples = [random_sample(k) for k in range(8)]
     first, second, other = fit(samples, 0, epochs=2), fit(samples, 0, epochs=2), fit(samples, 1, epochs=2)
