@@ -455,7 +455,7 @@ def test_export_invalid_selection_raises(run: Path, tmp_path: Path) -> None:
         export(tmp_path, [ExportFormat.GLB])
     with pytest.raises(DataError, match="object: expected an id or class of this run, got 'cub'; did you mean 'cube'"):
         export(run, [ExportFormat.GLB], tmp_path, Chosen(("cub",)))
-    with pytest.raises(DataError, match=r"object: expected a confidence >= 0.9 for 'cube', got at most 0.80"):
+    with pytest.raises(DataError, match=r"object: expected a probability >= 0.99 for 'cube', got at most 0.80"):
         export(run, [ExportFormat.GLB], tmp_path, Chosen(("cube",), min_probability=0.99))
     assert export(run, [ExportFormat.GLB], tmp_path, Chosen(("2",), min_probability=0.99)) == [
         tmp_path / "objects/cube_2.glb"
