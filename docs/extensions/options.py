@@ -16,6 +16,7 @@ from sphinx.util.docutils import SphinxDirective
 
 from framework.__main__ import COMMANDS
 from framework.commands.installation.plugins import COMMENTED_KEY, Option, registered
+from framework.config.composition import composed
 from framework.files.search_paths import CONF
 
 
@@ -61,14 +62,17 @@ class Settings(SphinxDirective):
 
 
 class Files(SphinxDirective):
-    """Directive for the choices of a config group without plugins, each with the first comment of its YAML."""
+    """Directive for the choices of a config group without plugins, with first comments and rows of experiments."""
 
     required_arguments = 1  # the group
 
     def run(self) -> list[nodes.Node]:
         group = self.arguments[0]
         return [
-            definitions((f"{group}={path.stem}", _head(path.read_text())) for path in sorted((CONF / group).iterdir()))
+            definitions(
+                (f"{group}={path.stem}", _head(path.read_text()) + _rows(group, path.stem))
+                for path in sorted((CONF / group).iterdir())
+            )
         ]
 
 
@@ -88,6 +92,13 @@ def _head(text: str) -> str:
             break
         head.append(line.removeprefix("#").strip())
     return " ".join(head)
+
+
+def _rows(group: str, name: str) -> str:
+    """Return a sentence with the rows of an experiment, or nothing for other groups."""
+    if group != "experiment":
+        return ""
+    return f" Rows: {', '.join(f'`{row}`' for row in composed(f'experiment={name}', 'row=any').rows)}."
 
 
 def _type(value: object) -> str:

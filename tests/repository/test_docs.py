@@ -20,6 +20,7 @@ import yaml
 import instancemap
 from framework import __version__
 from framework.commands.installation.plugins import registered
+from framework.config import composition
 from framework.files.search_paths import CONF
 from framework.registry import GROUPS
 from tests.support.doc_pages import CHECKOUT, DOCS, PAGES
@@ -91,6 +92,17 @@ def test_configuration_reference_has_all_parameters(built: Path) -> None:
             assert f"refiner.{parameter.name}</span>" in page
             assert parameter.comment in page
     assert "seed of all random numbers of a run" in (built / "configuration.html").read_text()
+
+
+def test_configuration_reference_has_all_experiment_rows(built: Path) -> None:
+    page = (built / "configuration.html").read_text()
+    experiments = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+    assert experiments
+    for name in experiments:
+        rows = composition.composed(f"experiment={name}", "row=any").rows
+        entry = page.partition(f">experiment={name}</span>")[2].partition("</dd>")[0]
+        assert rows
+        assert not [row for row in rows if f">{row}</span>" not in entry], name
 
 
 OF_TUTORIALS = {"color_blobs", "nearby", "my_refiner", "nearest_points", "saturated_regions"}  # plugins of the reader
