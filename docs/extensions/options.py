@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
+from functools import cache
 from typing import NamedTuple
 
 import yaml
@@ -19,6 +20,12 @@ from framework.commands.installation.plugins import COMMENTED_KEY, Option, regis
 from framework.files.search_paths import CONF
 
 VARIANT = " Here: "  # precedes the difference of a variant from its class in `Option.documentation`
+
+
+@cache
+def options_of_stage(stage: str) -> list[Option]:
+    """Return the options of a stage. Two pages contain them."""
+    return registered(stage)
 
 
 class Row(NamedTuple):
@@ -37,7 +44,7 @@ class Options(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         stage = self.arguments[0]
-        return [self.option(option) for option in registered(stage)]
+        return [self.option(option) for option in options_of_stage(stage)]
 
     def option(self, option: Option) -> nodes.section:
         section = nodes.section(ids=[_anchor(option)], names=[option.name])
@@ -57,9 +64,8 @@ class Overview(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         stage = self.arguments[0]
         page = self.env.app.builder.get_relative_uri(self.env.docname, f"configuration/{stage}")
-        return [
-            _table_of(("Option", "Description"), [self._row(option, page) for option in registered(stage)], (35, 65))
-        ]
+        rows = [self._row(option, page) for option in options_of_stage(stage)]
+        return [_table_of(("Option", "Description"), rows, (35, 65))]
 
     def _row(self, option: Option, page: str) -> nodes.row:
         name = nodes.literal("", f"{option.stage}={option.name}")
