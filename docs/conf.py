@@ -19,6 +19,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
+    "extensions.api_names",
     "extensions.arguments",
     "extensions.docstrings",
     "extensions.mathml",
