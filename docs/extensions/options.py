@@ -19,6 +19,7 @@ from framework.__main__ import COMMANDS
 from framework.commands.installation.plugins import COMMENTED_KEY, Option, registered
 from framework.config.composition import composed
 from framework.files.search_paths import CONF
+from framework.importing.formats import FORMATS
 
 VARIANT = " Here: "  # precedes the difference of a variant from its class in `Option.documentation`
 
@@ -110,6 +111,13 @@ class Commands(SphinxDirective):
         return [definitions(COMMANDS.items())]
 
 
+class Recordings(SphinxDirective):
+    """Directive for the formats of `instancemap import`."""
+
+    def run(self) -> list[nodes.Node]:
+        return [definitions((kind.name, kind.needs) for kind in FORMATS)]
+
+
 def _head(text: str) -> str:
     """Return the comment at the top of a YAML file, without Hydra's `# @package`."""
     lines = [line for line in text.splitlines() if not line.startswith("# @")]
@@ -189,4 +197,5 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("settings", Settings)
     app.add_directive("files", Files)
     app.add_directive("commands", Commands)
+    app.add_directive("recordings", Recordings)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

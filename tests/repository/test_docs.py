@@ -22,6 +22,7 @@ from framework import __version__
 from framework.commands.installation.plugins import registered
 from framework.config import composition
 from framework.files.search_paths import CONF
+from framework.importing.formats import FORMATS
 from framework.registry import GROUPS
 from tests.support.doc_pages import CHECKOUT, DOCS, PAGES
 
@@ -103,6 +104,11 @@ def test_configuration_reference_has_all_experiment_rows(built: Path) -> None:
         entry = page.partition(f">experiment={name}</span>")[2].partition("</dd>")[0]
         assert rows
         assert not [row for row in rows if f">{row}</span>" not in entry], name
+
+
+def test_own_data_page_has_all_recording_formats(built: Path) -> None:
+    page = (built / "tutorials" / "own_data.html").read_text()
+    assert not [kind.name for kind in FORMATS if f">{kind.name}</span>" not in page]
 
 
 OF_TUTORIALS = {"color_blobs", "nearby", "my_refiner", "nearest_points", "saturated_regions"}  # plugins of the reader

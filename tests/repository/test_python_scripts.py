@@ -23,7 +23,7 @@ PRINTED = {
     "Ask for objects": r"\d+ \w+( \w+)? 0\.\d\d \[(.|\n)*m\n\[(.|\n)*\d\.\d\d tv \w+ \[",
     "Find the floor": r"\d+ vertices on the floor",
     "Render a view": r"instance at the center: [1-9]",
-    "Extract an object": "",
+    "Extract an object": r"(\(\d{3,}, 3\) ?){3}",
     "Query during mapping": r"[1-9]\d* objects\n\w",
     "Use your own stage": r"0 frames lost; [1-9]\d* objects",
 }
@@ -66,6 +66,6 @@ def test_documented_script_prints_expected_output(place: Path, name: str) -> Non
     assert re.search(PRINTED[name], printed[name])
 
 
-@pytest.mark.parametrize(("name", "size"), [("desk.npz", 100_000), ("view.png", 1000), ("object.ply", 1000)])
+@pytest.mark.parametrize(("name", "size"), [("desk.npz", 100_000), ("view.png", 1000)])
 def test_documented_script_writes_file(place: Path, name: str, size: int) -> None:
     assert (place / name).stat().st_size > size
