@@ -312,12 +312,13 @@ class InstanceMap(InstanceTableMap):
         best_classes = self._best_classes()
         if self.crf.crf_weight > 0:
             labels = self.crf.smoothed(grid, self.labels.evidence, counts, surface, labels, best_classes)
-        structure = self._structure.of(surface, self.volume.gravity().up)
+        planes = self._structure.of(surface, self.volume.gravity().up)
         flat = np.array([k >= 0 and is_flat(self.classes[k]) for k in best_classes], np.bool_)
-        instance_ids = separate_instances(labels.instance_ids, structure, flat)
+        instance_ids = separate_instances(labels.instance_ids, planes, flat)
         too_small = self.confirmation.too_small(instance_ids, self.volume.voxel_size)
         instance_ids = np.where(too_small, np.int32(0), instance_ids)
         class_ids = np.where(instance_ids == labels.instance_ids, labels.class_ids, np.int32(-1))
+        structure = planes.of_vertices
         structure = np.where((instance_ids > 0) & is_building(structure), np.uint8(Structure.NONE), structure)
         return InstanceMesh(
             surface.vertices, surface.triangles, labels.colors, instance_ids, class_ids, self.classes, structure

@@ -40,6 +40,7 @@ TOP = 0.25  # m, maximum distance of the upper end of a wall from the upper end 
 COLUMN = 0.25  # m, width of the columns of a wall, each of which reaches high
 FRONT_DEPTH = (0.1, 1.0)  # m, distance of furniture fronts from the wall behind
 MIN_FLAT = 0.5  # minimum fraction of the vertices of a flat instance that are on floor, walls and ceiling
+MIN_OWN = 0.5  # minimum fraction of the vertices on a plane that are on one instance, if the plane is a side of it
 MIN_CEILING = 1.8  # m, minimum height of a ceiling above the floor
 
 
@@ -53,19 +54,32 @@ class RoomPlanes:
     columns: Bool  # (K, C) True for the columns of the plane that are structure; points beyond an end are in its column
 
 
+@dataclass(frozen=True)
+class SurfaceStructure:
+    """The structure of the V vertices of a surface."""
+
+    planes: Int32  # (V,) plane of each vertex, 0 = none
+    kinds: UInt8  # (K + 1,) `Structure` of each plane
+
+    @property
+    def of_vertices(self) -> UInt8:
+        """The `Structure` (V,) of each vertex."""
+        return self.kinds[self.planes]
+
+
 class VertexStructure:
     """The structure of the vertices of a surface, which is computed again only for another surface or up direction."""
 
     def __init__(self) -> None:
         self._surface: UnlabeledMesh | None = None
         self._up: bytes | None = None
-        self._structure: UInt8 = np.zeros(0, np.uint8)
+        self._structure = SurfaceStructure(np.zeros(0, np.int32), np.zeros(1, np.uint8))
 
     def __reduce__(self) -> tuple[type[VertexStructure], tuple[()]]:
         return VertexStructure, ()
 
-    def of(self, surface: UnlabeledMesh, up: Float64 | None) -> UInt8:
-        """Return the `Structure` (V,) of each vertex, which is NONE for all vertices if `up` is None.
+    def of(self, surface: UnlabeledMesh, up: Float64 | None) -> SurfaceStructure:
+        """Return the structure of the vertices, which is NONE for all vertices if `up` is None.
 
         Args:
             surface: The surface.
@@ -74,14 +88,14 @@ class VertexStructure:
         up_bytes = None if up is None else up.tobytes()
         if surface is not self._surface or up_bytes != self._up:
             self._surface, self._up = surface, up_bytes
-            self._structure = np.zeros(len(surface.vertices), np.uint8)
+            self._structure = SurfaceStructure(np.zeros(len(surface.vertices), np.int32), np.zeros(1, np.uint8))
             if up is not None:
                 self._structure = structure_of(surface.vertices, surface.triangles, up)
         return self._structure
 
 
-def structure_of(vertices: Float32, triangles: Int32, up: Float64) -> UInt8:
-    """Return the `Structure` (V,) of each vertex of a surface.
+def structure_of(vertices: Float32, triangles: Int32, up: Float64) -> SurfaceStructure:
+    """Return the structure of the vertices of a surface.
 
     Args:
         vertices: The vertices (V, 3) of the surface in the world frame, m.
@@ -97,24 +111,28 @@ def structure_of(vertices: Float32, triangles: Int32, up: Float64) -> UInt8:
         vertices, normals, found.planes.astype(np.float32), found.along.astype(np.float32), found.columns,
         np.float32(COLUMN), np.float32(REACH), plane_of_vertex,
     )  # fmt: skip
-    return np.append(np.uint8(Structure.NONE), found.kinds)[plane_of_vertex]
+    return SurfaceStructure(plane_of_vertex, np.append(np.uint8(Structure.NONE), found.kinds))
 
 
-def separate_instances(instance_ids: Int32, structure: UInt8, flat: Bool) -> Int32:
+def separate_instances(instance_ids: Int32, structure: SurfaceStructure, flat: Bool) -> Int32:
     """Return the instance (V,) of each vertex without the vertices on floor, walls and ceiling.
 
-    Flat instances, such as pictures, keep these vertices if at least half of their vertices are on them.
+    Flat instances, such as pictures, keep these vertices if at least half of their vertices are on them. They also keep
+    the vertices on a plane if at least half of these are on the instance, for example on the side of a refrigerator.
 
     Args:
         instance_ids: The instance (V,) of each vertex, 0 = none.
-        structure: The `Structure` (V,) of each vertex.
-        flat: A Boolean array, True for the ids of instances that can lie flat on a floor or a wall.
+        structure: The structure of the vertices.
+        flat: A Boolean array, True for the ids of instances that can be in the plane of a floor or a wall.
     """
-    on_structure = is_building(structure)
+    on_structure = is_building(structure.of_vertices)
+    shape = len(flat), len(structure.kinds)
+    pairs = instance_ids[on_structure] * shape[1] + structure.planes[on_structure]
+    counts = np.bincount(pairs, minlength=shape[0] * shape[1]).reshape(shape)  # by instance and plane
     sizes = np.bincount(instance_ids, minlength=len(flat))
-    on_plane = np.bincount(instance_ids[on_structure], minlength=len(flat))
-    keeps = flat & (on_plane >= MIN_FLAT * sizes)
-    return np.where(on_structure & ~keeps[instance_ids], np.int32(0), instance_ids)
+    is_flat = counts.sum(axis=1) >= MIN_FLAT * sizes
+    keeps = flat[:, None] & (is_flat[:, None] | (counts >= MIN_OWN * counts.sum(axis=0)))
+    return np.where(on_structure & ~keeps[instance_ids, structure.planes], np.int32(0), instance_ids)
 
 
 def is_building(structure: UInt8) -> Bool:

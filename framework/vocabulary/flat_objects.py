@@ -7,11 +7,11 @@ FLAT = frozenset((
     "cabinet", "calendar", "carpet", "clock", "closet", "cloth", "clothes", "cupboard", "curtain", "display",
     "door", "doorframe", "folder", "frame", "freezer", "fridge", "handle", "keyboard", "knife", "laptop", "locker",
     "magazine", "map", "mat", "mirror", "monitor", "mouse", "newspaper", "outlet", "painting", "paper", "phone",
-    "photo", "picture", "plate", "poster", "radiator", "refrigerator", "remote", "rug", "scissors", "screen",
-    "shelf", "sign", "skateboard", "socket", "switch", "television", "tie", "towel", "tv", "wardrobe", "whiteboard",
-    "window",
+    "photo", "picture", "plate", "poster", "radiator", "refridgerator", "refrigerator", "remote", "rug", "scissors",
+    "screen", "shelf", "sign", "skateboard", "socket", "switch", "television", "tie", "towel", "tv", "wardrobe",
+    "whiteboard", "window",
 ))  # fmt: skip
-"""Last words of class names in the singular."""
+"""Last words of class names in the singular, including the spelling of ScanNet's label space."""
 
 
 def is_flat(class_name: str) -> bool:

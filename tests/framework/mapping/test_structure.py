@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from framework.data import Float32, Float64, Int32, Structure, UInt8
-from framework.mapping.structure import VertexStructure, separate_instances, structure_of
+from framework.mapping.structure import SurfaceStructure, VertexStructure, separate_instances, structure_of
 from framework.mapping.voxels.meshing import UnlabeledMesh
 
 X, Y, Z = np.eye(3)
@@ -43,7 +43,7 @@ class Room:
         return (points @ rotation.T).astype(np.float32), np.concatenate(self.triangles)
 
     def structure(self, rotation: Float64 = ROTATIONS["upright"], noise: float = 0.0) -> UInt8:
-        return structure_of(*self.mesh(rotation, noise), rotation @ Z)
+        return structure_of(*self.mesh(rotation, noise), rotation @ Z).of_vertices
 
     def agreement(self, structure: UInt8, kind: Structure) -> float:
         """Return the IoU of the vertices with a kind."""
@@ -94,33 +94,49 @@ def test_structure_of_low_part_in_wall_plane_is_none() -> None:
 
 def test_vertex_structure_without_gravity_is_none() -> None:
     surface = UnlabeledMesh(*furnished().mesh(np.eye(3)), np.zeros(0, np.int32))
-    assert not VertexStructure().of(surface, None).any()
+    assert not VertexStructure().of(surface, None).of_vertices.any()
 
 
 def test_vertex_structure_of_new_surface_is_computed() -> None:
     room, structure = furnished(), VertexStructure()
     empty = UnlabeledMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros(0, np.int32))
-    assert len(structure.of(empty, Z)) == 0
-    assert room.agreement(structure.of(UnlabeledMesh(*room.mesh(np.eye(3)), np.zeros(0, np.int32)), Z), FLOOR) > 0.95
+    assert len(structure.of(empty, Z).planes) == 0
+    assert (
+        room.agreement(structure.of(UnlabeledMesh(*room.mesh(np.eye(3)), np.zeros(0, np.int32)), Z).of_vertices, FLOOR)
+        > 0.95
+    )
 
 
 def test_vertex_structure_of_new_up_direction_is_computed() -> None:
     surface = UnlabeledMesh(*furnished().mesh(np.eye(3)), np.zeros(0, np.int32))
     structure = VertexStructure()
-    upright = structure.of(surface, Z)
-    assert not np.array_equal(structure.of(surface, X), upright)
-    np.testing.assert_array_equal(structure.of(surface, Z), upright)
+    upright = structure.of(surface, Z).of_vertices
+    assert not np.array_equal(structure.of(surface, X).of_vertices, upright)
+    np.testing.assert_array_equal(structure.of(surface, Z).of_vertices, upright)
+
+
+KINDS = np.array([NONE, FLOOR, WALL, CEILING, FRONT], np.uint8)
 
 
 def test_separate_instances_removes_points_on_structure() -> None:
-    structure = np.array([WALL, FLOOR, CEILING, FRONT, NONE, NONE], np.uint8)
+    structure = SurfaceStructure(np.array([1, 2, 3, 4, 0, 0], np.int32), KINDS)
     ids = np.array([1, 1, 1, 1, 1, 0], np.int32)
     assert separate_instances(ids, structure, np.zeros(2, np.bool_)).tolist() == [0, 0, 0, 1, 1, 0]
 
 
 @pytest.mark.parametrize(("on_wall", "kept"), [(5, True), (4, False)])
 def test_separate_instances_keeps_flat_instances(on_wall: int, kept: bool) -> None:
-    structure = np.array([WALL] * on_wall + [NONE] * (10 - on_wall), np.uint8)
-    ids = np.ones(10, np.int32)
+    """A wall has 10 vertices without an instance."""
+    structure = SurfaceStructure(np.array([2] * on_wall + [0] * (10 - on_wall) + [2] * 10, np.int32), KINDS)
+    ids = np.repeat(np.int32([1, 0]), 10)
     separated = separate_instances(ids, structure, np.array([False, True]))
     assert (separated > 0).sum() == (10 if kept else 10 - on_wall)
+
+
+@pytest.mark.parametrize(("on_instance", "flat", "kept"), [(3, True, True), (2, True, False), (3, False, False)])
+def test_separate_instances_keeps_own_sides(on_instance: int, flat: bool, kept: bool) -> None:
+    """A wall has 6 vertices, some of which are on an instance with 10 other vertices."""
+    structure = SurfaceStructure(np.array([2] * 6 + [0] * 10, np.int32), KINDS)
+    ids = np.array([1] * on_instance + [0] * (6 - on_instance) + [1] * 10, np.int32)
+    separated = separate_instances(ids, structure, np.array([False, flat]))
+    assert (separated > 0).sum() == (10 + on_instance if kept else 10)
