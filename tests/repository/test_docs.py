@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from dataclasses import fields
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from framework import __version__
 from framework.commands.installation.plugins import registered
 from framework.files.search_paths import CONF
 from framework.registry import GROUPS
+from framework.tables.table_choice import TableChoice
 from tests.support.doc_pages import CHECKOUT, DOCS, PAGES
 
 pytestmark = pytest.mark.integration
@@ -91,6 +93,22 @@ def test_configuration_reference_has_all_parameters(built: Path) -> None:
             assert f"refiner.{parameter.name}</span>" in page
             assert parameter.comment in page
     assert "seed of all random numbers of a run" in (built / "configuration.html").read_text()
+
+
+@pytest.mark.parametrize(("command", "name"), [("edit", "guides/editing"), ("export", "exports")])
+def test_argument_table_has_options_of_help(built: Path, command: str, name: str) -> None:
+    words = [sys.executable, "-m", "framework", command, "--help"]
+    helped = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=60).stdout
+    options = set(re.findall(r"^  (--[a-z-]+)", helped, re.MULTILINE)) - {"--config-dir"}
+    assert len(options) > 4
+    page = re.sub(r"<[^>]+>", "", (built / f"{name}.html").read_text())
+    assert not [option for option in options if option not in page]
+
+
+def test_table_settings_are_documented(built: Path) -> None:
+    page = re.sub(r"<[^>]+>", "", (built / "guides" / "comparing_runs.html").read_text())
+    assert not [setting.name for setting in fields(TableChoice) if f"table.{setting.name}" not in page]
+    assert "KEYs of the pairs for comparisons" in page  # comment on the line above the field
 
 
 OF_TUTORIALS = {"color_blobs", "nearby", "my_refiner", "nearest_points", "saturated_regions"}  # plugins of the reader
