@@ -378,16 +378,18 @@ def long_tests() -> Measured:
     "0 failing commands, fresh virtual environment", "framework", "plugins", "conf", "instancemap.py", "pyproject.toml"
 )
 def wheel() -> Measured:
-    """Install the wheel in a new environment and use the package from an empty folder, as described in the README."""
+    """Build the package, install its wheel in a new environment and use it from an empty folder, as in the README."""
     example = (CHECKOUT / "README.md").read_text().split("```python\n")[1].split("```")[0]
     with tempfile.TemporaryDirectory() as directory:
-        wheels, environment, empty = (Path(directory, name) for name in ("wheels", "environment", "empty"))
+        dist, tools, environment, empty = (Path(directory, name) for name in ("dist", "tools", "environment", "empty"))
         empty.mkdir()
-        build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(wheels), str(CHECKOUT)]
-        subprocess.run(build, check=True)
-        venv.create(environment, with_pip=True)
+        for folder in (tools, environment):
+            venv.create(folder, with_pip=True)
+        subprocess.run([tools / "bin" / "pip", "install", "-q", "build", "twine"], check=True)
+        subprocess.run([tools / "bin" / "python", "-m", "build", "--outdir", dist, CHECKOUT], check=True)
+        subprocess.run([tools / "bin" / "twine", "check", "--strict", *dist.iterdir()], check=True)
         programs = environment / "bin"
-        install = [str(programs / "python"), "-m", "pip", "install", "-q", *map(str, wheels.glob("*.whl"))]
+        install = [str(programs / "python"), "-m", "pip", "install", "-q", *map(str, dist.glob("*.whl"))]
         subprocess.run(install, check=True)
         alone = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         commands = (
