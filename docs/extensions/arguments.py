@@ -1,4 +1,4 @@
-"""Directives for command-line arguments: `{arguments} edit` and `{fields} framework.tables.table_choice.TableChoice table`.
+"""Directives for arguments: `{arguments} edit` and `{fields} framework.tables.table_choice.TableChoice table`.
 
 The texts come from the argument parser of the command, as in `--help`, and from the comments of the dataclass fields.
 """
@@ -16,12 +16,14 @@ from typing import NoReturn
 from unittest import mock
 
 from docutils import nodes
-from extensions.docstrings import comments
-from extensions.options import Row, paragraph, table, yaml_value
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+from extensions.docstrings import comments
+from extensions.options import Row, paragraph, table, yaml_value
 from framework.__main__ import module_of
+
+IN_YAML = {"None": "null", "True": "true", "False": "false"}
 
 
 class BuiltParserError(Exception):
@@ -89,14 +91,12 @@ class Fields(SphinxDirective):
 
 
 def field_rows(of: type, block: str) -> list[Row]:
-    """Return the rows of the fields of a dataclass. Values are written as on the command line."""
+    """Return the rows of the fields of a dataclass, with values as on the command line."""
     said = comments(inspect.getsource(of))
     rows = []
     for field in dataclasses.fields(of):
-        default = field.default
-        if field.default_factory is not dataclasses.MISSING:
-            default = field.default_factory()
-        meaning = re.sub(r"\b(None|True|False)\b", lambda word: {"None": "null"}.get(word[0], word[0].lower()), said[field.name])
+        default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+        meaning = re.sub(r"\b(None|True|False)\b", lambda found: IN_YAML[found[0]], said[field.name])
         rows.append(Row(f"{block}.{field.name}", str(field.type), yaml_value(default), meaning))
     return rows
 

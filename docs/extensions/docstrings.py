@@ -19,7 +19,7 @@ from sphinx.util.rst import escape
 
 
 def comments(source: str) -> dict[str, str]:
-    """Return the comments of the annotated names in the source of a class: on their lines, or else on the line above."""
+    """Return the comments of the annotated names of a class: on their lines, or else on the line above."""
     tokens = [
         token for token in tokenize.generate_tokens(io.StringIO(source).readline) if token.type == tokenize.COMMENT
     ]

@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from dataclasses import fields
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from framework.config import composition
 from framework.files.search_paths import CONF
 from framework.importing.formats import FORMATS
 from framework.registry import GROUPS
+from framework.tables.table_choice import TableChoice
 from tests.support.doc_pages import CHECKOUT, DOCS, PAGES
 
 pytestmark = pytest.mark.integration
@@ -131,6 +133,22 @@ def test_pages_load_no_external_resources(built: Path) -> None:
         asked = re.findall(r'<(?:script|link|img|iframe)\b[^>]*?(?:src|href)="(?:https?:)?//[^"]*"', page.read_text())
         assert not asked, page.name
     assert "<math" in (built / "method.html").read_text()
+
+
+@pytest.mark.parametrize(("command", "name"), [("edit", "guides/editing"), ("export", "exports")])
+def test_argument_table_has_options_of_help(built: Path, command: str, name: str) -> None:
+    words = [sys.executable, "-m", "framework", command, "--help"]
+    helped = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=60).stdout
+    options = set(re.findall(r"^  (--[a-z-]+)", helped, re.MULTILINE)) - {"--config-dir"}
+    assert len(options) > 4
+    page = re.sub(r"<[^>]+>", "", (built / f"{name}.html").read_text())
+    assert not [option for option in options if option not in page]
+
+
+def test_table_settings_are_documented(built: Path) -> None:
+    page = re.sub(r"<[^>]+>", "", (built / "guides" / "comparing_runs.html").read_text())
+    assert not [setting.name for setting in fields(TableChoice) if f"table.{setting.name}" not in page]
+    assert "KEYs of the pairs for comparisons" in page  # comment on the line above the field
 
 
 def test_project_files_are_pages_with_valid_links(built: Path) -> None:
