@@ -2,8 +2,9 @@
 
 Things are the instances of the map, and stuff is its floor, walls and ceiling. Each class of stuff is one segment. A
 predicted and a true segment of one class match if their IoU is above 0.5. Points of ground-truth instances that are not
-evaluated, and points without annotation, are void: they count for no segment. A predicted segment without a match is
-ignored if most of its points are void, or if its class was not annotated.
+evaluated, of true segments with less than MIN_POINTS points, and points without annotation, are void: they count for no
+segment. A predicted segment without a match is ignored if most of its points are void, or if its class was not
+annotated.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def evaluate_panoptic(predictions: PredictedInstances, truth: SceneTruth) -> Pan
 
     Args:
         predictions: The instances of the map, with structure.
-        truth: The ground truth, with structure. Instances with less than MIN_POINTS points are void.
+        truth: The ground truth, with structure.
     """
     if truth.structure is None or predictions.structure is None:
         return PanopticEvaluation({}, {})
@@ -89,7 +90,9 @@ def evaluate_panoptic(predictions: PredictedInstances, truth: SceneTruth) -> Pan
         truth.points_world,
         MAX_DISTANCE,
     )
-    return _matched(predicted, _segments(truth.instance_ids, truth.structure), known, true_classes)
+    true = _segments(truth.instance_ids, truth.structure)
+    small = [-kind for kind in STUFF if (true == -kind).sum() < MIN_POINTS]
+    return _matched(predicted, np.where(np.isin(true, small), np.int32(0), true), known, true_classes)
 
 
 def _segments(instance_ids: Int32, structure: UInt8) -> Int32:

@@ -11,9 +11,10 @@ from framework.config.validation import check_bounds
 from framework.data import Bool, Float64, Frame, Int32, PointClusters, Pose
 from framework.geometry import require_pixels_inside
 from framework.interfaces import MapFuser, StageTimer, untimed
-from framework.mapping.instances.association import Matches, OverlapRule, Overlaps, count_overlaps, observe, vote_stride
+from framework.mapping.instances.association import Matches, observe, vote_stride
 from framework.mapping.instances.instance_list import Confirmation
 from framework.mapping.instances.instance_table import InstanceRecord
+from framework.mapping.instances.overlaps import OverlapRule, Overlaps, count_overlaps
 from framework.mapping.labels.pixel_lists import list_points_by_pixel
 from framework.mapping.voxels.tsdf_volume import VoxelHashing
 

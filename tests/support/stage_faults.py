@@ -14,8 +14,9 @@ from framework.explanation.contributions import Stage
 from framework.explanation.observation import count_mask_pixels
 from framework.explanation.replay import Explanation, PipelineFactory, Replays
 from framework.interfaces import ClusterRefiner, Detector, PoseTracker, RGBDSequence, SceneMap
-from framework.mapping.instances.association import Association, Matches, Overlaps
+from framework.mapping.instances.association import Association, Matches
 from framework.mapping.instances.instance_table import InstanceTable
+from framework.mapping.instances.overlaps import Overlaps
 from framework.mapping.labels.pixel_lists import PixelLists
 from framework.pipeline import Pipeline
 from framework.refinement.refine import keep_points

@@ -4,9 +4,10 @@ Each pixel of a cluster votes for the instance of the map at this pixel. The ins
 the measured surface or in a ray-cast view. The ray-cast view is our interpretation of section 3.3 of the paper.
 
 A cluster and an instance can match if their overlap is large enough. By default, the overlap is relative to the smaller
-of the two, so that a part of an object matches the whole. Matching is one to one, in order of decreasing IoU. An
-unmatched cluster creates a new instance. Most instances of false detections stay tentative. They are removed after some
-time, so that their number does not grow in a known place.
+of the two, so that a part of an object matches the whole. Matching is one to one, in order of decreasing IoU. The
+learned association replaces overlap and IoU by the log-odds of a match. An unmatched cluster creates a new instance.
+Most instances of false detections stay tentative. They are removed after some time, so that their number does not grow
+in a known place.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import combinations
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -25,11 +27,11 @@ from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose, View, check_label_space
 from framework.detection.true_instances import true_objects
 from framework.errors import DataError
-from framework.mapping.instances.association_kernels import count_votes
 from framework.mapping.instances.instance_table import Condition, InstanceTable
+from framework.mapping.instances.learned_association import WEIGHTS, AssociationScorer, pairs_of
 from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed_space
+from framework.mapping.instances.overlaps import OverlapRule, Overlaps, count_overlaps
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
-from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
 VOTES_ACROSS = 320  # approximate number of voting pixels per image row; more take longer without improving the result
 CENTER_POINTS = 20_000  # approximate number of points of a frame for the centers of its clusters
@@ -42,69 +44,7 @@ class InstanceSource(Enum):
     SURFACE_LOOKUP = "voxels at the measured surface"
     RAYCAST = "object indices of the map, ray-cast from the pose of the frame"
     GROUND_TRUTH = "true object of each cluster, an upper bound of association accuracy"
-
-
-class OverlapRule(Enum):
-    """Denominator of the overlap of a cluster and an instance."""
-
-    SMALLER = "size of the smaller of cluster and instance, so that a part of an object matches the whole"
-    IOU = "number of pixels in the union of cluster and instance"
-    CLUSTER = "size of the cluster, so that a detected part of an object matches the whole; the reverse may fail"
-
-
-@dataclass(frozen=True)
-class Overlaps:
-    """Overlap of the N clusters of a frame with the M visible instances."""
-
-    instance_ids: Int32  # (M,) ascending
-    visible: Int32  # (M,) number of pixels of each visible instance
-    sizes: Int32  # (N,) number of pixels of each cluster
-    votes: Int32  # (N, M) number of pixels shared by a cluster and an instance
-    seen: Int32  # (h, w) instance at every stride-th pixel of every stride-th row, 0 = none
-    stride: int  # distance between the samples in `seen`, px
-
-    def by(self, rule: OverlapRule, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return the overlaps (N, M), in [0, 1], with the given denominator, which is at least `min_pixels`."""
-        if rule is OverlapRule.CLUSTER:
-            return np.asarray(self.votes / np.maximum(self.sizes[:, None], min_pixels))
-        return self.over_smaller(min_pixels) if rule is OverlapRule.SMALLER else self.over_union(min_pixels)
-
-    def over_union(self, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return the IoUs (N, M), with a union of at least `min_pixels`."""
-        union = self.sizes[:, None] + self.visible[None, :] - self.votes
-        return np.asarray(self.votes / np.maximum(union, min_pixels))
-
-    def over_smaller(self, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return the overlaps (N, M), relative to the smaller of cluster and visible instance.
-
-        The denominator is at least `min_pixels`. Otherwise, an instance with a few stray voxels inside a cluster could
-        match it instead of the correct instance.
-        """
-        return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), min_pixels)
-
-
-def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> Overlaps:
-    """Return the overlaps of clusters with the visible instances.
-
-    Args:
-        points: The lists of clusters at the pixels.
-        instance_ids: The instance (h, w) at every stride-th pixel of every stride-th row, 0 = none.
-        stride: The distance between the samples, px. Each sample counts as stride^2 pixels.
-    """
-    flat = instance_ids.ravel()
-    seen = np.unique(flat[np.flatnonzero(np.diff(flat, prepend=0))])  # only the starts of runs, for speed
-    seen = seen[seen > 0]
-    by_chunk = np.zeros((CHUNKS, points.cluster_count + 1, len(seen) + 1), np.int32)
-    count_votes(points, instance_ids, stride, seen, by_chunk)
-    votes = by_chunk.sum(axis=0, dtype=np.int32) * np.int32(stride**2)
-    return Overlaps(
-        instance_ids=seen,
-        visible=votes[-1, :-1],
-        sizes=votes[:-1].sum(axis=1, dtype=np.int32),
-        votes=votes[:-1, :-1],
-        seen=instance_ids,
-        stride=stride,
-    )
+    LEARNED = "voxels at the measured surface, matched by a network instead of the overlap"
 
 
 def class_agreement(clusters: Float32, instances: Float32) -> npt.NDArray[np.float64]:
@@ -244,8 +184,10 @@ class Association:
     """Association of clusters with instances, and merging of instances that are parts of one object."""
 
     # source of the instances that clusters are compared with: SURFACE_LOOKUP (voxels at the depth readings), RAYCAST
-    # (rendered view) or GROUND_TRUTH (true object of each cluster, an upper bound)
+    # (rendered view), GROUND_TRUTH (true object of each cluster, an upper bound) or LEARNED (voxels at the depth
+    # readings; a network replaces min_overlap and overlap_rule)
     association: InstanceSource = InstanceSource.SURFACE_LOOKUP
+    association_weights: Path = WEIGHTS  # weights file of the network of LEARNED
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # denominator of the overlap
     # minimum Bhattacharyya coefficient of the class distributions of a cluster and an instance to match, in [0, 1]; 0 =
@@ -283,6 +225,8 @@ class Association:
         )
         self._merge_votes: Counter[tuple[int, int]] = Counter()  # votes by pair of instances; see merge_frames
         self._max_pairs = MIN_PAIRS
+        is_learned = self.association is InstanceSource.LEARNED
+        self._scorer = AssociationScorer.load(self.association_weights) if is_learned else None  # None = overlap
         self._instance_of: dict[int, int] = {}  # instance by true object, for GROUND_TRUTH
         self.matches: Matches | None = None  # of the last frame; None = no frame
 
@@ -318,9 +262,14 @@ class Association:
         A cluster creates an instance only if it meets `create_score` and `create_points`.
         """
         frame_index = table.number_of(frame_index)
-        allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
+        if self._scorer is None:
+            allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
+            preference = overlaps.over_union(self.create_points)
+        else:
+            preference = self._scorer.scores(pairs_of(table, overlaps, clusters, frame_index), overlaps.votes.shape)
+            allowed = preference > 0
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
-        match = match_one_to_one(allowed, overlaps.over_union(self.create_points))
+        match = match_one_to_one(allowed, preference)
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
         may_create = (instance_ids == 0) & self._may_create(clusters, overlaps)
         if not self.split_instances:

@@ -1,4 +1,4 @@
-"""Kernels of association.py."""
+"""Kernels of association.py and overlaps.py."""
 
 from __future__ import annotations
 

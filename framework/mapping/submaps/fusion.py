@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from framework.data import Int32
-from framework.mapping.instances.association import OverlapRule, Overlaps, match_one_to_one
+from framework.mapping.instances.association import match_one_to_one
+from framework.mapping.instances.overlaps import OverlapRule, Overlaps
 from framework.mapping.submaps.fusion_kernels import count_shared, fuse_voxels
 from framework.mapping.submaps.layer import Layer
 from framework.mapping.voxels.voxel_grid import WEIGHT_ONE, VoxelGrid

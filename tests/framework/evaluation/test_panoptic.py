@@ -42,9 +42,10 @@ def reference(predictions: PredictedInstances, truth: SceneTruth, min_points: in
         if own or kind in (FLOOR, WALL, CEILING):
             segments[0][(names[own], own) if own else (Structure(kind).name.lower(), 0)].add(v)
     counts = np.bincount(truth.instance_ids)
+    of_stuff = np.bincount(truth.structure[truth.instance_ids == 0], minlength=5)
     for v, (own, kind) in enumerate(zip(truth.instance_ids.tolist(), truth.structure.tolist(), strict=True)):
         name = truth.class_names.get(own) if own else Structure(kind).name.lower() if kind else None
-        if name is not None and (own == 0 or counts[own] >= min_points):
+        if name is not None and (counts[own] if own else of_stuff[kind]) >= min_points:
             segments[1][name, own].add(v)
             void.discard(v)
     sums: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
@@ -106,3 +107,11 @@ def test_panoptic_counts_building_in_instances(monkeypatch: pytest.MonkeyPatch) 
         [1] * 6 + [0] * 8 + [1] * 2, [0] * 6 + [FLOOR] * 2 + [WALL] * 4 + [CEILING] * 2 + [0] * 2, ("chair",)
     )
     assert evaluate_panoptic(found, truth).metrics()["panoptic.building_in_instances"] == 2 / 8
+
+
+def test_panoptic_quality_ignores_small_stuff() -> None:
+    """A ceiling with 99 points is void, so that a predicted wall on these points is no error."""
+    structure = [FLOOR] * 100 + [WALL] * 100 + [CEILING] * 99
+    truth = true([0] * 299, structure, {})
+    found = evaluate_panoptic(predicted([0] * 299, [FLOOR] * 100 + [WALL] * 199, ()), truth)
+    assert {name: quality.pq for name, quality in found.stuff.items()} == {"floor": 1.0, "wall": 1.0}

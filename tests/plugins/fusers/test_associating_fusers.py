@@ -14,8 +14,9 @@ from framework.data import Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError
 from framework.interfaces import MapFuser
 from framework.mapping.instance_map import InstanceMap
-from framework.mapping.instances.association import MIN_PAIRS, Association, Matches, OverlapRule, Overlaps
+from framework.mapping.instances.association import MIN_PAIRS, Association, Matches
 from framework.mapping.instances.instance_table import InstanceTable
+from framework.mapping.instances.overlaps import OverlapRule, Overlaps
 from framework.mapping.labels.label_rule import floored_log
 from framework.refinement.lifting import lift
 from framework.registry import assemble

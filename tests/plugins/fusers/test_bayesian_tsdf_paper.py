@@ -9,7 +9,8 @@ import pytest
 from framework.data import Bool, Float64, Frame, Int32, PointClusters, Pose
 from framework.geometry import inverse
 from framework.mapping.instance_map import InstanceMap
-from framework.mapping.instances.association import InstanceSource, Matches, OverlapRule
+from framework.mapping.instances.association import InstanceSource, Matches
+from framework.mapping.instances.overlaps import OverlapRule
 from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.evidence_rows import Storage
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel

@@ -10,7 +10,7 @@ import pytest
 
 from framework.data import Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, MapFullError
-from framework.mapping.instances.association import OverlapRule
+from framework.mapping.instances.overlaps import OverlapRule
 from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.fusers.object_volumes import ObjectVolumes, existence

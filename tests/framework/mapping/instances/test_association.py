@@ -10,13 +10,8 @@ from hypothesis import strategies as st
 
 from framework.data import PointClusters
 from framework.errors import DataError
-from framework.mapping.instances.association import (
-    OverlapRule,
-    Overlaps,
-    class_agreement,
-    count_overlaps,
-    match_one_to_one,
-)
+from framework.mapping.instances.association import class_agreement, match_one_to_one
+from framework.mapping.instances.overlaps import OverlapRule, Overlaps, count_overlaps
 from framework.mapping.labels.pixel_lists import (
     PixelLists,
     keep_on_top,
