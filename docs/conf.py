@@ -19,6 +19,8 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
+    "extensions.api_names",
+    "extensions.arguments",
     "extensions.docstrings",
     "extensions.mathml",
     "extensions.options",

@@ -19,16 +19,17 @@ from sphinx.util.rst import escape
 
 
 def comments(source: str) -> dict[str, str]:
-    """Return the comments of the annotated names in the source of a class."""
-    said = {
-        token.start[0]: token.string.lstrip("#: ").strip()
-        for token in tokenize.generate_tokens(io.StringIO(source).readline)
-        if token.type == tokenize.COMMENT
-    }
+    """Return the comments of the annotated names of a class: on their lines, or else on the line above."""
+    tokens = [
+        token for token in tokenize.generate_tokens(io.StringIO(source).readline) if token.type == tokenize.COMMENT
+    ]
+    said = {token.start[0]: token.string.lstrip("#: ").strip() for token in tokens}
+    above = {token.start[0] + 1: said[token.start[0]] for token in tokens if token.line.lstrip().startswith("#")}
     [found] = ast.parse(source).body
     assert isinstance(found, ast.ClassDef)
     return {
         line.target.id: " ".join(said[k] for k in range(line.lineno, (line.end_lineno or line.lineno) + 1) if k in said)
+        or above.get(line.lineno, "")
         for line in found.body
         if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)
     }

@@ -1,4 +1,4 @@
-"""Configuration reference from the registry: directives `{options} detector`, `{settings} config` and `{commands}`.
+"""Directives of the configuration reference, such as `{options} detector` and `{overview} detector`.
 
 Names, types, defaults and comments come from the dataclasses and the YAML files, as in `instancemap plugins`.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
+from functools import cache
 from typing import NamedTuple
 
 import yaml
@@ -16,7 +17,17 @@ from sphinx.util.docutils import SphinxDirective
 
 from framework.__main__ import COMMANDS
 from framework.commands.installation.plugins import COMMENTED_KEY, Option, registered
+from framework.config.composition import composed
 from framework.files.search_paths import CONF
+from framework.importing.formats import FORMATS
+
+VARIANT = " Here: "  # precedes the difference of a variant from its class in `Option.documentation`
+
+
+@cache
+def options_of_stage(stage: str) -> list[Option]:
+    """Return the options of a stage. Two pages contain them."""
+    return registered(stage)
 
 
 class Row(NamedTuple):
@@ -35,16 +46,34 @@ class Options(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         stage = self.arguments[0]
-        return [self.option(option) for option in registered(stage)]
+        return [self.option(option) for option in options_of_stage(stage)]
 
     def option(self, option: Option) -> nodes.section:
-        section = nodes.section(ids=[f"{option.stage}-{option.name}".replace("_", "-")], names=[option.name])
+        section = nodes.section(ids=[_anchor(option)], names=[option.name])
         section += nodes.title("", "", nodes.literal("", f"{option.stage}={option.name}"))
         section += paragraph(option.documentation)
         section += nodes.paragraph("", "", nodes.literal("", option.target), classes=["target"])
         rows = [Row(f"{option.stage}.{it.name}", it.type, it.default, it.comment) for it in option.parameters]
         section += table(rows) if rows else paragraph("No parameters.")
         return section
+
+
+class Overview(SphinxDirective):
+    """Directive for a table of the options of a stage, with links to their parameters."""
+
+    required_arguments = 1  # the stage
+
+    def run(self) -> list[nodes.Node]:
+        stage = self.arguments[0]
+        page = self.env.app.builder.get_relative_uri(self.env.docname, f"configuration/{stage}")
+        rows = [self._row(option, page) for option in options_of_stage(stage)]
+        return [_table_of(("Option", "Description"), rows, (35, 65))]
+
+    def _row(self, option: Option, page: str) -> nodes.row:
+        name = nodes.literal("", f"{option.stage}={option.name}")
+        link = nodes.reference("", "", name, refuri=f"{page}#{_anchor(option)}", internal=True)
+        description = option.documentation.rpartition(VARIANT)[2]  # of a variant: its difference from the class
+        return nodes.row("", nodes.entry("", nodes.paragraph("", "", link)), nodes.entry("", paragraph(description)))
 
 
 class Settings(SphinxDirective):
@@ -61,14 +90,17 @@ class Settings(SphinxDirective):
 
 
 class Files(SphinxDirective):
-    """Directive for the choices of a config group without plugins, each with the first comment of its YAML."""
+    """Directive for the choices of a config group without plugins, with first comments and rows of experiments."""
 
     required_arguments = 1  # the group
 
     def run(self) -> list[nodes.Node]:
         group = self.arguments[0]
         return [
-            definitions((f"{group}={path.stem}", _head(path.read_text())) for path in sorted((CONF / group).iterdir()))
+            definitions(
+                (f"{group}={path.stem}", _head(path.read_text()) + _rows(group, path.stem))
+                for path in sorted((CONF / group).iterdir())
+            )
         ]
 
 
@@ -77,6 +109,13 @@ class Commands(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         return [definitions(COMMANDS.items())]
+
+
+class Recordings(SphinxDirective):
+    """Directive for the formats of `instancemap import`."""
+
+    def run(self) -> list[nodes.Node]:
+        return [definitions((kind.name, kind.needs) for kind in FORMATS)]
 
 
 def _head(text: str) -> str:
@@ -88,6 +127,13 @@ def _head(text: str) -> str:
             break
         head.append(line.removeprefix("#").strip())
     return " ".join(head)
+
+
+def _rows(group: str, name: str) -> str:
+    """Return a sentence with the rows of an experiment, or nothing for other groups."""
+    if group != "experiment":
+        return ""
+    return f" Rows: {', '.join(f'`{row}`' for row in composed(f'experiment={name}', 'row=any').rows)}."
 
 
 def _type(value: object) -> str:
@@ -123,11 +169,19 @@ def definitions(items: Iterable[tuple[str, str]]) -> nodes.definition_list:
 
 def table(rows: Iterable[Row]) -> nodes.table:
     """Return a table with one row per parameter: name, type and default on the left, description on the right."""
-    group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in (45, 55)), cols=2)
-    head = nodes.row("", *(nodes.entry("", paragraph(word)) for word in ("Parameter", "Meaning")))
-    group += nodes.thead("", head)
-    group += nodes.tbody("", *map(_row, rows))
+    return _table_of(("Parameter", "Meaning"), map(_row, rows), (45, 55))
+
+
+def _table_of(titles: tuple[str, str], rows: Iterable[nodes.row], widths: tuple[int, int]) -> nodes.table:
+    group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in widths), cols=2)
+    group += nodes.thead("", nodes.row("", *(nodes.entry("", paragraph(title)) for title in titles)))
+    group += nodes.tbody("", *rows)
     return nodes.table("", group, classes=["parameters"])
+
+
+def _anchor(option: Option) -> str:
+    """Return the id of the section of an option on the page of its stage."""
+    return f"{option.stage}-{option.name}".replace("_", "-")
 
 
 def _row(row: Row) -> nodes.row:
@@ -139,7 +193,9 @@ def _row(row: Row) -> nodes.row:
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the extension with Sphinx."""
     app.add_directive("options", Options)
+    app.add_directive("overview", Overview)
     app.add_directive("settings", Settings)
     app.add_directive("files", Files)
     app.add_directive("commands", Commands)
+    app.add_directive("recordings", Recordings)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -41,7 +41,8 @@ class FigureChoice:
     A KEY is a parameter such as dataset.scene, or a group of options such as dataset.
     """
 
-    kind: str = "maps"  # kind of the figure, one of KINDS
+    # kind: maps, stage_times, bar, box, tradeoff, curve, progress or class_heatmap
+    kind: str = "maps"
     sequences: str = "dataset.scene"  # config key of the sequence
     names: dict[str, str] = field(default_factory=dict)  # display names of rows, or of values of `by` and `color_by`
     zoom: bool = False  # True = add a close-up of the largest difference between the columns; only for `maps`

@@ -85,8 +85,8 @@ class VoxelHashingIcp(PoseTracker):
     """Coarse-to-fine ICP with color against a view of the map, as in VoxelHashing and ElasticFusion.
 
     The tracker detects lost poses. A pose is accepted if most points agree with the map. Near the predicted pose of a
-    steady motion, less agreement is sufficient. Because wrong poses can also agree with the map
-    (docs/guides/trackers.md), all other poses are compared with the pose from features, if there is one.
+    steady motion, less agreement is sufficient. Because wrong poses can also agree with the map, all other poses are
+    compared with the pose from features, if there is one.
 
     The prediction is the motion measured by odometry, if the frames have odometry, and otherwise constant velocity. A
     frame near the prediction of odometry may determine only a part of the motion. Odometry determines the rest.

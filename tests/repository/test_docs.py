@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from dataclasses import fields
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -20,8 +21,11 @@ import yaml
 import instancemap
 from framework import __version__
 from framework.commands.installation.plugins import registered
+from framework.config import composition
 from framework.files.search_paths import CONF
+from framework.importing.formats import FORMATS
 from framework.registry import GROUPS
+from framework.tables.table_choice import TableChoice
 from tests.support.doc_pages import CHECKOUT, DOCS, PAGES
 
 pytestmark = pytest.mark.integration
@@ -93,6 +97,22 @@ def test_configuration_reference_has_all_parameters(built: Path) -> None:
     assert "seed of all random numbers of a run" in (built / "configuration.html").read_text()
 
 
+def test_configuration_reference_has_all_experiment_rows(built: Path) -> None:
+    page = (built / "configuration.html").read_text()
+    experiments = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+    assert experiments
+    for name in experiments:
+        rows = composition.composed(f"experiment={name}", "row=any").rows
+        entry = page.partition(f">experiment={name}</span>")[2].partition("</dd>")[0]
+        assert rows
+        assert not [row for row in rows if f">{row}</span>" not in entry], name
+
+
+def test_own_data_page_has_all_recording_formats(built: Path) -> None:
+    page = (built / "tutorials" / "own_data.html").read_text()
+    assert not [kind.name for kind in FORMATS if f">{kind.name}</span>" not in page]
+
+
 OF_TUTORIALS = {"color_blobs", "nearby", "my_refiner", "nearest_points", "saturated_regions"}  # plugins of the reader
 
 
@@ -113,6 +133,22 @@ def test_pages_load_no_external_resources(built: Path) -> None:
         asked = re.findall(r'<(?:script|link|img|iframe)\b[^>]*?(?:src|href)="(?:https?:)?//[^"]*"', page.read_text())
         assert not asked, page.name
     assert "<math" in (built / "method.html").read_text()
+
+
+@pytest.mark.parametrize(("command", "name"), [("edit", "guides/editing"), ("export", "exports")])
+def test_argument_table_has_options_of_help(built: Path, command: str, name: str) -> None:
+    words = [sys.executable, "-m", "framework", command, "--help"]
+    helped = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=60).stdout
+    options = set(re.findall(r"^  (--[a-z-]+)", helped, re.MULTILINE)) - {"--config-dir"}
+    assert len(options) > 4
+    page = re.sub(r"<[^>]+>", "", (built / f"{name}.html").read_text())
+    assert not [option for option in options if option not in page]
+
+
+def test_table_settings_are_documented(built: Path) -> None:
+    page = re.sub(r"<[^>]+>", "", (built / "guides" / "comparing_runs.html").read_text())
+    assert not [setting.name for setting in fields(TableChoice) if f"table.{setting.name}" not in page]
+    assert "KEYs of the pairs for comparisons" in page  # comment on the line above the field
 
 
 def test_project_files_are_pages_with_valid_links(built: Path) -> None:

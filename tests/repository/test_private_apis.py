@@ -1,4 +1,4 @@
-"""Tests for the list of private APIs of Hydra and numba in docs/development.md."""
+"""Tests for the list of private APIs of Hydra and numba in CONTRIBUTING.md."""
 
 from __future__ import annotations
 
@@ -14,10 +14,7 @@ from framework.config import hydra_api
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SECTION = (
-    (CHECKOUT / "docs" / "development.md")
-    .read_text(encoding="utf-8")
-    .partition("## Private APIs")[2]
-    .partition("\n## ")[0]
+    (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("## Private APIs")[2].partition("\n## ")[0]
 )
 PRIVATE = re.compile(r"(hydra\._internal|hydra\.core\.singleton|hydra\.version|numba\.core)(\.|$)|(hydra|numba)\..*\b_")
 
@@ -39,7 +36,7 @@ def private_imports() -> dict[tuple[str, str], set[str]]:
     return found
 
 
-def test_private_imports_are_listed_in_development_notes() -> None:
+def test_private_imports_are_listed_in_contributing() -> None:
     rows = re.findall(r"(?m)^\| `([\w.]+)` \| ([^|]+) \|", SECTION)
     listed = {(module, name) for module, names in rows for name in re.findall(r"`(\w+)`", names)}
     assert listed == set(private_imports())

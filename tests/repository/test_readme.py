@@ -17,7 +17,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from framework.api import Map, load_map
+from framework.api import load_map
 from framework.config import composition
 from framework.config.text_values import literal
 from framework.data import Camera, Frame
@@ -29,7 +29,7 @@ from framework.registry import STAGES, build, text_kind
 from framework.runs.mesh_file import read_mesh
 from framework.testing.corner_room import exact_clusters, frame_at
 from tests.support import stored_experiments
-from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
+from tests.support.doc_pages import CHECKOUT, LINES, block, blocks
 from tests.support.recordings.phone_exports import room_frames, write_stray_scanner
 from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
@@ -50,15 +50,6 @@ def test_documented_loop_maps_sequence() -> None:
     exec(block("python", "for frame in sequence"), {"sequence": CornerRoom(), "lift": lift, **stages})
     assert len(fuser.scene.vertices) == 6
     assert set(fuser.scene.instances()) == {1, 2}
-
-
-def test_documented_python_example_maps_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {"frames": CornerRoom()}
-    exec(block("python", "for frame in frames:"), names)
-    scene = names["scene"]
-    assert isinstance(scene, Map)
-    assert len(scene.mesh().vertices) > 1000
 
 
 def test_documented_data_frame_has_means_of_rows(
@@ -262,13 +253,6 @@ def test_default_pipeline_runs_end_to_end(ran: Path) -> None:
     mesh = read_mesh(ran / "defaults" / "mesh.ply")
     assert len(mesh.vertices) > 1000
     assert load_map(ran / "defaults" / "map.npz").scene.statistics.voxels == metrics["map.voxels"] > 0
-
-
-@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
-def test_experiment_rows_are_documented(name: str) -> None:
-    rows = composition.composed(f"experiment={name}", "row=any").rows
-    assert rows
-    assert not [row for row in rows if not any(f"`{row}`" in page for page in PAGES.values())]
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)

@@ -1,4 +1,4 @@
-"""Commands and code in README.md and docs/, by language and without duplicates."""
+"""Commands and code in README.md, CONTRIBUTING.md and docs/, by language and without duplicates."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 CHECKOUT = Path(__file__).resolve().parents[2]
 DOCS = CHECKOUT / "docs"
 PAGES = {
-    str(path.relative_to(CHECKOUT)): path.read_text() for path in [CHECKOUT / "README.md", *sorted(DOCS.rglob("*.md"))]
+    str(path.relative_to(CHECKOUT)): path.read_text()
+    for path in [CHECKOUT / "README.md", CHECKOUT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 }
 """Text of each page by its path in the checkout."""
 

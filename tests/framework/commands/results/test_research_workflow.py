@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import shutil
 import subprocess
@@ -14,7 +13,7 @@ import pytest
 
 from instancemap import load_runs
 from tests.support import option_files
-from tests.support.doc_pages import PAGES, blocks
+from tests.support.doc_pages import blocks
 from tests.support.fresh_environment import CHECKOUT, OFFLINE, PIP, build_wheels, create_environment, run_in
 from tests.support.latex import log_of_paper, requires_pdflatex
 from tests.support.table_text import grids
@@ -22,6 +21,7 @@ from tests.support.table_text import grids
 pytestmark = pytest.mark.acceptance
 
 TUTORIAL = "docs/tutorials/research_project.md"
+PACKAGE = CHECKOUT / "examples" / "my-methods"
 EXPERIMENT = "outputs/nearest_points"
 DATASETS, DETECTORS = ("desk", "my_recording", "my_room"), ("maskrcnn2go", "saturated_regions")
 ROWS = ("identity", "nearest_points")
@@ -29,14 +29,10 @@ SMALL = ("dataset.stop=3", "tracker=ground_truth", "fuser.voxel_size=0.03", "fus
 
 
 def write_package(folder: Path, recording: Path) -> None:
-    """Write the package of the tutorial, with a recording in the folder `recording`."""
-    pattern = r"`(my_methods/[\w./]+|pyproject\.toml)`[^`]*(?:`conf`[^`]*)?```\w+\n(.*?)```"
-    files = dict(re.findall(pattern, PAGES[TUTORIAL], re.DOTALL))
-    assert len(files) == 7
-    for name, content in files.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(content.replace("RECORDING", str(recording)))
+    """Copy the package of the tutorial, with a recording in the folder `recording`."""
+    shutil.copytree(PACKAGE, folder, ignore=shutil.ignore_patterns("__pycache__"))
+    option = folder / "my_methods" / "conf" / "dataset" / "my_recording.yaml"
+    option.write_text(option.read_text().replace("RECORDING", str(recording)))
 
 
 def commands() -> list[list[str]]:
