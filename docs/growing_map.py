@@ -14,14 +14,13 @@ from tqdm import tqdm
 
 from framework.api import begin
 from framework.config.composition import composed
-from framework.data import Int32
+from framework.data import LIKELY, Int32
 from framework.interfaces import RGBDSequence
 from framework.registry import build
 from framework.rendering.lit_view import LitView
 from framework.rendering.palette import instance_colors
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import best_view
-from framework.runs.run_directory import LIKELY
 from framework.runtime.process_settings import Settings
 from framework.runtime.run_log import Journal
 

@@ -2,7 +2,8 @@
 
 The features of a pair describe the masks, the geometry, the classes and the time since the last detection. Each cluster
 attends to the instances that it overlaps with, and each instance to its clusters, so that a score depends on the
-competitors. The weights were trained on synthetic rooms with simulated detectors (framework/training/train_association.py).
+competitors. The weights were trained on synthetic rooms with simulated detectors (see
+framework/training/train_association.py).
 
 All sums have a fixed order without BLAS, so that the scores do not depend on the number of threads.
 """
