@@ -66,7 +66,13 @@ def metrics_of(directory: Path) -> dict[str, Any]:
 
 def scores(directory: Path) -> dict[str, float]:
     """Return the metrics of the instances, without calibration, because imported maps have no probabilities."""
-    calibrated = ("instances.ece.", "instances.brier.", "instances.auroc.", "instances.calibration_count.")
+    calibrated = (
+        "instances.likely.",
+        "instances.ece.",
+        "instances.brier.",
+        "instances.auroc.",
+        "instances.calibration_count.",
+    )
     metrics = metrics_of(directory)
     return {key: metrics[key] for key in metrics if key.startswith("instances.") and not key.startswith(calibrated)}
 
