@@ -20,14 +20,14 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from extensions.docstrings import comments
-from extensions.options import Row, paragraph, table, yaml_value
+from extensions.options import Row, paragraph, table, table_of, yaml_value
 from framework.__main__ import module_of
 
 IN_YAML = {"None": "null", "True": "true", "False": "false"}
 
 
 class BuiltParserError(Exception):
-    """Carries the parser of a command out of its `main`."""
+    """The parser of a command, raised to leave its `main`."""
 
     def __init__(self, parser: argparse.ArgumentParser) -> None:
         super().__init__(parser.prog)
@@ -74,10 +74,7 @@ class Arguments(SphinxDirective):
             nodes.row("", *(nodes.entry("", cell) for cell in (_literal(name), paragraph(text))))
             for name, text in argument_rows(self.arguments[0])
         ]
-        group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in (40, 60)), cols=2)
-        group += nodes.thead("", nodes.row("", *(nodes.entry("", paragraph(word)) for word in ("Argument", "Meaning"))))
-        group += nodes.tbody("", *rows)
-        return [nodes.table("", group, classes=["parameters"])]
+        return [table_of(("Argument", "Meaning"), rows, (40, 60))]
 
 
 class Fields(SphinxDirective):
@@ -92,11 +89,11 @@ class Fields(SphinxDirective):
 
 def field_rows(of: type, block: str) -> list[Row]:
     """Return the rows of the fields of a dataclass, with values as on the command line."""
-    said = comments(inspect.getsource(of))
+    meanings = comments(inspect.getsource(of))
     rows = []
     for field in dataclasses.fields(of):
         default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
-        meaning = re.sub(r"\b(None|True|False)\b", lambda found: IN_YAML[found[0]], said[field.name])
+        meaning = re.sub(r"\b(None|True|False)\b", lambda found: IN_YAML[found[0]], meanings[field.name])
         rows.append(Row(f"{block}.{field.name}", str(field.type), yaml_value(default), meaning))
     return rows
 

@@ -67,7 +67,7 @@ class Overview(SphinxDirective):
         stage = self.arguments[0]
         page = self.env.app.builder.get_relative_uri(self.env.docname, f"configuration/{stage}")
         rows = [self._row(option, page) for option in options_of_stage(stage)]
-        return [_table_of(("Option", "Description"), rows, (35, 65))]
+        return [table_of(("Option", "Description"), rows, (35, 65))]
 
     def _row(self, option: Option, page: str) -> nodes.row:
         name = nodes.literal("", f"{option.stage}={option.name}")
@@ -169,10 +169,11 @@ def definitions(items: Iterable[tuple[str, str]]) -> nodes.definition_list:
 
 def table(rows: Iterable[Row]) -> nodes.table:
     """Return a table with one row per parameter: name, type and default on the left, description on the right."""
-    return _table_of(("Parameter", "Meaning"), map(_row, rows), (45, 55))
+    return table_of(("Parameter", "Meaning"), map(_row, rows), (45, 55))
 
 
-def _table_of(titles: tuple[str, str], rows: Iterable[nodes.row], widths: tuple[int, int]) -> nodes.table:
+def table_of(titles: tuple[str, str], rows: Iterable[nodes.row], widths: tuple[int, int]) -> nodes.table:
+    """Return a table with two columns of the given relative widths."""
     group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in widths), cols=2)
     group += nodes.thead("", nodes.row("", *(nodes.entry("", paragraph(title)) for title in titles)))
     group += nodes.tbody("", *rows)

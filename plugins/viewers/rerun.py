@@ -19,7 +19,7 @@ from typing import Any
 from uuid import uuid4
 
 from framework.config.validation import check_bounds, check_package, require
-from framework.data import Detections, Frame, Pose
+from framework.data import LIKELY, Detections, Frame, Pose
 from framework.errors import ConfigError, in_one_line
 from framework.interfaces import SceneMap, SubmapChange, SubmapGraph, Viewer
 from framework.live_view.drawing_thread import DrawingThread
@@ -56,7 +56,7 @@ class RerunViewer(Viewer):
     stride: int = 2  # step between the logged pixels of an image, px, in [1, 16]
     jpeg_quality: int = 75  # JPEG quality of the images, in [1, 100]
     region_size: float = 1.0  # side of the cubic regions in which the mesh is updated, m, in [0.1, 1000]
-    min_probability: float = 0.5  # minimum probability that a displayed object exists, in [0, 1]
+    min_probability: float = LIKELY  # minimum probability that a displayed object exists, in [0, 1]
     min_score: float = 0.3  # minimum score of labeled detections, in [0, 1]
     # maximum viewer memory in the modes WINDOW and BROWSER, e.g. 2GB or 25% of system memory; the oldest data is
     # dropped first

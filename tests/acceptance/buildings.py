@@ -23,9 +23,10 @@ from framework.files.tum_trajectory import read_tum
 from framework.geometry import transform
 from framework.synthetic.buildings.building_sequence import SyntheticBuilding
 from framework.synthetic.walk import FRAME_RATE
-from tests.acceptance.changing_scenes import LIKELY, distances
+from tests.acceptance.changing_scenes import distances
 from tests.acceptance.runner import CHECKOUT
 
+MIN_CONFIDENCE = 0.5  # minimum confidence of a counted instance
 VIEW_STEP = 5  # frames between two views that determine the true instances
 APART = 0.05  # m, minimum distance of a vertex of a doubled surface from the true surface
 
@@ -66,7 +67,7 @@ class BuildingRun:
         scene = load_map(run / "map.npz").scene
         mesh = scene.mesh()
         true_ids = observed_labels(mesh.vertices, _views(sequence, indices, poses))
-        likely = {k for k, instance in scene.instances().items() if instance.confidence >= LIKELY}
+        likely = {k for k, instance in scene.instances().items() if instance.confidence >= MIN_CONFIDENCE}
         T_true_map = align(poses, np.array([sequence.tour.pose(k) for k in indices]))
         surfaces = sequence.building.surfaces
         apart = distances(

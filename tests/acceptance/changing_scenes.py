@@ -16,7 +16,7 @@ import open3d as o3d
 
 from framework.api import begin, load_map, open_dataset
 from framework.config.composition import composed
-from framework.data import Float32, Float64, Int32
+from framework.data import LIKELY, Float32, Float64, Int32
 from framework.evaluation.trajectory import evaluate
 from framework.runtime.corrected_frames import TrackedFrame
 from framework.synthetic.dynamics import Dynamics
@@ -26,7 +26,6 @@ from tests.acceptance.runner import CHECKOUT
 
 CLOSE = 0.02  # m, maximum distance of a vertex of the person
 APART = 0.02  # m, minimum distance of a vertex from all surfaces of the room, such as the floor under the person
-LIKELY = 0.5  # minimum probability of a likely instance
 ROOM = {"kind": RoomKind.STUDIO, "seed": 0}  # the defaults of dataset=synthetic
 PARTS = 10  # number of parts of a sequence whose trajectories are compared
 

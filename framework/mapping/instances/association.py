@@ -27,6 +27,7 @@ from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose, View, check_label_space
 from framework.detection.true_instances import true_objects
 from framework.errors import DataError
+from framework.mapping.instances.cluster_shapes import cluster_centers
 from framework.mapping.instances.instance_table import Condition, InstanceTable
 from framework.mapping.instances.learned_association import WEIGHTS, AssociationScorer, pairs_of
 from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed_space
@@ -34,7 +35,6 @@ from framework.mapping.instances.overlaps import OverlapRule, Overlaps, count_ov
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 
 VOTES_ACROSS = 320  # approximate number of voting pixels per image row; more take longer without improving the result
-CENTER_POINTS = 20_000  # approximate number of points of a frame for the centers of its clusters
 MIN_PAIRS = 1024  # number of pairs with votes up to which those of removed instances are kept
 
 
@@ -156,16 +156,6 @@ def _observe_views(table: InstanceTable, matches: Matches, in_view: Set[int], mi
     camera = tuple(matches.camera_center.tolist())
     for k in in_view:
         table.records[k].viewing.see(camera)
-
-
-def cluster_centers(clusters: PointClusters) -> Float64:
-    """Return the mean (N, 3) of a sample of the points of each cluster, m. It is NaN for clusters without points."""
-    step = max(1, len(clusters.points_world) // CENTER_POINTS)
-    points, cluster = clusters.points_world[::step].astype(np.float64), clusters.cluster[::step]
-    points, cluster = points[cluster >= 0], cluster[cluster >= 0]
-    count = np.bincount(cluster, minlength=len(clusters))
-    sums = np.stack([np.bincount(cluster, points[:, axis], len(clusters)) for axis in range(3)], axis=1)
-    return np.asarray(sums / np.where(count, count, np.nan)[:, None])
 
 
 def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding]:

@@ -22,6 +22,7 @@ from safetensors.numpy import load_file
 from framework.data import Float64, Int64, PointClusters
 from framework.errors import DataError, in_one_line
 from framework.files.search_paths import candidates
+from framework.mapping.instances.cluster_shapes import cluster_shapes
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.instances.overlaps import Overlaps
 
@@ -104,7 +105,7 @@ def pairs_of(table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, 
     columns = [
         on_instance[n, m],
         on_cluster[n, m],
-        votes[n, m] / np.maximum(overlaps.sizes[n] + overlaps.visible[m] - votes[n, m], 1),
+        overlaps.over_union(1)[n, m],
         _largest_other(on_instance, n, m),
         _largest_other(on_cluster.T, m, n),
         1 - on_instance.sum(axis=1)[n],
@@ -133,26 +134,6 @@ def _largest_other(values: Float64, row: Int64, column: Int64) -> Float64:
     first = order[row, 0]
     second = values[row, order[row, 1]] if values.shape[1] > 1 else np.zeros(len(row))
     return np.asarray(np.where(first == column, second, values[row, first]))
-
-
-def cluster_shapes(clusters: PointClusters, sample: int = 20_000) -> tuple[Float64, Float64]:
-    """Return the centers (N, 3) and the root mean squared distances (N,) of the points of each cluster to them, m.
-
-    Both are NaN for clusters without points.
-
-    Args:
-        clusters: The clusters.
-        sample: The approximate number of points of the frame that are used.
-    """
-    step = max(1, len(clusters.points_world) // sample)
-    points, cluster = clusters.points_world[::step].astype(np.float64), clusters.cluster[::step]
-    points, cluster = points[cluster >= 0], cluster[cluster >= 0]
-    count = np.bincount(cluster, minlength=len(clusters)).astype(np.float64)
-    count[count == 0] = np.nan
-    sums = [np.bincount(cluster, points[:, axis], len(clusters)) for axis in range(3)]
-    centers = np.stack(sums, axis=1) / count[:, None]
-    squares = np.bincount(cluster, np.square(points - centers[cluster]).sum(axis=1), len(clusters))
-    return centers, np.sqrt(squares / count)
 
 
 @dataclass(frozen=True)
