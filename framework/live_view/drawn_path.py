@@ -55,10 +55,10 @@ class DrawnPath:
                 self._changed |= {k, min(k + 1, len(self._pieces) - 1)}  # the next one may begin at the last position
         self._next_submap = change.submap
 
-    def position(self, frame: int) -> Float64:
-        """Return the camera position (3,) of a frame, m."""
-        piece = next(one for one in self._pieces if frame in one.frames)
-        return piece.positions[piece.frames.index(frame)]
+    def position(self, frame: int) -> Float64 | None:
+        """Return the camera position (3,) of a frame, m, or None if the frame has not been added."""
+        piece = next((one for one in self._pieces if frame in one.frames), None)
+        return None if piece is None else piece.positions[piece.frames.index(frame)]
 
     def changed(self) -> Iterator[tuple[int, Float32]]:
         """Yield the number and the line (P, 3), m, of each piece that has changed since the last call."""

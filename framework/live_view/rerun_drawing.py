@@ -153,14 +153,20 @@ class RerunDrawing:
             self._loops = note.graph.loops
 
     def _draw_path(self) -> None:
-        """Draw the changed pieces of the path, and a line between the two camera positions of each loop."""
+        """Draw the changed pieces of the path, and a line between the two camera positions of each loop.
+
+        A correction is noted before its frame. Its loops are therefore drawn again until the path contains this frame.
+        """
         for k, line in self._path.changed():
             strip = self._rr.LineStrips3D([line], colors=PATH_COLOR, radii=PATH_RADIUS)
             self._recording.log(f"{at.PATH}/{k}", strip)
         if self._loops is not None:
-            ends = [[self._path.position(k) for k in (loop.earlier_frame, loop.frame)] for loop in self._loops]
-            self._recording.log(at.LOOPS, self._rr.LineStrips3D(ends, colors=LOOP_COLOR, radii=LOOP_RADIUS))
-            self._loops = None
+            ends = [(self._path.position(loop.earlier_frame), self._path.position(loop.frame)) for loop in self._loops]
+            known = [[start, end] for start, end in ends if start is not None and end is not None]
+            self._recording.log(at.LOOPS, self._rr.LineStrips3D(known, colors=LOOP_COLOR, radii=LOOP_RADIUS))
+            newest = max((loop.frame for loop in self._loops), default=None)
+            if newest is None or self._path.position(newest) is not None:
+                self._loops = None
 
     def _draw_times(self, notes: Sequence[FrameNote]) -> None:
         if notes:

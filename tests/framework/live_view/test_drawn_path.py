@@ -69,3 +69,10 @@ def test_drawn_path_is_interrupted_and_continued() -> None:
     path.interrupt()
     path.add(PIECE + 2, 0 * UP)
     assert lines(path) == {0: list(range(PIECE)), 1: [PIECE - 1, PIECE], 2: [0]}
+
+
+def test_drawn_path_position_of_missing_frame_is_none() -> None:
+    path = DrawnPath()
+    path.add(3, np.array([1.0, 2.0, 3.0]))
+    assert path.position(4) is None
+    np.testing.assert_array_equal(path.position(3), [1.0, 2.0, 3.0])
