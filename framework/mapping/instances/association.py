@@ -5,7 +5,9 @@ the measured surface or in a ray-cast view. The ray-cast view is our interpretat
 
 A cluster and an instance can match if their overlap is large enough. By default, the overlap is relative to the smaller
 of the two, so that a part of an object matches the whole. Matching is one to one, in order of decreasing IoU. The
-learned association replaces overlap and IoU by the log-odds of a match. An unmatched cluster creates a new instance.
+learned association replaces overlap and IoU by the log-odds of a match. A cluster with a low score matches a smaller
+instance only if their IoU is high: otherwise, the mask of a table could turn the keyboard on it into a table. An
+unmatched cluster creates a new instance.
 Most instances of false detections stay tentative. They are removed after some time, so that their number does not grow
 in a known place.
 """
@@ -175,7 +177,7 @@ class Association:
 
     # source of the instances that clusters are compared with: SURFACE_LOOKUP (voxels at the depth readings), RAYCAST
     # (rendered view), GROUND_TRUTH (true object of each cluster, an upper bound) or LEARNED (voxels at the depth
-    # readings; a network replaces min_overlap and overlap_rule)
+    # readings; a network replaces min_overlap, overlap_rule and extend_iou)
     association: InstanceSource = InstanceSource.SURFACE_LOOKUP
     association_weights: Path = WEIGHTS  # weights file of the network of LEARNED
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
@@ -183,7 +185,10 @@ class Association:
     # minimum Bhattacharyya coefficient of the class distributions of a cluster and an instance to match, in [0, 1]; 0 =
     # any classes match
     min_class_agreement: float = 0.0
-    create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; no minimum for updates
+    create_score: float = 0.2  # minimum score of a detection to create an instance, in [0, 1]; no minimum for updates
+    # minimum score of a detection to match a smaller instance without a minimum IoU, in [0, 1]; 0 = no minimum
+    extend_score: float = 0.3
+    extend_iou: float = 0.5  # minimum IoU of a detection below extend_score and a smaller instance to match, in [0, 1]
     # minimum number of points of a cluster to create an instance, >= 1; also the minimum denominator of the overlap
     create_points: int = 50
     # True = create an instance for the second of two clusters that match the same instance; False = ignore the second
@@ -207,6 +212,8 @@ class Association:
             min_overlap=(0.0, 1.0),
             min_class_agreement=(0.0, 1.0),
             create_score=(0.0, 1.0),
+            extend_score=(0.0, 1.0),
+            extend_iou=(0.0, 1.0),
             create_points=(1, 2**31),
             merge_overlap=(0.0, 1.0),
             merge_frames=(1, 2**31),
@@ -255,6 +262,7 @@ class Association:
         if self._scorer is None:
             allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
             preference = overlaps.over_union(self.create_points)
+            allowed &= ~self._extends(clusters, overlaps) | (preference > self.extend_iou)
         else:
             preference = self._scorer.scores(pairs_of(table, overlaps, clusters, frame_index), overlaps.votes.shape)
             allowed = preference > 0
@@ -295,6 +303,11 @@ class Association:
     def _may_create(self, clusters: PointClusters, overlaps: Overlaps) -> Bool:
         """Return a Boolean array (N,), True for clusters that may create an instance."""
         return np.asarray((clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points))
+
+    def _extends(self, clusters: PointClusters, overlaps: Overlaps) -> Bool:
+        """Return a Boolean array (N, M), True where a cluster with a low score would extend an instance."""
+        larger = overlaps.sizes[:, None] > overlaps.visible[None, :]
+        return np.asarray(larger & (clusters.scores < self.extend_score)[:, None])
 
     def _agree(self, table: InstanceTable, clusters: PointClusters, instance_ids: Int32) -> Bool:
         """Return a Boolean array (N, M), True where the class distributions allow a match."""

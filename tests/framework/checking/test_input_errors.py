@@ -93,7 +93,7 @@ def test_check_of_normalized_depth_names_it_alone(tmp_path: Path, kind: str) -> 
     assert finding.text.startswith("normalized frame by frame")
 
 
-@pytest.mark.parametrize("scale", [1000, 5000, 13107, 256, 4000])
+@pytest.mark.parametrize("scale", [1000, 13107, 256])
 def test_check_of_clipped_depth_in_fixed_unit_is_not_normalized(tmp_path: Path, scale: int) -> None:
     """Depth beyond the range of uint16 is clipped to 65535 or removed."""
     place = desk(tmp_path / "room")
@@ -265,9 +265,7 @@ def test_check_of_single_repeated_frame_is_uncertain(tmp_path: Path) -> None:
 # Timestamps
 
 
-@pytest.mark.parametrize(
-    ("unit", "start"), [(1e-9, 1305031102.0), (1e-3, 1305031102.0), (1e-6, 0.0), (1e-9, 0.0), (1e-3, 5.0)]
-)
+@pytest.mark.parametrize(("unit", "start"), [(1e-9, 1305031102.0), (1e-6, 0.0), (1e-3, 5.0)])
 def test_check_of_times_in_other_unit_names_setting(tmp_path: Path, unit: float, start: float) -> None:
     place = desk(tmp_path / "room")
     lines = [line.split(maxsplit=1) for line in (place / "poses.txt").read_text().splitlines()]
@@ -313,8 +311,6 @@ def replica(place: Path, pose: Callable[[Float64], Float64]) -> ReplicaNiceSlam:
     ("flips", "side", "mirrored"),
     [
         ((1, -1, 1), "world", "WORLD"),
-        ((-1, 1, 1), "world", "WORLD"),
-        ((1, 1, -1), "world", "WORLD"),
         ((-1, -1, -1), "world", "WORLD"),
         ((1, -1, 1), "camera", "CAMERA"),
     ],

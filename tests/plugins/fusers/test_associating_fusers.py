@@ -50,12 +50,44 @@ def test_fuser_instance_ids_do_not_depend_on_detection_order(new_fuser: NewFuser
 def test_fuser_weak_detection_creates_no_instance(new_fuser: NewFuser, frames: list[Frame]) -> None:
     fuser = new_fuser()
     first, second, _ = masks_of(frames[0])
-    fuse_masks(fuser, frames[0], [first, second], [0.9, 0.2])
+    fuse_masks(fuser, frames[0], [first, second], [0.9, 0.1])
     assert len(fuser.scene.table.records) == 1
-    fuse_masks(fuser, frames[1], masks_of(frames[1])[:2], [0.2, 0.2])
+    fuse_masks(fuser, frames[1], masks_of(frames[1])[:2], [0.1, 0.1])
     [record] = fuser.scene.table.records.values()
     assert record.observations == 2
-    assert record.score_sum == pytest.approx(1.1)
+    assert record.score_sum == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("part", "score", "parameters", "matches"),
+    [
+        (0.3, 0.29, {}, False),
+        (0.3, 0.3, {}, True),
+        (0.3, 0.29, {"extend_score": 0.0}, True),
+        (0.3, 0.29, {"extend_iou": 0.2}, True),
+        (0.7, 0.29, {}, True),  # the IoU is above 0.5
+    ],
+)
+def test_fuser_weak_detection_does_not_extend_smaller_instance(
+    new_fuser: NewFuser, frames: list[Frame], part: float, score: float, parameters: dict[str, float], matches: bool
+) -> None:
+    """First, a part of the object is detected, and then the whole object with a low score."""
+    fuser = new_fuser(create_score=0.2, **parameters)
+    whole = masks_of(frames[0])[0]
+    first = whole & (np.arange(CAMERA.width) < np.quantile(np.nonzero(whole)[1], part))
+    fuse_masks(fuser, frames[0], [first], [0.9])
+    fuse_masks(fuser, dataclasses.replace(frames[0], index=1), [whole], [score])
+    assert (len(fuser.scene.table.records) == 1) == matches
+
+
+def test_fuser_weak_detection_matches_larger_instance(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    fuser = new_fuser()
+    whole = masks_of(frames[0])[0]
+    part = whole & (np.arange(CAMERA.width) < np.quantile(np.nonzero(whole)[1], 0.3))
+    fuse_masks(fuser, frames[0], [whole], [0.9])
+    fuse_masks(fuser, dataclasses.replace(frames[0], index=1), [part], [0.2])
+    [record] = fuser.scene.table.records.values()
+    assert record.observations == 2
 
 
 @pytest.mark.parametrize(
@@ -308,6 +340,8 @@ def test_fuser_min_area_does_not_depend_on_voxel_size(new_fuser: NewFuser, voxel
         {"max_depth": 0.1},
         {"label_band": 9.0},
         {"min_overlap": 1.5},
+        {"extend_score": 1.1},
+        {"extend_iou": -0.1},
         {"min_class_agreement": -0.1},
         {"merge_frames": 0},
         {"merge_agreement": 1.1},
