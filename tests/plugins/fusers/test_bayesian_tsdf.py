@@ -59,12 +59,12 @@ def test_bayesian_tsdf_map_does_not_depend_on_thread_count(frames: list[Frame]) 
 def test_bayesian_tsdf_only_created_instances_allocate_rows(frames: list[Frame]) -> None:
     fuser = new_fuser()
     first, second, _ = masks_of(frames[0])
-    fuse_masks(fuser, frames[0], [second], [0.2])
+    fuse_masks(fuser, frames[0], [second], [0.1])
     assert fuser.scene.labels.row_count == 0
     fuse_masks(fuser, frames[0], [first], [0.9])
     alone = fuser.scene.labels.row_count
     assert alone > 0
-    fuse_masks(fuser, frames[0], [first, second], [0.9, 0.2])
+    fuse_masks(fuser, frames[0], [first, second], [0.9, 0.1])
     assert fuser.scene.labels.row_count == alone
 
 
