@@ -6,10 +6,9 @@ the measured surface or in a ray-cast view. The ray-cast view is our interpretat
 A cluster and an instance can match if their overlap is large enough. By default, the overlap is relative to the smaller
 of the two, so that a part of an object matches the whole. Matching is one to one, in order of decreasing IoU. The
 learned association replaces overlap and IoU by the log-odds of a match. A cluster with a low score matches a smaller
-instance only if their IoU is high: otherwise, the mask of a table could turn the keyboard on it into a table. An
-unmatched cluster creates a new instance.
-Most instances of false detections stay tentative. They are removed after some time, so that their number does not grow
-in a known place.
+instance only if their IoU is high. Otherwise, a keyboard could absorb the table under it. An unmatched cluster creates
+a new instance. Most instances of false detections stay tentative. They are removed after some time, so that their
+number does not grow in a known place.
 """
 
 from __future__ import annotations
