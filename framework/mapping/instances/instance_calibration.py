@@ -48,9 +48,9 @@ class InstanceCalibration:
     detectors without a calibration of their own.
     """
 
-    exists: tuple[float, ...] = (-0.598, 1.517, 0.438)  # constant and weights of `existence_terms`
-    class_probability: tuple[float, ...] = (-0.119, 0.919, 0.591)  # constant and weights of `class_terms`
-    expected_iou: tuple[float, ...] = (0.684, 0.036)  # constant and weights of `iou_terms`
+    exists: tuple[float, ...] = (-0.383, 1.433, 0.427)  # constant and weights of `existence_terms`
+    class_probability: tuple[float, ...] = (-0.185, 0.937, 0.559)  # constant and weights of `class_terms`
+    expected_iou: tuple[float, ...] = (0.684, 0.041)  # constant and weights of `iou_terms`
 
     def __post_init__(self) -> None:
         for name, count in (("exists", 3), ("class_probability", 3), ("expected_iou", 2)):
