@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import (
+    LIKELY,
+    Bool,
     Camera,
     Float32,
     Float64,
@@ -309,12 +311,10 @@ class InstanceMap(InstanceTableMap):
         changed[self.labels.blocks_with(relabeled)] = True
         self._merged = set()
         labels = self.vertex_labels.update(grid, self.labels.evidence, counts, surface, starts, changed)
-        best_classes = self._best_classes()
         if self.crf.crf_weight > 0:
-            labels = self.crf.smoothed(grid, self.labels.evidence, counts, surface, labels, best_classes)
+            labels = self.crf.smoothed(grid, self.labels.evidence, counts, surface, labels, self._best_classes())
         planes = self._structure.of(surface, self.volume.gravity().up)
-        flat = np.array([k >= 0 and is_flat(self.classes[k]) for k in best_classes], np.bool_)
-        instance_ids = separate_instances(labels.instance_ids, planes, flat)
+        instance_ids = separate_instances(labels.instance_ids, planes, self._flat())
         too_small = self.confirmation.too_small(instance_ids, self.volume.voxel_size)
         instance_ids = np.where(too_small, np.int32(0), instance_ids)
         class_ids = np.where(instance_ids == labels.instance_ids, labels.class_ids, np.int32(-1))
@@ -330,6 +330,16 @@ class InstanceMap(InstanceTableMap):
         for k, (class_id, _) in self.most_likely_classes().items():
             best[k] = class_id
         return best
+
+    def _flat(self) -> Bool:
+        """Return a Boolean array, True for the ids of likely instances that can be in the plane of a floor or a wall.
+
+        Detectors often take an empty wall for a piece of furniture, with a low score.
+        """
+        flat = np.zeros(self.table.last_id + 1, np.bool_)
+        for k, (class_id, exists) in self.most_likely_classes().items():
+            flat[k] = exists >= LIKELY and is_flat(self.classes[class_id])
+        return flat
 
     def gravity(self) -> Gravity:
         return self.whole().volume.gravity()

@@ -123,7 +123,7 @@ def separate_instances(instance_ids: Int32, structure: SurfaceStructure, flat: B
     Args:
         instance_ids: The instance (V,) of each vertex, 0 = none.
         structure: The structure of the vertices.
-        flat: A Boolean array, True for the ids of instances that can be in the plane of a floor or a wall.
+        flat: A Boolean array, True for the ids of likely instances that can be in the plane of a floor or a wall.
     """
     on_structure = is_building(structure.of_vertices)
     shape = len(flat), len(structure.kinds)

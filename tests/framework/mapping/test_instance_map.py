@@ -280,3 +280,22 @@ def test_instance_map_without_frames_has_empty_mesh(tmp_path: Path) -> None:
     assert len(scene.instances()) == 0
     scene.save(tmp_path / "map.npz")
     assert InstanceMap.load(tmp_path / "map.npz").statistics.voxels == 0
+
+
+@pytest.mark.parametrize(("score", "keeps"), [(0.9, True), (0.15, False)])
+def test_instance_map_wall_keeps_only_likely_flat_instance(score: float, keeps: bool) -> None:
+    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0, create_score=0.1)
+    for k, T in enumerate(walk(8)):
+        frame = room().frame(T, k)
+        wall = room().render(frame.camera, T)[2] == 1
+        flat = Detections(
+            wall[None],
+            np.zeros((1, 4), np.float32),
+            np.array([score], np.float32),
+            np.ones((1, 1), np.float32),
+            ("refrigerator",),
+        )
+        fuser.fuse(frame, Pose(T), lift(flat, frame, Pose(T)))
+    mesh = fuser.scene.mesh()
+    assert len(fuser.scene.instance_ids()) == 1
+    assert (mesh.instance_ids > 0).any() == keeps
