@@ -157,11 +157,6 @@ class InstancePoints:
     lifted: Counter[int]  # number of points on the object of the cluster before refinement, by true object
     visible: Counter[int]  # number of readings on the object of the cluster in these frames, by true object
 
-    @property
-    def main_object(self) -> int:
-        """The object with most of the points, 0 = no object."""
-        return max(self.points, key=lambda key: (self.points[key], -key), default=0)
-
 
 def instance_points(instance_id: int, frames: Sequence[FrameObservation], merged: Mapping[int, int]) -> InstancePoints:
     """Return the clusters that were matched with an instance, or with an instance that was merged into it."""
