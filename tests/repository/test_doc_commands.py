@@ -61,8 +61,8 @@ def test_documented_commands_and_scripts_are_all_tested() -> None:
     looked_at |= {
         "pip install .",
         *(
-            line for line in LINES if re.match("python docs/results/(ranks|steps).py ", line)
-        ),  # test_ranks.py, test_steps.py
+            line for line in LINES if re.match("python docs/(results/(ranks|steps)|gallery/picture).py ", line)
+        ),  # test_ranks.py, test_steps.py, test_gallery.py
         *(line for line in LINES if (name := re.match(r"python -m (tests\.[\w.]+)", line)) and find_spec(name[1])),
         *(line for line in LINES if line.startswith("docker ") and f"#   {line}\n" in shown_in),
     }
