@@ -1,6 +1,7 @@
 """Draw scenes, images and reports in one picture: python docs/gallery/picture.py PICTURE SOURCE ...
 
-A SOURCE is an exported scene (.glb, .usdc), an image (.png), or a report (.html). `run.html#section` is one section.
+A SOURCE is an exported scene (.glb, .usdc), an image (.png), or a report (.html). `report.html#section` is one section.
+Reports need Chromium and Playwright (pip install --group test).
 """
 
 from __future__ import annotations
