@@ -19,6 +19,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
+    "extensions.alt_texts",
     "extensions.api_names",
     "extensions.arguments",
     "extensions.docstrings",
