@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -31,6 +32,7 @@ exclude_patterns = ["extensions", "_build"]
 
 html_theme = "furo"
 html_title = f"InstanceMap {release}"
+html_baseurl = os.environ.get("READTHEDOCS_CANONICAL_URL", "")  # of the default version, for search engines
 html_static_path = ["static"]
 html_css_files = ["pages.css"]
 html_math_renderer = "mathml"
