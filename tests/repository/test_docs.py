@@ -213,6 +213,7 @@ def test_citation_file_has_required_keys() -> None:
     citation = yaml.safe_load((CHECKOUT / "CITATION.cff").read_text())
     assert citation["cff-version"] == "1.2.0"
     assert str(citation["version"]) == __version__
+    assert f"\n## {__version__} - {citation['date-released']}\n" in (CHECKOUT / "CHANGELOG.md").read_text()
     assert {"message", "title", "authors"} <= set(citation)
     for work in [citation, *citation["references"]]:
         assert {"title", "type", "authors"} <= set(work)
