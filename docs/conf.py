@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -19,6 +20,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
+    "extensions.alt_texts",
     "extensions.api_names",
     "extensions.arguments",
     "extensions.docstrings",
@@ -30,6 +32,7 @@ exclude_patterns = ["extensions", "_build"]
 
 html_theme = "furo"
 html_title = f"InstanceMap {release}"
+html_baseurl = os.environ.get("READTHEDOCS_CANONICAL_URL", "")  # of the default version, for search engines
 html_static_path = ["static"]
 html_css_files = ["pages.css"]
 html_math_renderer = "mathml"

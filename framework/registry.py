@@ -25,7 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from framework.config.composition import config_loader, running_loader
 from framework.config.hydra_api import CachingConfigRepository, create_defaults_list
-from framework.config.renamed_keys import rename_hint
+from framework.config.renamed_keys import rename_hint, replace_deprecated
 from framework.config.text_values import TextKind
 from framework.config.validation import values_of, without_interpolation
 from framework.errors import ConfigError, InstanceMapError, first_line
@@ -357,20 +357,22 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
             f"list[str], got {found}"
         ) from error
     plugins: dict[str, Any] = {}
-    for key in map(str, node):
-        if key == "_target_" or OmegaConf.is_missing(node, key):
+    stage = where.split()[0]
+    for given in map(str, node):
+        if given == "_target_" or OmegaConf.is_missing(node, given):
             continue
+        key = given if given in fields else replace_deprecated(f"{stage}.{given}").removeprefix(f"{stage}.")
         if key not in fields:
-            hint = rename_hint(f"{where.split()[0]}.{key}")
+            hint = rename_hint(f"{stage}.{key}")
             suggestion = f"; {hint}" if hint else _did_you_mean(key, list(fields))
             names = f"one of {', '.join(fields)}" if fields else "no parameters"
             expected = "a known parameter" if suggestion else names
             raise ConfigError(f"{where}: expected {expected}, got {key!r}{suggestion}")
         if key in stages:
-            plugins[key] = _inner(f"{where}: {key}", stages[key], node[key], holds_one(plugin_class, key))
+            plugins[key] = _inner(f"{where}: {key}", stages[key], node[given], holds_one(plugin_class, key))
             continue
         try:
-            value = node[key]
+            value = node[given]
         except OmegaConfBaseException as error:  # interpolation of a missing key
             reason = first_line(error)
             raise ConfigError(f"{where}: {key}: expected a valid reference, got an error ({reason})") from error

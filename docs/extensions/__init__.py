@@ -1,1 +1,1 @@
-"""Sphinx extensions: reference pages generated from the code, and formulas without network access."""
+"""Sphinx extensions: reference pages generated from the code, formulas without network access, and checks of pages."""

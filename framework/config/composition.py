@@ -23,7 +23,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
 from framework.config import hydra_api
-from framework.config.renamed_keys import rename_hint
+from framework.config.renamed_keys import rename_hint, replace_in_overrides
 from framework.errors import ConfigError, DataError, printable
 from framework.files.atomic_write import read_text
 from framework.files.search_paths import CONF
@@ -48,7 +48,7 @@ def composed_with_choices(*overrides: str) -> tuple[DictConfig, dict[str, str | 
         ConfigError: A name is unknown or a value is invalid.
     """
     with config_errors(), config_loader() as loader:
-        config = loader.load_configuration("config", [*overrides], RunMode.RUN, from_shell=False)
+        config = loader.load_configuration("config", replace_in_overrides(overrides), RunMode.RUN, from_shell=False)
         choices = {str(group): option for group, option in config.hydra.runtime.choices.items()}
         with open_dict(config):
             del config["hydra"]

@@ -1,6 +1,17 @@
-"""Config keys renamed before 0.1.0, for error messages with the new key."""
+"""Renamed config keys: deprecated names, which still work for one minor version, and removed names."""
 
 from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+log = logging.getLogger(__name__)
+
+DEPRECATED: dict[str, str] = {}
+"""New name of each key renamed since the previous minor version, in the same group. Move it to RENAMED afterward."""
 
 RENAMED = {
     "ahead": "prefetch",
@@ -63,13 +74,50 @@ RENAMED = {
     "viewer.mesh_every": "viewer.mesh_interval",
     "viewer.region": "viewer.region_size",
 }
-"""New name of each old key. Keys of a refiner in a chain (`refiner.links.NAME.KEY`) are listed as `refiner.KEY`."""
+"""New name of each removed key. Keys of a refiner in a chain (`refiner.links.NAME.KEY`) are listed as `refiner.KEY`."""
+
+
+def _current(key: str) -> str:
+    """Return the current name of a dotted config key, which may be deprecated."""
+    found = _listed(DEPRECATED, key)
+    return f"{key[: key.rfind('.') + 1]}{found.rpartition('.')[2]}" if found else key
+
+
+def replace_deprecated(key: str) -> str:
+    """Return the current name of a dotted config key. Log a warning if it is deprecated, once per process."""
+    if (new := _current(key)) != key:
+        _warn(key, new)
+    return new
+
+
+@cache
+def _warn(key: str, new: str) -> None:
+    log.warning("%s: deprecated, removed in the next minor version; set %s instead", key, new)
+
+
+def replace_in_overrides(overrides: Sequence[str]) -> list[str]:
+    """Return overrides with the current names of deprecated keys, and log warnings."""
+    return [re.sub(r"^([+~]*)([^=]+)", lambda found: found[1] + replace_deprecated(found[2]), one) for one in overrides]
+
+
+def replace_in_config(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the config of a stored run with the current names of deprecated keys."""
+    return {
+        _current(f"{prefix}{key}").removeprefix(prefix): replace_in_config(value, f"{prefix}{key}.")
+        if isinstance(value, Mapping)
+        else value
+        for key, value in config.items()
+    }
 
 
 def new_name(key: str) -> str | None:
     """Return the new name of a dotted config key, or None if it was not renamed."""
+    return _listed(RENAMED | DEPRECATED, key)
+
+
+def _listed(names: Mapping[str, str], key: str) -> str | None:
     parts = key.split(".")
-    return RENAMED.get(key) or (RENAMED.get(f"{parts[0]}.{parts[-1]}") if len(parts) > 2 else None)
+    return names.get(key) or (names.get(f"{parts[0]}.{parts[-1]}") if len(parts) > 2 else None)
 
 
 def rename_hint(key: str) -> str:

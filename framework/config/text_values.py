@@ -25,6 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from framework.config.composition import added_config_dirs, config_loader
 from framework.config.hydra_api import version_base
+from framework.config.renamed_keys import replace_in_overrides
 from framework.config.validation import checked_rows, without_interpolation
 
 SELECTING = (
@@ -86,7 +87,7 @@ KindOf = Callable[[DictConfig, str], TextKind | None]
 
 
 def literal(overrides: Sequence[str], kind_of: KindOf, multirun: bool = False) -> list[str]:
-    """Return overrides of the main config with quoted text values.
+    """Return overrides of the main config with quoted text values and without deprecated keys.
 
     A key that only the options of a swept group have gets the prefix ++, because Hydra first composes the config of a
     sweep with the default option.
@@ -99,6 +100,7 @@ def literal(overrides: Sequence[str], kind_of: KindOf, multirun: bool = False) -
     Raises:
         HydraException: A group has no such option.
     """
+    overrides = replace_in_overrides(overrides)
     if all(_is_plain(override) for override in overrides):
         return [*overrides]
     choices = _Choices(overrides, kind_of, multirun)

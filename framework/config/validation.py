@@ -14,7 +14,7 @@ from typing import Any, get_args, get_type_hints
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.config.renamed_keys import rename_hint
+from framework.config.renamed_keys import rename_hint, replace_deprecated, replace_in_overrides
 from framework.errors import ConfigError
 from framework.files.search_paths import usable_path
 
@@ -147,7 +147,7 @@ def checked_rows(node: Any) -> dict[str, list[str]]:
             raise ConfigError(
                 f"rows.{name}: expected a list of overrides, got {overrides!r}; write, for example, [refiner=identity]"
             )
-    return {name: list(overrides) for name, overrides in rows.items()}
+    return {name: replace_in_overrides(overrides) for name, overrides in rows.items()}
 
 
 def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:
@@ -164,15 +164,16 @@ def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:
     if not isinstance(node, Mapping):
         raise ConfigError(f"{name}: expected keys and values, got {node!r}")
     block, types = OmegaConf.structured(kind), get_type_hints(kind)
-    for key in map(str, node):
+    for given in map(str, node):
+        key = given if given in types else replace_deprecated(f"{name}.{given}").removeprefix(f"{name}.")
         if key not in types:
             if hint := rename_hint(f"{name}.{key}"):
                 raise ConfigError(f"{name}.{key}: expected a known key, got {key}; {hint}")
             raise ConfigError(f"{name}: expected one of {', '.join(types)}, got {key!r}")
         try:
-            block = OmegaConf.merge(block, OmegaConf.create({key: node[key]}))
+            block = OmegaConf.merge(block, OmegaConf.create({key: node[given]}))
         except OmegaConfBaseException as error:
-            raise ConfigError(f"{name}.{key}: expected {values_of(types[key])}, got {node[key]!r}") from error
+            raise ConfigError(f"{name}.{key}: expected {values_of(types[key])}, got {node[given]!r}") from error
     content = OmegaConf.to_container(block)
     assert isinstance(content, dict)
     return {str(key): value for key, value in content.items()}

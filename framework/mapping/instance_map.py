@@ -56,7 +56,7 @@ from framework.mapping.voxels.voxel_grid import MAX_BLOCKS
 from framework.sensors.noise_models import SensorKind
 from framework.vocabulary.flat_objects import is_flat
 
-FORMAT = 10  # format of the map file; increment it when the meaning of the contents changes
+FORMAT = 10  # format of the map file; increment it when the meaning of the contents changes, see test_released_maps.py
 SAVED_ARRAYS = (*VOLUME_ARRAYS, *PackedEvidence._fields, CLASS_EVIDENCE)
 LARGEST_SCALE = 2**40  # maximum score_scale of a map file (quantized class score for evidence of 1)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from framework.config.renamed_keys import replace_in_config
 from framework.errors import DataError
 from framework.files.atomic_write import read_text
 from framework.files.manifest import Manifest, verified
@@ -64,7 +65,7 @@ def causes(record: Record) -> list[str]:
 
 def _changed_parameters(before: Mapping[str, str], record: Record) -> Iterator[str]:
     """Yield the parameters in config.yaml that differ from those in manifest.json."""
-    now = parameters_of(record.config)
+    before, now = replace_in_config(before), parameters_of(record.config)
     for key in dict.fromkeys([*before, *now]):
         expected, got = (values.get(key, "no value") for values in (before, now))
         if expected != got:

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.config.composition import resolved
+from framework.config.renamed_keys import replace_in_config
 from framework.errors import DataError, first_line
 from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
 from framework.files.folders.staged_files import REPLACING, finish_replacement
@@ -220,7 +221,7 @@ def _read(directory: Path, name: str, check_files: bool = True) -> Record:
         written = path.stat().st_mtime
     except OSError as error:  # the run has been restarted
         raise DataError(f"{path}: expected a readable file, got an error ({error.strerror})") from error
-    return Record(directory, metrics, config, written)
+    return Record(directory, metrics, replace_in_config(config), written)
 
 
 def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
@@ -353,7 +354,7 @@ def read_config(directory: Path) -> dict[str, Any]:
     if not path_exists(path):
         return {}
     with verified(path):
-        return read_yaml(path)
+        return replace_in_config(read_yaml(path))
 
 
 def has_metrics(directory: Path) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import html
 import json
+import os
 import re
 import subprocess
 import sys
@@ -76,6 +77,52 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert done.returncode == 0, done.stderr
     return place / "html"
+
+
+BROKEN = [
+    ("![](there.png)", "alternative text"),
+    ("```{figure} there.png\nCaption\n```", "alternative text"),
+    ('<img src="there.png">', "alternative text"),
+    ("![A map](missing.png)", "image.not_readable"),
+    ("[Page](missing.md)", "missing.md"),
+    ("[Section](#no-heading)", "no-heading"),
+]
+"""Content of pages with an error, and a part of the expected warning."""
+
+
+def build_page(folder: Path, content: str) -> subprocess.CompletedProcess[str]:
+    """Build a page with this content and the heading `Probe`."""
+    pytest.importorskip("myst_parser", reason="myst_parser is missing: pip install --group docs")
+    (folder / "there.png").write_bytes((DOCS / "floor_plan.png").read_bytes())
+    (folder / "index.md").write_text(f"# Probe\n\n{content}\n")
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "-n",
+        "-q",
+        "-C",
+        "-b",
+        "dummy",
+        str(folder),
+        str(folder / "built"),
+    ]
+    command += ["-D", "extensions=myst_parser,extensions.alt_texts", "-D", "myst_heading_anchors=3"]
+    environment = {**os.environ, "PYTHONPATH": str(DOCS)}
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, env=environment)
+
+
+@pytest.mark.parametrize(("content", "expected"), BROKEN)
+def test_docs_build_broken_link_or_image_fails(tmp_path: Path, content: str, expected: str) -> None:
+    built = build_page(tmp_path, content)
+    assert built.returncode == 1
+    assert expected in built.stderr
+
+
+def test_docs_build_correct_links_and_images_pass(tmp_path: Path) -> None:
+    built = build_page(tmp_path, '![A map](there.png) [Section](#probe) <img src="there.png" alt="A map">')
+    assert built.returncode == 0, built.stderr
 
 
 def test_api_reference_has_all_public_names(built: Path) -> None:
@@ -166,6 +213,7 @@ def test_citation_file_has_required_keys() -> None:
     citation = yaml.safe_load((CHECKOUT / "CITATION.cff").read_text())
     assert citation["cff-version"] == "1.2.0"
     assert str(citation["version"]) == __version__
+    assert f"\n## {__version__} - {citation['date-released']}\n" in (CHECKOUT / "CHANGELOG.md").read_text()
     assert {"message", "title", "authors"} <= set(citation)
     for work in [citation, *citation["references"]]:
         assert {"title", "type", "authors"} <= set(work)

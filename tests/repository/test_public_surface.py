@@ -38,6 +38,15 @@ def test_public_names_exist() -> None:
         assert not [name for name in module.__all__ if not hasattr(module, name)]
 
 
+def test_deprecated_public_names_state_replacement() -> None:
+    """The message has the form that CONTRIBUTING.md prescribes, and the replacement exists."""
+    for module in PUBLIC.values():
+        for name in module.__all__:
+            message = getattr(getattr(module, name), "__deprecated__", None)
+            stated = message and re.fullmatch(r"use (\w+)[\w.()]* instead; removed in \d+\.\d+", message)
+            assert message is None or (stated and stated[1] in module.__all__), f"{name}: {message}"
+
+
 @pytest.mark.integration
 def test_instancemap_import_loads_no_test_code() -> None:
     code = "import sys, instancemap; print([name for name in ('pytest', 'framework.testing') if name in sys.modules])"
