@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tests.acceptance.runner import is_current, read_rows, write_rows
 
-ROW = ["kitchen_ate", "12.1", "ATE <= 15 mm", "2026-01-01", "abc1234", "2 cores, CPU", "1.0"]
+ROW = ["kitchen_ate", "12.1", "ATE <= 15 mm", "2026-01-01", "abc1234"]
 
 
 def test_acceptance_page_round_trip_keeps_rows(tmp_path: Path) -> None:
