@@ -41,13 +41,13 @@ The second command is a short test without meaningful values.
 
 ![Processor time, heap, instances and position error over all frames](endurance.png)
 """
-BOUNDS_INTRODUCTION = f"""The places are visited in turn. Growth is the median slope [quartiles] of all pairs of visits after {EXPIRY:,} frames,
-when tentative instances have expired. Bold: bound missed, because the lower quartile exceeds it. Italics: only the median
-exceeds the bound, so noise may be the cause.
+BOUNDS_INTRODUCTION = f"""The places are visited in turn. Growth is the median slope [quartiles] of all pairs of visits.
+Visits count after {EXPIRY:,} frames, when tentative instances have expired. Bold: bound missed, because the lower
+quartile exceeds it. Italics: only the median exceeds the bound, so noise may be the cause.
 """
 METHOD = """
-Processor time is relative to a reference computation; `long_run_slowdown` in [Acceptance](acceptance.md) is more precise.
-Heap is the memory allocated in the visits of a place. Drift is the increase of the position error.
+Processor time is relative to a reference computation; `long_run_slowdown` in [Acceptance](acceptance.md) is more
+precise. Heap is the memory allocated in the visits of a place. Drift is the increase of the position error.
 """
 
 
