@@ -129,7 +129,7 @@ def person_instances() -> Measured:
     return count, count == 0
 
 
-@measurement("mean change of ATE <= +2%, 0 additional lost frames, 10 parts, two networks", *PIPELINE)
+@measurement("mean change of ATE <= +2%, 0 additional lost frames, two networks", *PIPELINE)
 def masking_freiburg1_rpy() -> Measured:
     """Return the larger mean change of the ATE with two networks, in percent."""
     means, lost = [], 0
@@ -142,7 +142,7 @@ def masking_freiburg1_rpy() -> Measured:
     return max(means), max(means) <= 2 and lost == 0
 
 
-@measurement("0 wrong diagnoses, 75 recordings with one wrong convention, unit or delay", *CHECKS)
+@measurement("0 wrong diagnoses, 75 recordings with one error", *CHECKS)
 def wrong_diagnoses() -> Measured:
     return counted(recording_checks.wrong_diagnoses(SHARED))
 
@@ -220,7 +220,7 @@ def building_doubled() -> Measured:
     return value, value == 0
 
 
-@measurement("median distance from the true surface <= 10 mm", *PIPELINE)
+@measurement("median surface error <= 10 mm", *PIPELINE)
 def building_surface() -> Measured:
     value = 1e3 * max(one.corrected.distance for one in five_rooms())
     return value, value <= 10
@@ -233,7 +233,7 @@ def building_oracle() -> Measured:
     return value, value <= 0.01
 
 
-@measurement("difference of the surface distance from the oracle <= 2 mm", *PIPELINE)
+@measurement("difference of the surface error from the oracle <= 2 mm", *PIPELINE)
 def building_oracle_surface() -> Measured:
     value = 1e3 * max(abs(one.corrected.distance - one.oracle.distance) for one in five_rooms())
     return value, value <= 2
@@ -251,25 +251,25 @@ def calibrated_kitchen_distance() -> Measured:
     return value, value <= 0.5
 
 
-@measurement("0 false loops, 20 buildings with identical rooms, drift of 1 to 2%", *PIPELINE)
+@measurement("0 false loops, 20 buildings with identical rooms", *PIPELINE)
 def false_loops() -> Measured:
     value = sum(one.false for one in counted_loops())
     return value, value == 0
 
 
-@measurement("recall of revisits >= 0.8, same buildings as `false_loops`", *PIPELINE)
+@measurement("recall of revisits >= 0.8, 20 buildings with identical rooms", *PIPELINE)
 def loop_recall() -> Measured:
     value = sum(one.found for one in counted_loops()) / sum(one.revisits for one in counted_loops())
     return value, value >= 0.8
 
 
-@measurement("size of the map after two rounds / one round <= 1.05, one building", *PIPELINE)
+@measurement("size of the map after two rounds / one round <= 1.05", *PIPELINE)
 def building_second_round() -> Measured:
     value = second_round()
     return value, value <= 1.05
 
 
-@measurement("0 files differ between one and two threads, one building", *PIPELINE)
+@measurement("0 files differ between one and two threads", *PIPELINE)
 def building_threads() -> Measured:
     return counted(files_that_depend_on_threads())
 
@@ -296,18 +296,18 @@ def calibration_of_each_event() -> Measured:
     return counted(worse)
 
 
-@measurement("0 faults whose stage is not the cause of all lost objects, 4 faults in 3 rooms", *PIPELINE, "tests")
+@measurement("0 faults whose stage is not the cause, 4 faults in 3 rooms", *PIPELINE, "tests")
 def faults_without_cause() -> Measured:
     return counted(str(one) for one in explained_faults() if not one.named)
 
 
-@measurement("smallest fraction of the additional loss >= 0.8, 4 faults in 3 rooms", *PIPELINE, "tests")
+@measurement("fraction of the additional loss >= 0.8, 4 faults in 3 rooms", *PIPELINE, "tests")
 def loss_of_faulty_stage() -> Measured:
     value = min(one.fraction for one in explained_faults())
     return value, value >= 0.8
 
 
-@measurement("difference of the contributions from the loss <= 1e-9, 4 faults in 3 rooms", *PIPELINE, "tests")
+@measurement("difference of the contributions from the loss <= 1e-9", *PIPELINE, "tests")
 def sum_of_contributions() -> Measured:
     value = max(one.rest for one in explained_faults())
     return value, value <= 1e-9

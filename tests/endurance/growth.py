@@ -45,7 +45,6 @@ class Bound:
     quantity: str
     unit: str
     limit: float
-    reason: str
     measure: Callable[[Sequence[Block]], Measured]  # measures the quantity, given the blocks of one place
 
     def verdict(self, blocks: Sequence[Block]) -> Verdict:
@@ -118,27 +117,27 @@ def lost_frames(blocks: Sequence[Block]) -> Measured:
 
 BOUNDS = (
     Bound(
-        "heap", "bytes per frame", 500, "decreases to below 50 bytes (`long_run_growth`)",
+        "heap", "bytes per frame", 500,  # decreases to below 50 bytes (`long_run_growth`)
         growth(lambda block: block.heap),
     ),
     Bound(
-        "map", "% per 1,000 frames", 5, "sensor noise adds blocks at depth edges",
+        "map", "% per 1,000 frames", 5,  # sensor noise adds blocks at depth edges
         growth(lambda block: block.map_bytes, 1000, relative=True),
     ),
     Bound(
-        "processor time", "% per 1,000 frames", 5, "noise of about 3 %",
+        "processor time", "% per 1,000 frames", 5,  # noise of about 3 %
         growth(lambda block: block.relative_time, 1000, relative=True),
     ),
     Bound(
-        "confirmed instances", "per 1,000 frames", 10, "equal images repeat detection errors",
+        "confirmed instances", "per 1,000 frames", 10,  # equal images repeat detection errors
         growth(lambda block: block.confirmed, 1000),
     ),
     Bound(
-        "tentative instances", "per 1,000 frames", 50, "noise of about 20",
+        "tentative instances", "per 1,000 frames", 50,  # noise of about 20
         growth(lambda block: block.tentative, 1000),
     ),
-    Bound("drift", "mm", 5, "half of a voxel of 1 cm", drift_increase),
-    Bound("lost frames", "frames", 0, "the place is known", lost_frames),
+    Bound("drift", "mm", 5, drift_increase),  # half of a voxel of 1 cm
+    Bound("lost frames", "frames", 0, lost_frames),  # the place is known
 )  # fmt: skip
 """The bounds of the endurance run."""
 
