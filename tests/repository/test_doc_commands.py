@@ -20,10 +20,8 @@ from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
 pytestmark = pytest.mark.integration
 
 EXECUTED = [
-    "for frame in sequence",
     "class ColorBlobs",
     'load_runs("outputs/ablation_refiner',
-    "normals_of(",
 ]  # executed in test_readme.py
 CONTRACT = block("python", "class TestMyRefiner")
 PARSED = [line for line in LINES if line.startswith("python -m framework ") and line.split()[3] in main.COMMANDS]

@@ -10,7 +10,6 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,14 +23,11 @@ from framework.data import Camera, Frame
 from framework.files.search_paths import CONF
 from framework.interfaces import Detector
 from framework.pipeline import Pipeline
-from framework.refinement.lifting import lift
 from framework.registry import STAGES, build, text_kind
 from framework.runs.mesh_file import read_mesh
-from framework.testing.corner_room import exact_clusters, frame_at
 from tests.support import stored_experiments
 from tests.support.doc_pages import CHECKOUT, LINES, block, blocks
 from tests.support.recordings.phone_exports import room_frames, write_stray_scanner
-from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
 pytestmark = pytest.mark.integration
 
@@ -42,14 +38,6 @@ COMMANDS = {  # main config of each command
     and ("=" in words[3] or words[3] == "-m" or (CONF / f"{words[3].replace('-', '_')}.yaml").exists())
 }
 BENCHMARKS = [line for line in LINES if line.startswith("python -m pytest ")]
-
-
-def test_documented_loop_maps_sequence() -> None:
-    fuser = GridFuser()
-    stages = {"detector": SphereDetector(), "tracker": GivenPose(), "refiner": KeepAll(), "fuser": fuser}
-    exec(block("python", "for frame in sequence"), {"sequence": CornerRoom(), "lift": lift, **stages})
-    assert len(fuser.scene.vertices) == 6
-    assert set(fuser.scene.instances()) == {1, 2}
 
 
 def test_documented_data_frame_has_means_of_rows(
@@ -121,16 +109,6 @@ def test_tutorial_detector_runs_by_option_name(my_plugins: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert (my_plugins / "run" / "metrics.json").exists()
-
-
-def test_tutorial_normals_of_points_are_unit_vectors() -> None:
-    frame = frame_at(0)
-    names: dict[str, Any] = {"frame": frame, "clusters": exact_clusters(frame)}
-    exec(block("python", "normals_of("), names)
-    lengths = np.linalg.norm(names["of_points"], axis=1)
-    assert len(lengths) > 100
-    np.testing.assert_allclose(lengths[lengths > 0], 1, atol=1e-5)
-    assert (lengths > 0).mean() > 0.5
 
 
 OWN_PLUGIN = "python -m framework --config-dir my_conf detector=color_blobs detector.hue=120"
