@@ -21,9 +21,8 @@ PRINTED = {
     "Map a recording": "",
     "Map camera images": r"\(\d{4,}, 3\)",
     "Ask for objects": r"\d+ \w+( \w+)? 0\.\d\d \[(.|\n)*m\n\[(.|\n)*\d\.\d\d tv \w+ \[",
-    "Find the floor": r"\d+ vertices on the floor",
     "Render a view": r"instance at the center: [1-9]",
-    "Extract an object": r"(\(\d{3,}, 3\) ?){3}",
+    "Extract an object or the floor": r"\(\d{3,}, 3\)\n\d+ vertices on the floor",
     "Query during mapping": r"[1-9]\d* objects\n\w",
     "Use your own stage": r"0 frames lost; [1-9]\d* objects",
 }
