@@ -33,11 +33,9 @@ python -m tests.endurance --frames 1000 --out outputs/endurance
 
 The second command is a short test without meaningful values.
 
-| place | frames | detector |
-|---|---|---|
-| redkitchen, freiburg1_rpy | Kinect recording, forward and backward | `maskrcnn2go`, cached |
-| standing | one frame of redkitchen, new noise in each frame | `maskrcnn2go` |
-| room | rendered room, other objects on the way back | `simulated_maskrcnn2go` |
+- redkitchen, freiburg1_rpy: Kinect recordings, forward and backward
+- standing: one frame of redkitchen, new noise in each frame
+- room: rendered room, other objects on the way back
 
 ![Processor time, heap, instances and position error over all frames](endurance.png)
 """
