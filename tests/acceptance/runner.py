@@ -22,7 +22,7 @@ make acceptance
 ```
 
 The command runs the measurements that are missing or whose code has changed since the measured commit.
-`make acceptance MEASUREMENT=NAME` runs one. `tests/acceptance/measurements.py` defines them. All take about five hours.
+`make acceptance MEASUREMENT=NAME` runs one. All take about five hours.
 
 - `building_*`: the worst of three buildings of five rooms, unless stated otherwise
 - `calibration_*`: four real scenes, two networks, leave-one-scene-out
