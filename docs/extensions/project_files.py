@@ -20,7 +20,7 @@ PAGES = {
     "SECURITY.md": "security.md",
     "data/desk/README.md": "desk.md",
     "examples/README.md": "tutorials/examples.md",
-    "framework/mapping/instances/learned_association.md": "guides/learned_association.md",
+    "framework/mapping/instances/learned_association.md": "results/learned_association.md",
     "plugins/detectors/mask_rcnn_rooms.md": "guides/mask_rcnn_rooms.md",
     "plugins/detectors/maskrcnn2go.md": "guides/maskrcnn2go.md",
 }

@@ -31,7 +31,7 @@ make endurance
 python -m tests.endurance --frames 1000 --out outputs/endurance
 ```
 
-The second command is a short test without meaningful values.
+The second command is a short test.
 
 - redkitchen, freiburg1_rpy: Kinect recordings, forward and backward
 - standing: one frame of redkitchen, new noise in each frame
