@@ -25,7 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from framework.config.composition import config_loader, running_loader
 from framework.config.hydra_api import CachingConfigRepository, create_defaults_list
-from framework.config.renamed_keys import rename_hint, replace_deprecated
+from framework.config.renamed_keys import replace_deprecated
 from framework.config.text_values import TextKind
 from framework.config.validation import values_of, without_interpolation
 from framework.errors import ConfigError, InstanceMapError, first_line
@@ -363,8 +363,7 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
             continue
         key = given if given in fields else replace_deprecated(f"{stage}.{given}").removeprefix(f"{stage}.")
         if key not in fields:
-            hint = rename_hint(f"{stage}.{key}")
-            suggestion = f"; {hint}" if hint else _did_you_mean(key, list(fields))
+            suggestion = _did_you_mean(key, list(fields))
             names = f"one of {', '.join(fields)}" if fields else "no parameters"
             expected = "a known parameter" if suggestion else names
             raise ConfigError(f"{where}: expected {expected}, got {key!r}{suggestion}")

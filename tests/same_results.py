@@ -3,23 +3,21 @@
     python -m tests.same_results BEFORE AFTER
 
 Runs with the same path below BEFORE and AFTER are compared byte by byte: their files, the arrays in NPZ files, the
-metrics and the config. Metrics that depend on the machine or on the code version are ignored. Old config keys are
-translated to their new names. Keys that only one of the two configs has are listed and not compared. The exit status is
-1 if a run differs.
+metrics and the config. Metrics that depend on the machine or on the code version are ignored. Keys that only one of the
+two configs has are listed and not compared. The exit status is 1 if a run differs.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
 
-from framework.config.renamed_keys import new_name
+from framework.config.renamed_keys import replace_in_config
 from framework.runs.provenance import WITHOUT_EFFECT, leaves
 
 FILES = ("mesh.ply", "trajectory.txt", "instances.json")
@@ -36,10 +34,6 @@ NOT_RESULTS = (
     "time.",
     "code",
 )
-RENAMED = {  # old keys with several new names in framework/config/renamed_keys.py
-    "refiner.links.plane_removal.min_share": "refiner.links.plane_removal.min_frame_fraction",
-    "refiner.links.connected.min_share": "refiner.links.connected.min_piece_ratio",
-}
 
 
 def results(directory: Path) -> dict[str, object]:
@@ -56,17 +50,11 @@ def results(directory: Path) -> dict[str, object]:
     return found | {key: value for key, value in metrics.items() if not key.startswith(NOT_RESULTS)}
 
 
-def settings(directory: Path, names: Collection[str] = ()) -> dict[str, object]:
-    """Return the values of a config, keyed by dotted key. Keys that are not in `names` get their new names."""
+def settings(directory: Path) -> dict[str, object]:
+    """Return the values of a config, keyed by dotted key."""
     config: Any = OmegaConf.to_container(OmegaConf.load(directory / "config.yaml"))
-    named = {key if key in names else translated(key): value for key, value in leaves(config)}
-    return {key: value for key, value in named.items() if key.partition(".")[0] not in WITHOUT_EFFECT}
-
-
-def translated(key: str) -> str:
-    """Return the new name of a config key, or the same key if it was not renamed."""
-    group, dot, name = key.rpartition(".")
-    return RENAMED.get(key) or group + dot + (new_name(key) or name).rpartition(".")[2]
+    named = leaves(replace_in_config(config))
+    return {key: value for key, value in named if key.partition(".")[0] not in WITHOUT_EFFECT}
 
 
 def main() -> None:
@@ -80,8 +68,7 @@ def main() -> None:
             continue
         old, new = results(before / run), results(after / run)
         print(f"{run}: {len(old.keys() | new.keys())} files, arrays and metrics")
-        new_settings = settings(after / run)
-        old_settings = settings(before / run, new_settings)
+        old_settings, new_settings = settings(before / run), settings(after / run)
         if one_sided := sorted(old_settings.keys() ^ new_settings.keys()):
             print(f"{run}: not compared, only in one config: {', '.join(one_sided)}")
         for key in old_settings.keys() & new_settings.keys():

@@ -23,7 +23,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
 from framework.config import hydra_api
-from framework.config.renamed_keys import rename_hint, replace_in_overrides
+from framework.config.renamed_keys import replace_in_overrides
 from framework.errors import ConfigError, DataError, printable
 from framework.files.atomic_write import read_text
 from framework.files.search_paths import CONF
@@ -290,8 +290,6 @@ def _known_keys(error: OmegaConfBaseException) -> str:
     keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
     close = get_close_matches(str(error.key), keys, n=1)
     path = str(error.full_key or error.key)
-    if hint := rename_hint(path):
-        return f"{path}: expected a known key, got {error.key}; {hint}"
     if path == "table" or path.startswith("table.where."):  # new keys of a sweep
         key = f"+{path}.KEY" if path == "table" else f"+{path}"
         return f"{path}: expected a prefix + for a new key, got none; set {key}=VALUE"

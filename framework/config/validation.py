@@ -14,7 +14,7 @@ from typing import Any, get_args, get_type_hints
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.config.renamed_keys import rename_hint, replace_deprecated, replace_in_overrides
+from framework.config.renamed_keys import replace_deprecated, replace_in_overrides
 from framework.errors import ConfigError
 from framework.files.search_paths import usable_path
 
@@ -167,8 +167,6 @@ def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:
     for given in map(str, node):
         key = given if given in types else replace_deprecated(f"{name}.{given}").removeprefix(f"{name}.")
         if key not in types:
-            if hint := rename_hint(f"{name}.{key}"):
-                raise ConfigError(f"{name}.{key}: expected a known key, got {key}; {hint}")
             raise ConfigError(f"{name}: expected one of {', '.join(types)}, got {key!r}")
         try:
             block = OmegaConf.merge(block, OmegaConf.create({key: node[given]}))

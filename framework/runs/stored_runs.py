@@ -37,7 +37,6 @@ from framework.runs.provenance import (
     shows_speed,
     speed_settings,
 )
-from framework.runs.timings_file import current_key
 
 CONFIG = "config.yaml"
 METRICS = "metrics.json"  # exists only for completed runs
@@ -385,7 +384,7 @@ def _read_flat(path: Path) -> dict[str, Any]:
     for key, value in content.items():
         if key.startswith(FIGURES) and value is not None and not is_number(value):
             raise DataError(f"{path}: {key}: expected a number or null, got {value!r}")
-    return {current_key(key): value for key, value in content.items()}
+    return content
 
 
 def is_number(value: Any) -> TypeGuard[float]:

@@ -15,15 +15,6 @@ from framework.files.atomic_write import read_text
 from framework.files.manifest import verified
 
 HEADER = ["frame", "stage", "milliseconds"]
-OLD_STAGES = {
-    "read": "reading",
-    "detect": "detection",
-    "track": "tracking",
-    "lift": "lifting",
-    "refine": "refinement",
-    "fuse": "fusion",
-}
-"""Current stage names by the names before version 0.1.0, for old runs and sweeps."""
 MAX_FRAME = 2**53  # limit of frame numbers; smaller integers are exact in float64
 
 
@@ -33,12 +24,6 @@ class StageTimes:
 
     frames: Int64  # (F,) frame numbers, ascending
     milliseconds: Mapping[str, Float64]  # (F,) by stage, NaN = stage not run, e.g. integration of a lost frame
-
-
-def current_key(key: str) -> str:
-    """Return a key of metrics.json with the current name of its stage."""
-    parts = key.split(".")
-    return ".".join([parts[0], OLD_STAGES.get(parts[1], parts[1]), *parts[2:]]) if parts[0] == "stage_ms" else key
 
 
 def read_timings(path: Path) -> StageTimes:
@@ -62,7 +47,7 @@ def read_timings(path: Path) -> StageTimes:
             frame, stage, milliseconds = 0, "", np.nan
         if not (0 <= milliseconds < np.inf and abs(frame) < MAX_FRAME):
             raise DataError(f"{path}, line {number}: expected a frame, a stage and a time, got {','.join(line)!r:.60}")
-        taken[frame, OLD_STAGES.get(stage, stage)] = milliseconds
+        taken[frame, stage] = milliseconds
     if not taken:
         raise DataError(f"{path}: expected at least one time, got none")
     frames = sorted({frame for frame, _ in taken})

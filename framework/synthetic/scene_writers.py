@@ -93,8 +93,6 @@ def _begin(root: Path, recording: BenchmarkSettings) -> None:
             raise DataError(
                 f"{made_by}: expected valid JSON, got a damaged file; delete {root} or set another folder"
             ) from error
-        if isinstance(found, dict) and "haste" in found:  # earlier name of camera_speed
-            found["camera_speed"] = found.pop("haste")
         if found != wanted:
             raise ConfigError(f"{root}: expected scenes with the parameters {wanted}, got {found}; set another folder")
     elif root.exists() and (not root.is_dir() or any(not is_temporary(path.name) for path in root.iterdir())):

@@ -54,7 +54,7 @@ class ComparisonTable:
         """
         records, incomplete = completed_runs(directory)
         sweep = read_sweep(directory, literal_in_block("table", get_type_hints(TableChoice), overrides))
-        choice, asked = TableChoice.of_stored_sweep(sweep.get("table")), asked_keys(sweep)
+        choice, asked = TableChoice.of_sweep(sweep.get("table")), asked_keys(sweep)
         choice.check_keys({key for record in records for key in record.settings} | (asked or set()))
         selected = [record for record in records if choice.selects(record)]
         if not selected:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
-from framework.config.renamed_keys import new_name
 from framework.config.validation import check_known, check_page_columns, checked_block
 from framework.errors import ConfigError
 from framework.runs.provenance import leaves
 from framework.runs.run_rows import value_of
 from framework.runs.stored_runs import Record
-from framework.runs.timings_file import current_key
 from framework.tables.published import read_published
 
 LABEL = re.compile(r"[A-Za-z0-9:._/-]*")  # labels for \ref
@@ -113,9 +111,7 @@ class TableChoice:
     @classmethod
     def of(cls, node: Any) -> TableChoice:
         """Return the choice of a config block. Raises ConfigError for unknown keys and wrong types."""
-        choice = cls(**checked_block(cls, "table", node))
-        # a stored sweep may have keys of an older version
-        return replace(choice, columns=[current_key(key) for key in choice.columns])
+        return cls(**checked_block(cls, "table", node))
 
     @classmethod
     def of_sweep(cls, node: Any) -> TableChoice:
@@ -125,13 +121,6 @@ class TableChoice:
         given = dict(node or {})
         columns = PLAIN[:1] if given.get("columns_by") else PLAIN
         return cls.of({"columns": list(columns)} | given)
-
-    @classmethod
-    def of_stored_sweep(cls, node: Any) -> TableChoice:
-        """Return the table settings of a stored sweep. Keys of earlier versions are accepted."""
-        if isinstance(node, Mapping):
-            node = {(new_name(f"table.{key}") or f"table.{key}").removeprefix("table."): node[key] for key in node}
-        return cls.of_sweep(node)
 
     @property
     def keys(self) -> list[tuple[str, str]]:

@@ -9,7 +9,7 @@ import pytest
 
 from framework.errors import DataError
 from framework.runs.run_directory import write_timings
-from framework.runs.timings_file import current_key, read_timings
+from framework.runs.timings_file import read_timings
 from framework.runtime.run_log import RunResult, StageTime
 from tests.support.scenes.corner_room import GridMap
 
@@ -27,13 +27,6 @@ def test_timings_file_round_trip_has_nan_for_missing_stages(tmp_path: Path) -> N
     assert list(found.milliseconds) == ["tracking", "fusion"]
     np.testing.assert_array_equal(found.milliseconds["tracking"], [2.5, 3, 3.5])
     np.testing.assert_array_equal(found.milliseconds["fusion"], [20, np.nan, 0])
-
-
-def test_read_timings_old_stage_name_is_converted(tmp_path: Path) -> None:
-    (tmp_path / "timings.csv").write_text("frame,stage,milliseconds\n0,read,1\n0,fuse,2\n")
-    assert list(read_timings(tmp_path / "timings.csv").milliseconds) == ["reading", "fusion"]
-    assert current_key("stage_ms.track.p95") == "stage_ms.tracking.p95"
-    assert current_key("instances.ap50.track") == "instances.ap50.track"
 
 
 @pytest.mark.parametrize(

@@ -307,12 +307,6 @@ def test_table_notes_name_command_line_and_data(sweep: Path) -> None:
     )
 
 
-def test_stored_table_with_old_keys_is_read(sweep: Path) -> None:
-    table(sweep, over=["seed"], baseline="refiner=identity", columns=[AP50])
-    _, second = grids(write_tables(sweep))
-    assert second[0] == "| minus refiner=identity | pairs | AP50 |"
-
-
 @pytest.mark.parametrize(
     ("choice", "message"),
     [

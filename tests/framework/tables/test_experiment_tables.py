@@ -393,15 +393,6 @@ def test_latex_and_markdown_tables_escape_special_characters(sweep: Path) -> Non
     assert all(line.startswith(("%", "\\")) or "&" in line or not line for line in latex.splitlines())
 
 
-def test_table_old_stage_names_are_renamed(sweep: Path) -> None:
-    old = TABLE | {"columns": ["stage_ms.fuse.median"]}
-    (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": old, "rows": ROWS})))
-    run(sweep, "chain", 7, 0.5, 1.0, **{"stage_ms.fuse.median": 31.0})
-    lines = [" ".join(line.split()) for line in write_tables(sweep).splitlines()]
-    assert "| row | runs | fusion (ms) | poses |" in lines
-    assert "| chain | 4 | 31.0 (1 of 4) | ground_truth |" in lines
-
-
 def test_table_notes_name_data_without_evaluation(tmp_path: Path) -> None:
     for seed, frames in enumerate((600, 90)):
         run(tmp_path, "a", seed, None, 1.0, frames=frames, **{"choice.dataset": "desk"})

@@ -76,8 +76,6 @@ def test_check_outputs_accepts_options_and_parameters(output: str) -> None:
 @pytest.mark.parametrize(
     ("output", "message"),
     [
-        ("+table.over=[seed]", "table.over: expected a known key, got over; set table.average_over (new name of "),
-        ("+table.baseline=x", "table.baseline: expected a known key, got baseline; set table.base (new name of "),
         (
             "+table.group_by=refner",
             "table.group_by: expected a group of options or a parameter, got refner; did you mean",
@@ -124,8 +122,6 @@ def test_of_tables_lists_nested_keys() -> None:
     [
         (["table.group_by=dataset"], "set +table.KEY=VALUE"),
         (["experiment=ablation_refiner", "table.where.dataset=desk"], "set +table.where.dataset=VALUE"),
-        (["experiment=ablation_refiner", "table.baseline=chain"], "set table.base (new name of table.baseline)"),
-        (["experiment=ablation_refiner", "table.over=[seed]"], "set table.average_over (new name of table.over)"),
     ],
 )
 def test_table_override_error_names_fix(overrides: list[str], fix: str) -> None:
