@@ -236,6 +236,13 @@ def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Flo
     return np.stack([x, y, depth], axis=1).astype(np.float32, copy=False)
 
 
+def sampled_camera(camera: Camera, step: int) -> Camera:
+    """Return the camera whose pixels are every step-th pixel of an image, from pixel step // 2."""
+    height, width = (len(range(step // 2, side, step)) for side in camera.shape)
+    fx, fy, cx, cy = (value / step for value in (camera.fx, camera.fy, camera.cx - step // 2, camera.cy - step // 2))
+    return Camera(width, height, fx, fy, cx, cy)
+
+
 def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
     """Raise DataError if a pixel of `clusters` is outside of an image of size `shape` (height, width), px.
 

@@ -457,7 +457,7 @@ class SubmapSurfaces(ABC):
 class SceneMap(ABC):
     """The map of a fuser.
 
-    Implement `classes` and the six abstract members. Override the other ten members to provide more data or a faster
+    Implement `classes` and the six abstract members. Override the other members to provide more data or a faster
     implementation.
     """
 
@@ -486,7 +486,7 @@ class SceneMap(ABC):
         return zlib.crc32(repr(self.statistics).encode())
 
     def calibrate(self, calibration: Path | None) -> None:  # noqa: B027  # optional
-        """Set `Detector.calibration`, which is called before the first frame. By default, it is ignored."""
+        """Set the value of `Detector.calibration`, before the first frame. By default, it is ignored."""
 
     def instance_ids(self) -> frozenset[int]:
         """Return the ids of the objects in the map. A `Mapper` calls it before and after each frame."""

@@ -27,7 +27,6 @@ class FrameObservation:
     visible: Int64  # (T,) number of depth readings on each object
     centers_camera: Float64  # (T, 3) mean of these readings, m
     class_ids: Int32  # (N,) most likely class of each detection
-    scores: Float32  # (N,)
     objects: Int32  # (N,) true object of each cluster, 0 = none
     lifted: Int64  # (N, 1 + T) number of points of each cluster on each object, before refinement; column 0 = on none
     refined: Int64  # (N, 1 + T) after refinement; 0 if the frame is lost
@@ -104,7 +103,6 @@ class Observer(Viewer):
                 visible=visible,
                 centers_camera=centers,
                 class_ids=most_likely(detections.class_probabilities),
-                scores=detections.scores,
                 objects=objects_of_counts(lifted, truth_ids),
                 lifted=lifted,
                 refined=refined,

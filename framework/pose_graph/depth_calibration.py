@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, Pose
-from framework.geometry import exp_se3
+from framework.geometry import exp_se3, sampled_camera
 from framework.interfaces import DepthCalibrator
 from framework.pose_graph.depth_calibration_kernels import linearize_pairs
 from framework.sensors.depth_distortion import NODES, DepthDistortion
@@ -70,9 +70,7 @@ class CalibrationView:
             cv2.GaussianBlur(image, (0, 0), step / 2)[step // 2 :: step, step // 2 :: step] for image in readings
         )
         depth = np.where(valid >= VALID, total / np.maximum(valid, VALID), 0)
-        c, (height, width) = frame.camera, depth.shape
-        fx, fy, cx, cy = (value / step for value in (c.fx, c.fy, c.cx - step // 2, c.cy - step // 2))
-        camera = Camera(width, height, fx, fy, cx, cy)
+        camera = sampled_camera(frame.camera, step)
         normals, usable = _normals(camera, depth)
         return cls(T_world_camera, camera, np.where(usable, depth, 0).astype(np.float32), normals)
 

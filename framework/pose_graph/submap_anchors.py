@@ -14,7 +14,7 @@ import numpy as np
 
 from framework.config.validation import check_bounds, require
 from framework.data import Camera, Float32, Float64, Frame
-from framework.geometry import back_project, inverse, project, transform
+from framework.geometry import back_project, inverse, project, sampled_camera, transform
 from framework.tracking.keyframes import Keyframe
 
 VIEW_DISTANCE = 0.5  # m, distance between two views of equal direction
@@ -43,10 +43,7 @@ class DepthSamples:
     def of(cls, frame: Frame) -> DepthSamples:
         """Return the samples of a frame."""
         step = -(-max(frame.camera.shape) // CELLS)
-        depth = frame.depth[step // 2 :: step, step // 2 :: step]
-        c, height, width = frame.camera, *depth.shape
-        fx, fy, cx, cy = (value / step for value in (c.fx, c.fy, c.cx - step // 2, c.cy - step // 2))
-        return cls(Camera(width, height, fx, fy, cx, cy), depth)
+        return cls(sampled_camera(frame.camera, step), frame.depth[step // 2 :: step, step // 2 :: step])
 
     def points(self) -> Float32:
         """Return the sampled points (P, 3) in the camera frame, m."""

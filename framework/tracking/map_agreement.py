@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from framework.data import Camera, Float64, Frame, Pose
+from framework.data import Float64, Frame, Pose
 from framework.errors import DataError, FrameError
-from framework.geometry import FARTHEST
+from framework.geometry import FARTHEST, sampled_camera
 from framework.interfaces import SceneMap
 
 SIDE = 80  # maximum number of samples along the longer image side
@@ -63,7 +63,7 @@ def map_agreement(frame: Frame, T_world_camera: Float64, scene: SceneMap) -> Map
     depth = frame.depth[step // 2 :: step, step // 2 :: step]
     nearest, farthest = scene.depth_range
     valid = (depth > max(nearest, 0.0)) & (depth < farthest)
-    mapped = scene.render_visible(_sampled(frame.camera, step), T_world_camera).depth
+    mapped = scene.render_visible(sampled_camera(frame.camera, step), T_world_camera).depth
     visible = valid & (mapped > 0)
     close = np.maximum(CLOSE, 3 * frame.sensor.sigma(depth))
     agreeing = np.zeros_like(visible)
@@ -110,10 +110,3 @@ def check_resumed(frame: Frame, agreement: MapAgreement) -> str:
             "tracker=voxel_hashing_icp"
         )
     return ""
-
-
-def _sampled(camera: Camera, step: int) -> Camera:
-    """Return the camera whose pixels are every step-th pixel of an image, from pixel step // 2."""
-    height, width = (len(range(step // 2, side, step)) for side in camera.shape)
-    fx, fy, cx, cy = (value / step for value in (camera.fx, camera.fy, camera.cx - step // 2, camera.cy - step // 2))
-    return Camera(width, height, fx, fy, cx, cy)

@@ -1,1 +1,1 @@
-"""Training of detectors on synthetic scenes."""
+"""Training of detectors and of the learned association on synthetic scenes."""

@@ -121,7 +121,7 @@ def fit(samples: Sequence[Sample], seed: int, epochs: int = EPOCHS) -> dict[str,
 
 
 def rule(sample: Sample) -> tuple[Bool, Float64]:
-    """Return the pairs (N, M) that the default rule allows, and their IoUs, which it prefers."""
+    """Return the pairs (N, M) that the default rule with extend_score=0 allows, and their IoUs, which it prefers."""
     cluster, instance, features = sample.pairs.clusters, sample.pairs.instances, sample.pairs.features
     allowed, iou = np.zeros(sample.shape, np.bool_), np.zeros(sample.shape)
     allowed[cluster, instance] = features[:, :2].max(axis=1) > Association.min_overlap  # relative to the smaller

@@ -18,7 +18,7 @@ from framework.detection.stored.fingerprint import fingerprint
 from framework.interfaces import Detector
 
 SOMETHING_ELSE = "something else"
-MAX_WORDS = 500  # maximum number of text queries
+MAX_QUERIES = 500  # maximum number of text queries
 SIGNIFICANCE, MAX_SLANT, MIN_READINGS = 0.4, 85.0, 0.1  # parameters of masks from depth, as in onnx_boxes
 
 
@@ -49,9 +49,9 @@ class OpenVocabulary(Detector):
     def __post_init__(self) -> None:
         check_intervals("detector", self, score_threshold="(0, 1)", nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
         check_count("detector.max_detections", self.max_detections, MAX_DETECTIONS)
-        names = [word.strip() for word in self.text_queries]
-        fits = 1 <= len(names) <= MAX_WORDS and all(names) and len({*names, SOMETHING_ELSE}) == len(names) + 1
-        allowed = f"1 to {MAX_WORDS} different text queries, none of them {SOMETHING_ELSE!r}"
+        names = [query.strip() for query in self.text_queries]
+        fits = 1 <= len(names) <= MAX_QUERIES and all(names) and len({*names, SOMETHING_ELSE}) == len(names) + 1
+        allowed = f"1 to {MAX_QUERIES} different text queries, none of them {SOMETHING_ELSE!r}"
         require(fits, "detector.text_queries", self.text_queries, allowed)
         device = torch_device(self.device)
         self.classes = (*names, SOMETHING_ELSE)
@@ -75,15 +75,15 @@ class OpenVocabulary(Detector):
             masks, _ = masks_in_boxes(
                 boxes[kept], frame.depth, frame.camera, SIGNIFICANCE, MAX_SLANT, MIN_READINGS, frame.sensor
             )
-        distributions = word_distributions(probabilities[kept], self.score_threshold)
+        distributions = class_distributions(probabilities[kept], self.score_threshold)
         return without_duplicates(masks, scores[kept], distributions, self.classes, self.agnostic_nms_iou)
 
 
-def word_distributions(probabilities: Float32, threshold: float) -> Float32:
-    """Return the class distributions (N, W + 1) over the queries and `something else`.
+def class_distributions(probabilities: Float32, threshold: float) -> Float32:
+    """Return the class distributions (N, Q + 1) over the queries and `something else`.
 
     Args:
-        probabilities: The probability (N, W) of each query.
+        probabilities: The probability (N, Q) of each query.
         threshold: The probability of `something else`.
     """
     p = np.clip(probabilities.astype(np.float64), 1e-6, 1 - 1e-6)

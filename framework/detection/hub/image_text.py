@@ -93,9 +93,9 @@ class ImageTextModel:
         """Return the normalized embeddings (N, D) of image crops.
 
         Args:
-            crops: The crops (N, side, side, 4), RGB and mask. The masks are ignored.
+            crops: The crops (N, side, side, 3), RGB.
         """
-        images = torch.from_numpy(crops[..., :3]).to(self._device).permute(0, 3, 1, 2).float() * self._factor
+        images = torch.from_numpy(crops).to(self._device).permute(0, 3, 1, 2).float() * self._factor
         mean, std = (torch.tensor(values, device=self._device)[:, None, None] for values in (self._mean, self._std))
         pixels = ((images - mean) / std).to(self._network.dtype)
         return self._unit(self._network.get_image_features(pixel_values=pixels))
@@ -151,8 +151,8 @@ def _space(folder: Path, model: str) -> str:
     return f"{folder.name}@{hashlib.sha256(hashes.encode()).hexdigest()[:HASH_DIGITS]}"
 
 
-def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundings: float = 1.0) -> UInt8:
-    """Return square crops (N, side, side, 4) of an image around masks, with RGB and mask (0 or 255).
+def square_crops(color: UInt8, masks: Bool, side: int, context: float, contrast: float) -> UInt8:
+    """Return square crops (N, side, side, 3) of an image around masks.
 
     The crop of an empty mask is black. Pixels of a crop outside the image are treated as black surroundings.
 
@@ -161,28 +161,27 @@ def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundi
         masks: The masks (N, H, W).
         side: The side of the resized crops, px.
         context: The side of a crop before resizing, as a multiple of the longer side of the mask's bounding box.
-        surroundings: The contrast of pixels outside the mask. With 1 they are unchanged, with 0 they are gray.
+        contrast: The contrast of pixels outside the mask. With 1 they are unchanged, with 0 they are gray.
     """
-    crops = np.zeros((len(masks), side, side, 4), np.uint8)
+    crops = np.zeros((len(masks), side, side, 3), np.uint8)
     for k, box in enumerate(tight_boxes(masks)):
         if masks[k].any():
-            with_mask = np.dstack([color, masks[k].view(np.uint8) * np.uint8(255)])
-            crops[k] = _square_crop(with_mask, box, side, context, surroundings)
+            crops[k] = _square_crop(color, masks[k], box, side, context, contrast)
     return crops
 
 
-def _square_crop(image: UInt8, box: Float32, side: int, context: float, surroundings: float) -> UInt8:
-    """Return the crop (side, side, 4) of an image (H, W, 4) around a box."""
-    height, width = image.shape[:2]
+def _square_crop(color: UInt8, mask: Bool, box: Float32, side: int, context: float, contrast: float) -> UInt8:
+    """Return the crop (side, side, 3) of an image (H, W, 3) with a mask (H, W) around a box."""
+    height, width = mask.shape
     x1, y1, x2, y2 = (int(value) for value in box)
     wide = max(1, round(context * (max(x2 - x1, y2 - y1) + 1)))  # px
     left, top = (x1 + x2 + 1 - wide) // 2, (y1 + y2 + 1 - wide) // 2
-    square = np.zeros((wide, wide, image.shape[2]), np.uint8)
+    square, around = np.zeros((wide, wide, 3), np.uint8), np.ones((wide, wide), np.bool_)
     u1, v1, u2, v2 = max(left, 0), max(top, 0), min(left + wide, width), min(top + wide, height)
-    square[v1 - top : v2 - top, u1 - left : u2 - left] = image[v1:v2, u1:u2]
-    if surroundings < 1:
-        around = square[..., 3] == 0
-        square[around, :3] = np.round(GRAY + surroundings * (square[around, :3].astype(np.float32) - GRAY))
+    inside = slice(v1 - top, v2 - top), slice(u1 - left, u2 - left)
+    square[inside], around[inside] = color[v1:v2, u1:u2], ~mask[v1:v2, u1:u2]
+    if contrast < 1:
+        square[around] = np.round(GRAY + contrast * (square[around].astype(np.float32) - GRAY))
     interpolation = cv2.INTER_AREA if side < wide else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(square, (side, side), interpolation=interpolation))
 

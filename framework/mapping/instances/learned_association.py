@@ -28,6 +28,7 @@ from framework.mapping.instances.overlaps import Overlaps
 
 WEIGHTS = Path("framework/mapping/instances/learned_association.safetensors")
 WIDTH = 32  # number of hidden features
+UNKNOWN_CENTER = (np.nan, np.nan, np.nan)
 FEATURES = (
     "fraction of the cluster on the instance",
     "fraction of the visible instance on the cluster",
@@ -50,19 +51,19 @@ FEATURES = (
 """Features of a pair. A weights file lists the features that it was trained with."""
 
 
-def shapes(width: int = WIDTH) -> dict[str, tuple[int, ...]]:
+def shapes() -> dict[str, tuple[int, ...]]:
     """Return the shape of each weight by name."""
     return {
-        "pair.weight": (len(FEATURES), width),
-        "pair.bias": (width,),
-        "of_cluster": (width,),  # attention of a cluster to its instances
-        "of_instance": (width,),  # attention of an instance to its clusters
-        "match.weight": (3 * width, width),
-        "match.bias": (width,),
-        "match.score": (width,),
-        "new.weight": (width, width),
-        "new.bias": (width,),
-        "new.score": (width,),
+        "pair.weight": (len(FEATURES), WIDTH),
+        "pair.bias": (WIDTH,),
+        "of_cluster": (WIDTH,),  # attention of a cluster to its instances
+        "of_instance": (WIDTH,),  # attention of an instance to its clusters
+        "match.weight": (3 * WIDTH, WIDTH),
+        "match.bias": (WIDTH,),
+        "match.score": (WIDTH,),
+        "new.weight": (WIDTH, WIDTH),
+        "new.bias": (WIDTH,),
+        "new.score": (WIDTH,),
         "offset": (1,),
     }
 
@@ -95,7 +96,7 @@ def pairs_of(table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, 
     on_instance = votes / np.maximum(overlaps.sizes[:, None], 1)
     on_cluster = votes / np.maximum(overlaps.visible[None, :], 1)
     centers, extents = cluster_shapes(clusters)
-    located = np.array([_center(record.viewing.center_sum, record.viewing.centered) for record in records])
+    located = np.array([record.viewing.center or UNKNOWN_CENTER for record in records])
     distance = np.sqrt(np.square(centers[n] - located[m]).sum(axis=1))
     distance = np.where(np.isfinite(distance), np.minimum(distance, 3.0), 0.0)  # 0 = unknown
 
@@ -122,10 +123,6 @@ def pairs_of(table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, 
         of_instance([np.log1p(max(frame_index - record.last_frame, 0)) / 5 for record in records]),
     ]
     return CandidatePairs(n, m, np.stack(columns, axis=1))
-
-
-def _center(center_sum: tuple[float, float, float], count: int) -> tuple[float, ...]:
-    return tuple(value / count if count else np.nan for value in center_sum)
 
 
 def _largest_other(values: Float64, row: Int64, column: Int64) -> Float64:

@@ -31,6 +31,14 @@ class Viewing:
         """Mean IoU of a detection and the visible instance, or None if unknown."""
         return self.outline_sum / self.outlines if self.outlines else None
 
+    @property
+    def center(self) -> Point | None:
+        """Mean of the centers of the detections in the world frame, m, or None if unknown."""
+        if not self.centered:
+            return None
+        x, y, z = self.center_sum
+        return x / self.centered, y / self.centered, z / self.centered
+
     def detect(self, outline: float) -> None:
         """Add a detection, given its IoU with the visible instance, in pixels."""
         self.outlines += 1
@@ -49,13 +57,9 @@ class Viewing:
 
     def _is_new(self, camera: Point, last: Point) -> bool:
         """Return True if the instance is seen from another direction or distance than in the last new view."""
-        if not self.centered:
+        center = self.center
+        if center is None:
             return False
-        center = (
-            self.center_sum[0] / self.centered,
-            self.center_sum[1] / self.centered,
-            self.center_sum[2] / self.centered,
-        )
         distances = math.dist(camera, center), math.dist(last, center)
         near, far = min(distances), max(distances)
         if far > NEW_RATIO * near:

@@ -87,8 +87,8 @@ class DenseCrf:
 
     crf_weight: float = 0.0  # weight of the pairwise potentials, in [0, 1000]; 0 = off
     crf_position: float = 0.06  # standard deviation of the distance of similar vertices, m, in [0.001, 10]
-    crf_color: float = 20.0  # standard deviation of their colors, 8-bit levels, in [0.1, 1000]
-    crf_normal: float = 0.3  # standard deviation of their unit normals, in [0.001, 10]
+    crf_color: float = 20.0  # standard deviation of the colors of similar vertices, 8-bit levels, in [0.1, 1000]
+    crf_normal: float = 0.3  # standard deviation of the unit normals of similar vertices, in [0.001, 10]
     crf_limit: float = 3.0  # maximum magnitude of the log-odds of the map, in [0, 100]
 
     def __post_init__(self) -> None:

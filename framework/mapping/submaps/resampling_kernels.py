@@ -70,7 +70,7 @@ def _nearby_blocks(source, R, t, coords, nearby):
         nearby: The output (27,), three blocks along each axis, x fastest, -1 = not allocated.
 
     Returns:
-        Whether any of the blocks is allocated, and the coordinates of the first one.
+        True if any of the blocks is allocated, and the coordinates of the first one.
     """
     half = 0.5 * (BLOCK_SIDE - 1)
     x, y, z = (BLOCK_SIDE * coords[0] + half, BLOCK_SIDE * coords[1] + half, BLOCK_SIDE * coords[2] + half)
@@ -110,7 +110,7 @@ def _corner_voxels(nearby, first, i, j, k, found):
         found: The output (8,), x fastest.
 
     Returns:
-        Whether any of the blocks is allocated.
+        True if any of the blocks is allocated.
     """
     n = ((k >> 3) - first[2]) * 9 + ((j >> 3) - first[1]) * 3 + (i >> 3) - first[0]
     block = nearby[n]

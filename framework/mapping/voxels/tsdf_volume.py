@@ -137,8 +137,7 @@ class TsdfVolume:
             "frames": self.integrator.frames,
             **self.gravity_estimator.saved(),
         }
-        blocks = {name: array for name, array in self.arrays().items() if name in VOLUME_ARRAYS}
-        return header, blocks | pack_voxels(self.voxels)._asdict()
+        return header, self.arrays() | pack_voxels(self.voxels)._asdict()
 
     def arrays(self) -> dict[str, Array]:
         """Return the arrays of the grid without unused capacity."""

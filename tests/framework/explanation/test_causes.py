@@ -21,7 +21,7 @@ POINTS = 200  # number of true points of each object
 FRAME = FrameObservation(
     index=0, lost=False, detected=True, truth_ids=np.int32([1, 2]), visible=np.int64([200, 300]),
     centers_camera=np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 2.0]]), class_ids=np.int32([0, 1]),
-    scores=np.float32([0.9, 0.8]), objects=np.int32([1, 2]), lifted=np.int64([[5, 190, 0], [5, 0, 280]]),
+    objects=np.int32([1, 2]), lifted=np.int64([[5, 190, 0], [5, 0, 280]]),
     refined=np.int64([[0, 180, 0], [0, 0, 270]]), instance_ids=np.int32([7, 8]),
 )  # fmt: skip
 """A frame in which both objects are detected, and matched with instances 7 and 8."""
@@ -132,7 +132,7 @@ def test_explain_merged_instance_counts_as_remaining_one() -> None:
 
 def test_explain_false_instance_on_no_object_names_detection() -> None:
     frame = replace(
-        FRAME, class_ids=np.int32([0, 1, 0]), scores=np.float32([0.9, 0.8, 0.5]), objects=np.int32([1, 2, 0]),
+        FRAME, class_ids=np.int32([0, 1, 0]), objects=np.int32([1, 2, 0]),
         lifted=np.vstack([FRAME.lifted, [100, 0, 0]]), refined=np.vstack([FRAME.refined, [100, 0, 0]]),
         instance_ids=np.int32([7, 8, 9]),
     )  # fmt: skip

@@ -167,7 +167,7 @@ def test_query_with_embeddings_uses_model_of_run(
     pytest.importorskip("transformers")
     folder = write_image_text(tmp_path / "siglip")
     model = ImageTextModel(str(folder), "main", "cpu", half_precision=False)
-    crops = np.random.default_rng(3).integers(0, 255, (3, SIDE, SIDE, 4)).astype(np.uint8)
+    crops = np.random.default_rng(3).integers(0, 255, (3, SIDE, SIDE, 3)).astype(np.uint8)
     scene = mapped(model.embed_crops(crops), model.space)
     scene.save(tmp_path / "map.npz")
     (tmp_path / "config.yaml").write_text(f"detector: {{model: {folder}}}\n")

@@ -14,7 +14,7 @@ import torch
 from framework.data import Camera, Frame
 from framework.detection.hub.prompted_models import BoxPromptedMasks, TextPromptedBoxes
 from framework.errors import ConfigError, DataError
-from plugins.detectors.open_vocabulary import SOMETHING_ELSE, OpenVocabulary, word_distributions
+from plugins.detectors.open_vocabulary import SOMETHING_ELSE, OpenVocabulary, class_distributions
 from tests.support import registered
 from tests.support.networks.tiny_image_text import write_image_text
 from tests.support.networks.tiny_open_vocabulary import SIDE, write_owlv2, write_sam
@@ -137,12 +137,12 @@ def test_open_vocabulary_masks_lie_in_prompt_boxes(sam: Path, shape: tuple[int, 
 
 
 def test_open_vocabulary_distribution_uses_odds_and_other_class() -> None:
-    rows = word_distributions(np.float32([[0.1, 0.1], [0.5, 0.1], [0.9, 0.001]]), 0.1)
+    rows = class_distributions(np.float32([[0.1, 0.1], [0.5, 0.1], [0.9, 0.001]]), 0.1)
     np.testing.assert_allclose(rows.sum(axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(rows[0], [1 / 3] * 3, atol=1e-6)
     np.testing.assert_allclose(rows[1], np.array([9, 1, 1]) / 11, atol=1e-6)
     assert rows[2, 0] > 0.98
-    assert np.isfinite(word_distributions(np.float32([[0, 1]]), 0.1)).all()
+    assert np.isfinite(class_distributions(np.float32([[0, 1]]), 0.1)).all()
 
 
 @pytest.mark.parametrize("masks", ["sam", "depth"])

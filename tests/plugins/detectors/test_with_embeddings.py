@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from framework.data import Camera, Detections, Frame
-from framework.detection.hub.image_text import ImageTextModel, square_crops
+from framework.detection.hub.image_text import GRAY, ImageTextModel, square_crops
 from framework.detection.stored.cache import identity_of
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
@@ -57,11 +57,11 @@ def test_with_embeddings_vectors_agree_with_transformers(folder: Path) -> None:
     from transformers import AutoModel, AutoTokenizer
 
     model = ImageTextModel(str(folder), "main", "cpu", half_precision=False)
-    crops = np.random.default_rng(0).integers(0, 255, (3, SIDE, SIDE, 4)).astype(np.uint8)
+    crops = np.random.default_rng(0).integers(0, 255, (3, SIDE, SIDE, 3)).astype(np.uint8)
     network = AutoModel.from_pretrained(folder).eval()
     is_clip = network.config.model_type == "clip"
     mean, std = ((0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)) if is_clip else (0.5, 0.5)
-    pixels = torch.tensor((crops[..., :3] / 255 - np.array(mean)) / np.array(std)).float().permute(0, 3, 1, 2)
+    pixels = torch.tensor((crops / 255 - np.array(mean)) / np.array(std)).float().permute(0, 3, 1, 2)
     prompt = "a photo of red chair." if is_clip else "This is a photo of red chair."
     tokens = AutoTokenizer.from_pretrained(folder)([prompt], padding="max_length", max_length=16, return_tensors="pt")
     more = {"attention_mask": tokens["attention_mask"]} if is_clip else {}
@@ -116,18 +116,19 @@ def test_with_embeddings_crop_is_padded_square_around_box() -> None:
     color[..., 0], color[..., 1] = np.arange(60), np.arange(40)[:, None]
     mask = np.zeros((1, 40, 60), np.bool_)
     mask[0, 10:18, 20:36] = True
-    [crop] = square_crops(color, mask, 16, 1.0)
+    [crop] = square_crops(color, mask, 16, 1.0, 1.0)
     np.testing.assert_array_equal(crop[0, :, 0], np.arange(20, 36))
     np.testing.assert_array_equal(crop[:, 0, 1], np.arange(6, 22))
-    np.testing.assert_array_equal(np.nonzero(crop[..., 3].any(axis=1))[0], np.arange(4, 12))
-    [wide] = square_crops(color, mask, 32, 2.0)
+    [gray] = square_crops(color, mask, 16, 1.0, 0.0)
+    np.testing.assert_array_equal(np.flatnonzero((gray != GRAY).any(axis=(1, 2))), np.arange(4, 12))
+    [wide] = square_crops(color, mask, 32, 2.0, 1.0)
     np.testing.assert_array_equal(wide[16, :, 0], np.arange(12, 44))
     mask[:] = False
     mask[0, :4, :4] = True
-    [corner] = square_crops(color, mask, 8, 2.0)
+    [corner] = square_crops(color, mask, 8, 2.0, 1.0)
     assert (corner[:2] == 0).all(), "expected 0 outside the image"
-    assert (corner[2:6, 2:6, 3] == 255).all()
-    assert not square_crops(color, np.zeros((1, 40, 60), np.bool_), 8, 1.5).any()
+    np.testing.assert_array_equal(corner[2:6, 2:6], color[:4, :4])
+    assert not square_crops(color, np.zeros((1, 40, 60), np.bool_), 8, 1.5, 1.0).any()
 
 
 def test_with_embeddings_fingerprint_covers_detector_and_model(siglip: Path, tmp_path: Path) -> None:
