@@ -15,6 +15,7 @@ from framework.files.atomic_write import read_text
 from framework.files.manifest import verified
 
 HEADER = ["frame", "stage", "milliseconds"]
+HEADER_SIZE = len(",".join(HEADER)) + 1  # bytes, with the end of the line
 OLD_STAGES = {
     "read": "reading",
     "detect": "detection",
