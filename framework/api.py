@@ -642,7 +642,8 @@ def import_map(
         label_space: The names of class ids: a label space such as "nyu40", or a text or JSON file; None = NYU40 for
             ScanNet predictions, otherwise none.
         class_names: "COCO" (instances of other classes are left out), "OWN" (the given names), or "AUTO" (OWN if a name
-            is in no known label space, or if `evaluation.label_space` is not COCO; otherwise COCO).
+            is in no known label space, if none has a COCO class, or if `evaluation.label_space` is not COCO; otherwise
+            COCO).
         instance_property: The property of the PLY file with instance ids; None = detected by name.
         class_property: The property with class ids; None = detected by name; "" = no classes.
         no_instance: The id of points without an instance.
@@ -654,8 +655,8 @@ def import_map(
         The run directory.
 
     Raises:
-        ConfigError: The directory is not empty, or an argument is invalid.
-        DataError: A file is missing or invalid, or no instance is left.
+        ConfigError: An argument is invalid.
+        DataError: The directory is not empty, a file is missing or invalid, or no instance is left.
     """
     from framework.runs.external_maps.map_import import MapImport
     from framework.runs.external_maps.ply_instances import LabelProperties
@@ -691,7 +692,7 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
         run: The run directory, or a map.
         words: The text query.
         by: "embeddings" of images, or "names" of classes and colors; None = embeddings if available.
-        model: Folder, file or huggingface.co id of the embedding model; None = the model of the detector of the run.
+        model: Folder or huggingface.co id of the embedding model; None = the model of the detector of the run.
 
     Returns:
         The matching objects, best match first, and the ranking method.

@@ -261,8 +261,6 @@ def _literal_value(value: str, kind: TextKind, interpolates: Callable[[str], boo
         return value  # converted to the same text
     if found == value and ("${" not in value or interpolates(value)):
         return value
-    if listed:
-        return value
     literal_text = value if "${" not in value or interpolates(value) else without_interpolation(value)
     return _in_quotes(literal_text)
 

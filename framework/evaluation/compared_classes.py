@@ -184,9 +184,7 @@ def classes_of_space(label_space: str) -> tuple[str, ...]:
         ConfigError: The label space or file does not exist.
         DataError: The JSON file is invalid.
     """
-    if label_space == AGNOSTIC:
-        return (OBJECT,)
-    names = read_class_ids(label_space, KEY, also=(AGNOSTIC,)).values()
+    names = read_class_ids(label_space, KEY).values()
     return tuple(dict.fromkeys(name for name in names if label_key(name) != NO_CLASS))
 
 

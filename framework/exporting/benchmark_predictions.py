@@ -68,7 +68,7 @@ class BenchmarkPredictions:
         space = label_space or evaluated.label_space or SCANNET20
         if label_space is None and space not in (*BENCHMARK_IDS, AGNOSTIC):
             space = SCANNET20
-        names_by_id = {1: OBJECT} if space == AGNOSTIC else read_class_ids(space, "label_space", also=(AGNOSTIC,))
+        names_by_id = {1: OBJECT} if space == AGNOSTIC else read_class_ids(space, "label_space")
         if (least := min(names_by_id)) < 1:
             raise DataError(
                 f"label_space: expected {', '.join([*BENCHMARK_IDS, AGNOSTIC])} or a JSON file with class ids of at "

@@ -71,8 +71,8 @@ class Chosen:
         for name, low, high in (("min_probability", 0.0, 1.0), ("resolution", 0.01, 1.0), ("robot_height", 0.1, 3.0)):
             value = getattr(self, name)
             require(low <= value <= high, name, value, f"a value in [{low:g}, {high:g}]")
-        if self.triangles is not None and self.triangles < 4:
-            raise DataError(f"triangles: expected at least 4, got {self.triangles}")
+        if self.triangles is not None:
+            require(self.triangles >= 4, "triangles", self.triangles, "at least 4")
 
     @classmethod
     def named(cls, objects: Sequence[str | int] = (), **choices: Any) -> Chosen:
@@ -130,7 +130,8 @@ def export(
         The paths of the files.
 
     Raises:
-        DataError: The run or an option is invalid, or a format requires an unknown up direction or floor height.
+        ConfigError: An option is invalid.
+        DataError: The run is invalid, or a format requires an unknown up direction or floor height.
     """
     formats, chosen = list(dict.fromkeys(formats)), chosen or Chosen()
     if ExportFormat.USD in formats:

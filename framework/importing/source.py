@@ -19,7 +19,7 @@ from framework.geometry import nearest_rigid
 from framework.sensors.noise_models import SensorKind
 
 SMALLEST_SIDE = 2  # px, minimum side of a depth image for resampling
-UNSURE, FAIRLY_SURE, SURE = 0, 1, 2  # ARKit's low, medium and high confidence
+UNSURE, SURE = 0, 2  # ARKit's low and high confidence; 1 = medium
 
 log = logging.getLogger(__name__)
 

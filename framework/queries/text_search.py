@@ -52,7 +52,7 @@ class TextQuery:
 
     words: str  # text of 1 to 1000 characters
     by: str | None = None  # embeddings or names; None = embeddings if the map has any or `model` is set, else names
-    model: str | None = None  # embedding model for the text: folder, file or id; None = model of the run's detector
+    model: str | None = None  # embedding model: folder or huggingface.co id; None = model of the run's detector
 
     def __post_init__(self) -> None:
         if not isinstance(self.words, str) or not 0 < len(self.words.strip()) <= LONGEST_QUERY:

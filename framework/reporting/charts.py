@@ -197,15 +197,14 @@ def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT
     return _distances(frames, errors, height, "Position error", "chart-errors")
 
 
-def motions(frames: Sequence[int], distances: Float64, height: float = FLAT_HEIGHT) -> str:
+def motions(frames: Sequence[int], distances: Float64) -> str:
     """Draw a line chart of the correction of the camera position by frame, and return its SVG element.
 
     Args:
         frames: Frame numbers (n,).
         distances: Distances (n,) between the tracked and the corrected positions, m.
-        height: Height of the chart, px.
     """
-    return _distances(frames, distances, height, "Correction of the position", "chart-motions")
+    return _distances(frames, distances, FLAT_HEIGHT, "Correction of the position", "chart-motions")
 
 
 def depth_corrections(distortion: DepthDistortion, depth: float) -> str:

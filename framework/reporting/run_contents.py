@@ -34,11 +34,9 @@ from framework.runs.stored_runs import (
     read_partial,
     read_record,
 )
-from framework.runs.timings_file import StageTimes, read_timings
+from framework.runs.timings_file import HEADER_SIZE, StageTimes, read_timings
 from framework.runtime.run_log import FUSION, FUSION_STAGES
 from framework.sensors.depth_distortion import DepthDistortion
-
-TIMINGS_HEADER = "frame,stage,milliseconds\n"
 
 
 @dataclass(frozen=True)
@@ -88,9 +86,7 @@ class RunContents:
             tuple(sorted(objects, key=lambda one: one.id)),
             timestamps,
             poses,
-            read_timings(timings)
-            if path_exists(timings) and check_regular(timings).st_size > len(TIMINGS_HEADER)
-            else None,
+            read_timings(timings) if path_exists(timings) and check_regular(timings).st_size > HEADER_SIZE else None,
             tracked,
             read_pose_graph(directory / POSE_GRAPH),
             read_depth_distortion(directory / DEPTH_DISTORTION),

@@ -15,6 +15,7 @@ from framework.files.atomic_write import read_text
 from framework.files.manifest import verified
 
 HEADER = ["frame", "stage", "milliseconds"]
+HEADER_SIZE = len(",".join(HEADER)) + 1  # bytes, with the end of the line
 MAX_FRAME = 2**53  # limit of frame numbers; smaller integers are exact in float64
 
 

@@ -1,4 +1,4 @@
-r"""LaTeX tables for a paper: environments `table` and `table*` with a caption and a label."""
+"""LaTeX tables for a paper: environments `table` and `table*` with a caption and a label."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
 
+from framework.errors import DataError
 from framework.files.atomic_write import read_text
 from framework.runs.stored_runs import read_yaml
 from framework.tables.experiment_tables import SETTINGS, rendered_tables
@@ -36,7 +37,7 @@ def changed_tables(directory: Path) -> Iterator[str]:
     settings = read_yaml(directory / SETTINGS) if (directory / SETTINGS).exists() else {}
     rendered = rendered_tables(directory, list(map(str, settings.get("overrides") or ())))
     for path in stored:
-        expected, found = (_grids(path.suffix, text) for text in (rendered[path.name], read_text(path)))
+        expected, found = (_grids(path, text) for text in (rendered[path.name], read_text(path)))
         if _shape(expected) != _shape(found):
             rewrite = f"run instancemap tables {shlex.quote(str(directory))}"
             yield f"{path}: expected the rows and columns of the runs' table, got different ones; {rewrite}"
@@ -52,11 +53,14 @@ def _shape(grids: list[Grid]) -> list[list[int]]:
     return [list(map(len, grid)) for grid in grids]
 
 
-def _grids(suffix: str, text: str) -> list[Grid]:
+def _grids(path: Path, text: str) -> list[Grid]:
     """Return the cells of the tables in a file."""
-    if suffix == ".csv":
-        return [list(csv.reader(text.splitlines()))]
-    rule, separator = ("| --", "|") if suffix == ".md" else ("\\midrule", "&")
+    if path.suffix == ".csv":
+        try:
+            return [list(csv.reader(text.splitlines()))]
+        except csv.Error as error:
+            raise DataError(f"{path}: expected valid CSV, got an error ({error})") from error
+    rule, separator = ("| --", "|") if path.suffix == ".md" else ("\\midrule", "&")
     lines = (line for line in text.splitlines() if not line.startswith((rule, "%")))
     tables = (list(table) for is_table, table in groupby(lines, lambda line: separator in line) if is_table)
     return [[[cell.strip(" |\\") for cell in line.split(f" {separator} ")] for line in table] for table in tables]

@@ -28,7 +28,6 @@ LARGEST_FILE = 2**20  # bytes, maximum size of a list of labels
 LONGEST_CLASS_NAME = 100  # characters
 _OTHER_NAMES = "other_names"  # section for spellings outside of all spaces
 
-
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled loader is ten times as fast, but optional
 _SECTIONS: dict[str, dict[str, str | None]] = yaml.load(Path(__file__).with_suffix(".yaml").read_text("utf-8"), _LOADER)
 """COCO name by section and name; None = no object class of COCO."""
@@ -109,13 +108,12 @@ class LabelMapping:
         return rows.astype(np.float32), known
 
 
-def read_labels(name_or_path: str, key: str = "detector.label_space", also: Sequence[str] = ()) -> tuple[str, ...]:
+def read_labels(name_or_path: str, key: str = "detector.label_space") -> tuple[str, ...]:
     """Return the names of a label space, or the lines of a text file with one name per line.
 
     Args:
         name_or_path: The name of a label space, such as "coco" or "nyu40", or the path of a text file.
         key: The config key or option, for messages.
-        also: Other values of the key, for messages.
 
     Raises:
         ConfigError: The label space or file does not exist, or the file is invalid.
@@ -152,7 +150,7 @@ def read_labels(name_or_path: str, key: str = "detector.label_space", also: Sequ
     return tuple(NO_CLASS if name.lower() in _UNUSED_NAMES else name for name in names)
 
 
-def read_class_ids(name_or_path: str, key: str, also: Sequence[str] = ()) -> dict[int, str]:
+def read_class_ids(name_or_path: str, key: str) -> dict[int, str]:
     """Return the name of each class id in a label space or file.
 
     NYU40, ScanNet20 and ScanNet200 have the ids of ScanNet's benchmarks. The ids of another label space or a text file
@@ -161,14 +159,13 @@ def read_class_ids(name_or_path: str, key: str, also: Sequence[str] = ()) -> dic
     Args:
         name_or_path: The name of a label space, or the path of a text or JSON file.
         key: The config key or option, for messages.
-        also: Other values of the key, for messages.
 
     Raises:
         ConfigError: The label space or text file does not exist, or the file is invalid.
         DataError: The JSON file is invalid.
     """
     if Path(name_or_path).suffix.lower() != ".json":
-        labels = read_labels(name_or_path, key, also)
+        labels = read_labels(name_or_path, key)
         return dict(zip(BENCHMARK_IDS.get(name_or_path, range(len(labels))), labels, strict=True))
     path = expanded(Path(name_or_path))
     content = read_json(path)

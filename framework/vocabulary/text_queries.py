@@ -15,11 +15,10 @@ STOP_WORDS = frozenset((
 ))  # fmt: skip
 SHADES = frozenset(("light", "dark", "bright", "pale", "deep"))  # ignored, because they also depend on the lighting
 IRREGULAR = {"people": "person", "men": "person", "women": "person", "mice": "mouse", "knives": "knife",
-             "shelves": "shelf", "scissors": "scissors", "skis": "skis", "glasses": "glass"}  # fmt: skip
-EVERYDAY = {"fridge": "refrigerator", "plant": "potted plant", "phone": "cell phone", "mug": "cup", "screen": "tv",
-            "rucksack": "backpack", "settee": "couch", "armchair": "couch", "stool": "chair",
+             "shelves": "shelf", "glasses": "glass"}  # fmt: skip
+EVERYDAY = {"phone": "cell phone", "mug": "cup", "screen": "tv", "rucksack": "backpack", "settee": "couch",
             "telly": "tv"}  # fmt: skip
-"""Everyday words outside of all label spaces, with their COCO names."""
+"""COCO names of everyday words that have none in MEANINGS."""
 
 MAX_WORDS = 4  # maximum number of words in a name of a label space
 

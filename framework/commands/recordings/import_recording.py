@@ -40,7 +40,6 @@ def main() -> None:
     add("--confidence", metavar="LEVEL", type=int, default=default.confidence, help=confidence)
     rotation = "clockwise image rotation, degrees: 90, 180 or 270; default: no rotation"
     add("--rotate", metavar="DEGREES", type=int, default=default.rotate, help=rotation)
-    add("--turn", dest="rotate", type=int, default=argparse.SUPPRESS, help=argparse.SUPPRESS)  # earlier name
     add = parser.add_argument_group("ROS bag topics (default: detected by type and name)").add_argument
     add("--color", metavar="TOPIC", default="", help="color images")
     add("--depth", metavar="TOPIC", default="", help="depth images")

@@ -32,7 +32,6 @@ def main() -> None:
     add("--width", metavar="PX", type=int, default=default.width, help="image width, px, multiple of 4; default: 640")
     speed = f"camera speed relative to the recommended recording speed, in (0, {MAX_CAMERA_SPEED:g}]; default: 2"
     add("--camera-speed", metavar="FACTOR", type=float, default=default.camera_speed, help=speed)
-    add("--haste", dest="camera_speed", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)  # earlier name
     add("--jobs", metavar="N", type=int, default=available_cores(), help="number of processes; default: all cores")
     parsed = arguments(parser)
     with one_line_errors():

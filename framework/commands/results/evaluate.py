@@ -49,13 +49,6 @@ def main() -> None:
     )
     changed = "evaluate even if the ground truth has changed since the run; implied by --ground-truth"
     parser.add_argument("--allow-changed-ground-truth", action="store_true", help=changed)
-    parser.add_argument(  # earlier name
-        "--other-truth",
-        dest="allow_changed_ground_truth",
-        action="store_true",
-        default=argparse.SUPPRESS,
-        help=argparse.SUPPRESS,
-    )
     space = (
         "label space, as in evaluation.label_space: coco, nyu40, scannet20, scannet200, agnostic or a file; '' = names "
         "are compared unchanged; default: label space of the last evaluation"

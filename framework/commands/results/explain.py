@@ -46,6 +46,8 @@ def main() -> None:
     figure = "figure of the contributions with one bar per run; written with the suffixes .png and .pdf"
     parser.add_argument("--figure", metavar="FILE", type=Path, help=figure)
     parsed = arguments(parser)
+    if parsed.figure is not None and parsed.causes_only:
+        parser.error("--figure: expected contributions of the stages, got --causes-only; omit one of the options")
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
         from framework.explanation.contributions import Contributions

@@ -64,6 +64,6 @@ def accept(directory: Path, names: Sequence[str]) -> None:
     listed = {*manifest.files, *RUN_FILES}
     if unlisted := [name for name in names if name not in listed]:
         expected = f"expected files listed in {directory / MANIFEST}"
-        raise ConfigError(f"accept: {expected}, got {', '.join(unlisted)}; choose {', '.join(sorted(listed))}")
+        raise ConfigError(f"--accept: {expected}, got {', '.join(unlisted)}; choose {', '.join(sorted(listed))}")
     with locked(directory):  # `evaluate` may replace the manifest at the same time
         Manifest.read(directory).with_files(directory, names).write(directory)

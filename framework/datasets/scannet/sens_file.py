@@ -190,7 +190,8 @@ def _read_header(path: Path, file: BinaryIO, length: int) -> SensHeader:
             f"{path}, byte {at + 4}: expected raw or zlib depth, got Occipital's proprietary compression; export the "
             "frames with ScanNet's SensReader"
         )
-    for byte, name, code, known in ((at, "color", color_code, (0, 1, 2)), (at + 4, "depth", depth_code, (0, 1))):
+    compressions = (at, "color", color_code, (RAW, PNG, JPEG)), (at + 4, "depth", depth_code, (RAW, ZLIB))
+    for byte, name, code, known in compressions:
         if code not in known:
             raise DataError(f"{path}, byte {byte}: expected a compression of {name} in {known}, got {code}")
     color_camera, depth_camera = color_intrinsics.camera(*sizes[:2]), depth_intrinsics.camera(*sizes[2:])

@@ -1,10 +1,10 @@
 """Import of scans from 3D Scanner App by Laan Labs (https://3dscannerapp.com), exported as "All Data".
 
-frame_00000.json        intrinsics of color, 3 x 3, row-major; cameraPoseARFrame, ARKit's T_world_camera, 4 x 4,
-                        row-major; time, s
-frame_00000.jpg         8-bit color in sensor orientation, only for some frames
-depth_00000.png         uint16 mm, 256x192
-conf_00000.png          uint8 0 to 2, from ARKit, optional
+    frame_00000.json        intrinsics of color, 3 x 3, row-major; cameraPoseARFrame, ARKit's T_world_camera, 4 x 4,
+                            row-major; time, s
+    frame_00000.jpg         8-bit color in sensor orientation, only for some frames
+    depth_00000.png         uint16 mm, 256x192
+    conf_00000.png          uint8 0 to 2, from ARKit, optional
 
 Only low-resolution scans contain depth.
 """

@@ -45,9 +45,10 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_PINHOLE", "SIMPLE_RADIAL")  # with the coefficients above
 DEPTH_UNITS = ("integer_depth_scale", "depth_unit_scale_factor")
 UNITS_PER_METER = 1000.0  # default of depth
-log = logging.getLogger(__name__)
 APP_SCALE = "depth_integer_scale"  # written by the app NeRFCapture, which stores no metric depth
 PIXEL_CENTER = 0.5  # px, coordinate of the center of the first pixel
+
+log = logging.getLogger(__name__)
 
 
 def recognized(path: Path) -> bool:

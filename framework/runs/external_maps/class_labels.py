@@ -77,7 +77,10 @@ def read_entries(path: Path) -> list[tuple[str, dict[str, Any]]]:
         DataError: The file is missing or invalid.
     """
     if path.suffix.lower() == ".csv":
-        rows = csv.DictReader(read_text(path).splitlines())
+        try:
+            rows = [*csv.DictReader(read_text(path).splitlines())]
+        except csv.Error as error:
+            raise DataError(f"{path}: expected valid CSV, got an error ({error})") from error
         return [(f"{path}, line {k}", {str(key): value for key, value in row.items()}) for k, row in enumerate(rows, 2)]
     content = read_json(path)
     if isinstance(content, list):

@@ -16,7 +16,7 @@ from PIL import ImageColor
 from scipy.spatial.transform import Rotation
 
 from framework.data import Box, Structure
-from framework.errors import DataError
+from framework.errors import ConfigError, DataError
 from framework.exporting.decimation import decimated
 from framework.exporting.exports import PREDICTIONS, Chosen, ExportFormat, export
 from framework.exporting.glb import glb
@@ -461,7 +461,7 @@ def test_export_invalid_selection_raises(run: Path, tmp_path: Path) -> None:
         tmp_path / "objects/cube_2.glb"
     ]
     assert export(run, [ExportFormat.GLB], tmp_path, Chosen(min_probability=0.99)) == [tmp_path / "scene.glb"]
-    with pytest.raises(DataError, match="triangles: expected at least 4, got 0"):
+    with pytest.raises(ConfigError, match="triangles: expected at least 4, got 0"):
         Chosen(triangles=0)
 
 

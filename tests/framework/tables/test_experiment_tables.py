@@ -96,6 +96,13 @@ def test_changed_tables_name_edited_cell(sweep: Path, name: str, before: str, af
     assert any(message in change for change in changed_tables(sweep)), list(changed_tables(sweep))
 
 
+def test_changed_tables_too_long_field_is_error(sweep: Path) -> None:
+    write_tables(sweep)
+    (sweep / "table.csv").write_text("x" * 200_000)
+    with pytest.raises(DataError, match=r"table.csv: expected valid CSV, got an error \(field larger than"):
+        list(changed_tables(sweep))
+
+
 def test_changed_tables_uses_overrides_of_stored_tables(sweep: Path) -> None:
     write_tables(sweep, ["table.base=identity", "table.columns=[instances.ap50]"])
     assert list(changed_tables(sweep)) == []

@@ -23,6 +23,7 @@ from framework.vocabulary.text_queries import ObjectWords, object_words
         ("an orange chair", ("chair",), ("orange",), ()),
         ("teddy bears", ("teddy bear",), (), ()),
         ("the fridge", ("refrigerator",), (), ()),
+        ("plants and a stool", ("potted plant", "chair"), (), ()),
         ("light blue couch", ("couch",), ("blue",), ()),
         ("dark gray, pale chairs", ("chair",), ("gray",), ("pale",)),
         ("a red light", (), ("red",), ("light",)),

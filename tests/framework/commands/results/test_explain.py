@@ -35,6 +35,17 @@ def test_explain_writes_explanation_and_prints_contributions(
     assert (tmp_path / "bars.png").exists()
 
 
+def test_explain_figure_without_contributions_is_rejected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(tmp_path), "--causes-only", "--figure", str(tmp_path / "bars")]
+    monkeypatch.setattr(sys, "argv", ["instancemap explain", *words])
+    with pytest.raises(SystemExit) as ended:
+        explain.main()
+    assert ended.value.code == 2
+    assert "--figure: expected contributions of the stages, got --causes-only" in capsys.readouterr().err
+
+
 def test_explain_config_has_truth_of_replaced_stages(tmp_path: Path) -> None:
     config = read_record(write_run(tmp_path / "run")).config
     assert explain.given_stages(config) == frozenset()

@@ -89,7 +89,7 @@ def test_verify_accepted_files_are_unchanged(stored: Path, command: Command) -> 
     assert command(verify, stored, "--accept", "instances.json", "mesh.ply")[::2] == (0, "")
     assert "mesh.ply" not in Manifest.read(stored).files
     status, _, error = command(verify, stored, "--accept", "notes.txt")
-    assert (status, "accept: expected files listed in " in error) == (1, True)
+    assert (status, "error: --accept: expected files listed in " in error) == (1, True)
 
 
 def test_verify_accept_in_locked_directory_is_rejected(stored: Path, command: Command) -> None:

@@ -55,6 +55,12 @@ def test_labels_by_id_are_read(content: object, tmp_path: Path) -> None:
     assert found == {3: InstanceLabel("chair", 0.5), 12: InstanceLabel("sofa", None)}
 
 
+def test_too_long_csv_field_is_error(tmp_path: Path) -> None:
+    path = written(tmp_path / "labels.csv", f"id,class\n3,{'x' * 200_000}\n")
+    with pytest.raises(DataError, match=r"labels.csv: expected valid CSV, got an error \(field larger than"):
+        read_labels_by_id(path, None)
+
+
 def test_labels_without_classes_have_no_name(tmp_path: Path) -> None:
     path = written(tmp_path / "labels.csv", "id,confidence\n3,0.5\n")
     assert read_labels_by_id(path, None) == {3: InstanceLabel(None, 0.5)}
