@@ -21,6 +21,7 @@ pytest.register_assert_rewrite("framework.testing")  # before these modules are 
 import tests.support.cached_lights  # noqa: E402, F401
 from framework.config import composition  # noqa: E402
 from tests.support.scenes.corner_room import CornerRoom  # noqa: E402
+from tests.support.small_overviews import use_small_overviews  # noqa: E402
 
 os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # tests never download weights, 180 MB
 # with a deadline, tests would fail on a busy machine
@@ -98,6 +99,12 @@ def ready(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Any]
 def room() -> CornerRoom:
     """Return a sequence of six frames with exact ground truth."""
     return CornerRoom()
+
+
+@pytest.fixture
+def small_overviews(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write smaller overview images, which saves about 0.3 s of each run or edit."""
+    use_small_overviews(monkeypatch)
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ from framework.runs.provenance import config_hash
 from tests.support.forked_commands import FAKE_CONF, clean_environment, completed
 
 pytestmark = pytest.mark.integration
+REPEATED = pytest.mark.acceptance  # the same rule with other values
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 STAGES = ("dataset", "detector", "tracker", "refiner", "fuser")
@@ -134,7 +135,12 @@ def test_module_search_path_excludes_working_directory(
 
 @pytest.mark.parametrize(
     ("variable", "value"),
-    [("NUMBA_NUM_THREADS", "0"), ("NUMBA_DISABLE_JIT", "1"), ("NUMBA_THREADING_LAYER", "foo"), ("NUMBA_OPT", "9")],
+    [
+        ("NUMBA_NUM_THREADS", "0"),
+        ("NUMBA_DISABLE_JIT", "1"),
+        pytest.param("NUMBA_THREADING_LAYER", "foo", marks=REPEATED),
+        pytest.param("NUMBA_OPT", "9", marks=REPEATED),
+    ],
 )
 def test_command_invalid_variable_is_one_line_error(tmp_path: Path, variable: str, value: str) -> None:
     line = [sys.executable, "-m", "framework", "compile", "nothing"]
@@ -154,6 +160,7 @@ def test_commands_ignore_matplotlib_backend_of_user(tmp_path: Path) -> None:
     assert done.stdout == "agg\n"
 
 
+COMPILE, MAP = ["compile", "nothing"], ["detector=simulated", "dataset=synthetic"]
 LIBRARY = """
 import os, signal
 try:
@@ -165,10 +172,14 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="requires signals of POSIX")
-@pytest.mark.parametrize(("name", "line"), [("SIGINT", "interrupted by Ctrl-C"), ("SIGUSR1", "ended by SIGUSR1")])
 @pytest.mark.parametrize(
-    ("library", "arguments"),
-    [("filelock", ["compile", "nothing"]), ("pycolmap", ["detector=simulated", "dataset=synthetic"])],
+    ("library", "arguments", "name", "line"),
+    [
+        ("filelock", COMPILE, "SIGINT", "interrupted by Ctrl-C"),
+        ("pycolmap", MAP, "SIGUSR1", "ended by SIGUSR1"),
+        pytest.param("filelock", COMPILE, "SIGUSR1", "ended by SIGUSR1", marks=REPEATED),
+        pytest.param("pycolmap", MAP, "SIGINT", "interrupted by Ctrl-C", marks=REPEATED),
+    ],
 )
 def test_command_signal_while_loading_is_one_line(
     tmp_path: Path, library: str, arguments: list[str], name: str, line: str

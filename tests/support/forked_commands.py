@@ -24,7 +24,10 @@ LIBRARIES = [
     "framework.rendering.overview",
     "scipy.spatial.transform",
     "tests.support.cached_lights",
+    "tests.support.preloaded",
     "matplotlib.font_manager",
+    "pycolmap",
+    "threadpoolctl",
 ]
 _context = multiprocessing.get_context("forkserver")
 _context.set_forkserver_preload(LIBRARIES)

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from framework.commands.running.run import run
 from framework.config import composition
 from framework.files.manifest import MANIFEST
+from tests.support.small_overviews import use_small_overviews
 
 FAKES = Path(__file__).resolve().parent / "fake_conf"
 CONFIG: dict[str, Any] = {
@@ -38,6 +39,7 @@ def write_run(directory: Path, **dataset: Any) -> Path:
     config = CONFIG | {"dataset": CONFIG["dataset"] | dataset}
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(composition, "_added", [FAKES])
+        use_small_overviews(patched)
         run(OmegaConf.create(config), directory, {})
     return directory
 

@@ -7,6 +7,7 @@ import logging
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -39,18 +40,27 @@ def errors(found: RecordingCheck) -> list[Finding]:
     return [finding for finding in found.findings if finding.verdict is Verdict.ERROR]
 
 
+@cache
+def desk_files() -> dict[str, bytes]:
+    """Return the content of the undistorted images of the desk, keyed by path."""
+    files = {}
+    for k in range(FRAMES):
+        frame = DESK[2 * k]
+        images = {"color": frame.color[..., ::-1], "depth": np.rint(1000 * frame.depth).astype(np.uint16)}
+        files |= {f"{name}/{k:06d}.png": cv2.imencode(".png", image)[1].tobytes() for name, image in images.items()}
+    return files
+
+
 def desk(place: Path, poses: bool = True, pose: Callable[[Float64], Float64] = lambda T: T) -> Path:
     """Write every second frame of the desk as undistorted images, with depth in mm."""
     for name in ("color", "depth"):
         (place / name).mkdir(parents=True)
-    frames = [DESK[2 * k] for k in range(FRAMES)]
-    for k, frame in enumerate(frames):
-        cv2.imwrite(str(place / f"color/{k:06d}.png"), frame.color[..., ::-1])
-        cv2.imwrite(str(place / f"depth/{k:06d}.png"), np.rint(1000 * frame.depth).astype(np.uint16))
-    camera = frames[0].camera
-    write_camera(place, 1, 1, camera)
+    for name, content in desk_files().items():
+        (place / name).write_bytes(content)
+    write_camera(place, 1, 1)
     if poses:
-        write_tum(place / "poses.txt", [k / 15 for k in range(FRAMES)], [pose(one.T_world_camera) for one in frames])
+        given = [DESK.contents.frames[2 * k].T_world_camera for k in range(FRAMES)]
+        write_tum(place / "poses.txt", [k / 15 for k in range(FRAMES)], [pose(T) for T in given if T is not None])
     return place
 
 

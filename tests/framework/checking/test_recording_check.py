@@ -29,7 +29,8 @@ from tests.support.recordings.damaged import in_millimeters, inverted_opengl, sc
 pytestmark = pytest.mark.integration
 
 FARTHEST = 5.0  # maximum mapped depth, m
-DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
+FRAMES = 34  # half of the desk, which halves the time of a check
+DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy", stop=FRAMES)
 
 
 KIND, AXES, DELAY, POSES = (f"dataset.{name}=" for name in ("pose_kind", "camera_axes", "depth_delay", "pose_delay"))
@@ -49,7 +50,7 @@ def settings(findings: tuple[Finding, ...]) -> list[str]:
     ],
 )
 def test_recording_check_of_changed_desk_names_setting(tmp_path: Path, damage: Mapping[str, Any], setting: str) -> None:
-    place = write_damaged(tmp_path / "damaged", DESK, **damage)
+    place = write_damaged(tmp_path / "damaged", DESK, frames=FRAMES, **damage)
     assert " ".join(settings(check(RgbdFolder(place), FARTHEST).findings)) == setting
 
 
@@ -71,7 +72,7 @@ def test_recording_check_reports_clock_delay_in_two_units(tmp_path: Path) -> Non
     path = tmp_path / DESK.name / "groundtruth.txt"
     words = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
     path.write_text("".join(f"{float(time) + 0.1:.4f} {' '.join(pose)}\n" for time, *pose in words))
-    [fault] = check(TumRgbd(tmp_path, scene=DESK.name), FARTHEST).errors
+    [fault] = check(TumRgbd(tmp_path, scene=DESK.name, stop=FRAMES), FARTHEST).errors
     assert fault.setting == POSES + "3"
     assert "3 frames late (0.096 s)" in fault.text
 
@@ -84,7 +85,7 @@ def test_recording_check_unrelated_poses_fit_no_convention(tmp_path: Path) -> No
         T[:3, :3] = Rotation.from_rotvec((0, 0, 0.5 * next(turned))).as_matrix()
         return T
 
-    [fault] = check(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, pose=another)), FARTHEST).errors
+    [fault] = check(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, frames=FRAMES, pose=another)), FARTHEST).errors
     assert fault.subject == "poses"
     assert "in all supported conventions" in fault.text
     assert "tracker=voxel_hashing_icp" in fault.setting
@@ -203,12 +204,12 @@ def test_run_with_inverted_poses_logs_warning(tmp_path: Path, caplog: pytest.Log
     warn_of_poses(DESK)
     warn_of_poses(Part(20))
     assert not caplog.text
-    warn_of_poses(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, pose=inverse)))
+    warn_of_poses(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, frames=FRAMES, pose=inverse)))
     assert "poses: stored as T_camera_world" in caplog.text
     assert "run `instancemap check`" in caplog.text
 
 
 def test_check_reports_depth_sensor() -> None:
-    [finding] = [finding for finding in check(DESK, FARTHEST).findings if finding.subject == "sensor"]
+    [finding] = [finding for finding in check(replace(DESK, stop=6), FARTHEST).findings if finding.subject == "sensor"]
     assert (finding.verdict, finding.setting) == (Verdict.FINE, "")
     assert finding.text == "KINECT_V1, standard deviation of depth 1.9 mm at 1 m, 14.0 mm at 3 m"

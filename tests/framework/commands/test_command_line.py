@@ -15,6 +15,7 @@ from framework.commands.command_line import _config_dirs, directory_name, print_
 from framework.errors import DataError
 
 pytestmark = pytest.mark.integration
+REPEATED = pytest.mark.acceptance  # the same rule with other values
 
 
 def test_directory_name_is_built_from_overrides() -> None:
@@ -46,7 +47,9 @@ def test_print_for_directories_continues_after_error(
     assert capsys.readouterr() == ("a table.base=x\nb table.base=x\n", "error: there is nothing\n")
 
 
-@pytest.mark.parametrize("command", ["tables", "figures", "evaluate", "plugins"])
+@pytest.mark.parametrize(
+    "command", ["tables", "plugins", *(pytest.param(name, marks=REPEATED) for name in ("figures", "evaluate"))]
+)
 def test_command_with_closed_pipe_ends_without_output(command: str) -> None:
     """An example is `python -m framework tables DIR | head -1`."""
     reader, writer = os.pipe()

@@ -32,8 +32,9 @@ from framework.testing.corner_room import exact_clusters, frame_at, pose_at
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.support import reported_run
 from tests.support.scenes.corner_room import GivenPose
+from tests.support.small_overviews import use_small_overviews
 
-pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered", "small_overviews")]
 
 EDITS = [{"delete": [1]}, {"rename": [2, "chair"]}]
 CHANGED = {"instances.json", "mesh.ply", "map.npz", "overview.png", "metrics.json"}
@@ -52,6 +53,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def edited(run: Path) -> Path:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(composition, "_added", [reported_run.FAKES])
+        use_small_overviews(patched)
         return instancemap.edit(run, EDITS)
 
 

@@ -25,6 +25,7 @@ from tests.support.scenes.corner_room import CornerRoom
 from tests.support.slow_scannet import SceneFiles, slow_ious, slow_metrics
 
 pytestmark = pytest.mark.integration
+REPEATED = pytest.mark.acceptance  # the same rule with other values
 SCENE = Path(__file__).resolve().parents[4] / "shared" / "data" / "scannet_scene0000"
 
 OVERRIDES = (
@@ -61,7 +62,7 @@ def benchmark_figures(metrics: dict[str, Any]) -> dict[str, float]:
     return {key: value for key, value in metrics.items() if key.startswith(("instances.scannet.", "semantic."))}
 
 
-@pytest.mark.parametrize("label_space", ["scannet20", "scannet200", "nyu40"])
+@pytest.mark.parametrize("label_space", ["scannet20", "scannet200", pytest.param("nyu40", marks=REPEATED)])
 def test_exported_predictions_have_metrics_of_run(scannet_run: Path, tmp_path: Path, label_space: str) -> None:
     metrics = metrics_in(scannet_run, label_space)
     paths = export(scannet_run, [ExportFormat.SCANNET], tmp_path)

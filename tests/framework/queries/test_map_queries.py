@@ -21,6 +21,7 @@ from framework.queries import map_queries
 from tests.support.scenes.corner_room import CornerRoom
 
 pytestmark = pytest.mark.integration
+REPEATED = pytest.mark.acceptance  # the same rule with other values
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 STAGES = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
@@ -100,7 +101,7 @@ def test_map_queries_equal_slow_reference(fuser: str) -> None:
     """Compare `at_pixel` with the whole view, and `nearest` with a search of all vertices."""
     mapper = Mapper(*STAGES[:-1], f"fuser={fuser}", "fuser.voxel_size=0.04")
     rng = np.random.default_rng(0)
-    for frame in CornerRoom():
+    for frame in CornerRoom(frames=3):
         mapper.add(frame)
         assert frame.T_world_camera is not None
         camera = replace(frame.camera, width=frame.camera.width - 3, cx=frame.camera.cx - 0.3)  # no whole tiles
@@ -144,7 +145,14 @@ def test_map_nearest_leaves_far_instances_out(mapper: Mapper) -> None:
     assert [*instances._created] == [key]
 
 
-@pytest.mark.parametrize("fuser", ["bayesian_tsdf", "object_volumes", "open3d_vbg", "class_only_fusion"])
+@pytest.mark.parametrize(
+    "fuser",
+    [
+        "bayesian_tsdf",
+        "object_volumes",
+        *(pytest.param(name, marks=REPEATED) for name in ("open3d_vbg", "class_only_fusion")),
+    ],
+)
 def test_map_objects_of_class_are_not_created(fuser: str) -> None:
     mapper = Mapper(*STAGES[:-1], f"fuser={fuser}", "fuser.voxel_size=0.04")
     for frame in CornerRoom():

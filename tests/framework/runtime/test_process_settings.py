@@ -25,22 +25,22 @@ pytestmark = pytest.mark.integration
 CHECKOUT = Path(__file__).resolve().parents[3]
 
 
-def test_thread_limit_applies_to_libraries_loaded_later() -> None:
-    """Torch is imported after the settings were applied. The settings themselves do not import torch."""
+def test_settings_apply_to_libraries_loaded_later() -> None:
+    """Torch is imported after the first settings were applied. The settings themselves do not import torch."""
     code = """
 import sys
 from framework.runtime.process_settings import Settings
-Settings(seed=0, device="cpu", threads=1).apply()
+Settings(seed=4, device="cpu", threads=1).apply()
 import cv2, numba
 assert "torch" not in sys.modules
 import torch
-Settings(seed=0, device="cpu", threads=1).apply()
-print(numba.get_num_threads(), cv2.getNumThreads(), torch.get_num_threads())
-Settings(seed=0, device="cpu", threads=3).apply()
+Settings(seed=5, device="cpu", threads=1).apply()
+print(numba.get_num_threads(), cv2.getNumThreads(), torch.get_num_threads(), torch.initial_seed())
+Settings(seed=5, device="cpu", threads=3).apply()
 print(torch.get_num_threads())
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert done.stdout.split() == ["1", "1", "1", "3"]
+    assert done.stdout.split() == ["1", "1", "1", "5", "3"]
 
 
 def test_thread_limit_is_passed_to_scipy_and_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,20 +69,6 @@ def test_thread_limit_is_passed_to_scipy_and_open3d(monkeypatch: pytest.MonkeyPa
     finally:
         numba.set_num_threads(before)
     assert asked == [1, 1]
-
-
-def test_apply_seeds_torch_only_if_loaded() -> None:
-    code = """
-import sys
-from framework.runtime.process_settings import Settings
-Settings(seed=4, device="cpu", threads=1).apply()
-assert "torch" not in sys.modules
-import torch
-Settings(seed=5, device="cpu", threads=1).apply()
-print(torch.initial_seed())
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert done.stdout.split() == ["5"]
 
 
 def test_frozen_garbage_collector_is_restored() -> None:

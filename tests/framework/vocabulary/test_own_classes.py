@@ -21,6 +21,7 @@ from tests.support import option_files
 from tests.support.forked_commands import completed
 
 pytestmark = pytest.mark.integration
+REPEATED = pytest.mark.acceptance  # the same rule with other values
 
 NAMES = {1: "forklift", 2: "pallet"}  # by instance id
 MAPPING = ("tracker=ground_truth", "fuser.voxel_size=0.02", "fuser.min_observations=1")
@@ -113,14 +114,6 @@ def test_own_classes_have_column_in_table(run: Path) -> None:
     assert "forklift" in done.stdout
 
 
-def test_class_agnostic_masks_are_objects(tmp_path: Path) -> None:
-    words = write_room(tmp_path / "room", dict.fromkeys(NAMES, "object"))
-    done = completed(tmp_path, *words, *MAPPING, "hydra.run.dir=outputs/objects")
-    assert done.returncode == 0, done.stderr[-4000:]
-    assert [one["class"] for one in read_json(tmp_path / "outputs/objects/instances.json")] == ["object", "object"]
-    assert read_json(tmp_path / "outputs/objects/metrics.json")["instances.ap50_agnostic"] == 1.0
-
-
 def test_python_run_equals_command(run: Path, tmp_path: Path) -> None:
     room = run.parent.parent / "room"
     detector = [f"detector.path={room / 'masks'}", f"detector.label_space={room / 'names.txt'}"]
@@ -173,6 +166,11 @@ def test_python_query_finds_class_by_name(python_run: OwnRun, key: int) -> None:
     assert len(found.objects) == [*python_run.names.values()].count(name)
 
 
+@pytest.mark.parametrize(
+    "python_run",
+    [pytest.param("own", marks=REPEATED), "object", pytest.param("punctuation", marks=REPEATED)],
+    indirect=True,
+)
 def test_class_agnostic_map_gets_classes_by_edit(python_run: OwnRun, tmp_path: Path) -> None:
     ids = [one["id"] for one in read_json(python_run.directory / "instances.json")]
     edits = [{"rename": [ids[0], "forklift truck"]}]

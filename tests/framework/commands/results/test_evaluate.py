@@ -31,6 +31,7 @@ from tests.support.reported_run import unverified_copy
 from tests.support.scenes.corner_room import CornerRoom
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
+REPEATED = pytest.mark.acceptance  # the same rule with other values
 CHECKOUT = Path(__file__).resolve().parents[4]
 CONFIG = reported_run.CONFIG | {
     "dataset": reported_run.CONFIG["dataset"] | {"frames": 4},
@@ -285,7 +286,7 @@ def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
     assert command(stored)[0] == 0
 
 
-@pytest.mark.parametrize("started", [["-m", "framework"], ["-P", "-m", "framework"]])
+@pytest.mark.parametrize("started", [["-m", "framework"], pytest.param(["-P", "-m", "framework"], marks=REPEATED)])
 def test_evaluate_does_not_execute_code_in_run_directory(started: list[str], stored: Path) -> None:
     (stored / "brought.py").write_text(
         "print('runs')\nfrom tests.support.scenes.corner_room import CornerRoom as Brought\n"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import subprocess
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ from framework.tables.published import read_published
 from tests.support.forked_commands import FAKE_CONF, completed
 
 pytestmark = pytest.mark.integration
+REPEATED = pytest.mark.acceptance  # the same rule with other values
 
 CHECKOUT = Path(__file__).resolve().parents[4]
 FAKES = CHECKOUT / "tests" / "support" / "fake_conf"
@@ -119,10 +122,13 @@ def test_experiment_row_name_accepts_number() -> None:
     assert OmegaConf.create("{rows: {ours: [], 2: []}, all: '${all_of:${rows}}'}").all == "ours,2"
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
 @pytest.mark.parametrize(
-    ("preset", "all_rows"),
-    [(None, False), ("paper", False), *(pytest.param(p, True, marks=pytest.mark.acceptance) for p in [None, *PRESETS])],
+    ("experiment", "preset", "all_rows"),
+    [
+        *((experiment, None, False) for experiment in EXPERIMENTS),
+        *((experiment, "paper", False) for experiment in ("ablation_fuser", "ablation_tracker", "table3_map")),
+        *(pytest.param(*case, True, marks=REPEATED) for case in product(EXPERIMENTS, [None, *PRESETS])),
+    ],
 )
 def test_experiment_rows_compose_with_every_preset(experiment: str, preset: str | None, all_rows: bool) -> None:
     """The rows are composed and their stages are built. Without `all_rows`, only the last rows are tested."""
@@ -175,13 +181,13 @@ def test_sequences_choose_data_detector_and_pose_source() -> None:
 def test_sequences_with_given_poses_use_ground_truth_tracker(sequences: str) -> None:
     """The tracker set by `sequences` overrides that of `preset`, and the command line overrides both."""
     given = sequences.endswith("_given_poses")
-    own = {preset: chosen(preset=preset)["tracker"] for preset in PRESETS}
     for preset in PRESETS:
         asked = {"experiment": "table3_map", "sequences": sequences, "preset": preset}
-        assert chosen(**asked)["tracker"] == ("ground_truth" if given else own[preset])
-        assert chosen(**asked, tracker="icp_only")["tracker"] == "icp_only"
+        assert chosen(**asked)["tracker"] == ("ground_truth" if given else chosen(preset=preset)["tracker"])
+    assert chosen(**asked, tracker="icp_only")["tracker"] == "icp_only"
 
 
+@functools.cache
 def chosen(**choices: str) -> dict[str, str]:
     """Return the option that Hydra chooses in each config group."""
     with initialize_config_dir(str(CONF), version_base="1.3"):

@@ -90,24 +90,29 @@ def test_resumed_kitchen_tracking_matches_single_run(tmp_path: Path, shared_data
     check_halves(tmp_path, RgbdFolder(shared_data / "redkitchen", stride=3))
 
 
+@pytest.fixture(scope="module")
+def stored_desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder with the map and the keyframes of 15 tracked frames of the desk."""
+    desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *TRACKED)
+    return stored_files(desk, tmp_path_factory.mktemp("stored") / "desk")
+
+
 @pytest.mark.parametrize("tracker", ["voxel_hashing_icp", "pycolmap_pnp"])
-def test_resume_in_another_room_leaves_map_unchanged(tmp_path: Path, shared_data: Path, tracker: str) -> None:
+def test_resume_in_another_room_leaves_map_unchanged(
+    stored_desk: Path, tmp_path: Path, shared_data: Path, tracker: str
+) -> None:
     stages = (*TRACKED, f"tracker={tracker}")
-    desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *stages)
-    before = stored_files(desk, tmp_path / "desk")
-    elsewhere, poses = mapped(RgbdFolder(shared_data / "redkitchen", stride=30), *stages, f"resume_from={before}")
+    elsewhere, poses = mapped(RgbdFolder(shared_data / "redkitchen", stride=30), *stages, f"resume_from={stored_desk}")
     assert all(pose.lost for pose in poses)
     assert len(poses) == 10
     elsewhere.scene.save(tmp_path / "after.npz")
-    assert (tmp_path / "after.npz").read_bytes() == (before / "map.npz").read_bytes()
+    assert (tmp_path / "after.npz").read_bytes() == (stored_desk / "map.npz").read_bytes()
 
 
-def test_resume_lost_camera_relocalizes_in_known_view(tmp_path: Path) -> None:
-    desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *TRACKED)
-    before = stored_files(desk, tmp_path / "desk")
+def test_resume_lost_camera_relocalizes_in_known_view(stored_desk: Path) -> None:
     black = replace(DESK[5], color=np.zeros_like(DESK[5].color))
     empty = replace(DESK[6], depth=np.zeros_like(DESK[6].depth))
-    _, poses = mapped([black, empty, DESK[11], DESK[12]], *TRACKED, f"resume_from={before}")
+    _, poses = mapped([black, empty, DESK[11], DESK[12]], *TRACKED, f"resume_from={stored_desk}")
     assert [pose.lost for pose in poses] == [True, True, False, False]
 
 

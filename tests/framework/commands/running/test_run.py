@@ -25,6 +25,7 @@ from tests.support.forked_commands import FAKE_CONF, ForkedCommand
 from tests.support.noted_calls import CALLS
 
 pytestmark = pytest.mark.integration
+REPEATED = pytest.mark.acceptance  # the same rule with other values
 
 CHECKOUT = Path(__file__).resolve().parents[4]
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
@@ -72,11 +73,19 @@ def ignore_ctrl_c() -> None:
 
 
 @pytest.mark.parametrize(
-    "number",
-    [signal.SIGTERM, signal.SIGHUP, signal.SIGXCPU, signal.SIGUSR1, signal.SIGUSR2],
-    ids=lambda number: number.name,
+    ("number", "background"),
+    [
+        (signal.SIGTERM, False),
+        (signal.SIGXCPU, False),
+        (signal.SIGHUP, True),
+        *(pytest.param(number, False, marks=REPEATED) for number in (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)),
+        *(
+            pytest.param(number, True, marks=REPEATED)
+            for number in (signal.SIGTERM, signal.SIGXCPU, signal.SIGUSR1, signal.SIGUSR2)
+        ),
+    ],
+    ids=lambda value: getattr(value, "name", value),
 )
-@pytest.mark.parametrize("background", [False, True])
 def test_run_signal_leaves_partial_outputs(tmp_path: Path, number: signal.Signals, background: bool) -> None:
     """A run in the background of a shell script ignores Ctrl-C, but other signals end the run."""
     place = tmp_path / "run"
@@ -93,7 +102,7 @@ def test_run_signal_leaves_partial_outputs(tmp_path: Path, number: signal.Signal
     assert not (place / "metrics.json").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGXCPU])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGXCPU, marks=REPEATED)])
 def test_run_repeated_sigxcpu_completes_partial_outputs(tmp_path: Path, number: signal.Signals) -> None:
     """The kernel sends SIGXCPU every second, also while the outputs are written."""
     place = tmp_path / "run"
@@ -126,8 +135,8 @@ def test_run_cpu_limit_leaves_partial_outputs(tmp_path: Path) -> None:
     ("kind", "message"),
     [
         ("OSError", "OSError: weights.bin: Input/output error"),
-        ("ValueError", "ValueError: operands could not be broadcast together"),
-        ("MemoryError", "MemoryError: Unable to allocate 40 GiB"),
+        pytest.param("ValueError", "ValueError: operands could not be broadcast together", marks=REPEATED),
+        pytest.param("MemoryError", "MemoryError: Unable to allocate 40 GiB", marks=REPEATED),
         ("masks", "masks"),
     ],
 )
@@ -218,7 +227,7 @@ def test_run_on_full_disk_writes_small_files(tmp_path: Path) -> None:
     assert figures(place)["instances.ap50"] == 1.0
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=REPEATED)])
 def test_run_signal_during_saving_completes_outputs(tmp_path: Path, number: signal.Signals) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, "fuser.slow_save_s=1", f"hydra.run.dir={place}")
@@ -251,7 +260,7 @@ def test_run_second_signal_in_saving_leaves_complete_files(tmp_path: Path) -> No
 LIVE = ("dataset=live", "dataset.frames_sent=100000", "fuser.capacity=100000", "fuser.note=note")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=REPEATED)])
 def test_live_run_signal_completes_outputs(tmp_path: Path, number: signal.Signals) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, *LIVE, f"hydra.run.dir={place}")
@@ -390,7 +399,9 @@ def test_run_calls_viewer_from_begin_run_to_end_run(
     assert calls[-1][3].startswith(str(outcome[2]))
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGXCPU])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, *(pytest.param(number, marks=REPEATED) for number in (signal.SIGUSR1, signal.SIGXCPU))]
+)
 def test_detect_signal_ends_in_one_line(tmp_path: Path, number: signal.Signals) -> None:
     words = ("dataset=fake", "dataset.frames=100000", "dataset.slow_s=0.01", "detector=fake", "out=found.json")
     process = ForkedCommand(tmp_path, "detect", "--config-dir", str(FAKE_CONF), *words)

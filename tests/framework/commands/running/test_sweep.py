@@ -25,8 +25,10 @@ from framework.files.folders.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.runs.provenance import config_hash
 from framework.runs.run_directory import MAPPED
+from tests.support.forked_commands import FAKE_CONF, completed
 
 pytestmark = pytest.mark.integration
+REPEATED = pytest.mark.acceptance  # the same rule with other values
 
 CHECKOUT = Path(__file__).resolve().parents[4]
 FAILED = "error: a run failed: dataset tests.support.scenes.corner_room.CornerRoom: frames"
@@ -42,7 +44,7 @@ PATIENCE_S = 180
 
 def begin(directory: Path, *arguments: str, sweep: str = "experiment=fake_ablation") -> subprocess.Popen[str]:
     """Start the fake experiment or another sweep in a separate process group, like a terminal."""
-    fakes = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), sweep]
+    fakes = ["--config-dir", str(FAKE_CONF), sweep]
     clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
     environment = clean | {
         "PYTHONPATH": str(CHECKOUT),
@@ -66,6 +68,13 @@ def end(process: subprocess.Popen[str]) -> subprocess.CompletedProcess[str]:
         os.killpg(process.pid, signal.SIGKILL)
         raise
     return subprocess.CompletedProcess(process.args, process.returncode, out, errors)
+
+
+def serial(
+    directory: Path, *arguments: str, sweep: str = "experiment=fake_ablation"
+) -> subprocess.CompletedProcess[str]:
+    """Run a sweep without worker processes, in a forked process."""
+    return completed(directory, "--config-dir", str(FAKE_CONF), sweep, *arguments, timeout=PATIENCE_S)
 
 
 def wait_until(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
@@ -126,7 +135,7 @@ def test_sweep_with_other_launcher_keeps_completed_runs(
 ) -> None:
     directory = Path(shutil.copytree(whole[0], tmp_path / "copy"))  # the table lists the other number of threads
     before = recorded(directory)
-    again = end(begin(directory, "row=half", "seed=1,2,3", SLOW, "threads=2"))
+    again = serial(directory, "row=half", "seed=1,2,3", SLOW, "threads=2")
     assert again.returncode == 0, again.stderr
     assert again.stderr.count("skipped: the completed run in") == 3
     assert recorded(directory) == before
@@ -183,7 +192,8 @@ def swept(directory: Path, *arguments: str) -> tuple[subprocess.CompletedProcess
 
     Return the process, and the completion time of each run, ns, keyed by the varying part of the directory name.
     """
-    done = end(begin(directory, *FAKES, "dataset.frames=3", "hydra.sweep.dir=s", *arguments, sweep="-m"))
+    words = (*FAKES, "dataset.frames=3", "hydra.sweep.dir=s", *arguments)
+    done = end(begin(directory, *words, sweep="-m")) if BY_JOBLIB[0] in words else serial(directory, *words, sweep="-m")
     assert done.returncode == 0, done.stderr
     runs = (directory / "s").glob("*/metrics.json")
     return done, {path.parent.name.partition("refiner=fake,")[2]: path.stat().st_mtime_ns for path in runs}
@@ -300,7 +310,7 @@ def running_after(seconds: float, processes: list[psutil.Process]) -> list[psuti
     return []
 
 
-@pytest.mark.parametrize("signaled", [False, True])
+@pytest.mark.parametrize("signaled", [False, pytest.param(True, marks=REPEATED)])
 def test_sweep_killed_leaves_partial_outputs_only(tmp_path: Path, signaled: bool) -> None:
     """If the main process is killed, the workers write partial outputs and exit, even if they get no signal."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
@@ -358,7 +368,7 @@ def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
 
 def test_sweep_in_locked_folder_is_rejected(tmp_path: Path) -> None:
     with locked(tmp_path / PLACE):
-        done = end(begin(tmp_path))
+        done = serial(tmp_path)
     assert (done.returncode, done.stdout) == (1, "")
     assert len(done.stderr.splitlines()) == 1
     assert (

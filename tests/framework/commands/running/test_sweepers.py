@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 
 from framework.config.composition import one_line
 from framework.files.search_paths import CONF
-from tests.framework.commands.running.test_sweep import BY_JOBLIB, FAKES, begin, end
+from tests.framework.commands.running.test_sweep import BY_JOBLIB, FAKES, begin, end, serial
 
 N_TRIALS = 30
 SPACE = ["fuser.voxel_size=interval(0.005,0.05)", "refiner.x=interval(0,1)"]
@@ -62,7 +62,7 @@ def best_value(directory: Path, seed: int, sampler: str) -> float:
 def test_optuna_beats_random_search_in_median(tmp_path: Path) -> None:
     optuna = pytest.importorskip("optuna", reason="requires hydra-optuna-sweeper (extra sweepers)")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    seeds = range(20)
+    seeds = range(10)
     tpe, random = ([best_value(tmp_path, seed, sampler) for seed in seeds] for sampler in ("tpe", "random"))
     assert np.median(tpe) > np.median(random)
 
@@ -73,7 +73,7 @@ def test_optuna_optimizes_metric_of_runs(tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="requires hydra-optuna-sweeper (extra sweepers)")
     arguments = (
         "hydra/sweeper=optuna",
-        "hydra.sweeper.n_trials=4",
+        "hydra.sweeper.n_trials=3",
         "hydra.sweeper.storage=sqlite:///study.db",
         "hydra.sweeper.study_name=lost",
         "objective=frames_lost",
@@ -82,7 +82,7 @@ def test_optuna_optimizes_metric_of_runs(tmp_path: Path) -> None:
         "skip_completed=true",
     )
     for _ in range(2):
-        done = end(begin(tmp_path, *FAKES, *arguments, sweep="-m"))
+        done = serial(tmp_path, *FAKES, *arguments, sweep="-m")
         assert done.returncode == 0, done.stderr
         runs = [json.loads(path.read_text()) for path in (tmp_path / "s").glob("*/metrics.json")]
         found = OmegaConf.load(tmp_path / "s" / "optimization_results.yaml")
@@ -123,7 +123,7 @@ def test_optuna_optimizes_several_metrics(tmp_path: Path) -> None:
 def test_optuna_without_known_metric_reports_error(tmp_path: Path, arguments: list[str], message: str) -> None:
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="requires hydra-optuna-sweeper (extra sweepers)")
     swept = ("hydra/sweeper=optuna", "hydra.sweeper.n_trials=1", "dataset.frames=range(2,4)")
-    done = end(begin(tmp_path, *FAKES, *swept, *arguments, sweep="-m"))
+    done = serial(tmp_path, *FAKES, *swept, *arguments, sweep="-m")
     assert (done.returncode, done.stderr.splitlines()[-1]) == (1, f"error: {message}")
     assert "Traceback" not in done.stderr
 
