@@ -30,7 +30,7 @@ make endurance
 python -m tests.endurance --frames 1000 --out outputs/endurance
 ```
 
-The first command maps {frames:,} frames of {places} places in one process. The second command is a short test. The process
+The first command maps {frames:,} frames of {places} places in one process. The second is a short test. The process
 visits the places in turn:
 
 - redkitchen, freiburg1_rpy: Kinect recordings, forward and backward
@@ -39,15 +39,15 @@ visits the places in turn:
 
 ![Processor time, heap, instances and position error over all frames](endurance.png)
 """
-BOUNDS_INTRODUCTION = f"""Growth is the median slope over all pairs of visits, with quartiles in brackets. Visits in the first
-{EXPIRY:,} frames are excluded, because tentative instances have not expired yet. Bold values miss the bound: their lower quartile
-exceeds it. For italic values, only the median exceeds the bound, so noise may be the cause.
+BOUNDS_INTRODUCTION = f"""Growth is the median slope over all pairs of visits, with quartiles in brackets. The
+first {EXPIRY:,} frames are excluded, because tentative instances have not expired yet. Bold values miss the bound:
+their lower quartile exceeds it. For italic values, only the median exceeds the bound, so noise may be the cause.
 """
 METHOD = """
 Processor time is relative to a reference computation. [Acceptance](acceptance.md) has a more precise measurement,
-`long_run_slowdown`. Heap is the memory allocated during visits of a place. Drift is the increase of the position error.
-The map grows because sensor noise adds blocks at depth edges. Instances grow because repeated images repeat detection
-errors.
+`long_run_slowdown`. Heap is the memory allocated during visits of a place. Drift is the increase of the position
+error. The map grows because sensor noise adds blocks at depth edges. Instances grow because repeated images repeat
+detection errors.
 """
 
 
