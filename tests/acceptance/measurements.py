@@ -111,7 +111,7 @@ def kitchen_ap50() -> Measured:
     return ap50(0.6, "redkitchen")
 
 
-@measurement("ATE with / without the person <= 1.1", *PIPELINE)
+@measurement("ATE with/without the person <= 1.1", *PIPELINE)
 def person_ate_ratio() -> Measured:
     ratio = max(run.ate for run in changing_scenes.masked()) / changing_scenes.without_person().ate
     return ratio, ratio <= 1.1
@@ -202,7 +202,7 @@ def hashing_cost() -> Measured:
     return cost, cost <= 5
 
 
-@measurement("ATE with / without back end <= 1/3", *PIPELINE)
+@measurement("ATE with/without back end <= 1/3", *PIPELINE)
 def building_ate() -> Measured:
     value = max(one.corrected.ate / one.drifted.ate for one in five_rooms())
     return value, value <= 1 / 3
@@ -239,13 +239,13 @@ def building_oracle_surface() -> Measured:
     return value, value <= 2
 
 
-@measurement("ATE with / without back end <= 0.8, motion capture", *PIPELINE)
+@measurement("ATE with/without back end <= 0.8, motion capture", *PIPELINE)
 def calibrated_freiburg1_ate() -> Measured:
     value = depth_calibration.of_freiburg1().ratio
     return value, value <= 0.8
 
 
-@measurement("distance from structure-from-motion poses with / without back end <= 0.5", *PIPELINE)
+@measurement("distance from structure-from-motion poses with/without back end <= 0.5", *PIPELINE)
 def calibrated_kitchen_distance() -> Measured:
     value = depth_calibration.of_kitchen().ratio
     return value, value <= 0.5

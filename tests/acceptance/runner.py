@@ -25,7 +25,7 @@ The command runs missing and outdated measurements. A measurement is outdated if
 take about five hours. `make acceptance MEASUREMENT=NAME` runs one of them.
 
 - `building_*`: worst of three buildings with five rooms each, unless stated otherwise
-- oracle: map from the corrected poses and depth
+- *oracle*: map from the corrected poses and depth
 - `calibration_*`: four real scenes, two networks, leave-one-scene-out
 - `large_map_*`: 20 rooms, 1 cm voxels
 - `long_run_*`: 20,000 frames of a mapped room

@@ -44,10 +44,10 @@ first {EXPIRY:,} frames are excluded, because tentative instances have not expir
 their lower quartile exceeds it. For italic values, only the median exceeds the bound, so noise may be the cause.
 """
 METHOD = """
-Processor time is relative to a reference computation. [Acceptance](acceptance.md) has a more precise measurement,
-`long_run_slowdown`. Heap is the memory allocated during visits of a place. Drift is the increase of the position
-error. The map grows because sensor noise adds blocks at depth edges. Instances grow because repeated images repeat
-detection errors.
+Processor time is relative to a reference computation. For a more precise measurement, see `long_run_slowdown` in
+[Acceptance](acceptance.md). Heap is the memory allocated during visits of a place. Drift is the increase of the
+position error. Sensor noise adds map blocks at depth edges. Repeated images repeat detection errors, which add
+instances.
 """
 
 
