@@ -111,13 +111,13 @@ def kitchen_ap50() -> Measured:
     return ap50(0.6, "redkitchen")
 
 
-@measurement("ATE with / without the person <= 1.1", *PIPELINE)
+@measurement("ATE with/without the person <= 1.1", *PIPELINE)
 def person_ate_ratio() -> Measured:
     ratio = max(run.ate for run in changing_scenes.masked()) / changing_scenes.without_person().ate
     return ratio, ratio <= 1.1
 
 
-@measurement("<= 0.1% of the vertices on the person", *PIPELINE)
+@measurement("<= 0.1% of vertices on the person", *PIPELINE)
 def person_vertices() -> Measured:
     percentage = 100 * max(run.vertices for run in changing_scenes.masked())
     return percentage, percentage <= 0.1
@@ -153,7 +153,7 @@ def false_alarms() -> Measured:
     return count, count <= 1
 
 
-@measurement("time of Open3D's loop / whole loop >= 6, kitchen, 1 cm", *PIPELINE, "tests/benchmarks")
+@measurement("time per frame of Open3D / InstanceMap >= 6, kitchen, 1 cm", *PIPELINE, "tests/benchmarks")
 def speed_ratio() -> Measured:
     with tempfile.TemporaryDirectory() as directory:
         report = Path(directory, "benchmark.json")
@@ -187,7 +187,7 @@ def fuzzing() -> Measured:
 
 
 @measurement(
-    "<= 5% of the time to load a map of the kitchen", "framework/files", "framework/mapping", "tests/acceptance"
+    "<= 5% of the loading time, map of the kitchen", "framework/files", "framework/mapping", "tests/acceptance"
 )
 def hashing_cost() -> Measured:
     """Compare the time to load a map with its manifest to the time without, where zipfile checks the arrays."""
@@ -202,19 +202,19 @@ def hashing_cost() -> Measured:
     return cost, cost <= 5
 
 
-@measurement("ATE with / without back end <= 1/3", *PIPELINE)
+@measurement("ATE with/without back end <= 1/3", *PIPELINE)
 def building_ate() -> Measured:
     value = max(one.corrected.ate / one.drifted.ate for one in five_rooms())
     return value, value <= 1 / 3
 
 
-@measurement("AP50 lost against true poses <= 0.03", *PIPELINE)
+@measurement("decrease of AP50 from ground-truth to tracked poses <= 0.03", *PIPELINE)
 def building_ap50() -> Measured:
     value = max(one.given.ap50 - one.corrected.ap50 for one in five_rooms())
     return value, value <= 0.03
 
 
-@measurement("0 instances doubled only by the tracked poses", *PIPELINE)
+@measurement("0 instances duplicated only with tracked poses", *PIPELINE)
 def building_doubled() -> Measured:
     value = sum(len(one.corrected.doubled - one.given.doubled) for one in five_rooms())
     return value, value == 0
@@ -226,26 +226,26 @@ def building_surface() -> Measured:
     return value, value <= 10
 
 
-@measurement("difference of AP50, mean IoU from the oracle <= 0.01", *PIPELINE)
+@measurement("AP50 and mean IoU: difference from the oracle <= 0.01", *PIPELINE)
 def building_oracle() -> Measured:
     pairs = [(one.corrected, one.oracle) for one in five_rooms()]
     value = max(max(abs(a.ap50 - b.ap50), abs(a.mean_iou - b.mean_iou)) for a, b in pairs)
     return value, value <= 0.01
 
 
-@measurement("difference of the surface error from the oracle <= 2 mm", *PIPELINE)
+@measurement("surface error: difference from the oracle <= 2 mm", *PIPELINE)
 def building_oracle_surface() -> Measured:
     value = 1e3 * max(abs(one.corrected.distance - one.oracle.distance) for one in five_rooms())
     return value, value <= 2
 
 
-@measurement("ATE with / without back end <= 0.8, motion capture", *PIPELINE)
+@measurement("ATE with/without back end <= 0.8, motion capture", *PIPELINE)
 def calibrated_freiburg1_ate() -> Measured:
     value = depth_calibration.of_freiburg1().ratio
     return value, value <= 0.8
 
 
-@measurement("distance from structure from motion with / without back end <= 0.5", *PIPELINE)
+@measurement("distance from structure-from-motion poses with/without back end <= 0.5", *PIPELINE)
 def calibrated_kitchen_distance() -> Measured:
     value = depth_calibration.of_kitchen().ratio
     return value, value <= 0.5
@@ -263,13 +263,13 @@ def loop_recall() -> Measured:
     return value, value >= 0.8
 
 
-@measurement("size of the map after two rounds / one round <= 1.05", *PIPELINE)
+@measurement("map size after two rounds / one round <= 1.05", *PIPELINE)
 def building_second_round() -> Measured:
     value = second_round()
     return value, value <= 1.05
 
 
-@measurement("0 files differ between one and two threads", *PIPELINE)
+@measurement("0 different files between one and two threads", *PIPELINE)
 def building_threads() -> Measured:
     return counted(files_that_depend_on_threads())
 
@@ -296,7 +296,7 @@ def calibration_of_each_event() -> Measured:
     return counted(worse)
 
 
-@measurement("0 faults whose stage is not the cause, 4 faults in 3 rooms", *PIPELINE, "tests")
+@measurement("0 faults attributed to a wrong stage, 4 faults in 3 rooms", *PIPELINE, "tests")
 def faults_without_cause() -> Measured:
     return counted(str(one) for one in explained_faults() if not one.named)
 
@@ -307,7 +307,7 @@ def loss_of_faulty_stage() -> Measured:
     return value, value >= 0.8
 
 
-@measurement("difference of the contributions from the loss <= 1e-9", *PIPELINE, "tests")
+@measurement("difference between the sum of contributions and the loss <= 1e-9", *PIPELINE, "tests")
 def sum_of_contributions() -> Measured:
     value = max(one.rest for one in explained_faults())
     return value, value <= 1e-9

@@ -15,20 +15,21 @@ PAGE = CHECKOUT / "docs" / "results" / "acceptance.md"
 COLUMNS = ("measurement", "value", "bound", "commit, date")
 HEADER = """# Acceptance
 
-Check the measured properties of the project against their bounds:
+Check accuracy, robustness and speed against their bounds:
 
 ```console
 make acceptance
 ```
 
-The command runs the measurements that are missing or whose code has changed since the measured commit.
-`make acceptance MEASUREMENT=NAME` runs one. All take about five hours.
+The command runs missing and outdated measurements. A measurement is outdated if its code has changed. All measurements
+take about five hours. `make acceptance MEASUREMENT=NAME` runs one of them.
 
-- `building_*`: the worst of three buildings of five rooms, unless stated otherwise
+- `building_*`: worst of three buildings with five rooms each, unless stated otherwise
+- *oracle*: map from the corrected poses and depth
 - `calibration_*`: four real scenes, two networks, leave-one-scene-out
 - `large_map_*`: 20 rooms, 1 cm voxels
-- `long_run_*`: 20,000 frames of a known room
-- `person_*`: rendered person, `masking=people`, detection on every and every fifth frame
+- `long_run_*`: 20,000 frames of a mapped room
+- `person_*`: rendered person, `masking=people`, detection on every frame and on every fifth frame
 
 """
 MACHINE = "\nMachine of the latest measurement: "

@@ -23,30 +23,31 @@ LEGEND_MM, LEGEND_STEP_MM = 3.5, 24.0  # distance of the legend from the top, an
 KILO, MEGA = 1e3, 1e6
 INTRODUCTION = """# Endurance
 
-Check that memory, processor time, instances and position errors do not grow. One process maps {frames:,} frames of
-{places} places:
+Test a long run for growth of memory, processor time, instances and position errors:
 
 ```console
 make endurance
 python -m tests.endurance --frames 1000 --out outputs/endurance
 ```
 
-The second command is a short test.
+The first command maps {frames:,} frames of {places} places in one process. The second is a short test. The process
+visits the places in turn:
 
 - redkitchen, freiburg1_rpy: Kinect recordings, forward and backward
-- standing: one frame of redkitchen, new noise in each frame
-- room: rendered room, other objects on the way back
+- standing: one frame of redkitchen, with new noise in each frame
+- room: rendered room, with other objects on the way back
 
 ![Processor time, heap, instances and position error over all frames](endurance.png)
 """
-BOUNDS_INTRODUCTION = f"""The places are visited in turn. Growth is the median slope [quartiles] of all pairs of visits.
-Visits count after {EXPIRY:,} frames, when tentative instances have expired. Bold: bound missed, because the lower
-quartile exceeds it. Italics: only the median exceeds the bound, so noise may be the cause.
+BOUNDS_INTRODUCTION = f"""Growth is the median slope over all pairs of visits, with quartiles in brackets. The
+first {EXPIRY:,} frames are excluded, because tentative instances have not expired yet. Bold values miss the bound:
+their lower quartile exceeds it. For italic values, only the median exceeds the bound, so noise may be the cause.
 """
 METHOD = """
-Processor time is relative to a reference computation; `long_run_slowdown` in [Acceptance](acceptance.md) is more
-precise. Heap is the memory allocated in the visits of a place. The map grows because sensor noise adds blocks at depth
-edges, and instances because equal images repeat detection errors. Drift is the increase of the position error.
+Processor time is relative to a reference computation. For a more precise measurement, see `long_run_slowdown` in
+[Acceptance](acceptance.md). Heap is the memory allocated during visits of a place. Drift is the increase of the
+position error. Sensor noise adds map blocks at depth edges. Repeated images repeat detection errors, which add
+instances.
 """
 
 
