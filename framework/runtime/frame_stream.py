@@ -125,10 +125,10 @@ class LiveFrames(FrameStream):
         try:
             with closing(self._video.frames()) as readers:
                 for found in readers:
+                    if found is not None:
+                        self._keep(found)  # also the frame that arrives at the end
                     if self._over:
                         break
-                    if found is not None:
-                        self._keep(found)
         except Exception as error:
             self._end(error)
         else:
