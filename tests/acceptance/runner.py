@@ -72,7 +72,7 @@ def read_rows(page: Path = PAGE) -> dict[str, list[str]]:
 
 def write_rows(rows: dict[str, list[str]], page: Path = PAGE) -> None:
     """Write the page with these rows, and with this machine below the table."""
-    body = "".join(f"| {' | '.join(row)} |\n" for row in (COLUMNS, *(rows[name] for name in sorted(rows))))
+    body = "".join(f"|{'|'.join(row)}|\n" for row in (COLUMNS, *(rows[name] for name in sorted(rows))))
     head, _, table = body.partition("\n")
     page.write_text(f"{HEADER}{head}\n|{'---|' * len(COLUMNS)}\n{table}{MACHINE}{machine()}.\n")
 
