@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 
 from framework.config.text_values import typed
 from framework.errors import ConfigError, DataError
@@ -44,6 +45,11 @@ def open_source(path: Path, topics: Topics | None = None, options: BagOptions | 
         raise DataError(f"{path}: expected a recording, got no such file or folder")
     if path.suffix.lower() == ".zip":
         raise DataError(f"{path}: expected a folder or recording, got a zip archive; unpack it")
+    if path.suffix.lower() == ".oni":
+        scene = path.with_suffix("")
+        command = f"instancemap convert-oni {quote(str(path))} {quote(str(scene))}"
+        overrides = f"dataset=scenenn {typed('dataset.root', scene.parent)} {typed('dataset.scene', scene.name)}"
+        raise DataError(f"{path}: expected a recording, got an OpenNI file; run {command}, then instancemap {overrides}")
     folders = [entry for entry in path.iterdir() if entry.is_dir()] if path.is_dir() else []
     # unpacked archives often have an outer folder
     for place in (path, *(folders if len(folders) == 1 else [])):

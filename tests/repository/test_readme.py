@@ -111,7 +111,7 @@ def test_tutorial_detector_runs_by_option_name(my_plugins: Path) -> None:
     assert (my_plugins / "run" / "metrics.json").exists()
 
 
-OWN_PLUGIN = "python -m framework --config-dir my_conf detector=color_blobs detector.hue=120"
+OWN_PLUGIN = "python -m framework --config-dir my_conf detector=color_blobs detector.hue=220"
 FAKES = {"dataset": "CornerRoom", "tracker": "GivenPose", "refiner": "KeepAll", "fuser": "GridFuser"}
 
 

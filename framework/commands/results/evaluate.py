@@ -165,15 +165,18 @@ def over_scenes(scenes: Sequence[BenchmarkScene]) -> str:
 
 
 def summary(found: Reevaluation, transfer: Transfer) -> str:
-    """Return the changes of the main metrics and the number of other changes as text."""
+    """Return the changes and new values of the main metrics, and the numbers of other changes, as text."""
     changed, added = found.changed, found.added
     prefix = "instances." if transfer is Transfer.TO_TRUTH else f"instances.{transfer.value}."
-    shown = [key for key in (*(prefix + name for name in MAIN_FIGURES), "annotation_release") if key in changed]
-    parts = [f"{head(key)} {_step(*changed[key])}" for key in shown]
+    main = [prefix + name for name in MAIN_FIGURES]
+    shown = [key for key in (*main, "annotation_release") if key in changed]
+    parts = [f"{head(key)} {found.metrics[key]:.3f}" for key in main if key in added and found.metrics[key] is not None]
+    new = len(added) - len(parts)
+    parts += [f"{head(key)} {_step(*changed[key])}" for key in shown]
     if others := len(changed) - len(shown):
         parts.append(f"{others} other{'s' * (others > 1)}")
-    if added:
-        parts.append(f"{len(added)} new")
+    if new:
+        parts.append(f"{new} new")
     return ", ".join(parts) or "unchanged"
 
 

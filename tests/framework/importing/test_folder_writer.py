@@ -158,6 +158,13 @@ def test_open_source_unknown_format_error_lists_formats(tmp_path: Path) -> None:
         open_source(tmp_path / "nowhere")
 
 
+def test_open_source_of_oni_file_names_conversion(tmp_path: Path) -> None:
+    (tmp_path / "room.oni").touch()
+    expected = r"run instancemap convert-oni .*room.oni .*room, then instancemap dataset=scenenn .* dataset.scene=room$"
+    with pytest.raises(DataError, match=expected):
+        open_source(tmp_path / "room.oni")
+
+
 def test_open_source_of_rgbd_folder_names_dataset(tmp_path: Path) -> None:
     write_folder(source(frame(0)), tmp_path / "out", Writing())
     with pytest.raises(DataError, match=r"got an RGB-D folder; run instancemap dataset=rgbd_folder dataset.root=.*out"):

@@ -104,6 +104,15 @@ def test_evaluate_replaces_only_evaluation_metrics(stored: Path, command) -> Non
     assert metrics_of(stored) == true | CODE | {"fps": 3.0, "trajectory.ate_rmse_m": 0.25}
 
 
+def test_evaluate_prints_new_main_metrics(stored: Path, command) -> None:
+    true = metrics_of(stored)
+    write_metrics(stored, {key: value for key, value in true.items() if not key.startswith("instances.ap")})
+    status, out, err = command(stored, "--dry-run")
+    assert (status, err) == (0, "")
+    assert out.startswith(f"{stored}: AP50 1.000, AP25 1.000, AP {true['instances.ap']:.3f}, ")
+    assert out.endswith(" new\n")
+
+
 def test_evaluate_prints_metrics_of_chosen_transfer(stored: Path, command) -> None:
     true = metrics_of(stored)
     write_metrics(stored, true | {"instances.ap50": 0.125, "instances.to_map.ap25": 0.25})
