@@ -49,7 +49,9 @@ def open_source(path: Path, topics: Topics | None = None, options: BagOptions | 
         scene = path.with_suffix("")
         command = f"instancemap convert-oni {quote(str(path))} {quote(str(scene))}"
         overrides = f"dataset=scenenn {typed('dataset.root', scene.parent)} {typed('dataset.scene', scene.name)}"
-        raise DataError(f"{path}: expected a recording, got an OpenNI file; run {command}, then instancemap {overrides}")
+        raise DataError(
+            f"{path}: expected a recording, got an OpenNI file; run {command}, then instancemap {overrides}"
+        )
     folders = [entry for entry in path.iterdir() if entry.is_dir()] if path.is_dir() else []
     # unpacked archives often have an outer folder
     for place in (path, *(folders if len(folders) == 1 else [])):

@@ -28,7 +28,8 @@ def test_notebook_runs_from_top_to_bottom(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     assert "exists" in done.stdout
     assert "ATE" in done.stdout
-    assert {path.name for path in (tmp_path / "outputs" / "notebook").iterdir()} == {"default", "identity"}
+    [folder] = (tmp_path / "outputs").iterdir()
+    assert {path.name for path in folder.iterdir()} == {"default", "identity"}
 
 
 def test_notebook_is_stored_without_outputs() -> None:
