@@ -34,8 +34,8 @@ The first command maps {frames:,} frames of {places} places in one process. The 
 visits the places in turn:
 
 - redkitchen, freiburg1_rpy: Kinect recordings, forward and backward
-- standing: one frame of redkitchen, with new noise in each frame
-- room: rendered room, with other objects on the way back
+- standing: one frame of redkitchen, repeated with new noise
+- room: rendered room, with different objects on the way back
 
 ![Processor time, heap, instances and position error over all frames](endurance.png)
 """
@@ -45,7 +45,7 @@ their lower quartile exceeds it. For italic values, only the median exceeds the 
 """
 METHOD = """
 Processor time is relative to a reference computation. For a more precise measurement, see `long_run_slowdown` in
-[Acceptance](acceptance.md). Heap is the memory allocated during visits of a place. Drift is the increase of the
+[Acceptance](acceptance.md). Heap is the memory allocated during visits to a place. Drift is the increase in the
 position error. Sensor noise adds map blocks at depth edges. Repeated images repeat detection errors, which add
 instances.
 """
