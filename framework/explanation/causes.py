@@ -363,10 +363,8 @@ def _cause_of_class(key: int, class_name: str, figures: StageFigures, classes: S
     if next(iter(found), "") != class_name:
         unknown = "" if class_name in classes else f"; the detector has no class {class_name}"
         return Cause.DETECTION, counts + unknown
-    points = figures.objects_of_instance
-    other = next((k for k in points if k not in (0, key) and points[k] >= MIN_FOREIGN * sum(points.values())), 0)
-    if other:
-        return Cause.ASSOCIATION, f"{counts}; instance {figures.instance} has the class of object {other}"
+    if others := [k for k in _other_objects(figures) if k != key]:
+        return Cause.ASSOCIATION, f"{counts}; instance {figures.instance} has the class of object {others[0]}"
     return Cause.FUSION, f"{counts}, but instance {figures.best_instance} has another class"
 
 

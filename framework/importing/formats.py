@@ -28,6 +28,12 @@ FORMATS = (
     ros_bag.FORMAT,
 )
 
+DATASETS = {
+    "rgbd_folder": ("an RGB-D folder", ("camera.json", "depth")),
+    "tum_rgbd": ("a TUM RGB-D sequence", ("rgb.txt", "depth.txt")),
+}
+"""Name and files of the layouts that a dataset reads without an import, by `dataset`."""
+
 
 def open_source(path: Path, topics: Topics | None = None, options: BagOptions | None = None) -> Source:
     """Open a recording in any supported format.
@@ -64,9 +70,10 @@ def open_source(path: Path, topics: Topics | None = None, options: BagOptions | 
             if given:
                 raise ConfigError(f"{', '.join(given)}: expected a ROS bag, got {path}; omit these options")
             return replace(kind.open(place), path=place)
-    if (path / "camera.json").exists() and (path / "depth").is_dir():
-        command = f"instancemap dataset=rgbd_folder {typed('dataset.root', path)}"
-        raise DataError(f"{path}: expected a recording, got an RGB-D folder; run {command}")
+    for dataset, (name, files) in DATASETS.items():
+        if all((path / file).exists() for file in files):
+            command = f"instancemap dataset={dataset} {typed('dataset.root', path)}"
+            raise DataError(f"{path}: expected a recording, got {name}; run {command}")
     known = ", ".join(kind.name for kind in FORMATS)
     found = "got an unknown format; run instancemap import --help for the files of each format"
     raise DataError(f"{path}: expected a supported format ({known}), {found}")

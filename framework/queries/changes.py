@@ -50,7 +50,7 @@ class Change:
 
     kind: Kind
     name: str  # name of its class
-    probability: float  # probability of `kind`; for NOT_SEEN, probability that the object exists
+    probability: float  # probability of `kind`; for NOT_SEEN, confidence of the object
     before: int | None  # id in the first map
     after: int | None  # id in the second map
     place: Float64  # (3,) m, last center in the world frame
@@ -113,7 +113,7 @@ class _Object:
 
     @property
     def confidence(self) -> float:
-        """Probability that the object exists."""
+        """Confidence of the object, in [0, 1]."""
         return float(min(max(self.instance.confidence, 0.0), 1.0))
 
 

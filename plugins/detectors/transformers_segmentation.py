@@ -19,6 +19,7 @@ from torch.nn import functional
 from framework.config.validation import LONGEST_SIDE, MAX_DETECTIONS, check_count, check_intervals, require
 from framework.data import Detections, Float32, Frame, UInt8
 from framework.detection.hub.hub_model import PREPROCESSING, commit_of, find_model, imported_transformers, read_part
+from framework.detection.hub.image_text import IMAGENET_MEAN, IMAGENET_STD
 from framework.detection.masks.binary_masks import without_duplicates
 from framework.detection.runtimes.device import torch_device
 from framework.detection.stored.fingerprint import fingerprint
@@ -27,7 +28,6 @@ from framework.files.json_file import read_json
 from framework.interfaces import Detector
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS, ClassNames, to_class_names
 
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # defaults for files without values
 RESAMPLING = {2: "bilinear", 3: "bicubic"}  # by Pillow's constants
 PLACEHOLDER = re.compile(r"LABEL_\d+|N/A", re.IGNORECASE)  # name of an unnamed class or unused id
 

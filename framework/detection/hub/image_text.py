@@ -29,6 +29,7 @@ from framework.files.hashing import path_hash
 from framework.files.json_file import read_json
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 LONGEST_SIDE = 1024  # maximum side of a model's input, px
 HASH_DIGITS = 16  # number of digits of a local folder's content hash in the name of the embedding space
 MAX_TOKENS = 64  # maximum length of a text, tokens; the limit is 77 for CLIP and 64 for SigLIP

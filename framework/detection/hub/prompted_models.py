@@ -15,14 +15,13 @@ from torch.nn import functional
 from framework.data import Bool, Float32, UInt8
 from framework.detection.candidates import corners
 from framework.detection.hub.hub_model import TOKENIZER, find_model, imported_transformers, read_part
-from framework.detection.hub.image_text import CLIP_MEAN, CLIP_STD, network_pixels
+from framework.detection.hub.image_text import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, network_pixels
 from framework.detection.runtimes.device import ready
 from framework.errors import ConfigError, DataError
 
 PROMPT = "a photo of a {}"  # Minderer et al. 2023
 MAX_TOKENS = 16  # maximum length of a text, tokens, as in the training of OWLv2
 PADDING = 128  # gray value of the padding to the right of or below the image in OWLv2's square input
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 SAM_FAMILY = {
     "sam": ("SamModel", False),
     "sam2": ("Sam2Model", True),

@@ -171,6 +171,13 @@ def test_open_source_of_rgbd_folder_names_dataset(tmp_path: Path) -> None:
         open_source(tmp_path / "out")
 
 
+def test_open_source_of_tum_sequence_names_dataset(tmp_path: Path) -> None:
+    for name in ("rgb.txt", "depth.txt"):
+        (tmp_path / name).touch()
+    with pytest.raises(DataError, match=r"got a TUM RGB-D sequence; run instancemap dataset=tum_rgbd dataset\.root="):
+        open_source(tmp_path)
+
+
 def test_open_source_finds_nested_export_folder(tmp_path: Path) -> None:
     write_scanner_app(tmp_path / "outer/2026_11_23", room_frames(1))
     assert open_source(tmp_path / "outer").format == "3D Scanner App"
