@@ -43,7 +43,7 @@ class Bound:
     """The maximum value of a quantity of each place."""
 
     quantity: str
-    unit: str
+    unit: str  # with the space after the number
     limit: float
     measure: Callable[[Sequence[Block]], Measured]  # measures the quantity, given the blocks of one place
 
@@ -68,7 +68,7 @@ class Verdict:
         """Return the error message of a bound that is not met."""
         bound = self.bound
         got = f"{self.measured.value:.4g}"
-        return f"{self.place}: {bound.quantity}: expected at most {bound.limit:g} {bound.unit}, got {got}"
+        return f"{self.place}: {bound.quantity}: expected at most {bound.limit:g}{bound.unit}, got {got}"
 
 
 def growth(
@@ -117,7 +117,7 @@ def lost_frames(blocks: Sequence[Block]) -> Measured:
 
 BOUNDS = (
     Bound(
-        "heap", "bytes per frame", 500,  # decreases to below 50 bytes (`long_run_growth`)
+        "heap", " bytes per frame", 500,  # decreases to below 50 bytes (`long_run_growth`)
         growth(lambda block: block.heap),
     ),
     Bound(
@@ -125,19 +125,19 @@ BOUNDS = (
         growth(lambda block: block.map_bytes, 1000, relative=True),
     ),
     Bound(
-        "processor time", "% per 1,000 frames", 5,  # noise of about 3 %
+        "processor time", "% per 1,000 frames", 5,  # noise of about 3%
         growth(lambda block: block.relative_time, 1000, relative=True),
     ),
     Bound(
-        "confirmed instances", "per 1,000 frames", 10,  # equal images repeat detection errors
+        "confirmed instances", " per 1,000 frames", 10,  # equal images repeat detection errors
         growth(lambda block: block.confirmed, 1000),
     ),
     Bound(
-        "tentative instances", "per 1,000 frames", 50,  # noise of about 20
+        "tentative instances", " per 1,000 frames", 50,  # noise of about 20
         growth(lambda block: block.tentative, 1000),
     ),
-    Bound("drift", "mm", 5, drift_increase),  # half of a voxel of 1 cm
-    Bound("lost frames", "frames", 0, lost_frames),  # the place is known
+    Bound("drift", " mm", 5, drift_increase),  # half of a voxel of 1 cm
+    Bound("lost frames", " frames", 0, lost_frames),  # the place is known
 )  # fmt: skip
 """The bounds of the endurance run."""
 

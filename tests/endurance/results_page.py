@@ -85,7 +85,7 @@ def bounds_table(verdicts: Sequence[Verdict]) -> list[str]:
     rows = []
     for bound in dict.fromkeys(verdict.bound for verdict in verdicts):
         measured = {verdict.place: _measured_text(verdict) for verdict in verdicts if verdict.bound is bound}
-        rows.append([bound.quantity, f"{bound.limit:g} {bound.unit}", *(measured[place] for place in places)])
+        rows.append([bound.quantity, f"{bound.limit:g}{bound.unit}", *(measured[place] for place in places)])
     return table(["growth", "bound", *places], rows)
 
 
@@ -110,7 +110,7 @@ def figure(blocks: Sequence[Block], provenance: str) -> Page:
     page = Page(
         PAGE_MM,
         height,
-        "One line for each visit of a place, one point for each block. Processor time: median (solid), 95 % (dotted). "
+        "One line for each visit to a place, one point for each block. Processor time: median (solid), 95% (dotted). "
         "Heap: difference from the first compared visit. Instances: confirmed (solid) and tentative (dotted). "
         f"Position error: root mean square. {provenance}",
     )
