@@ -33,7 +33,7 @@ class Moment:
     number: int  # number of the frame among all frames of the place
     visit: int  # number of the visit, from 0
     view: int  # view of the place, in [0, views)
-    returning: bool  # True on the way back
+    returning: bool  # True on the backward pass
 
     @property
     def time(self) -> float:
@@ -124,7 +124,7 @@ class StandingCamera(Place):
 class ChangingRoom(Place):
     """A synthetic room whose objects come and go.
 
-    On the way back, half of the movable objects replace the other half.
+    On the backward pass, half of the movable objects replace the other half.
     """
 
     name = "room"

@@ -30,12 +30,12 @@ make endurance
 python -m tests.endurance --frames 1000 --out outputs/endurance
 ```
 
-The first command maps {frames:,} frames of {places} places in one process. The second is a short test. The process
-visits the places in turn:
+The first command maps {frames:,} frames of {places} sequences in one process. The second is a short test. The process
+maps the sequences in turn:
 
 - redkitchen, freiburg1_rpy: Kinect recordings, forward and backward
 - standing: one frame of redkitchen, repeated with new noise
-- room: rendered room, with different objects on the way back
+- room: rendered room, with different objects on the backward pass
 
 ![Processor time, heap, instances and position error over all frames](endurance.png)
 """
