@@ -127,10 +127,15 @@ class EvidenceRows:
         other._free()
         return other
 
+    def best_instances(self) -> Int32:
+        """Return the most likely instance of each labeled voxel (N,), 0 = none."""
+        evidence = self.in_use()
+        return np.where(evidence.instance_value[:, 0] > 0, evidence.instance_ids[:, 0], np.int32(0))
+
     def best_ids(self) -> Int32:
         """Return the instances that are the most likely ones of a voxel, ascending."""
-        evidence = self.in_use()
-        return np.unique(evidence.instance_ids[:, 0][evidence.instance_value[:, 0] > 0])
+        ids = np.unique(self.best_instances())
+        return ids[ids > 0]
 
     def voxels_of(self, blocks: Int32) -> Int32:
         """Return the index (N, 512) of each voxel of the blocks (N,) among the labeled voxels, -1 = not labeled."""

@@ -60,14 +60,12 @@ def keep_near(grid, blocks, voxels, weights):
 
 
 @device
-def majority(labels, weights):
-    """Return the index of the largest weight (8,) among the voxels with the majority label, -1 = no majority.
+def most_common(labels, weights):
+    """Return the index of the largest weight (8,) among the voxels with the most common label, and the label's weight.
 
-    The majority label is positive and has more than half of the total weight.
+    If all weights are 0, the index is 0.
     """
-    total = np.float32(0.0)
-    for c in range(CORNERS):
-        total += weights[c]
+    elected, most = 0, np.float32(0.0)
     for c in range(CORNERS):
         votes = np.float32(0.0)
         largest = c
@@ -76,9 +74,22 @@ def majority(labels, weights):
                 votes += weights[d]
                 if weights[d] > weights[largest]:
                     largest = d
-        if labels[c] > 0 and votes > np.float32(0.5) * total:
-            return largest
-    return -1
+        if votes > most:
+            elected, most = largest, votes
+    return elected, most
+
+
+@device
+def majority(labels, weights):
+    """Return the index of the largest weight (8,) among the voxels with the majority label, -1 = no majority.
+
+    The majority label is positive and has more than half of the total weight.
+    """
+    elected, votes = most_common(labels, weights)
+    total = np.float32(0.0)
+    for c in range(CORNERS):
+        total += weights[c]
+    return elected if labels[elected] > 0 and votes > np.float32(0.5) * total else -1
 
 
 @device

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import prange
 
 from framework.compilation.kernel_cache import njit
+from framework.mapping.labels.vertex_labels_kernels import most_common
 from framework.mapping.voxels.voxel_grid_kernels import (
     BLOCK_SIDE,
     BLOCK_VOXELS,
@@ -25,6 +28,14 @@ from framework.mapping.voxels.voxel_walk import voxel_number
 MAX_COVERED = 27  # maximum number of blocks that a moved block overlaps: three along each axis
 ROUNDING = 1e-6  # voxels, bound of rounding errors
 MIN_OBSERVED = 0.5  # minimum fraction of the trilinear weight on observed voxels
+
+
+class VoxelInstances(NamedTuple):
+    """The most likely instances of the voxels of B blocks."""
+
+    labeled: Any  # (512 B,) index of each voxel among the labeled voxels, -1 = not labeled
+    instance_ids: Any  # (N,) instance of each labeled voxel, 0 = none
+    near: Any  # maximum distance of voting voxels from the surface, in stored units
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -128,12 +139,38 @@ def _corner_voxels(nearby, first, i, j, k, found):
     return exists
 
 
+@device
+def _elect(found, portions, tsdf, instances, ids, votes, nearest):
+    """Return the corner whose label evidence is copied, by a vote of the corners near the surface.
+
+    Args:
+        found: The voxels (8,) at the corners.
+        portions: The trilinear weights (8,), 0 = unobserved.
+        tsdf: The stored distances of the source voxels.
+        instances: The instances of the source voxels.
+        ids: A scratch array (8,).
+        votes: A scratch array (8,).
+        nearest: The corner with the largest weight, which is returned if no corner is near the surface.
+    """
+    for c in range(8):
+        ids[c], votes[c] = 0, 0.0
+        if portions[c] > 0.0 and abs(tsdf[found[c]]) <= instances.near:
+            labeled = instances.labeled[found[c]]
+            ids[c] = instances.instance_ids[labeled] if labeled >= 0 else 0
+            votes[c] = portions[c]
+    elected, most = most_common(ids, votes)
+    return elected if most > 0.0 else nearest
+
+
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def resample(source, R, t, target, most_jump, nearest):
+def resample(source, R, t, target, most_jump, instances, label_source):
     """Resample moved voxels.
 
     Distances, weights and colors are interpolated trilinearly between observed voxels. If the distances at the corners
     of a cell differ by more than `most_jump`, the nearest voxel is copied, because there is no surface in between.
+
+    Near the surface, the instance is the most common one of the corners, weighted trilinearly, as for vertices. The
+    label evidence comes from its corner with the largest weight, and far from the surface from the nearest corner.
 
     Args:
         source: The voxel grid before the motion.
@@ -141,14 +178,17 @@ def resample(source, R, t, target, most_jump, nearest):
         t: The translation (3,) from new to old coordinates, voxels.
         target: The output grid, whose blocks are allocated and unobserved.
         most_jump: The maximum difference of the distances at the corners, in stored units.
-        nearest: The output (B, 512), the nearest observed source voxel as block * 512 + index in the block, -1 = none.
+        instances: The instances of the source voxels; empty = no labels.
+        label_source: The output (B, 512), the source voxel of the label evidence as block * 512 + index in the block,
+            -1 = no observed voxel.
     """
     coords, tsdf, weight, color = target.block_coords, target.tsdf, target.weight, target.color
     old_tsdf, old_weight, old_color = source.tsdf.ravel(), source.weight.ravel(), source.color.ravel()
-    for block in prange(nearest.shape[0]):
+    for block in prange(label_source.shape[0]):
         found, nearby = np.empty(8, np.int32), np.empty(27, np.int32)
         portions = np.empty(8, np.float64)
-        nearest[block] = -1
+        ids, votes = np.empty(8, np.int32), np.empty(8, np.float32)
+        label_source[block] = -1
         exists, first = _nearby_blocks(source, R, t, coords[block], nearby)
         for n in range(BLOCK_VOXELS if exists else 0):
             x = np.float64(coords[block, 0] * BLOCK_SIDE + (n & 7))
@@ -191,7 +231,10 @@ def resample(source, R, t, target, most_jump, nearest):
                         r, g, b = unpack_color(packed)
                         colored += portions[c]
                         red, green, blue = red + portions[c] * r, green + portions[c] * g, blue + portions[c] * b
-            nearest[block, n] = found[best]
+            elected = best
+            if len(instances.labeled) > 0 and abs(distance) <= observed * instances.near:
+                elected = _elect(found, portions, old_tsdf, instances, ids, votes, best)
+            label_source[block, n] = found[elected]
             tsdf[block, n] = np.int16(np.rint(distance / observed))
             weight[block, n] = np.uint16(max(1.0, np.rint(mass / observed)))
             if colored >= MIN_OBSERVED * observed:

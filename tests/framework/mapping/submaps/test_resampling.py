@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from framework.data import Float64
+from framework.mapping.labels.vertex_labels_kernels import REACH
 from framework.mapping.submaps.layer import Layer
 from framework.mapping.submaps.resampling import resampled
 from framework.mapping.voxels.meshing import MAX_JUMP, SurfaceNets
@@ -36,8 +40,18 @@ def motion(shift: tuple[float, float, float], rotvec: tuple[float, float, float]
     return T
 
 
-def voxels(layer: Layer) -> dict[tuple[int, int, int], tuple[int, int, int, tuple[int, ...]]]:
-    """Return distance, weight, color and instances of each observed voxel by its coordinates."""
+class Voxel(NamedTuple):
+    """An observed voxel."""
+
+    distance: int  # stored units
+    weight: int
+    color: int
+    best: int  # most likely instance, 0 = none
+    ids: tuple[int, ...]  # instance slots
+
+
+def voxels(layer: Layer) -> dict[tuple[int, int, int], Voxel]:
+    """Return the observed voxels by their coordinates."""
     grid, found = layer.voxels.grid, {}
     evidence = layer.labels.evidence
     for block in range(layer.voxels.block_count):
@@ -47,7 +61,9 @@ def voxels(layer: Layer) -> dict[tuple[int, int, int], tuple[int, int, int, tupl
             row = grid.label_row[block]
             voxel = evidence.labeled[row, n] if row >= 0 else -1
             ids = tuple(evidence.instance_ids[voxel].tolist()) if voxel >= 0 else ()
-            found[place] = int(grid.tsdf[block, n]), int(grid.weight[block, n]), int(grid.color[block, n]), ids
+            best = ids[0] if voxel >= 0 and evidence.instance_value[voxel, 0] > 0 else 0
+            stored = (int(array[block, n]) for array in (grid.tsdf, grid.weight, grid.color))
+            found[place] = Voxel(*stored, best, ids)
     return found
 
 
@@ -68,22 +84,33 @@ def test_resampled_equals_slow_reference(layer: Layer, rotvec: tuple[float, floa
         place = list(after)[index]
         point = T_old_new[:3, :3] @ place + T_old_new[:3, 3] / VOXEL
         corner, rest = np.floor(point).astype(int), point - np.floor(point)
-        near = []
+        corners = []
         for c in np.ndindex(2, 2, 2):
             portion = float(np.prod(np.where(c, rest, 1 - rest)))
             if (voxel := before.get(tuple((corner + c).tolist()))) is not None:
-                near.append((portion, *voxel))
-        total = sum(one[0] for one in near)
+                corners.append((portion, voxel))
+        total = sum(portion for portion, _ in corners)
         assert total >= 0.5
-        nearest = max(near)
-        distances = [one[1] for one in near]
-        expected = sum(one[0] * one[1] for one in near) / total
-        weight = sum(one[0] * one[2] for one in near) / total
+        distances = [voxel.distance for _, voxel in corners]
         if max(distances) - min(distances) > most_jump:
-            expected, weight = nearest[1], nearest[2]
-        assert after[place][0] == pytest.approx(expected, abs=0.501)
-        assert after[place][1] == pytest.approx(weight, abs=0.501)
-        assert after[place][3] == nearest[4]
+            corners, total = [(1.0, max(corners)[1])], 1.0
+        new = after[place]
+        distance = sum(p * voxel.distance for p, voxel in corners) / total
+        assert new.distance == pytest.approx(distance, abs=0.501)
+        assert new.weight == pytest.approx(sum(p * voxel.weight for p, voxel in corners) / total, abs=0.501)
+        assert new.ids == elected(corners, distance, int(REACH * VOXEL / float(layer.voxels.grid.tsdf_unit))).ids
+
+
+def elected(corners: list[tuple[float, Voxel]], distance: float, reach: float) -> Voxel:
+    """Return the voxel whose labels a voxel at a distance from the surface gets, see `resample`."""
+    near = [(portion, voxel) for portion, voxel in corners if abs(voxel.distance) <= reach]
+    if abs(distance) > reach or not near:
+        return max(corners)[1]
+    votes: Counter[int] = Counter()
+    for portion, voxel in near:
+        votes[voxel.best] += portion
+    winner = max(votes, key=lambda k: votes[k])
+    return max(one for one in near if one[1].best == winner)[1]
 
 
 def test_resampled_surface_is_moved_surface(layer: Layer) -> None:
