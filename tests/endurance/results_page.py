@@ -31,7 +31,7 @@ python -m tests.endurance --frames 1000 --out outputs/endurance
 ```
 
 The first command maps {frames:,} frames of {places} sequences in one process. The second is a short test. The process
-maps the sequences in turn:
+takes turns between the sequences, so that each one is mapped several times:
 
 - redkitchen, freiburg1_rpy: Kinect recordings, forward and backward
 - standing: one frame of redkitchen, repeated with new noise
@@ -39,13 +39,13 @@ maps the sequences in turn:
 
 ![Processor time, heap, instances and position error over all frames](endurance.png)
 """
-BOUNDS_INTRODUCTION = f"""Growth is the median slope over all pairs of visits, with quartiles in brackets. The
-first {EXPIRY:,} frames are excluded, because tentative instances have not expired yet. Bold values miss the bound:
-their lower quartile exceeds it. For italic values, only the median exceeds the bound, so noise may be the cause.
+BOUNDS_INTRODUCTION = f"""Growth is the median slope over all pairs of passes through a sequence, with quartiles in
+brackets. The first {EXPIRY:,} mapped frames of each sequence are excluded, because tentative instances have not expired
+yet. Values are bold if their lower quartile exceeds the bound, and italic if only their median does (possibly noise).
 """
 METHOD = """
 Processor time is relative to a reference computation. For a more precise measurement, see `long_run_slowdown` in
-[Acceptance](acceptance.md). Heap is the memory allocated during visits to a place. Drift is the increase in the
+[Acceptance](acceptance.md). Heap is the memory allocated while a sequence is mapped. Drift is the increase in the
 position error. Sensor noise adds map blocks at depth edges. Repeated images repeat detection errors, which add
 instances.
 """
@@ -110,8 +110,9 @@ def figure(blocks: Sequence[Block], provenance: str) -> Page:
     page = Page(
         PAGE_MM,
         height,
-        "One line for each visit to a place, one point for each block. Processor time: median (solid), 95% (dotted). "
-        "Heap: difference from the first compared visit. Instances: confirmed (solid) and tentative (dotted). "
+        "One line for each pass through a sequence, one point for each block. "
+        "Processor time: median (solid), 95% (dotted). "
+        "Heap: difference from the first compared pass. Instances: confirmed (solid) and tentative (dotted). "
         f"Position error: root mean square. {provenance}",
     )
     labels = ("processor time, ms", "heap growth, KB", "process, MB", "instances", "position error, mm")
@@ -122,7 +123,7 @@ def figure(blocks: Sequence[Block], provenance: str) -> Page:
     for axes, label in zip((cost, heap, process, instances, error), labels, strict=True):
         style_axes(axes, "", label, "y")
         axes.set_xlim(0, max(block.all_frames for block in blocks))
-    style_axes(error, "frames of all places", labels[-1], "y")
+    style_axes(error, "frames of all sequences", labels[-1], "y")
     frames, sizes = zip(*((block.all_frames, block.process / MEGA) for block in blocks), strict=True)
     process.plot(frames, sizes, color=INK, linewidth=0.8)
     for k, (color, own) in enumerate(zip(COLORS, by_place(blocks).values(), strict=False)):
