@@ -26,6 +26,7 @@ from tests.acceptance.runner import CHECKOUT, Measured, measurement
 
 SHARED = CHECKOUT.parent / "shared" / "data"
 PIPELINE = ("framework", "plugins", "conf")
+TESTS = ("tests/conftest.py", "tests/framework", "tests/plugins", "tests/support")
 YOLO = SHARED.parent / "weights" / "yolo11n_seg" / "yolo11n_seg.onnx"
 MASKING_DETECTORS = (("detector=maskrcnn2go",), ("detector=onnx_segmentation", f"detector.weights={YOLO}"))
 CHECKS = (
@@ -194,7 +195,7 @@ def long_run_slowdown() -> Measured:
     return value, value <= 1.05
 
 
-@measurement("exit status 0, 2,000 cases per test", *PIPELINE, "tests")
+@measurement("exit status 0, 2,000 cases per test", *PIPELINE, *TESTS)
 def fuzzing() -> Measured:
     return failures("tests", "-k", "fuzz", INSTANCEMAP_FUZZ="2000")
 
@@ -404,7 +405,7 @@ def random_kills() -> Measured:
     return failures("tests/framework/commands/running/test_random_kills.py", INSTANCEMAP_KILLS="30")
 
 
-@measurement("exit status 0, tests marked `acceptance`", *PIPELINE, "tests")
+@measurement("exit status 0, tests marked `acceptance`", *PIPELINE, *TESTS)
 def long_tests() -> Measured:
     return failures("-m", "acceptance", "tests")
 
