@@ -286,6 +286,7 @@ class Pipeline:
                     journal.frame_begins()
                     if isinstance(outcome, FrameError):
                         self.skip(outcome, journal)
+                        stream.reported(outcome)
                         continue
                     frame, detections, timings = outcome
                     journal.record(timings)

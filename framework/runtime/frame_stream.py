@@ -6,7 +6,7 @@ import threading
 import time
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing, contextmanager
 from functools import partial
@@ -40,9 +40,12 @@ class FrameStream(AbstractContextManager["FrameStream"]):
     def take(self) -> FrameReader | FrameError | None:
         """Return the reader of the next frame, the error of an unusable frame, or None at the end."""
 
-    def unreported(self) -> Iterator[FrameError]:
-        """Yield the errors of unusable frames that were not taken. Called after the end of the stream."""
-        yield from ()
+    def reported(self, error: FrameError) -> None:
+        """Record that the error of an unusable frame was counted."""
+
+    def unreported(self) -> Sequence[FrameError]:
+        """Return the errors of received unusable frames that were not counted. Called after the end of the stream."""
+        return ()
 
     def dropped_of(self, frames: int) -> int:
         """Return the number of dropped frames after the end of the stream, given the number of processed frames."""
@@ -84,6 +87,7 @@ class LiveFrames(FrameStream):
         self._received = 0  # number of frames, including unusable frames
         self._newest: FrameReader | None = None
         self._unusable: deque[FrameError] = deque()
+        self._unreported: list[FrameError] = []  # also those that were taken before the run was interrupted
         self._error: Exception | None = None
         self._over = False  # no more frames arrive or are needed
         self._changed = threading.Condition()
@@ -114,9 +118,12 @@ class LiveFrames(FrameStream):
             raise self._error
         return reader
 
-    def unreported(self) -> Iterator[FrameError]:
-        while self._unusable:
-            yield self._unusable.popleft()
+    def reported(self, error: FrameError) -> None:
+        with self._changed:
+            self._unreported = [one for one in self._unreported if one is not error]
+
+    def unreported(self) -> Sequence[FrameError]:
+        return self._unreported
 
     def dropped_of(self, frames: int) -> int:
         return self._received - frames
@@ -139,6 +146,7 @@ class LiveFrames(FrameStream):
             self._received += 1
             if isinstance(found, FrameError):
                 self._unusable.append(found)
+                self._unreported.append(found)
             else:
                 self.dropped += self._newest is not None
                 self._newest = found
