@@ -10,6 +10,8 @@ import numpy as np
 from framework.data import Array
 from framework.files.atomic_write import check_regular
 
+CHUNK = 2**22  # bytes; smaller chunks delay threads that wait for the interpreter lock
+
 
 def add_values(digest: hashlib._Hash, array: Array) -> None:
     """Add the values of an array to a hash."""
@@ -35,5 +37,9 @@ def path_hash(path: Path) -> str:
             digest.update(f"{len(name)}:{name}:{path_hash(below)}".encode())
         return digest.hexdigest()
     check_regular(path)
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    digest = hashlib.sha256()
+    with path.open("rb", buffering=0) as file:
+        chunk = memoryview(bytearray(min(CHUNK, path.stat().st_size) or 1))
+        while count := file.readinto(chunk):
+            digest.update(chunk[:count])
+    return digest.hexdigest()
