@@ -18,13 +18,11 @@ import numpy as np
 from framework.data import Float64
 from framework.geometry import nearest_rotation
 
-# standard deviations of tracked motions and of loops; only their ratios matter
-DRIFT = (0.02, 0.01)  # translation, m, and rotation, rad, per m of the path
-STEP_NOISE = (0.005, 0.002)  # translation, m, and rotation, rad, of a short path
-LOOP_NOISE = (0.02, 0.006)  # translation, m, and rotation, rad; includes the drift within a submap
+# m and rad, standard deviations of a loop, including drift within a submap; only their ratio to those of drift matters
+LOOP_NOISE = (0.02, 0.006)
 # m, residuals of a loop edge at which its weight is 1/4; decreasing, because all residuals are large at the beginning
 # (graduated non-convexity, Yang et al., 2020)
-MAX_LOOP_RESIDUALS = (10.0, 1.0, 0.1)
+MAX_LOOP_RESIDUALS = (6.0, 0.6, 0.06)
 MIN_WEIGHT = 0.25  # minimum weight of a loop edge
 
 
@@ -35,24 +33,30 @@ class GraphEdge:
     first: int
     second: int
     T_first_second: Float64  # (4, 4)
+    information: Float64  # (6, 6) inverse covariance of the twist (rotation, translation), rad and m
     is_loop: bool = False
+
+    @classmethod
+    def tracked(cls, first: int, second: int, T_first_second: Float64, covariance: Float64) -> GraphEdge:
+        """Return the edge of a tracked motion.
+
+        Args:
+            first: The first anchor.
+            second: The second anchor.
+            T_first_second: The motion (4, 4).
+            covariance: The covariance (6, 6) of the twist (translation, rotation) in the frame of the second anchor.
+        """
+        return cls(first, second, T_first_second, np.roll(np.linalg.inv(covariance), (3, 3), (0, 1)))
+
+    @classmethod
+    def loop(cls, first: int, second: int, T_first_second: Float64) -> GraphEdge:
+        """Return the edge of a loop between two anchors."""
+        return cls(first, second, T_first_second, np.diag(np.repeat(LOOP_NOISE[::-1], 3) ** -2), is_loop=True)
 
     @property
     def path(self) -> float:
         """The length, m, of the path along which the tracker may have drifted."""
         return 0.0 if self.is_loop else float(np.linalg.norm(self.T_first_second[:3, 3]))
-
-    @property
-    def deviations(self) -> Float64:
-        """Standard deviations (6,) of the twist in the frame of the second anchor, m and rad."""
-        if self.is_loop:
-            return np.repeat(LOOP_NOISE, 3)
-        return np.repeat(np.hypot(STEP_NOISE, self.path * np.array(DRIFT)), 3)
-
-    @property
-    def information(self) -> Float64:
-        """Information matrix (6, 6) of the twist in Open3D's order: rotation, translation."""
-        return np.diag(np.roll(self.deviations, 3) ** -2)
 
 
 @dataclass
@@ -123,10 +127,12 @@ def optimize(poses: Sequence[Float64], edges: Sequence[GraphEdge]) -> Optimized:
         graph.edges.append(
             registration.PoseGraphEdge(edge.second, edge.first, edge.T_first_second, edge.information, edge.is_loop)
         )
-    for distance in MAX_LOOP_RESIDUALS:
-        is_last = distance == MAX_LOOP_RESIDUALS[-1]
+    # Open3D multiplies the squared distance by the mean information of all edges, not by that of loops
+    mean = float(np.mean([edge.information[-1, -1] for edge in edges]))
+    for residual in MAX_LOOP_RESIDUALS:
+        is_last = residual == MAX_LOOP_RESIDUALS[-1]
         option = registration.GlobalOptimizationOption(
-            max_correspondence_distance=distance,
+            max_correspondence_distance=residual / (LOOP_NOISE[0] * np.sqrt(mean)),
             edge_prune_threshold=MIN_WEIGHT if is_last else 0.0,
             preference_loop_closure=1.0,
             reference_node=0,

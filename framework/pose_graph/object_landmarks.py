@@ -65,12 +65,7 @@ class SharedObject(NamedTuple):
 class ObjectEdge(GraphEdge):
     """The transform between two anchors that aligns the objects that both submaps observe."""
 
-    hessian: Float64  # (6, 6) of the twist (rotation, translation)
     objects: int
-
-    @property
-    def information(self) -> Float64:
-        return self.hessian
 
 
 class NoLandmarks:
@@ -231,4 +226,4 @@ def _edge(pairs: Sequence[SharedObject], T_first_second: Float64) -> ObjectEdge:
         rotation, translation = np.split(np.linalg.pinv(H, 1e-6) @ np.einsum("k,kia,ki->a", weights, J, residuals), 2)
         T_first_second = T_first_second @ exp_se3(np.concatenate([translation, rotation]))
     edge = (pairs[0].first.submap, pairs[0].second.submap, T_first_second)
-    return ObjectEdge(*edge, is_loop=True, hessian=H, objects=len(pairs))
+    return ObjectEdge(*edge, information=H, is_loop=True, objects=len(pairs))

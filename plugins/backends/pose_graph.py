@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from framework.interfaces import (
 )
 from framework.pose_graph.delayed_result import DelayedResult
 from framework.pose_graph.depth_calibration import DepthCalibration
+from framework.pose_graph.drift_covariance import DriftCovariance
 from framework.pose_graph.graph_optimization import AnchorGraph, GraphEdge, Optimized, load_optimizer, optimize
 from framework.pose_graph.loop_detection import Drift, Extracted, Guess, Loop, LoopDetection, QueryView, Reach
 from framework.pose_graph.loop_verification import LoopVerification, match_hidden, overlaps
@@ -84,6 +85,7 @@ class PoseGraph(BackEnd):
         self.loops: list[Loop] = []  # the loops of all corrections
         self._closed: list[ClosedLoop] = []  # the same loops with their corrections
         self._graph = AnchorGraph()
+        self._drift = DriftCovariance()
         self._landmarks = ObjectLandmarks() if self.object_landmarks else NoLandmarks()
         self._frames = 0  # number of frames
         self._views = 0  # number of views
@@ -114,7 +116,7 @@ class PoseGraph(BackEnd):
         if self._guesses and self._verification is None and self._correction is None and corrected is unchanged:
             self._verify(self._guesses.popleft(), scene)  # not before the scene is corrected, too
         T_world_camera = corrected.moved(self.anchors.current, pose.T_world_camera)
-        self._divide(frame, T_world_camera)
+        self._divide(frame, replace(pose, T_world_camera=T_world_camera))
         hidden = self._look(frame, T_world_camera)
         change = SubmapChange(corrected.motions, corrected.shown, hidden, self.anchors.current)
         self._landmarks.observe(change, self.anchors.submaps, frame.camera, scene)
@@ -138,14 +140,20 @@ class PoseGraph(BackEnd):
             tuple(closed for loop, closed in zip(self.loops, self._closed, strict=True) if loop.edge in edges),
         )
 
-    def _divide(self, frame: Frame, T_world_camera: Float64) -> None:
+    def _divide(self, frame: Frame, pose: Pose) -> None:
         """Begin a submap, or enter another one, if the camera has left the current one."""
-        left = self.anchors.current
-        self.anchors.divide(frame, T_world_camera)
+        left, T_world_camera, submaps = self.anchors.current, pose.T_world_camera, self.anchors.submaps
+        if submaps:
+            self._drift.move(submaps[left].local(T_world_camera), pose.covariance)
+        if not self.anchors.divide(frame, T_world_camera):
+            return
         entered = self.anchors.current
+        T_entered_camera = submaps[entered].local(T_world_camera)
         if entered != left and not self._graph.connected(left, entered):
-            T_left_entered = self.anchors.submaps[left].local(self.anchors.submaps[entered].T_world_anchor)
-            self._graph.edges.append(GraphEdge(left, entered, T_left_entered))
+            T_left_entered = submaps[left].local(submaps[entered].T_world_anchor)
+            covariance = self._drift.at(inverse(T_entered_camera))
+            self._graph.edges.append(GraphEdge.tracked(left, entered, T_left_entered, covariance))
+        self._drift.enter(T_entered_camera)
 
     def _look(self, frame: Frame, T_world_camera: Float64) -> frozenset[int]:
         """Compare the frame with the hidden submaps if its view is new, and return the submaps to hide."""
@@ -237,7 +245,7 @@ class PoseGraph(BackEnd):
         T_best_anchor = T_best_camera @ inverse(view.T_anchor_camera)
         return Loop(
             view.frame.index, best.frames[earlier], inverse(best.views[earlier]) @ T_best_camera,
-            GraphEdge(best.number, view.submap.number, T_best_anchor, is_loop=True),
+            GraphEdge.loop(best.number, view.submap.number, T_best_anchor),
             frozenset(shown), view.number, guess.reach.path,
         )  # fmt: skip
 

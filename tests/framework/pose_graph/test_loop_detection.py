@@ -63,7 +63,7 @@ def test_extract_keyframe_in_other_direction_is_not_matched(first: Submap) -> No
 
 
 def loop(view: int, correction: np.ndarray) -> Loop:
-    return Loop(view, 0, np.eye(4), GraphEdge(0, 1, correction, is_loop=True), frozenset({0}), view, 20.0)
+    return Loop(view, 0, np.eye(4), GraphEdge.loop(0, 1, correction), frozenset({0}), view, 20.0)
 
 
 def test_agreeing_single_loop_is_not_accepted() -> None:

@@ -61,11 +61,13 @@ def test_object_edges_one_object_determines_three_degrees() -> None:
 
 
 def test_optimize_object_edge_moves_object_onto_itself() -> None:
-    """The drift of a path of 30 m is far larger than the noise of the object."""
+    """The standard deviation of the drift, 0.6 m and 0.3 rad, is far larger than the noise of the object."""
     true, drift = exp_se3(np.array([30.0, 0, 0, 0, 0.5, 0])), exp_se3(np.array([0.1, -0.05, 0.08, 0, 0, 0]))
     anchors, one = [np.eye(4), true @ drift], true[:3, 3] + POSITIONS[2:3]
     edges = object_edges(observed(0, np.eye(4), one), observed(1, true, one), anchors)
-    poses, kept = optimize(anchors, [GraphEdge(0, 1, true @ drift), *edges])
+    poses, kept = optimize(
+        anchors, [GraphEdge.tracked(0, 1, true @ drift, np.diag(np.repeat([0.6, 0.3], 3) ** 2)), *edges]
+    )
     p_second = transform(inverse(true), one[0])
     assert np.linalg.norm(transform(poses[1], p_second) - one[0]) < 0.01
     assert len(kept) == 2
@@ -122,7 +124,7 @@ def test_landmarks_returning_camera_connects_submaps() -> None:
     anchors.submaps = [views(0, np.eye(4), np.eye(4)), views(1, drift @ SECOND, drift)]
     landmarks.observe(SubmapChange(hidden=frozenset({0}), submap=1), anchors.submaps, CAMERA, Room())
     anchors.submaps[0].hidden = True
-    loop = Loop(90, 0, np.eye(4), GraphEdge(0, 1, SECOND, is_loop=True), frozenset({0}), 3, 20.0)
+    loop = Loop(90, 0, np.eye(4), GraphEdge.loop(0, 1, SECOND), frozenset({0}), 3, 20.0)
     (edge,) = landmarks.edges([loop], anchors, CAMERA, Room(T_world_room=drift, first=11))
     assert (edge.first, edge.second, edge.objects) == (0, 1, 2)
     for center, _ in SPHERES:
