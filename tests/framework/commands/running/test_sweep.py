@@ -87,7 +87,8 @@ def wait_until(condition: Callable[[], object], process: subprocess.Popen[str]) 
 
 def recorded(directory: Path) -> dict[str, int]:
     """Return the completion time of each completed run, ns since the epoch, keyed by the directory name."""
-    return {path.parent.name: path.stat().st_mtime_ns for path in (directory / PLACE).glob("*/metrics.json")}
+    last = (directory / PLACE).glob("*/manifest.json")  # the last file of a completed run
+    return {path.parent.name: path.stat().st_mtime_ns for path in last if (path.parent / "metrics.json").exists()}
 
 
 def begun(directory: Path) -> dict[str, int]:
