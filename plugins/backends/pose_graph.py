@@ -41,6 +41,7 @@ TRACKED_COVERAGE = 0.2  # minimum fraction for a guess that is the tracked pose
 SAME_PLACE = 8.0  # m, maximum path between hidden submaps that are rendered together
 MIN_OVERLAP = 0.05  # minimum fraction of a frame's points on a submap that it shows
 EXTENT = 3.0  # m, distance of the surface from the anchor at which motions are compared with min_motion
+MIN_LOOPS = 2  # minimum number of loops of a correction that agree with the optimized graph
 EXTRACTION_DELAY = 3  # number of frames between a view and the use of its features, which a thread extracts
 SAME_GUESS = Drift(0.1, 0.05)  # m and rad, maximum difference of two guesses of which the first one is enough
 
@@ -56,7 +57,7 @@ class Correction(NamedTuple):
     """A correction of the graph in progress."""
 
     loops: Sequence[Loop]
-    edges: int  # number of edges that are optimized
+    added: range  # numbers of the edges of the loops and of their landmarks; later edges are not optimized
     result: DelayedResult[Optimized]
 
 
@@ -262,24 +263,31 @@ class PoseGraph(BackEnd):
     def _optimize(self, loops: Sequence[Loop], landmarks: Sequence[GraphEdge]) -> None:
         """Start the optimization of the graph with additional loops and the edges of their landmarks."""
         self._guesses.clear()
+        before = len(self._graph.edges)
         self._graph.edges.extend([*(loop.edge for loop in loops), *landmarks])
         poses, edges = [one.T_world_anchor for one in self.anchors.submaps], list(self._graph.edges)
-        due = self._frames + self.correction_delay
-        self._correction = Correction(loops, len(edges), DelayedResult(partial(optimize, poses, edges), due))
+        result = DelayedResult(partial(optimize, poses, edges), self._frames + self.correction_delay)
+        self._correction = Correction(loops, range(before, len(edges)), result)
 
     def _corrected(self, correction: Correction) -> SubmapChange:
-        """Move the anchors, and return the motions and the hidden submaps of the loops that agree with the graph."""
+        """Move the anchors, and return the motions and the hidden submaps of the loops that agree with the graph.
+
+        Nothing changes if only one loop agrees, because those that confirmed it do not.
+        """
         self._correction = None
         optimized = correction.result.get()
-        self._graph.edges = [*optimized.edges, *self._graph.edges[correction.edges :]]
         loops = [loop for loop in correction.loops if loop.edge in optimized.edges]
+        if len(loops) < MIN_LOOPS:
+            del self._graph.edges[correction.added.start : correction.added.stop]
+            return SubmapChange(submap=self.anchors.current)
+        self._graph.edges = [*optimized.edges, *self._graph.edges[correction.added.stop :]]
         self._report(loops)
         shown = frozenset().union(*(loop.shown for loop in loops))
         motions = {}
         for submap, T_world_new in zip(self.anchors.submaps, self._graph.extended(optimized.poses), strict=True):
             T_new_old = T_world_new @ inverse(submap.T_world_anchor)
             step = np.linalg.norm(T_world_new[:3, 3] - submap.T_world_anchor[:3, 3])
-            if loops and step + EXTENT * rotation_angle(T_new_old[:3, :3]) >= self.min_motion:
+            if step + EXTENT * rotation_angle(T_new_old[:3, :3]) >= self.min_motion:
                 motions[submap.number] = T_new_old
                 submap.T_world_anchor = T_world_new
         for number in shown:

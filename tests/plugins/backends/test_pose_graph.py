@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -15,6 +15,7 @@ from framework.data import Camera, Frame, Pose
 from framework.geometry import exp_se3, inverse, pose_distance, transform
 from framework.interfaces import SubmapChange
 from framework.pose_graph import object_landmarks
+from framework.pose_graph.graph_optimization import GraphEdge, Optimized, optimize
 from framework.pose_graph.loop_detection import LoopDetection
 from framework.pose_graph.object_landmarks import ObservedObject
 from framework.pose_graph.submap_anchors import Submap
@@ -114,6 +115,24 @@ def test_backend_implausible_drift_is_not_corrected(max_drift: float) -> None:
     assert not back_end.loops
 
 
+def test_backend_loop_whose_confirmation_is_removed_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    corrections = []
+
+    def one_loop_left(poses: Sequence[np.ndarray], edges: Sequence[GraphEdge]) -> Optimized:
+        optimized = optimize(poses, edges)
+        loops = [edge for edge in optimized.edges if edge.is_loop]
+        corrections.append(len(loops))
+        return Optimized(optimized.poses, [edge for edge in optimized.edges if edge not in loops[1:]])
+
+    monkeypatch.setattr(pose_graph, "optimize", one_loop_left)
+    back_end = PoseGraph(correction_delay=1)
+    found = changes(back_end)
+    assert set(corrections) == {2}  # a correction does not keep the loops of an earlier one
+    assert len(corrections) > 1  # later views are verified
+    assert not any(change.motions or change.shown for _, change in found)
+    assert not back_end.loops
+
+
 def test_backend_small_correction_shows_submaps_without_motion() -> None:
     nearly = exp_se3(np.array([0.002, 0, 0, 0, 0, 0]))
     shown = [change for _, change in changes(PoseGraph(), nearly) if change.shown]
@@ -123,7 +142,7 @@ def test_backend_small_correction_shows_submaps_without_motion() -> None:
 
 def test_backend_slow_threads_change_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
     fast = changes(PoseGraph())
-    extract, optimize = LoopDetection.extract, pose_graph.optimize
+    extract = LoopDetection.extract
     monkeypatch.setattr(LoopDetection, "extract", lambda *view: time.sleep(0.02) or extract(*view))
     monkeypatch.setattr(pose_graph, "optimize", lambda *graph: time.sleep(0.5) or optimize(*graph))
     assert repr(changes(PoseGraph())) == repr(fast)
