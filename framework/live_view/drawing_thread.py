@@ -214,7 +214,8 @@ class DrawingThread:
 class Pace:
     """Rate limiter of an operation.
 
-    The operation runs at most once per interval. It takes at most the given fraction of the clock's time on average.
+    The operation runs at most once per interval. It takes at most the given fraction of the clock's time on average,
+    except for the first time, which includes loading kernels.
     """
 
     def __init__(self, interval: float, fraction: float, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -222,6 +223,7 @@ class Pace:
         self.fraction = fraction  # in (0, 1]
         self.clock = clock  # s; time.thread_time measures only the CPU time of the calling thread
         self._next = 0.0  # s, by time.perf_counter
+        self._is_first = True
 
     def due(self) -> bool:
         return time.perf_counter() >= self._next
@@ -232,4 +234,6 @@ class Pace:
         began, before = time.perf_counter(), self.clock()
         self._next = began + self.interval
         yield
-        self._next = began + max(self.interval, (self.clock() - before) / self.fraction)
+        if not self._is_first:
+            self._next = began + max(self.interval, (self.clock() - before) / self.fraction)
+        self._is_first = False
