@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     import rerun as rr
 
 MM = 1000  # depth image units per m
-UNKNOWN = 65535  # label of masks without an instance of the map
-UNKNOWN_COLOR = np.array([235, 235, 235], np.uint8)
-MASK_OPACITY = 0.5
+UNKNOWN_COLOR = np.array([235, 235, 235], np.uint8)  # of masks without an instance of the map
+MASK_OPACITY = 128  # of 255
 PATH_COLOR, LOST_COLOR, LOOP_COLOR = (40, 160, 255), (230, 60, 50), (255, 170, 40)
 NAME_RADIUS = 0.005  # m, radius of the point that carries an object name
 PATH_RADIUS = 0.004  # m, radius of the line of the camera path
@@ -63,11 +62,9 @@ class RerunDrawing:
         self._forward: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) z axis of the first camera
         self._mesh: InstanceMesh | None = None  # as last drawn, with the shown instances
         self._names: dict[int, str] = {}  # names of the shown instances
-        self._named: dict[int, str] = {}  # names of all instances so far
         recording.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         stages, colors = [*at.STAGE_COLORS], [*at.STAGE_COLORS.values()]
         recording.log(at.STAGE_MS, rerun.SeriesLines(names=stages, colors=colors), static=True)
-        self._name_masks()
 
     def draw_frames(
         self, notes: Sequence[FrameNote | CorrectionNote], skipped: Sequence[str], picture: FrameUpdate | None
@@ -100,9 +97,6 @@ class RerunDrawing:
         members = vertices_by_id(ids)
         self._names = {key: mesh.classes[shown[key][0]] for key in members}
         self._colors.add({key: mesh.vertices[of].mean(axis=0, dtype=np.float64) for key, of in members.items()})
-        if not self._named.items() >= self._names.items():
-            self._named |= self._names
-            self._name_masks()
         self._draw_mesh(self._mesh)
         self._draw_boxes(members, {key: shown[key][1] for key in members}, snapshot)
 
@@ -191,20 +185,25 @@ class RerunDrawing:
         self._draw_found(picture)
 
     def _draw_found(self, picture: FrameUpdate) -> None:
-        """Draw the masks and names of the detections in the colors of their instances."""
+        """Draw the masks and names of the detections in the colors of their instances.
+
+        Masks are a color image, because rerun 0.41 shows labels above 128 in wrong colors (rerun-io/rerun#12939).
+        """
         found, stride = picture.detections, self._stride
         ids = np.zeros(len(found), np.int32)
         if self._mesh is not None and not picture.pose.lost:
             ids = seen_instances(found.masks, picture.frame, picture.pose.T_world_camera, self._mesh)
-        numbers = np.where((ids > 0) & (ids < UNKNOWN), ids, UNKNOWN).astype(np.uint16)
-        image = np.zeros(found.masks[:, ::stride, ::stride].shape[1:], np.uint16)
-        for mask, number in zip(found.masks[::-1, ::stride, ::stride], numbers[::-1], strict=True):
-            image[mask] = number  # the best detection is drawn last
-        self._recording.log(at.MASKS, self._rr.SegmentationImage(image, opacity=MASK_OPACITY))
+        colors = [self._colors.get(k, UNKNOWN_COLOR) for k in ids.tolist()]
+        masks = found.masks[:, ::stride, ::stride]
+        image = np.zeros((*masks.shape[1:], 4), np.uint8)  # BGR and opacity
+        for mask, color in zip(masks[::-1], colors[::-1], strict=True):
+            image[mask] = (*color[::-1], MASK_OPACITY)  # the best detection is drawn last
+        png = cv2.imencode(".png", image)[1].tobytes()
+        self._recording.log(at.MASKS, self._rr.EncodedImage(contents=png, media_type="image/png", draw_order=0.0))
         named = np.flatnonzero(found.scores >= self._min_score).tolist()
         classes = found.class_probabilities.argmax(axis=1)
         labels = [f"{found.classes[classes[k]]} {found.scores[k]:.2f}" for k in named]
-        colors = [self._colors.get(int(ids[k]), UNKNOWN_COLOR) for k in named]
+        colors = [colors[k] for k in named]
         boxes = (found.boxes[named] + 0.5) / stride  # integer coordinates are pixel corners in rerun
         form = self._rr.Box2DFormat.XYXY
         self._recording.log(at.FOUND, self._rr.Boxes2D(array=boxes, array_format=form, colors=colors))
@@ -227,12 +226,6 @@ class RerunDrawing:
                 color=LOST_COLOR if pose.lost else PATH_COLOR,
             ),
         )
-
-    def _name_masks(self) -> None:
-        """Log the names of the labels in mask images."""
-        known = [(key, name, self._colors[key]) for key, name in self._named.items()]
-        nothing, unknown = (0, "nothing", np.zeros(4, np.uint8)), (UNKNOWN, "not in the map", UNKNOWN_COLOR)
-        self._recording.log(at.MASKS, self._rr.AnnotationContext([nothing, unknown, *known]), static=True)
 
     def _draw_mesh(self, mesh: InstanceMesh) -> None:
         colors = self._colors.painted(mesh)

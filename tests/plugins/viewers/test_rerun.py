@@ -16,6 +16,7 @@ from typing import Any
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
+import cv2
 import numpy as np
 import pytest
 
@@ -171,11 +172,12 @@ def test_rerun_objects_and_masks_share_colors_and_names(recorded: Path) -> None:
     assert set(found["Boxes2D:colors"]) == set(boxes["Boxes3D:colors"])
     labels = list(rows(recorded, "world/camera/names"))[-1]["Points2D:labels"]
     assert sorted(label.split()[0] for label in labels) == ["chair", "couch"]
-    buffer = list(rows(recorded, "world/camera/masks"))[-1]["SegmentationImage:buffer"][0]
-    image = np.array(buffer, np.uint8).view(np.uint16)
+    png = list(rows(recorded, "world/camera/masks"))[-1]["EncodedImage:blob"][0]
+    image = cv2.imdecode(np.array(png, np.uint8), cv2.IMREAD_UNCHANGED)  # BGR and opacity
     masks = SphereDetector().detect(CornerRoom()[5]).masks
-    assert np.count_nonzero(image) == masks.any(axis=0).sum()
-    assert len(set(image[image > 0].tolist())) == 2
+    np.testing.assert_array_equal(image[..., 3] > 0, masks.any(axis=0))
+    red, green, blue = (image[masks.any(axis=0)][:, k].astype(int) for k in (2, 1, 0))
+    assert set((red << 24 | green << 16 | blue << 8 | 255).tolist()) == set(boxes["Boxes3D:colors"])
 
 
 def test_rerun_camera_has_pose_and_intrinsics(recorded: Path) -> None:
