@@ -37,7 +37,7 @@ def hardware() -> Iterator[Check]:
     if Path("/proc/meminfo").exists():
         sizes = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines() if ":" in line)
         total, free = (int(sizes[key].split()[0]) / 2**20 for key in ("MemTotal", "MemAvailable"))
-        fix = "close other programs, or set fuser.voxel_size=0.02 (one eighth of the map's memory)"
+        fix = "close other programs, or set fuser.voxel_size=0.02 (a quarter of the map's memory)"
         yield Check.of("memory", free >= MIN_MEMORY_GIB, f"{free:.1f} of {total:.1f} GiB free", fix)
 
 
