@@ -25,7 +25,7 @@ class Pictured:
     """The runs shown in a figure."""
 
     choice: FigureChoice
-    rows: Mapping[str, RunRow | None]  # by display name; None = no complete run
+    rows: Mapping[str, RunRow | None]  # requested rows by display name; None = no complete run
     incomplete: Sequence[Incomplete]
     requested: Mapping[str, Sequence[str]] = field(default_factory=dict)  # values that the sweep requested, by KEY
     command_line: Sequence[str] = ()  # overrides of the sweep on the command line
@@ -47,8 +47,10 @@ class Pictured:
         records, incomplete = completed_runs(directory)
         choice.check_keys({key for record in records for key in record.settings} | (asked or set()))
         found = rows_of(records, choice.over, changes, asked)
+        chosen = {row for (row,) in requested_runs(sweep, ["row"])} or {*changes}
+        expected = [name for name in changes if name in chosen or any(row.system == name for row in found)]
         rows: dict[str, RunRow | None] = {}
-        for system in dict.fromkeys([*changes, *(row.system for row in found)]):
+        for system in dict.fromkeys([*expected, *(row.system for row in found)]):
             of_system: dict[str, RunRow | None] = {
                 choice.called(", ".join(filter(None, [choice.called(system), *row.variant])) or row.name): row
                 for row in found
@@ -56,7 +58,7 @@ class Pictured:
             }
             rows |= of_system or {choice.called(system): None}
         keys = filter(None, (choice.by, choice.color_by))
-        requested = {key: [value for (value,) in requested_runs(sweep, [key])] for key in keys} | {"row": list(changes)}
+        requested = {key: [value for (value,) in requested_runs(sweep, [key])] for key in keys} | {"row": expected}
         return cls(choice, rows, incomplete, requested, command_line(sweep), asked)
 
     @property

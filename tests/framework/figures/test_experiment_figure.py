@@ -141,6 +141,16 @@ def test_figure_note_names_overrides_and_data(maps: Path) -> None:
     assert expected in " ".join(note.split())
 
 
+def test_map_figure_omits_rows_that_were_not_requested(tmp_path: Path) -> None:
+    root = experiment(tmp_path / "figure4", {"part": [], "whole": [], "paper": [], "last": []}, kind="maps")
+    run(root, "part", "011")
+    run(root, "paper", "011")  # by an earlier sweep
+    sweep = OmegaConf.load(root / "multirun.yaml")
+    task = {"overrides": {"task": ["row=part,whole"]}}
+    (root / "multirun.yaml").write_text(OmegaConf.to_yaml({**sweep, "hydra": task}))
+    assert [*Pictured.below(root).rows] == ["part", "whole", "paper"]
+
+
 def test_map_figure_labels_damaged_map_and_missing_truth(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
     (maps / "dataset.scene=011,row=part,seed=0" / "mesh.ply").write_bytes(b"ply\n")
     run(maps, "whole", "gone")
