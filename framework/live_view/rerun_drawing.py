@@ -59,7 +59,8 @@ class RerunDrawing:
         self._path = DrawnPath()
         self._loops: tuple[ClosedLoop, ...] | None = None  # to be drawn; None = unchanged
         self._up: Float64 | None = None  # (3,) up direction, as drawn
-        self._forward: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) z axis of the first camera
+        self._is_upright = False  # True = `_up` was estimated from the map
+        self._T_world_first: Float64 = np.eye(4)  # (4, 4) pose of the first camera
         self._mesh: InstanceMesh | None = None  # as last drawn, with the shown instances
         self._names: dict[int, str] = {}  # names of the shown instances
         recording.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -87,6 +88,9 @@ class RerunDrawing:
         self._set_time(snapshot.index, snapshot.timestamp)
         if snapshot.up is not None:
             self._turn(snapshot.up)
+            if not self._is_upright:
+                self._is_upright = True
+                self._show_from_first_camera()
         shown = {key: of for key, of in snapshot.objects.items() if of[1] >= self._min_probability}
         mesh = snapshot.mesh
         if self._label_space is None:
@@ -118,16 +122,21 @@ class RerunDrawing:
         """Rotate the world frame, so that `up` (3,) is the z axis of the view."""
         if self._up is None or not np.allclose(self._up, up, atol=MIN_TURN):
             self._up = up
-            self._recording.log(at.WORLD, self._rr.Transform3D(mat3x3=turned(up, self._forward)))
+            self._recording.log(at.WORLD, self._rr.Transform3D(mat3x3=turned(up, self._T_world_first[:3, 2])))
 
     def _begin_world(self, T_world_camera: Float64) -> None:
         """Orient the world frame by the first camera, until the up direction of the map is known."""
-        up, self._forward = -T_world_camera[:3, 1], T_world_camera[:3, 2]
-        self._turn(up)
-        T_view_camera = T_world_camera.copy()
-        T_view_camera[:3] = turned(up, self._forward) @ T_world_camera[:3]
-        self._recording.send_blueprint(at.layout(T_view_camera))
+        self._T_world_first = T_world_camera
+        self._turn(-T_world_camera[:3, 1])
+        self._show_from_first_camera()
         self._recording.log(at.LOG, self._rr.TextLog("mapping started", level="INFO"))
+
+    def _show_from_first_camera(self) -> None:
+        """Place the viewpoint of the map behind the first camera."""
+        assert self._up is not None
+        T_view_camera = self._T_world_first.copy()
+        T_view_camera[:3] = turned(self._up, T_view_camera[:3, 2]) @ T_view_camera[:3]
+        self._recording.send_blueprint(at.layout(T_view_camera))
 
     def _note(self, note: FrameNote) -> None:
         self._set_time(note.index, note.timestamp)

@@ -25,7 +25,7 @@ from framework.data import Frame, Pose
 from framework.errors import ConfigError, FrameError
 from framework.interfaces import SceneMap
 from framework.live_view import rerun_program
-from framework.live_view.rerun_layout import STAGE_COLORS
+from framework.live_view.rerun_layout import EYE_ABOVE, EYE_BACK, STAGE_COLORS
 from framework.live_view.rerun_program import free_port
 from framework.pipeline import Pipeline
 from framework.registry import assemble
@@ -110,6 +110,21 @@ def stages_timed(milliseconds: Sequence[float]) -> list[str]:
 def test_rerun_recording_is_valid_and_has_blueprint(recorded: Path) -> None:
     rrd("verify", recorded)
     assert len(RrdReader(recorded).blueprints()) >= 1
+
+
+def test_rerun_viewpoint_is_behind_first_camera_in_upright_map(recorded: Path) -> None:
+    reader, positions = RrdReader(recorded), []
+    for store in reader.blueprints():
+        batches = [chunk.to_record_batch().to_pydict() for chunk in reader.stream(store=store)]
+        positions += [batch["EyeControls3D:position"][-1][0] for batch in batches if "EyeControls3D:position" in batch]
+    R_view_world = [
+        np.array(row["Transform3D:mat3x3"][0]).reshape(3, 3).T  # stored by columns
+        for row in rows(recorded, "world")
+    ]
+    assert len(positions) == 2  # before and after the up direction is estimated
+    for R, position in zip((R_view_world[0], R_view_world[-1]), positions, strict=True):
+        first = R @ pose_at(0)[:3]
+        np.testing.assert_allclose(position, first[:, 3] - EYE_BACK * first[:, 2] + [0, 0, EYE_ABOVE], atol=1e-5)
 
 
 def test_rerun_stage_times_cover_only_completed_stages(recorded: Path) -> None:
