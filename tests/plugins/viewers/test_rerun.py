@@ -21,22 +21,26 @@ import numpy as np
 import pytest
 
 from framework.api import Mapper
-from framework.data import Frame, Pose
+from framework.data import Frame, InstanceMesh, Pose
 from framework.errors import ConfigError, FrameError
+from framework.geometry import exp_se3
 from framework.interfaces import SceneMap
 from framework.live_view import rerun_program
+from framework.live_view.drawing_thread import FrameNote, MapSnapshot
+from framework.live_view.rerun_drawing import RerunDrawing, turned
 from framework.live_view.rerun_layout import EYE_ABOVE, EYE_BACK, STAGE_COLORS
 from framework.live_view.rerun_program import free_port
 from framework.pipeline import Pipeline
 from framework.registry import assemble
 from framework.runtime.run_log import STAGES as STAGE_NAMES
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
-from plugins.viewers.rerun import Mode, RerunViewer
+from plugins.viewers.rerun import RECORDING, Mode, RerunViewer
 from tests.support import registered
 from tests.support.scenes.corner_room import CAMERA, CornerRoom, GivenPose, KeepAll, SphereDetector, pose_at
 from tests.support.scenes.given_changes import GivenChanges, RoomTracker, SubmapFuser
 
 pytest.importorskip("rerun", reason="requires rerun-sdk (extra viewer)")
+import rerun as rr
 from pyarrow.types import is_temporal
 from rerun.chunk import RrdReader
 
@@ -112,19 +116,28 @@ def test_rerun_recording_is_valid_and_has_blueprint(recorded: Path) -> None:
     assert len(RrdReader(recorded).blueprints()) >= 1
 
 
-def test_rerun_viewpoint_is_behind_first_camera_in_upright_map(recorded: Path) -> None:
-    reader, positions = RrdReader(recorded), []
+def test_rerun_viewpoint_follows_the_estimated_up_direction(tmp_path: Path) -> None:
+    """The first camera looks down, so that its up direction differs from that of the map."""
+    up, file = np.array([0.0, -1.0, 0.0]), tmp_path / RECORDING
+    T_world_camera = exp_se3(np.array([0.3, -1.2, 0.1, -0.7, 0.2, 0.0]))
+    recording = rr.RecordingStream("test", recording_id="test")
+    recording.save(file)
+    drawing = RerunDrawing(recording, stride=1, jpeg_quality=75, region=1.0, min_probability=0.5, min_score=0.5)
+    empty = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8)
+    mesh = InstanceMesh(*empty, np.zeros(0, np.int32), np.zeros(0, np.int32), ("chair",))
+    drawing.draw_frames([FrameNote(0, 0.0, Pose(T_world_camera), {})], [], None)
+    for estimate in (None, up, up):
+        drawing.draw_map(MapSnapshot(0, 0.0, mesh, {}, estimate))
+    drawing.close()
+    reader, positions = RrdReader(file), []
     for store in reader.blueprints():
         batches = [chunk.to_record_batch().to_pydict() for chunk in reader.stream(store=store)]
-        positions += [batch["EyeControls3D:position"][-1][0] for batch in batches if "EyeControls3D:position" in batch]
-    R_view_world = [
-        np.array(row["Transform3D:mat3x3"][0]).reshape(3, 3).T  # stored by columns
-        for row in rows(recorded, "world")
-    ]
-    assert len(positions) == 2  # before and after the up direction is estimated
-    for R, position in zip((R_view_world[0], R_view_world[-1]), positions, strict=True):
-        first = R @ pose_at(0)[:3]
-        np.testing.assert_allclose(position, first[:, 3] - EYE_BACK * first[:, 2] + [0, 0, EYE_ABOVE], atol=1e-5)
+        positions += [batch["EyeControls3D:position"][0][0] for batch in batches if "EyeControls3D:position" in batch]
+    expected = []
+    for drawn in (-T_world_camera[:3, 1], up):
+        first = turned(drawn, T_world_camera[:3, 2]) @ T_world_camera[:3]
+        expected.append((first[:, 3] - EYE_BACK * first[:, 2] + [0, 0, EYE_ABOVE]).tolist())
+    np.testing.assert_allclose(sorted(positions), sorted(expected), atol=1e-5)  # blueprints have no order
 
 
 def test_rerun_stage_times_cover_only_completed_stages(recorded: Path) -> None:
