@@ -13,7 +13,7 @@ from framework.data import Float64
 from framework.figures.figure_page import INK, PAGE_MM, PNG_DPI, SMALL_PT, Page
 from framework.figures.metric_axes import COLORS, style_axes
 from framework.files.atomic_write import atomic_write
-from tests.endurance.growth import EXPIRY, Verdict, by_place, by_visit, first_compared, rms
+from tests.endurance.growth import Verdict, by_place, by_visit, first_compared, rms
 from tests.endurance.visits import Block
 
 NAME = "endurance"
@@ -31,7 +31,7 @@ python -m tests.endurance --frames 1000 --out outputs/endurance
 ```
 
 The first command maps {frames:,} frames of {places} sequences in one process. The second is a short test. The process
-takes turns between the sequences, so that each one is mapped several times:
+cycles through the sequences and maps each one several times:
 
 - redkitchen, freiburg1_rpy: Kinect recordings, forward and backward
 - standing: one frame of redkitchen, repeated with new noise
@@ -39,8 +39,8 @@ takes turns between the sequences, so that each one is mapped several times:
 
 ![Processor time, heap, instances and position error over all frames](endurance.png)
 """
-BOUNDS_INTRODUCTION = f"""Growth is the median slope over all pairs of passes through a sequence, with quartiles in
-brackets. The first {EXPIRY:,} mapped frames of each sequence are excluded, because tentative instances have not expired
+BOUNDS_INTRODUCTION = """Growth is the median slope over all pairs of passes through a sequence, with quartiles in
+brackets. The first passes through each sequence are excluded, because tentative instances have not expired
 yet. Values are bold if their lower quartile exceeds the bound, and italic if only their median does (possibly noise).
 """
 METHOD = """
