@@ -25,7 +25,7 @@ class Pictured:
     """The runs shown in a figure."""
 
     choice: FigureChoice
-    rows: Mapping[str, RunRow | None]  # requested rows by display name; None = no complete run
+    rows: Mapping[str, RunRow | None]  # requested rows and rows with runs, by display name; None = no complete run
     incomplete: Sequence[Incomplete]
     requested: Mapping[str, Sequence[str]] = field(default_factory=dict)  # values that the sweep requested, by KEY
     command_line: Sequence[str] = ()  # overrides of the sweep on the command line
