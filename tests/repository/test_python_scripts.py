@@ -18,7 +18,7 @@ SCRIPTS = dict(re.findall(r"## ([^\n]+)\n\n```python\n(.*?)```", PAGE, re.DOTALL
 
 
 PRINTED = {
-    "Map a recording": "",
+    "Map a sequence": "",
     "Map camera images": r"\(\d{4,}, 3\)",
     "Ask for objects": r"\d+ \w+( \w+)? 0\.\d\d \[(.|\n)*m\n\[(.|\n)*\d\.\d\d tv \w+ \[",
     "Render a view": r"instance at the center: [1-9]",

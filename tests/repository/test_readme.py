@@ -82,7 +82,7 @@ def test_tutorial_detector_detects_red_square(my_plugins: Path, monkeypatch: pyt
     color[10:30, 40:60] = (20, 220, 30)  # a green square
     found = detector.detect(Frame(0, 0.0, color, np.ones((48, 64), np.float32), camera))
     assert len(found) == 1
-    np.testing.assert_array_equal(found.boxes, [[5, 10, 25, 30]])
+    np.testing.assert_array_equal(found.boxes, [[5, 10, 24, 29]])
     assert found.masks[0].sum() == 400
     assert found.masks[0, 10:30, 5:25].all()
     assert found.classes[0] == "cup"
