@@ -17,8 +17,7 @@ from framework.interfaces import RGBDSequence, RGBDVideo
 from framework.registry import build
 from framework.reporting.run_contents import RunContents
 from framework.runs.metrics import TRUTH, truth_sha256
-from framework.runs.provenance import leaves
-from framework.runs.stored_runs import MERGED_FROM
+from framework.runs.stored_runs import MERGED_FROM, check_resolved
 
 MAX_WIDTH = 640  # px, of stored images
 MIN_CLARITY = 0.3  # minimum clarity, so that a blurred close view of an object is preferred to a sharp distant view
@@ -40,9 +39,8 @@ class RunSource:
             return cls(contents, None, "the map was imported without a dataset")
         if MERGED_FROM in contents.record.metrics:
             return cls(contents, None, "the map was merged from the frames of several runs")
-        if any("${" in str(value) for _, value in leaves({"dataset": dataset})):
-            return cls(contents, None, "the interpolations in the config of the run are not resolved")
         try:
+            check_resolved({"dataset": dataset})
             video = build(RGBDVideo, OmegaConf.create(dataset))
         except (InstanceMapError, OSError) as error:
             return cls(contents, None, str(error))

@@ -34,7 +34,7 @@ from framework.runs.metrics import (
     evaluated,
     is_evaluation,
 )
-from framework.runs.provenance import code_version, leaves
+from framework.runs.provenance import code_version
 from framework.runs.stored_map import read_objects
 from framework.runs.stored_runs import (
     CONFIG,
@@ -44,6 +44,7 @@ from framework.runs.stored_runs import (
     METRICS,
     TRAJECTORY,
     Record,
+    check_resolved,
     read_record,
 )
 
@@ -72,9 +73,7 @@ class Truth:
             raise DataError(
                 f"{CONFIG}: expected a dataset to compare with, got none; import the map again with dataset=NAME"
             )
-        for key, value in leaves({"dataset": dataset}):
-            if "${" in str(value):
-                raise DataError(f"{key}: expected a resolved value in the run's {CONFIG}, got {value}; repeat the run")
+        check_resolved({"dataset": dataset})
         video = build(RGBDVideo, OmegaConf.create(dict(dataset)))
         named = dataset.get("ground_truth")
         return cls(video.scene_truth(), video.annotation, None if named is None else str(named))

@@ -223,6 +223,17 @@ def _read(directory: Path, name: str, check_files: bool = True) -> Record:
     return Record(directory, metrics, replace_in_config(config), written)
 
 
+def check_resolved(config: Mapping[str, Any]) -> None:
+    """Check that a stored config contains no interpolation, because it could read environment variables.
+
+    Raises:
+        DataError: A value contains an interpolation.
+    """
+    for key, value in leaves(config):
+        if "${" in str(value):
+            raise DataError(f"{key}: expected a resolved value in the run's {CONFIG}, got {value}; repeat the run")
+
+
 def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
     """Return the completed and the incomplete runs in a folder and its subfolders, sorted by path."""
     records: list[Record] = []

@@ -168,7 +168,7 @@ def false_alarms() -> Measured:
     return count, count <= 1
 
 
-@measurement("time per frame of Open3D / InstanceMap >= 6, kitchen, 1 cm", *PIPELINE, "tests/benchmarks")
+@measurement("time per frame of Open3D / InstanceMap >= 6, redkitchen, 1 cm", *PIPELINE, "tests/benchmarks")
 def speed_ratio() -> Measured:
     with tempfile.TemporaryDirectory() as directory:
         report = Path(directory, "benchmark.json")
@@ -202,7 +202,7 @@ def fuzzing() -> Measured:
 
 
 @measurement(
-    "<= 5% of the loading time, map of the kitchen",
+    "change of the loading time with a manifest <= +5%, map of redkitchen",
     "framework/files",
     "framework/mapping",
     "tests/acceptance/loading_time.py",
@@ -284,13 +284,13 @@ def loop_recall() -> Measured:
     return value, value >= 0.8
 
 
-@measurement("map size after two rounds / one round <= 1.05", *pipeline_and("buildings"))
+@measurement("map size after two rounds / one round <= 1.05, one building", *pipeline_and("buildings"))
 def building_second_round() -> Measured:
     value = second_round()
     return value, value <= 1.05
 
 
-@measurement("0 different files between one and two threads", *pipeline_and("buildings"))
+@measurement("0 different files between one and two threads, one building", *pipeline_and("buildings"))
 def building_threads() -> Measured:
     return counted(files_that_depend_on_threads())
 

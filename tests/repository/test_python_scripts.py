@@ -18,7 +18,7 @@ SCRIPTS = dict(re.findall(r"## ([^\n]+)\n\n```python\n(.*?)```", PAGE, re.DOTALL
 
 
 PRINTED = {
-    "Map a sequence": "",
+    "Map a sequence": r"[1-9]\d* objects",
     "Map camera images": r"\(\d{4,}, 3\)",
     "Ask for objects": r"\d+ \w+( \w+)? 0\.\d\d \[(.|\n)*m\n\[(.|\n)*\d\.\d\d tv \w+ \[",
     "Render a view": r"instance at the center: [1-9]",

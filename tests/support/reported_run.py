@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from omegaconf import OmegaConf
 
 from framework.commands.running.run import run
 from framework.config import composition
 from framework.files.manifest import MANIFEST
+from framework.runs.provenance import config_hash
 from tests.support.small_overviews import use_small_overviews
 
 FAKES = Path(__file__).resolve().parent / "fake_conf"
@@ -47,6 +49,16 @@ def write_run(directory: Path, **dataset: Any) -> Path:
 def unverified_copy(directory: Path, copy: Path) -> Path:
     """Copy a run directory without the manifest, so that a test can change its files."""
     return Path(shutil.copytree(directory, copy, ignore=shutil.ignore_patterns(MANIFEST)))
+
+
+def store_parameter(directory: Path, key: str, value: object) -> None:
+    """Change a parameter in config.yaml, and the hash of the config in metrics.json."""
+    group, name = key.split(".")
+    config = yaml.safe_load((directory / "config.yaml").read_text())
+    config[group][name] = value
+    (directory / "config.yaml").write_text(yaml.safe_dump(config))
+    metrics = json.loads((directory / "metrics.json").read_text())
+    (directory / "metrics.json").write_text(json.dumps(metrics | {"config_hash": config_hash(config)}))
 
 
 def rename_class(directory: Path, name: str) -> None:

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.errors import ConfigError, DataError
-from framework.runs.stored_runs import Record, completed_runs
+from framework.runs.stored_runs import Record, check_resolved, completed_runs
 
 if TYPE_CHECKING:
     from framework.explanation.contributions import Contributions, Stage
@@ -87,6 +87,7 @@ def explain_run(record: Record, metric: str = "instances.ap50", with_contributio
     if record.is_imported or record.derived:
         found = record.derived or "an imported map"
         raise DataError(f"{record.directory}: expected a mapped sequence, got {found}; explain the original run")
+    check_resolved(record.config)
     video = build(RGBDVideo, OmegaConf.create(dict(record.dataset)))
     if not isinstance(video, RGBDSequence):
         raise ConfigError(f"{record.directory}: expected a run of a sequence, got live video")

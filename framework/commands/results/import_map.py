@@ -23,7 +23,7 @@ def main() -> None:
     add = parser.add_argument
     add("mesh", metavar="MESH", type=Path, help="mesh or point cloud: a PLY file, or points (V, 3) in an NPY file")
     add("directory", metavar="DIR", type=Path, help="output run directory; must be new or empty")
-    data = "dataset to compare with: dataset=NAME, dataset.KEY=VALUE, seed=N; default: no dataset"
+    data = "overrides: dataset=NAME, dataset.KEY=VALUE, evaluation.KEY=VALUE, seed=N; default: no dataset"
     add("overrides", metavar="KEY=VALUE", nargs="*", help=data)
     add("--name", metavar="NAME", help="name of the row in tables; default: name of DIR")
     labels = (

@@ -20,7 +20,15 @@ from framework.errors import ConfigError, DataError
 from framework.registry import text_kind
 from framework.runs.reproduction import Reproduction, causes
 from framework.runs.run_bundle import opened_bundle
-from framework.runs.stored_runs import METRICS, Record, find_records, no_run_error, read_record, without_derived
+from framework.runs.stored_runs import (
+    METRICS,
+    Record,
+    check_resolved,
+    find_records,
+    no_run_error,
+    read_record,
+    without_derived,
+)
 from framework.tables.comparison import ComparisonTable
 from framework.tables.table_check import TABLE_FORMATS, changed_tables
 
@@ -136,6 +144,7 @@ def _run_again(record: Record, overrides: Sequence[str], directory: Path) -> Non
     """Run the stored config, with overrides, in a new run directory."""
     from framework.commands.running.run import run
 
+    check_resolved(record.config)
     config = OmegaConf.create(dict(record.config))
     OmegaConf.set_struct(config, True)  # unknown keys are errors
     for override in overrides:

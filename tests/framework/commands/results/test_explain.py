@@ -9,10 +9,11 @@ import pytest
 
 from framework.commands.results import explain
 from framework.config import composition
+from framework.errors import DataError
 from framework.explanation.contributions import STAGES, Stage
 from framework.explanation.stored_explanation import StoredExplanation
 from framework.runs.stored_runs import read_record
-from tests.support.reported_run import FAKES, write_run
+from tests.support.reported_run import FAKES, store_parameter, unverified_copy, write_run
 
 pytestmark = pytest.mark.integration
 
@@ -44,6 +45,13 @@ def test_explain_figure_without_contributions_is_rejected(
         explain.main()
     assert ended.value.code == 2
     assert "--figure: expected contributions of the stages, got --causes-only" in capsys.readouterr().err
+
+
+def test_explain_stored_config_cannot_read_environment(tmp_path: Path) -> None:
+    run = unverified_copy(write_run(tmp_path / "run"), tmp_path / "changed")
+    store_parameter(run, "fuser.voxel_size", "${oc.env:SECRET}")
+    with pytest.raises(DataError, match=r"fuser\.voxel_size: expected a resolved value in the run's config\.yaml"):
+        explain.explain_run(read_record(run), with_contributions=False)
 
 
 def test_explain_config_has_truth_of_replaced_stages(tmp_path: Path) -> None:

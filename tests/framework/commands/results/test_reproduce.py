@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.reported_run import store_parameter
+
 pytestmark = pytest.mark.integration
 
 CHECKOUT = Path(__file__).resolve().parents[4]
@@ -128,6 +130,18 @@ def test_reproduce_override_of_unknown_key_is_rejected(runs: Path, run: Path) ->
     done = reproduce(runs, run, "dataset.nothing=3")
     assert done.returncode == 1
     assert "dataset.nothing=3: expected KEY=VALUE with a key and a type of the run's config" in done.stderr
+
+
+def test_reproduce_stored_config_cannot_read_environment(
+    runs: Path, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SECRET", "hunter2")
+    store_parameter(run, "refiner.weights", "${oc.env:SECRET}")
+    command(run.parent, "verify", str(run), "--accept", "config.yaml", "metrics.json")
+    done = reproduce(runs, run)
+    assert done.returncode == 1
+    assert "refiner.weights: expected a resolved value in the run's config.yaml, got ${oc.env:SECRET}" in done.stderr
+    assert "hunter2" not in done.stdout + done.stderr
 
 
 def test_reproduce_unknown_row_lists_rows(runs: Path, run: Path) -> None:
