@@ -341,8 +341,11 @@ class Mapper(Map):
             self._T_world_color = self.pipeline.T_world_color
             now = self.scene.instance_ids()
         if now is before:  # usual case
-            return FrameResult(found.T_world_camera)
-        return FrameResult(found.T_world_camera, new=tuple(sorted(now - before)), removed=tuple(sorted(before - now)))
+            return FrameResult(found.T_world_camera, covariance=found.covariance)
+        return FrameResult(
+            found.T_world_camera, covariance=found.covariance,
+            new=tuple(sorted(now - before)), removed=tuple(sorted(before - now)),
+        )  # fmt: skip
 
     def finish(self) -> None:
         """Apply the last correction of the map. Call it after the last frame.

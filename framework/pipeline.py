@@ -210,7 +210,10 @@ class Pipeline:
             return self.tracker.keyframes()
         except Exception as error:
             journal.stopped_by = journal.stopped_by or error
+        try:
             return self.tracker.keyframes()
+        except Exception:  # the map is saved without keyframes
+            return {}
 
     def empty_map_reason(self, journal: Journal) -> str:
         """Return the reason for an empty map, for an error message."""
@@ -414,12 +417,15 @@ class Pipeline:
 
     def apply(self, change: SubmapChange, journal: Journal) -> None:
         """Change the map, and move the poses of earlier frames with it."""
-        merged = self.fuser.correct(change)
-        self.tracker.correct(change)
-        self.color_to_depth.correct(change, journal.tracked.submap)
-        if self.T_world_color is not None:
-            self.T_world_color = change.moved(journal.tracked.submap, self.T_world_color)
-        journal.corrected(change, merged)
+        merged: Mapping[int, int] = {}
+        try:
+            merged = self.fuser.correct(change)
+        finally:  # the submaps of a full map have moved, too
+            self.tracker.correct(change)
+            self.color_to_depth.correct(change, journal.tracked.submap)
+            if self.T_world_color is not None:
+                self.T_world_color = change.moved(journal.tracked.submap, self.T_world_color)
+            journal.corrected(change, merged)
         self.viewer.correct(change, self.backend.graph())
 
     def compare_with_map(self, frame: Frame, pose: Pose, journal: Journal) -> None:

@@ -85,6 +85,11 @@ def add_config_dir(folder: Path) -> None:
     _added.append(folder.resolve())
 
 
+def remove_config_dir(folder: Path) -> None:
+    """Remove the config options of add_config_dir."""
+    _added.remove(folder.resolve())
+
+
 def added_config_dirs() -> tuple[Path, ...]:
     """Return the folders of add_config_dir."""
     return tuple(_added)

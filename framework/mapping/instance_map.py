@@ -181,11 +181,13 @@ class InstanceMap(InstanceTableMap):
         """
         merged: dict[int, int] = {}
         self.submaps.move(change.motions)
-        for number in sorted(change.shown):
-            self._merge_pairs(self.submaps.show(number, association.min_overlap, association.create_points), merged)
-        self.submaps.hide(change.hidden)
-        self.submaps.current = change.submap
-        self.relabel()
+        try:
+            for number in sorted(change.shown):
+                self._merge_pairs(self.submaps.show(number, association.min_overlap, association.create_points), merged)
+            self.submaps.hide(change.hidden)
+            self.submaps.current = change.submap
+        finally:
+            self.relabel()
         return {k: remaining(k, merged) for k in merged}
 
     def absorb(self, other: InstanceMap, T_world_other: Float64, association: Association) -> dict[int, int]:
@@ -212,7 +214,7 @@ class InstanceMap(InstanceTableMap):
         layer = other.whole().submaps.visible
         if not np.array_equal(T_world_other, np.eye(4)):
             layer = resampled(layer, T_world_other)
-        offset = self.table.absorb(other.table)
+        offset = self.table.absorb(other.table, T_world_other)
         layer.labels.renumber_instances(offset)
         pairs = self.submaps.add(self.submaps.current, layer, association.min_overlap, association.create_points)
         merged = self._merge_pairs(pairs, {})

@@ -120,7 +120,7 @@ class DepthCalibration(DepthCalibrator):
 
         The views are discarded.
         """
-        views, self._views = self._views, []
+        views, self._views, self._tracked = self._views, [], 0
         if len(views) < MIN_VIEWS:
             log.info("depth is not corrected: expected at least %d views, got %d", MIN_VIEWS, len(views))
             return None

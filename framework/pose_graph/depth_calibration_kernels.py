@@ -7,7 +7,6 @@ from numba import prange
 
 from framework.compilation.kernel_cache import njit
 
-UNKNOWNS = 12  # of the two poses of a pair
 CORNERS = 4  # number of nodes around a pixel
 
 

@@ -104,7 +104,7 @@ def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int,
             score = _score(instance_ids[chosen][visible])
             score *= 1 + 0.15 * np.cos(azimuth)  # prefer the direction of the cameras
             if score > best_score:
-                best_score, R, shown = score, R_trial, points[visible]
+                best_score, R, shown = score, R_trial, points[visible] if len(visible) else points
     # frame only the visible points, without the ceiling and the near walls
     return fitted(R, shown, width, height)
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from framework.config.composition import add_config_dir
+from framework.config.composition import add_config_dir, remove_config_dir
 from framework.errors import DataError, reason_of
 from framework.files.atomic_write import atomic_write
 from framework.files.manifest import MANIFEST, Manifest
@@ -104,6 +104,7 @@ def opened_bundle(path: Path, trust_code: bool) -> Iterator[Path]:
         finally:
             if has_code:
                 sys.path.remove(str(folder / PLUGINS))
+                remove_config_dir(folder / OPTIONS)
 
 
 @contextmanager

@@ -170,11 +170,13 @@ class RunRecord:
             attempt((folder / name).unlink, missing_ok=True)
         if not (folder / CONFIG).exists():
             attempt(_write_config, folder / CONFIG, self.config)
-        timestamps, poses = _reliable(result.tracked)
         comments = origin_comments(video.world_origin)
-        attempt(write_tum, folder / TRAJECTORY, timestamps, poses, comments)
-        if result.as_tracked is not None:
-            attempt(write_tum, folder / TRACKED_TRAJECTORY, *_reliable(result.as_tracked), comments)
+        reliable = attempt(_reliable, result.tracked)
+        if reliable is not None:
+            attempt(write_tum, folder / TRAJECTORY, *reliable, comments)
+        as_tracked = None if result.as_tracked is None else attempt(_reliable, result.as_tracked)
+        if as_tracked is not None:
+            attempt(write_tum, folder / TRACKED_TRAJECTORY, *as_tracked, comments)
         if result.graph is not None:
             attempt(write_pose_graph, folder / POSE_GRAPH, result.graph)
         if result.depth_distortion is not None:
@@ -204,8 +206,8 @@ class RunRecord:
         labels = {} if found is None else likely_labels(found[1], scene.classes)
         if found is not None and (self.config.get("evaluation") or {}).get("doubled_instances"):
             figures |= attempt(doubled_metrics, video, found[0], labels.keys(), result) or {}
-        if found is not None:
-            attempt(write_overview, folder / "overview.png", found[0], labels, poses, caption(shown))
+        if found is not None and reliable is not None:
+            attempt(write_overview, folder / "overview.png", found[0], labels, reliable[1], caption(shown))
         if attempt.error is None:
             attempt(write_json, folder / METRICS, self._metrics(video, figures))
         if attempt.error is None:

@@ -22,7 +22,7 @@ from framework.runtime.corrected_frames import CorrectedFrames, TrackedFrame
 from framework.runtime.digests import StageDigest, digest_of
 from framework.runtime.frame_stream import steady_time
 from framework.runtime.progress import Progress
-from framework.runtime.spooled_list import Spool, SpooledList
+from framework.runtime.spooled_list import Item, Spool, SpooledList
 from framework.sensors.depth_distortion import DepthDistortion
 from framework.sensors.noise_models import SensorKind
 
@@ -152,7 +152,7 @@ class Journal:
             log.warning(
                 "%d of %d frames disagree with the map at their given poses: frames %s; run `instancemap check`, or "
                 "estimate the poses with tracker=voxel_hashing_icp",
-                len(self.disagreeing), self.frames, frame_ranges(self.disagreeing),
+                len(self.disagreeing), self.frames, frame_ranges(self._read(self.disagreeing)),
             )  # fmt: skip
         if self.masks_omitted:
             log.warning("%d masks omitted in total because their frames had too many points", self.masks_omitted)
@@ -341,6 +341,8 @@ class Journal:
 
     def result(self) -> RunResult:
         """Return the result after the loop."""
+        intervals = np.diff(self._read(self.frames_began)).tolist()
+        disagreeing, latencies = self._read(self.disagreeing), self._read(self.latencies)
         return RunResult(
             scene=self.scene,
             frames=self.frames,
@@ -350,12 +352,20 @@ class Journal:
             digests=self.digests,
             seconds=self.seconds,
             stopped_by=self.stopped_by,
-            intervals=tuple(np.diff(list(self.frames_began)).tolist()),
+            intervals=tuple(intervals),
             pose_source=self.pose_source,
-            disagreeing=tuple(self.disagreeing) if self.compared else None,
+            disagreeing=disagreeing if self.compared else None,
             masks_omitted=self.masks_omitted,
-            live=LiveFigures(self.frames_dropped, tuple(self.latencies)) if self.frames_expected is None else None,
+            live=LiveFigures(self.frames_dropped, latencies) if self.frames_expected is None else None,
         )
+
+    def _read(self, items: SpooledList[Item]) -> tuple[Item, ...]:
+        """Return the items of a list, or () after an error of the disk, which is stored in `stopped_by`."""
+        try:
+            return tuple(items)
+        except (OSError, EOFError) as error:
+            self.stopped_by = self.stopped_by or error
+            return ()
 
 
 def frame_ranges(indices: Sequence[int]) -> str:

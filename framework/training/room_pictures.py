@@ -7,7 +7,6 @@ shapes. The folder of a room contains 000000.jpg, 000000.png (16-bit instance id
 from __future__ import annotations
 
 import multiprocessing
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -64,7 +63,7 @@ def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: in
         processes: The number of rendering processes.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    missing = [number for number in range(first, first + rooms) if not room_folder(folder, number).is_dir()]
+    missing = [number for number in range(first, first + rooms) if not room_folder(folder, number, views).is_dir()]
     if not missing:
         return
     # Processes are spawned, because threads of numba and OpenCV do not work after a fork.
@@ -74,9 +73,9 @@ def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: in
             bar.update()
 
 
-def room_folder(folder: Path, number: int) -> Path:
-    """Return the folder of a room."""
-    return folder / f"room_{number:06d}"
+def room_folder(folder: Path, number: int, views: int) -> Path:
+    """Return the folder of a room with this number of images."""
+    return folder / f"room_{number:06d}_{views}"
 
 
 def render_room(folder: Path, views: int, number: int) -> None:
@@ -93,7 +92,12 @@ def render_room(folder: Path, views: int, number: int) -> None:
             write_image(target / f"{k:06d}.jpg", bgr, cv2.IMWRITE_JPEG_QUALITY, QUALITY)
             write_image(target / f"{k:06d}.png", ids)
             write_json(target / "classes.json", names)  # also syncs the entries of the images
-        shutil.move(target, room_folder(folder, number))
+        room = room_folder(folder, number, views)
+        try:
+            target.rename(room)
+        except OSError:
+            if not room.is_dir():  # another process has not rendered the room
+                raise
     sync_folder(folder)
 
 
@@ -171,11 +175,11 @@ def _tinted(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 class RoomPictures:
     """Training images of rendered rooms, read on demand."""
 
-    def __init__(self, folder: Path, first: int, rooms: int) -> None:
+    def __init__(self, folder: Path, first: int, rooms: int, views: int) -> None:
         self.files: list[Path] = []
         self._names: dict[Path, dict[int, str]] = {}
         for number in range(first, first + rooms):
-            room = room_folder(folder, number)
+            room = room_folder(folder, number, views)
             if not room.is_dir():
                 raise DataError(f"{room}: expected a rendered room, got no folder; call render_rooms first")
             self.files += sorted(room.glob("*.jpg"))

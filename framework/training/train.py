@@ -57,13 +57,15 @@ def train(config: DictConfig, folder: Path) -> AveragePrecision:
     network = _started(config.network)
     schedule = Schedule(**dict(config.schedule), seed=config.seed)
     wanted = config.pictures
+    for key in ("rooms", "views", "held_out_rooms", "held_out_views"):
+        require(wanted[key] >= 1, f"pictures.{key}", wanted[key], "at least 1")
     rooms = Path(wanted.folder or Path(platformdirs.user_cache_dir("instancemap")) / "rooms")
     processes = wanted.processes or available_cores()
     render_rooms(rooms, 0, wanted.rooms, wanted.views, processes)
     render_rooms(rooms, HELD_OUT, wanted.held_out_rooms, wanted.held_out_views, processes)
 
     device = str(torch_device(config.device, "device"))
-    pictures = RoomPictures(rooms, 0, wanted.rooms)
+    pictures = RoomPictures(rooms, 0, wanted.rooms, wanted.views)
     trainer = Trainer(network, pictures, schedule, folder, device)
     log.info("%d images, step %d of %d, on %s", len(pictures), trainer.step, schedule.steps, device)
     trainer.run()
@@ -82,8 +84,9 @@ def train(config: DictConfig, folder: Path) -> AveragePrecision:
     node = {"_target_": DETECTOR, "weights": str(weights.absolute()), "device": device}
     detector = build(Detector, OmegaConf.create(node))
     precision = detection_ap(
-        _detected(detector, RoomPictures(rooms, HELD_OUT, wanted.held_out_rooms)), detector.classes, MIN_PIXELS
-    ).masks
+        _detected(detector, RoomPictures(rooms, HELD_OUT, wanted.held_out_rooms, wanted.held_out_views)),
+        detector.classes, MIN_PIXELS,
+    ).masks  # fmt: skip
     card |= _known({"held_out_rooms": wanted.held_out_rooms, "mask_ap50": precision.ap50, "mask_ap": precision.ap})
     save_network(trainer.trained(), weights, card, half=True)
     with atomic_write(folder / PRECISION) as path:

@@ -71,8 +71,9 @@ class Open3dOdometry(PoseTracker):
             max_depth=(1e-3, 1e3), max_distance=(1e-4, 10.0), max_translation=(1e-3, 100.0), max_rotation=(1e-3, 3.15),
             min_matched=(0.0, 1.0),
         )  # fmt: skip
-        from open3d.t.pipelines import odometry
+        import open3d as o3d  # waits for an import in another thread, unlike the import of a submodule
 
+        odometry = o3d.t.pipelines.odometry
         iterations = (self.iterations_coarse, self.iterations_middle, self.iterations_fine)
         self._criteria = [odometry.OdometryConvergenceCriteria(count) for count in iterations]
         self._loss = odometry.OdometryLossParams(depth_outlier_trunc=self.max_distance)
@@ -110,14 +111,14 @@ class Open3dOdometry(PoseTracker):
         self, image: o3d.t.geometry.RGBDImage, reference: o3d.t.geometry.RGBDImage, frame: Frame
     ) -> tuple[Float64, str]:
         """Return T_last_camera (4, 4) and the reason for rejecting it, "" = accepted."""
-        from open3d.t.pipelines import odometry
+        import open3d as o3d
 
         readings = np.count_nonzero((frame.depth > 0) & (frame.depth <= self.max_depth))
         if readings == 0:
             return np.eye(4), "the frame has no depth"
         try:
             with _one_thread():
-                result = odometry.rgbd_odometry_multi_scale(
+                result = o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(
                     image, reference, _tensor(frame.camera.K), _tensor(np.eye(4)), 1.0, self.max_depth, self._criteria,
                     self._method, self._loss,
                 )  # fmt: skip

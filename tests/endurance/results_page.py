@@ -41,8 +41,9 @@ each one several times:
 ![Processor time, heap, process memory, instances and position error over all frames](endurance.png)
 """
 BOUNDS_INTRODUCTION = """Except for drift and lost frames, growth is the median slope over all pairs of passes
-through a sequence, with quartiles in brackets. The first passes through each sequence are excluded, because tentative instances have not expired
-yet. Values are bold if their lower quartile exceeds the bound, and italic if only their median does (possibly noise).
+through a sequence, with quartiles in brackets. The first passes through each sequence are excluded, because tentative
+instances have not expired yet. Values are bold if their lower quartile exceeds the bound, and italic if only their
+median does (possibly noise).
 """
 METHOD = """
 Processor time is relative to a reference computation. For a more precise measurement, see `long_run_slowdown` in

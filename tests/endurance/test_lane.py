@@ -21,8 +21,8 @@ def test_short_run_writes_page_and_figure(tmp_path: Path) -> None:
     assert [(one.bound, one.place) for one in found] == [(bound, place) for bound in BOUNDS for place in PLACES]
     page = (tmp_path / "endurance.md").read_text()
     assert "maps 112 frames of 4 sequences" in page
-    assert f"| growth | bound | {' | '.join(PLACES)} |" in page
-    assert "\n| lost frames | 0 frames | 0 | 0 | 0 | 0 |" in page
+    assert f"|growth|bound|{'|'.join(PLACES)}|" in page
+    assert "\n|lost frames|0 frames|0|0|0|0|" in page
     assert cv2.imread(str(tmp_path / "endurance.png")).shape[1] > 1000
 
 

@@ -401,11 +401,19 @@ class FailsOnceOnKeyframes(GivenPose):
         return {}
 
 
+class FailsOnKeyframes(GivenPose):
+    def keyframes(self) -> Mapping[str, Array]:
+        raise MemoryError("no memory for features")
+
+
 def test_run_to_any_end_keeps_map_after_keyframes_error(room: CornerRoom) -> None:
     result = pipeline(tracker=FailsOnceOnKeyframes()).run_to_any_end(room)
     assert isinstance(result.stopped_by, MemoryError)
     assert (result.frames, len(result.tracked)) == (6, 6)
     assert len(mapped(result).vertices) > 0
+    result = pipeline(tracker=FailsOnKeyframes()).run_to_any_end(room)
+    assert isinstance(result.stopped_by, MemoryError)
+    assert (result.keyframes, len(result.tracked)) == ({}, 6)
     result = pipeline(tracker=FailsOnceOnKeyframes(), fuser=_Fails()).run_to_any_end(room)
     assert "40 GiB" in str(result.stopped_by), "expected the first error"
 

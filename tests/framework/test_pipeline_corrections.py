@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from framework.data import Detections, Frame, Pose
+from framework.errors import MapFullError
 from framework.interfaces import BackEnd, PoseTracker, SceneMap, SubmapChange, SubmapGraph, Viewer
 from framework.pipeline import Pipeline
 from framework.runtime.digests import digest_of
@@ -142,6 +143,19 @@ def test_pipeline_without_need_of_corrections_logs_nothing(
     caplog.set_level("INFO")
     assert pipeline(GivenPose(), fuser, backend).run(room).as_tracked is None
     assert not [record for record in caplog.records if "back end" in record.message]
+
+
+def test_pipeline_full_map_moves_poses_with_submaps(room: CornerRoom) -> None:
+    class Full(SubmapFuser):
+        def correct(self, change: SubmapChange) -> Mapping[int, int]:
+            super().correct(change)
+            raise MapFullError("expected fewer blocks")
+
+    fuser = Full()
+    result = pipeline(fuser=fuser).run_to_any_end(room)
+    assert isinstance(result.stopped_by, MapFullError)
+    assert fuser.corrected == [CHANGES[2], LAST]
+    np.testing.assert_allclose(result.tracked[0].pose.T_world_camera, LAST.moved(0, CHANGES[2].moved(0, pose_at(0))))
 
 
 def test_pipeline_back_end_error_at_the_end_keeps_map(room: CornerRoom) -> None:

@@ -15,7 +15,7 @@ PICTURES = 6
 
 def write_room(folder: Path, number: int) -> None:
     """Write a room like render_room(), with images of 64x48 px."""
-    room = room_folder(folder, number)
+    room = room_folder(folder, number, PICTURES)
     room.mkdir(parents=True)
     rng = np.random.default_rng(number)
     for k in range(PICTURES):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from framework.data import Camera
 from framework.datasets.calibration.undistortion import Distortion
-from framework.datasets.frames.conventions import COARSEST_DEPTH, FINEST_DEPTH
+from framework.datasets.frames.conventions import check_depth_scale
 from framework.errors import DataError, errors_of
 from framework.files.atomic_write import MAX_TEXT, read_bytes
 from framework.files.json_file import parse_json
@@ -90,11 +90,7 @@ def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tu
         DataError: A key is missing or has an invalid value.
     """
     *camera, depth_scale = numbers_of(path, content, *keys)
-    if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
-        raise DataError(
-            f"{path}: {keys[-1]}: expected {COARSEST_DEPTH:g} to {FINEST_DEPTH:g} units per m (1000 for millimeters), "
-            f"got {depth_scale:g}"
-        )
+    check_depth_scale(f"{path}: {keys[-1]}", depth_scale)
     return pinhole(path, *camera), depth_scale
 
 

@@ -173,6 +173,23 @@ def color_delay_of(parameter: str) -> float | None:
     return delay
 
 
+def check_depth_scale(where: str, depth_scale: float) -> None:
+    """Check the depth scale of a calibration file, units per meter.
+
+    Args:
+        where: The file and the key, for the error message.
+        depth_scale: The depth scale.
+
+    Raises:
+        DataError: The scale is implausible.
+    """
+    if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
+        raise DataError(
+            f"{where}: expected {COARSEST_DEPTH:g} to {FINEST_DEPTH:g} units per m (1000 for millimeters), "
+            f"got {depth_scale:g}"
+        )
+
+
 @dataclass(frozen=True)
 class DepthReading:
     """Convention of stored depth images."""

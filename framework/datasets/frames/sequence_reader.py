@@ -190,7 +190,9 @@ class Recording(RGBDSequence):
         if self.odometry is not None:
             self._check_odometry(self.odometry)
         if self.ground_truth is not None and any(self.world_origin):
-            self.named_truth = read_named_truth(Path(self.ground_truth), self.world_origin)
+            poses = [frame.T_world_camera for frame in frames if frame.T_world_camera is not None]
+            cameras = np.array([T[:3, 3] for T in poses]).reshape(-1, 3)
+            self.named_truth = read_named_truth(Path(self.ground_truth), self.world_origin, cameras)
         if self.named_truth is not None:
             self.annotation = self.named_truth.name
             self._check_truth_poses(self.named_truth)

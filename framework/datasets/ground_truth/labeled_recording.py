@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from framework.data import FrameTruth, SceneTruth
 from framework.datasets.frames.sequence_reader import Recording
@@ -30,6 +32,8 @@ class LabeledRecording(Recording):
     def __post_init__(self) -> None:
         self.mesh: LabeledMesh | None = None
         super().__post_init__()
+        if any(self.world_origin):
+            self.mesh = self._in_map_world(self.mesh)
 
     def load_mesh(self, files: Sequence[Path], read: Callable[..., LabeledMesh]) -> None:
         """Load the mesh if all of its files exist and `ground_truth` is not set.
@@ -51,6 +55,12 @@ class LabeledRecording(Recording):
             raise DataError(f"dataset.frame_ground_truth: {expected}; add the file, or set this key to false")
         elif len(missing) < len(files):
             log.warning("%s: expected a file of the labeled mesh, got none; instances are not evaluated", missing[0])
+
+    def _in_map_world(self, mesh: LabeledMesh | None) -> LabeledMesh | None:
+        """Return a mesh relative to the world offset."""
+        if mesh is None:
+            return None
+        return replace(mesh, vertices=(mesh.vertices.astype(np.float64) - self.world_origin).astype(np.float32))
 
     def truth_in(self, index: int) -> FrameTruth | None:
         T_world_camera = self.contents.frames[index].T_world_camera

@@ -9,7 +9,7 @@ entries.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PureWindowsPath
 from typing import Any, TextIO
@@ -86,11 +86,16 @@ def _annotated(path: Path, dataset: Mapping[str, Any]) -> list[Any]:
             f"categories, got the keys {', '.join(map(repr, dataset))}"
         )
     images, annotations, categories = parts
+    for kind, entries in (("image", images), ("category", categories)):
+        for k, one in enumerate(entries):
+            if not isinstance(one.get("id"), Hashable):
+                raise DataError(f"{path}, {kind} {k}: expected a number or a text as id, got {one['id']!r}")
     files = {image.get("id"): _file_of(image) for image in images}
     names = {category.get("id"): category.get("name") for category in categories}
     found = []
     for k, one in enumerate(annotations):
-        if one.get("image_id") not in files or one.get("category_id") not in names:
+        ids = one.get("image_id"), one.get("category_id")
+        if not all(isinstance(key, Hashable) for key in ids) or ids[0] not in files or ids[1] not in names:
             raise DataError(
                 f"{path}, annotation {k}: expected ids of images and categories, got image_id="
                 f"{one.get('image_id')!r}, category_id={one.get('category_id')!r}"

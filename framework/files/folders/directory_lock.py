@@ -55,9 +55,12 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
         wait: True = wait until other processes release the lock.
 
     Raises:
-        DataError: Another process holds the lock, and `wait` is False.
+        DataError: Another process holds the lock, and `wait` is False, or the directory cannot be created.
     """
-    make_folder(directory)
+    try:
+        make_folder(directory)
+    except OSError as error:
+        raise DataError(f"{directory}: expected a writable folder, got an error ({error.strerror})") from error
     lock = FileLock(directory / LOCK, fallback_to_soft=False)
     try:
         try:

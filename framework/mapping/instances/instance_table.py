@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from struct import Struct
@@ -216,11 +215,15 @@ class InstanceTable:
         self.last_id = max(self.last_id, record.id)
         self._changed.add(record.id)
 
-    def absorb(self, other: InstanceTable) -> int:
+    def absorb(self, other: InstanceTable, T_world_other: Float64) -> int:
         """Add the instances of another table, and return the offset of their ids.
 
         Their frames follow the frames of this table. The distance is a multiple of PAGE. Embeddings of both tables must
         have the same space.
+
+        Args:
+            other: The other table.
+            T_world_other: The pose (4, 4) of its world frame.
         """
         self.embedding_space = self.embedding_space or other.embedding_space
         self.begin_recording()
@@ -241,7 +244,7 @@ class InstanceTable:
                     last_frame=last_frame,
                     observed_in=frames[0],
                     in_view=frames[1],
-                    viewing=copy(record.viewing),
+                    viewing=record.viewing.moved(T_world_other),
                 )
             )
         since = self.frames_detected - other.frames_detected

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from framework.data import Float64
 
 NEW_ANGLE = math.radians(10.0)  # change of the viewing direction between two views, rad
 NEW_RATIO = 1.25  # ratio of the viewing distances of two views
@@ -75,6 +79,17 @@ class Viewing:
         self.centered += other.centered
         self.center_sum = _plus(self.center_sum, other.center_sum)
         self.camera = self.camera if other.camera is None else other.camera
+
+    def moved(self, T_new_old: Float64) -> Viewing:
+        """Return the sums in another world frame, given its transform (4, 4) from this world frame."""
+        R, t = T_new_old[:3, :3], T_new_old[:3, 3]
+        camera = None if self.camera is None else _point(R @ np.array(self.camera) + t)
+        return replace(self, center_sum=_point(R @ np.array(self.center_sum) + self.centered * t), camera=camera)
+
+
+def _point(vector: Float64) -> Point:
+    x, y, z = vector.tolist()
+    return x, y, z
 
 
 def _plus(a: Point, b: Point) -> Point:

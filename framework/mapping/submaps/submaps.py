@@ -143,7 +143,7 @@ class Submaps:
         for k in instance_ids:
             if (kept := remaining(k, self._merged)) != k:
                 layer.labels.merge_instances(kept, k)
-        removed = [k for k in instance_ids if remaining(k, self._merged) == k and k not in self.table.records]
+        removed = sorted({remaining(k, self._merged) for k in instance_ids} - self.table.records.keys())
         if removed:
             layer.labels.remove_instances(removed)
         return layer

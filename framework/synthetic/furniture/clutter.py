@@ -128,7 +128,7 @@ def plant(rng: Rng) -> Furniture:
         width = rng.uniform(0.05, 0.075)
         blade = rounded_box(2 * width, reach, 0.006, 0.0025, 1, 0.05)
 
-        def droop(p: Float64, reach: float = reach, width: float = width, tilt: float = tilt) -> Float64:
+        def droop(p: Float64, reach: float = reach, tilt: float = tilt) -> Float64:
             f = p[:, 1] / reach + 0.5
             p[:, 0] *= np.sin(np.pi * np.clip(0.06 + 0.93 * f, 0, 1)) ** 0.8
             p[:, 2] += 0.25 * np.abs(p[:, 0])

@@ -117,6 +117,19 @@ def test_best_view_looks_down_and_shows_objects() -> None:
     assert (ids == 2).sum() > 200
 
 
+def test_best_view_of_ceiling_alone_frames_it() -> None:
+    """All candidate views look down, so none shows a front face."""
+    x, y = np.meshgrid([-1.0, 1.0], [-1.0, 1.0])
+    corners = np.stack([x.ravel(), y.ravel(), np.full(4, 2.5)], axis=1).astype(np.float32)
+    surface = Surface(corners, np.array([[0, 2, 1], [1, 2, 3]], np.int32))  # visible from below
+    camera, T = best_view(surface, np.zeros(4, np.int32), walk(), 200, 150)
+    assert np.isfinite(T).all()
+    in_camera = (corners - T[:3, 3]) @ T[:3, :3]
+    assert (in_camera[:, 2] > 0).all()
+    u, v = camera.fx * in_camera[:, 0] / in_camera[:, 2], camera.fy * in_camera[:, 1] / in_camera[:, 2]
+    assert np.abs([u + camera.cx - 100, v + camera.cy - 75]).max() < 110
+
+
 def test_overview_shows_colors_left_and_instances_right(tmp_path: Path) -> None:
     mesh, instances = furnished(), {1: ("chair", 0.9), 2: ("couch", 0.6)}
     overview.write_overview(tmp_path / "overview.png", mesh, instances, walk(), "two boxes")

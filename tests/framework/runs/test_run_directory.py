@@ -9,7 +9,7 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -252,6 +252,16 @@ def test_run_directory_full_disk_keeps_map_and_trajectory(
     kept = ["trajectory.txt", "timings.csv", "digests.csv", "metrics.partial.json", "map.npz", "keyframes.npz"]
     assert renamed == kept
     assert {path.name for path in record.directory.iterdir()} >= {"config.yaml", *kept}
+
+
+def test_run_directory_unreadable_poses_keep_map(record: RunRecord, room: CornerRoom) -> None:
+    class Unreadable(list[TrackedFrame]):
+        def __iter__(self) -> Iterator[TrackedFrame]:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    assert "Input/output error" in str(record.write(room, replace(mapped(room), tracked=Unreadable())).error)
+    assert {path.name for path in record.directory.iterdir()} >= {"map.npz", "mesh.ply", "instances.json"}
+    assert not (record.directory / "trajectory.txt").exists()
 
 
 def test_run_directory_removed_during_run_is_recreated(record: RunRecord, room: CornerRoom) -> None:

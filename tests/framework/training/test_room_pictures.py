@@ -30,8 +30,8 @@ def test_room_pictures_show_known_classes_in_varied_colors(seen: list) -> None:
 
 def test_room_pictures_round_trip_keeps_masks_and_classes(seen: list, tmp_path: Path) -> None:
     render_room(tmp_path, 3, 2)
-    assert [path.name for path in tmp_path.iterdir()] == ["room_000002"], "expected no temporary folder"
-    stored = RoomPictures(tmp_path, 2, 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["room_000002_3"], "expected no temporary folder"
+    stored = RoomPictures(tmp_path, 2, 1, 3)
     assert len(stored) == 3
     for k, (color, ids, names) in enumerate(seen):
         example = stored[k]
@@ -42,7 +42,13 @@ def test_room_pictures_round_trip_keeps_masks_and_classes(seen: list, tmp_path: 
 
 
 def test_render_rooms_keeps_existing_rooms(tmp_path: Path) -> None:
-    kept = room_folder(tmp_path, 0)
+    kept = room_folder(tmp_path, 0, 3)
     kept.mkdir()
     room_pictures.render_rooms(tmp_path, 0, 1, 3, 1)
     assert list(kept.iterdir()) == []
+
+
+def test_render_rooms_renders_other_number_of_images(tmp_path: Path) -> None:
+    room_folder(tmp_path, 0, 3).mkdir()
+    room_pictures.render_rooms(tmp_path, 0, 1, 1, 1)
+    assert len(RoomPictures(tmp_path, 0, 1, 1)) == 1

@@ -15,7 +15,7 @@ from framework.errors import ConfigError, DataError
 from framework.training.losses import Budget
 from framework.training.room_pictures import RoomPictures
 from framework.training.trainer import CHECKPOINT, CURVE, HISTORY, Schedule, Trainer
-from tests.support.tiny_rooms import write_room
+from tests.support.tiny_rooms import PICTURES, write_room
 
 TINY = Architecture(
     classes=("chair", "bed"),
@@ -31,7 +31,7 @@ SHORT = Schedule(steps=6, batch=2, warmup=2, checkpoint_interval=3, budget=Budge
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> RoomPictures:
     folder = tmp_path_factory.mktemp("rooms")
     write_room(folder, 0)
-    return RoomPictures(folder, 0, 1)
+    return RoomPictures(folder, 0, 1, PICTURES)
 
 
 def network() -> MaskRCNN:
@@ -108,8 +108,8 @@ def test_trainer_unknown_picture_classes_raise(pictures: RoomPictures, tmp_path:
 
 
 def test_room_pictures_missing_room_raises(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="room_000003: expected a rendered room"):
-        RoomPictures(tmp_path, 3, 1)
+    with pytest.raises(DataError, match="room_000003_6: expected a rendered room"):
+        RoomPictures(tmp_path, 3, 1, PICTURES)
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ def config(folder: Path, *overrides: str) -> DictConfig:
             overrides=[
                 "device=cpu", "network.width=8", "network.fpn_channels=8", "network.head_features=16",
                 f"pictures.folder={folder}", "pictures.rooms=1", "pictures.held_out_rooms=1",
+                f"pictures.views={PICTURES}", f"pictures.held_out_views={PICTURES}",
                 "schedule.batch=2", *overrides,
             ],
         )  # fmt: skip

@@ -42,7 +42,7 @@ def test_bundled_network_is_small_and_has_model_card(detector: MaskRCNNDetector)
 def test_bundled_network_detects_objects_in_unseen_rooms(detector: MaskRCNNDetector, tmp_path: Path) -> None:
     """The bound is low, because there are few images. The complete results are in the model card."""
     render_rooms(tmp_path, ROOMS, 2, 10, 1)
-    pictures = RoomPictures(tmp_path, ROOMS, 2)
+    pictures = RoomPictures(tmp_path, ROOMS, 2, 10)
     found = []
     for k in range(len(pictures)):
         example = pictures[k]

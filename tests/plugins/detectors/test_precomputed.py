@@ -315,6 +315,11 @@ def test_precomputed_invalid_entry_raises_one_line_error(tmp_path: Path, changes
         ('{"annotations": []}', "expected a list of results in COCO's format, or an object with lists of images, ann"),
         ('{"images": [], "annotations": [], "categories": []}', "expected at least one detection"),
         ('{"images": [], "annotations": [{"image_id": 3}], "categories": []}', "annotation 0: expected ids of images"),
+        ('{"images": [], "annotations": [{"image_id": []}], "categories": []}', "annotation 0: expected ids of images"),
+        (
+            '{"images": [{"id": [1]}], "annotations": [], "categories": []}',
+            "image 0: expected a number or a text",
+        ),
         ("[]", "expected at least one detection"),
         ("[3]", "entry 0"),
     ],

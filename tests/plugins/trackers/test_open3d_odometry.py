@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -34,6 +36,22 @@ BEST = [
 @pytest.fixture(scope="module")
 def frames() -> list[Frame]:
     return [papered_frame(T @ LOOKING_INTO_A_CORNER, k) for k, T in enumerate(walk(12))]
+
+
+DURING_IMPORT = """
+import sys, threading, time
+from plugins.trackers.open3d_odometry import Open3dOdometry
+threading.Thread(target=__import__, args=("open3d",)).start()
+while "open3d" not in sys.modules:
+    time.sleep(0.001)
+Open3dOdometry()
+"""
+
+
+def test_open3d_odometry_waits_for_import_in_another_thread() -> None:
+    """The back end imports Open3D in a thread."""
+    done = subprocess.run([sys.executable, "-c", DURING_IMPORT], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def run(tracker: Open3dOdometry, frames: list[Frame]) -> list[Pose]:

@@ -6,6 +6,7 @@ The files are written as in the documentation of the programs that are named in 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -179,6 +180,20 @@ def test_own_camera_of_other_program_matches_file(
     assert own is not None
     assert (own.stored.camera, own.stored.distortion, own.stored.depth_scale) == (CAMERA, lens, scale)
     assert f"room: camera from {path}, with {scale:g} depth units per m" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("calibration.yaml", ORB_SLAM.replace("2000.0", "0.001"), "depth scale: expected 1 to 1e+06 units per m"),
+        ("info.txt", INFO.format(color=CAMERA).replace("Shift = 1000", "Shift = 0"), "m_depthShift: expected 1 to 1e"),
+    ],
+)
+def test_own_camera_implausible_depth_scale_raises(tmp_path: Path, file: str, content: str, message: str) -> None:
+    write_color(tmp_path / "color/0.png", (1, 2, 3), (240, 320))
+    written(tmp_path, file, content)
+    with pytest.raises(DataError, match=re.escape(message)):
+        own_camera("room", tmp_path, [tmp_path / "color/0.png"], 500)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

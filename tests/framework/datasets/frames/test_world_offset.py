@@ -88,17 +88,21 @@ def test_pose_far_from_world_offset_is_refused(tmp_path: Path) -> None:
         RgbdFolder(recording(tmp_path, FAR[0]), world_offset="0 0 0")[0]
 
 
-@pytest.mark.parametrize("shift", FAR, ids=str)
-def test_truth_mesh_of_recording_far_from_origin_is_moved(tmp_path: Path, shift: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(
+    ("shift", "world_offset"),
+    [*((shift, "AUTO") for shift in FAR), ((30, 0, 0), "30 0 0"), ((0, 0, 0), "-9 4 0")],
+    ids=str,
+)
+def test_truth_mesh_moves_with_world_offset(tmp_path: Path, shift: tuple[float, ...], world_offset: str) -> None:
     """A mesh in the world frame of the recording or in that of the map is the same ground truth."""
     place = recording(tmp_path, shift)
-    origin = np.array(RgbdFolder(place).world_origin)
+    origin = np.array(RgbdFolder(place, world_offset=world_offset).world_origin)
     corners = np.array([[0, 0, 1], [1.25, 0, 1], [0, 1.5, 1.125]]) + shift
     (tmp_path / "instances.json").write_text('{"1": {"name": "desk", "class": "dining table"}}')
     for name, vertices in {"world": corners, "map": corners - origin}.items():
         rows = "".join(f"{x:.4f} {y:.4f} {z:.4f} 1\n" for x, y, z in vertices)
         (tmp_path / f"{name}.ply").write_text(f"{TRIANGLE}{rows}3 0 1 2\n")
-        truth = RgbdFolder(place, ground_truth=tmp_path / f"{name}.ply").scene_truth()
+        truth = RgbdFolder(place, ground_truth=tmp_path / f"{name}.ply", world_offset=world_offset).scene_truth()
         assert truth is not None
         np.testing.assert_allclose(truth.points_world, corners - origin, atol=1e-3)
 

@@ -246,6 +246,17 @@ def test_scannet_truth_matches_labeled_mesh(tmp_path: Path, write: Writer) -> No
     np.testing.assert_array_equal(seen.instance_ids[12, sure], expected[sure])
 
 
+def test_scannet_truth_moves_with_world_offset(tmp_path: Path, write: Writer) -> None:
+    write(tmp_path / SCENE, shots())
+    write_labels(tmp_path / SCENE)
+    words = f"dataset.root={tmp_path}", f"dataset.scene={SCENE}", "dataset.frame_ground_truth=true"
+    near, moved = opened("scannet", *words), opened("scannet", *words, "dataset.world_offset=5 0 -2")
+    points, ids = (np.asarray(getattr(moved.scene_truth(), name)) for name in ("points_world", "instance_ids"))
+    np.testing.assert_allclose(points + np.array([5, 0, -2]), near.scene_truth().points_world, atol=1e-5)
+    np.testing.assert_array_equal(ids, near.scene_truth().instance_ids)
+    assert (moved[1].truth.instance_ids != near[1].truth.instance_ids).mean() < 0.01
+
+
 def test_scannet_missing_label_table_changes_annotation_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Without the label table, the metrics differ. Tables must not mix such runs with others."""
     as_sens(tmp_path / SCENE, shots())

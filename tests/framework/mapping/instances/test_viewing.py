@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from math import cos, radians, sin
 
+import numpy as np
 import pytest
 
+from framework.geometry import exp_se3
 from framework.mapping.instances.viewing import Viewing
 
 CENTER = (0.0, 0.0, 2.0)
@@ -56,3 +58,18 @@ def test_merged_viewing_adds_detections():
     other.see((0.0, 0.0, 0.0))
     one.merge(other)
     assert one == Viewing(1, 2, 1.4, 1, CENTER, (0.0, 0.0, 0.0))
+
+
+def test_moved_viewing_has_views_of_moved_cameras():
+    T = exp_se3(np.array([1.0, -2.0, 0.5, 0.3, -0.7, 0.2]))
+    viewing, expected = Viewing(), Viewing()
+    for center, camera in (((0.0, 0.0, 2.0), (0.0, 0.0, 0.0)), ((0.2, 0.1, 1.9), (0.9, 0.0, 0.1))):
+        viewing.locate(center)
+        expected.locate(tuple(T[:3, :3] @ center + T[:3, 3]))
+        viewing.see(camera)
+        expected.see(tuple(T[:3, :3] @ camera + T[:3, 3]))
+    moved = viewing.moved(T)
+    assert (moved.views, moved.centered) == (expected.views, expected.centered) == (2, 2)
+    assert moved.center == pytest.approx(expected.center)
+    assert moved.camera == pytest.approx(expected.camera)
+    assert Viewing().moved(T) == Viewing()

@@ -48,6 +48,7 @@ def test_absorbed_half_equals_joint_map(storage: str, T_other_world: Float64) ->
         assert (one.observations, one.last_frame) == (10, PAGE + 4), "expected the frames of both halves"
         assert one.class_probabilities.argmax() == joint.instances()[k].class_probabilities.argmax()
         assert one.obb.center == pytest.approx(joint.instances()[k].obb.center, abs=VOXEL)
+        assert found.table.records[k].viewing.center == pytest.approx(joint.table.records[k].viewing.center, abs=VOXEL)
     of_joint, of_parts = joint.render(CAMERA, POSES[4]), found.render(CAMERA, POSES[4])
     both = (of_joint.depth > 0) & (of_parts.depth > 0)
     is_resampled = T_other_world is ELSEWHERE

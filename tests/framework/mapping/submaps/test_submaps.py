@@ -177,6 +177,21 @@ def test_hidden_submap_follows_merged_and_removed_instances() -> None:
     assert set(scene.labels.best_ids().tolist()) == {1}
 
 
+def test_hidden_submap_follows_removal_after_merge(tmp_path: Path) -> None:
+    fuser = new_fuser()
+    fuse(fuser, POSES)
+    scene = scene_of(fuser)
+    fuser.correct(SubmapChange(hidden=frozenset({0}), submap=1))
+    kept = scene.table.create(len(scene.classes), 0).id
+    scene.merge(kept, 1)
+    scene.remove([kept])
+    scene.relabel()
+    scene.save(tmp_path / "map.npz")
+    assert set(InstanceMap.load(tmp_path / "map.npz").instances()) == {2, 3}
+    fuser.correct(SubmapChange(shown=frozenset({0}), submap=2))
+    assert set(scene.labels.best_ids().tolist()) <= {0, 2, 3}
+
+
 def test_map_with_hidden_submaps_is_saved_whole(tmp_path: Path) -> None:
     fuser = new_fuser()
     fuse(fuser, POSES[:4])
