@@ -25,7 +25,7 @@ COMMANDS = {
     "check": "validate an RGB-D sequence and suggest parameter fixes",
     "diff": "list objects that appeared, vanished or moved between two runs",
     "edit": "merge, split, rename and delete instances of a run, for use as ground truth",
-    "merge": "merge the maps of two runs of overlapping places",
+    "merge": "merge the overlapping maps of two runs",
     "export": "export a run to standard 3D and map formats: GLB, USD, PLY, OBJ, ROS map, scene graph",
     "verify": "compare the files of runs with the hashes in their manifests",
     "bundle": "pack the runs, tables and plugin code of an experiment into a ZIP file",

@@ -32,6 +32,20 @@ class ConfigError(InstanceMapError):
     """An unknown name, or an invalid value of a parameter."""
 
 
+class ParameterError(ConfigError):
+    """A parameter of a plugin outside of its interval.
+
+    Args:
+        owner: Class of the plugin, or of a part of it.
+        name: Name of the parameter.
+        problem: Allowed and found values.
+    """
+
+    def __init__(self, owner: str, name: str, problem: str) -> None:
+        super().__init__(f"{owner}.{name}: {problem}")
+        self.name, self.problem = name, problem
+
+
 class DataError(InstanceMapError):
     """Unusable input: a missing, corrupt or inconsistent file, or an array of the wrong shape or type."""
 

@@ -28,7 +28,7 @@ from framework.config.hydra_api import CachingConfigRepository, create_defaults_
 from framework.config.renamed_keys import replace_deprecated
 from framework.config.text_values import TextKind
 from framework.config.validation import values_of, without_interpolation
-from framework.errors import ConfigError, InstanceMapError, first_line
+from framework.errors import ConfigError, InstanceMapError, ParameterError, first_line
 from framework.files.search_paths import PROJECT_ROOT, usable_path
 from framework.interfaces import (
     BackEnd,
@@ -97,7 +97,7 @@ def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
         if isinstance(value, Path):
             usable_path(f"{stage}.{name}", value)
     try:
-        with _errors_at(where):
+        with _errors_at(where, stage, stage):
             plugin: Plugin = assemble(plugin_class, **arguments)
     except (ImportError, ValueError) as error:
         raise ConfigError(f"{where}: expected a working constructor, got an error ({first_line(error)})") from error
@@ -127,12 +127,24 @@ def text_kind(config: DictConfig, key: str) -> TextKind | None:
 
 
 @contextmanager
-def _errors_at(where: str) -> Iterator[None]:
-    """Prepend `where` to the message of an InstanceMapError in the `with` body."""
+def _errors_at(where: str, stage: str, key: str) -> Iterator[None]:
+    """Prepend `where` to the message of an InstanceMapError in the `with` body.
+
+    If the message begins with a parameter, such as "refiner.eps: ...", it begins with `key` instead of the stage.
+
+    Args:
+        where: Stage and class name, and the parameter of a nested plugin.
+        stage: Stage of the plugin.
+        key: Config key of the plugin: the stage, or for example refiner.links.dbscan.
+    """
     try:
         yield
+    except ParameterError as error:
+        raise ConfigError(f"{key}.{error.name}: {error.problem}") from error
     except InstanceMapError as error:
-        raise type(error)(f"{where}: {error}") from error
+        message = str(error)
+        named = message.startswith(f"{stage}.")
+        raise type(error)(f"{key}{message.removeprefix(stage)}" if named else f"{where}: {message}") from error
 
 
 def assemble(plugin_class: type[Plugin], /, **values: Any) -> Plugin:
@@ -291,7 +303,7 @@ def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
             f"{where}: expected all methods of {interface.__name__} in {class_name}, got none for: {missing}; "
             "implement them"
         )
-    with _errors_at(where):
+    with _errors_at(where, where.split()[0], where.split()[0]):
         parameter_fields(found)
     plugin_class: type[Plugin] = found
     return plugin_class
@@ -368,7 +380,7 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
             expected = "a known parameter" if suggestion else names
             raise ConfigError(f"{where}: expected {expected}, got {key!r}{suggestion}")
         if key in stages:
-            plugins[key] = _inner(f"{where}: {key}", stages[key], node[given], holds_one(plugin_class, key))
+            plugins[key] = _inner(where, key, stages[key], node[given], holds_one(plugin_class, key))
             continue
         try:
             value = node[given]
@@ -400,17 +412,18 @@ def holds_one(plugin_class: type, name: str) -> bool:
     return get_type_hints(plugin_class)[name] in STAGES.values()
 
 
-def _inner(where: str, interface: type[Any], node: Any, one: bool) -> Any:
+def _inner(where: str, key: str, interface: type[Any], node: Any, one: bool) -> Any:
     """Return a nested plugin or a mapping of nested plugins by name, without null entries."""
+    outer, stage = where.split()[0], stage_of(interface)
     if one:
-        with _errors_at(where):
+        with _errors_at(f"{where}: {key}", stage, f"{outer}.{key}"):
             return build(interface, node)
     if not isinstance(node, DictConfig):
-        raise ConfigError(f"{where}: expected plugins by name, got {_shown(node)}")
+        raise ConfigError(f"{where}: {key}: expected plugins by name, got {_shown(node)}")
     found = {}
     for name in map(str, node):
         if node[name] is not None:
-            with _errors_at(f"{where}.{name}"):
+            with _errors_at(f"{where}: {key}.{name}", stage, f"{outer}.{key}.{name}"):
                 found[name] = build(interface, node[name])
     return found
 

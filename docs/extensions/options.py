@@ -16,11 +16,12 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from framework.__main__ import COMMANDS
-from framework.commands.installation.plugins import COMMENTED_KEY, Option, registered
+from framework.commands.installation.plugins import Option, registered
 from framework.config.composition import composed
 from framework.files.search_paths import CONF
 from framework.importing.formats import FORMATS
 
+_SETTING = re.compile(r"(  )?(\w+):(?: +(\S.*?))?(?: +# (.*))?")  # line of a setting; indented in a group of settings
 VARIANT = " Here: "  # precedes the difference of a variant from its class in `Option.documentation`
 
 
@@ -77,16 +78,24 @@ class Overview(SphinxDirective):
 
 
 class Settings(SphinxDirective):
-    """Directive for the top-level settings of a main config, such as `seed`, with the comments of its YAML."""
+    """Directive for the settings of a main config, such as `seed`, with the comments of its YAML."""
 
     required_arguments = 1  # the config's name
 
     def run(self) -> list[nodes.Node]:
-        text = (CONF / f"{self.arguments[0]}.yaml").read_text()
-        given = yaml.safe_load(text)
-        comments = {match["key"]: match["comment"] for match in COMMENTED_KEY.finditer(text)}
-        keys = [key for key in given if key not in ("defaults", "hydra")]
-        return [table(Row(key, _type(given[key]), yaml_value(given[key]), comments.get(key, "")) for key in keys)]
+        return [table(settings((CONF / f"{self.arguments[0]}.yaml").read_text()))]
+
+
+def settings(text: str) -> Iterator[Row]:
+    """Yield a row for each setting of a main config, such as `evaluation.names`, without Hydra's settings."""
+    group = ""
+    for match in filter(None, map(_SETTING.fullmatch, text.splitlines())):
+        indented, key, value, comment = match.groups()
+        group = group if indented else key
+        if group in ("defaults", "hydra") or not value:
+            continue
+        found = yaml.safe_load(value)
+        yield Row(f"{group}.{key}" if indented else key, _type(found), yaml_value(found), comment or "")
 
 
 class Files(SphinxDirective):

@@ -83,9 +83,7 @@ def check_normalization(sequence: RGBDSequence, chosen: Sequence[int]) -> Findin
         text = f"rounded to {count} different values per image; export depth again, for example as uint16 in mm"
         return Finding(Verdict.ERROR, "depth", text)
     if all(one.nearest == 1 for one in found):
-        text = (
-            f"constant: all readings of an image are equal in {len(found)} of {len(found)} images; export depth again"
-        )
+        text = f"constant: all readings of an image are equal, in all {len(found)} checked images; export depth again"
         return Finding(Verdict.ERROR, "depth", text)
     full = [one for one in found if one.is_full]
     limit = full[0].largest if full else float(np.median([one.largest for one in found]))
@@ -95,8 +93,8 @@ def check_normalization(sequence: RGBDSequence, chosen: Sequence[int]) -> Findin
     if not is_normalized and len(full) < max(MIN_FRAMES, MIN_FULL_FRACTION * len(found)):
         return None
     text = (
-        f"normalized frame by frame: the largest value is {limit:g} in {len(alike)} of {len(found)} images"
-        f"{', and the smallest values are near 0' * from_zero}; expected distances in a fixed unit, which no setting "
-        "can restore: export depth again, for example as uint16 in mm"
+        f"normalized frame by frame: expected distances in a fixed unit, got the largest value {limit:g} in "
+        f"{len(alike)} of {len(found)} images{', and smallest values near 0' * from_zero}; no setting can restore the "
+        "unit, so export depth again, for example as uint16 in mm"
     )
     return Finding(Verdict.ERROR, "depth", text)

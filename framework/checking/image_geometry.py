@@ -36,7 +36,7 @@ SIZES = ((1280, 720), (1920, 1080), (848, 480), (640, 360), (960, 540), (512, 42
 """Usual image sizes of sensors, px."""
 MAX_ASPECT = 1.1  # maximum ratio of fx and fy of most cameras
 ALIKE = 1.05  # ratio up to which two residuals count as equal
-MAX_FACTOR_ERROR = 0.1  # maximum relative difference from a usual ratio; cameras have principal points within 8 %
+MAX_FACTOR_ERROR = 0.1  # maximum relative difference from a usual ratio; cameras have principal points within 8%
 SUBJECT = "camera"
 log = logging.getLogger(__name__)
 TURNS = {2: "a mirror image", 3: "a rotation by 180 degrees", 4: "a vertical mirror image", 5: "a transposition"}
@@ -73,7 +73,8 @@ def check_camera(camera: Camera, pairs: Sequence[MatchedPair] = ()) -> Finding |
         text = f"{expected}; {fix} (residual of a rigid motion between frames: {ratio:.2f} times as much with this fix)"
         return Finding(Verdict.ERROR, SUBJECT, text)
     if offset > MAX_OFFSET:
-        return Finding(Verdict.NOTE, SUBJECT, f"{expected}; frame pairs do not contradict it, as for cropped images")
+        consistent = "frame pairs are consistent with these intrinsics, as for cropped images"
+        return Finding(Verdict.NOTE, SUBJECT, f"{expected}; {consistent}")
     return None
 
 

@@ -335,8 +335,8 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
     missing = 1 - len(readings) / sum(frame.depth.size for frame in frames)
     beyond = float((readings > farthest).mean())
     text = (
-        f"median {median:.2f} m, {100 * missing:.0f} % of the pixels without a reading, "
-        f"{100 * beyond:.0f} % of the readings beyond the mapped range of {farthest:g} m"
+        f"median {median:.2f} m, {missing:.0%} of the pixels without a reading, "
+        f"{beyond:.0%} of the readings beyond the mapped range of {farthest:g} m"
     )
     low, high = PLAUSIBLE
     if not low <= median <= high:

@@ -1,7 +1,7 @@
 """Check of the registration of color and depth in space and time.
 
-Depth edges must coincide with color edges. The check shifts and scales depth edges, and also uses depth edges of nearby
-frames, and compares them with color gradients.
+Depth edges must coincide with color edges. The check compares depth edges with color gradients. It shifts and scales
+the depth edges, and also tries depth edges of nearby frames.
 """
 
 from __future__ import annotations
@@ -155,15 +155,15 @@ def judge(
     apart = max(map(abs, zoomed.shift))
     if zoomed.zoom == 1.0 and zoomed.moved and apart <= step / 2:
         text = (
-            f"edges are {100 * apart:.1f} % of the width apart, with an image motion of {100 * step:.1f} % per frame: "
+            f"edges are {apart:.1%} of the width apart, with an image motion of {step:.1%} per frame: "
             "not synchronized or not registered; run the check on a part with slower camera motion"
         )
         return Finding(Verdict.NOTE, subject, text), 0
     if zoomed.zoom != 1.0 or zoomed.moved:
         x, y = (100 * fraction for fraction in zoomed.shift)
         text = (
-            f"depth is not registered to color: depth edges fit best {x:+.1f} % of the width to the right and "
-            f"{y:+.1f} % down, scaled by {zoomed.zoom:g}; enable the alignment of depth to color in the camera's driver"
+            f"depth is not registered to color: depth edges fit best {x:+.1f}% of the width to the right and "
+            f"{y:+.1f}% down, scaled by {zoomed.zoom:g}; enable the alignment of depth to color in the camera's driver"
         )
         return Finding(Verdict.ERROR, subject, text), 0
     return Finding(Verdict.FINE, subject, "edges match without a delay"), 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from difflib import get_close_matches
@@ -15,7 +16,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.config.renamed_keys import replace_deprecated, replace_in_overrides
-from framework.errors import ConfigError
+from framework.errors import ConfigError, ParameterError
 from framework.files.search_paths import usable_path
 
 MAX_DETECTIONS = 1000  # maximum number of detections per image; each has a mask of the image size; COCO evaluates 100
@@ -43,11 +44,13 @@ def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
         bounds: The interval (low, high) of each parameter by name.
 
     Raises:
-        ConfigError: A parameter is outside of its interval.
+        ParameterError: A parameter is outside of its interval. The registry replaces the class by the stage.
     """
     for name, (low, high) in bounds.items():
         value = getattr(plugin, name)
-        require(low <= value <= high, f"{type(plugin).__name__}.{name}", value, f"a value in [{low:g}, {high:g}]")
+        if not low <= value <= high:
+            allowed = f"at least {low:g}" if high == math.inf else f"a value in [{low:g}, {high:g}]"
+            raise ParameterError(type(plugin).__name__, name, f"expected {allowed}, got {value}")
 
 
 def check_intervals(stage: str, plugin: object, **intervals: str) -> None:

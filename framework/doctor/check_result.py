@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
@@ -62,4 +63,4 @@ def anonymous(text: str | Path) -> str:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user in a container may have no name
         return text
-    return text.replace(f"/{user}/", "/USER/") if user != "root" else text
+    return text if user == "root" else re.sub(rf"/{re.escape(user)}(?![\w.-])", "/USER", text)

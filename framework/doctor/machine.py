@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -26,6 +27,8 @@ SYSTEM_LIBRARIES = {
 
 PREFIXES = ("HF_", "INSTANCEMAP_", "NUMBA_", "OMP_", "TRANSFORMERS_", "CUDA_VISIBLE", "XDG_CACHE", "PYTHONPATH")
 """Prefixes of the names of the listed environment variables."""
+
+SECRET = re.compile("KEY|PASS|SECRET|TOKEN")  # in names of environment variables whose values are not printed
 
 
 def hardware() -> Iterator[Check]:
@@ -82,4 +85,5 @@ def environment() -> Iterator[Check]:
     for name in sorted(name for name in os.environ if name.startswith(PREFIXES)):
         _, _, error = errors.get(name, "").partition(": ")
         detail, _, fix = error.partition("; ")
-        yield Check.of(name, not error, detail or anonymous(os.environ[name]) or '""', fix, required=True)
+        value = "set" if SECRET.search(name) else anonymous(os.environ[name]) or '""'
+        yield Check.of(name, not error, detail or value, fix, required=True)

@@ -28,7 +28,7 @@ def included_and_hub() -> Iterator[Check]:
         if value.startswith(INCLUDED):
             size = _size(PROJECT_ROOT / value)
             detail = f"included, {size / 1e6:.1f} MB" if size else f"{anonymous(PROJECT_ROOT / value)} is missing"
-            fix = "pip install --force-reinstall --no-deps instancemap"
+            fix = "pip install --force-reinstall --no-deps instancemap (in a checkout: git checkout -- plugins)"
             yield Check.of(name, size > 0, detail, fix, required=name == default)
         elif MODEL_ID.fullmatch(value):
             folder = _hub_cache() / f"models--{value.replace('/', '--')}"

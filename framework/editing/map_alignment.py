@@ -1,4 +1,4 @@
-"""Alignment of two maps of overlapping places.
+"""Alignment of two overlapping maps.
 
 Keyframes give the transform between the maps, and ICP of the surfaces refines it. A wrong transform ruins a map, so the
 result is verified: the cameras of each map must see the surface of the other map where it is.

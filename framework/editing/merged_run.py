@@ -1,4 +1,4 @@
-"""Runs whose map is the union of two stored maps of overlapping places."""
+"""Runs whose map is the union of two overlapping stored maps."""
 
 from __future__ import annotations
 

@@ -56,8 +56,8 @@ class BenchmarkPredictions:
 
         Args:
             run: The run directory.
-            label_space: nyu40, scannet20, scannet200, or a JSON file with the name of each class id; None = the label
-                space of the evaluation if it is one of these, otherwise scannet20.
+            label_space: nyu40, scannet20, scannet200, agnostic, or a JSON file with the name of each class id. None =
+                the label space of the evaluation if it is one of these names, otherwise scannet20.
             points: PLY or NPY file with the points in the world frame of the dataset; None = ground-truth points.
 
         Raises:
@@ -98,7 +98,7 @@ class BenchmarkPredictions:
         )
 
     def write_scannet(self, directory: Path) -> list[Path]:
-        """Write the files of the format `scannet`, and return the paths of the lists of instances and classes."""
+        """Write the files of the format `scannet`, and return the paths of all files except the masks."""
         instances, semantics = directory / "scannet" / "instances", directory / "scannet" / "semantics"
         lines = []
         for k, (key, class_id, confidence) in enumerate(zip(self.ids, self.class_ids, self.confidences, strict=True)):

@@ -59,12 +59,13 @@ class Chosen:
 
     objects: Sequence[str] = ()  # ids or classes; () = the whole room
     min_probability: float = LIKELY  # minimum probability that an object exists, in [0, 1]
-    triangles: int | None = None  # maximum triangle count of the scene and of each object file, >= 4; None = no limit
+    triangles: int | None = None  # approximate triangle count of the scene, maximum of each object; None = no limit
     coloring: Coloring = Coloring.APPEARANCE  # vertex colors
     collision: Collision = Collision.HULL  # collision shape of objects in USD files
     resolution: float = 0.05  # cell size of a floor plan, m, in [0.01, 1]
     robot_height: float = 1.0  # minimum height of observed empty space above a free cell, m, in [0.1, 3]
-    label_space: str | None = None  # of predictions: nyu40, scannet20, scannet200 or a JSON file; None = as evaluated
+    # of predictions: nyu40, scannet20, scannet200, agnostic or a JSON file; None = as evaluated
+    label_space: str | None = None
     points: Path | str | None = None  # PLY or NPY file with the points of predictions; None = ground-truth points
 
     def __post_init__(self) -> None:

@@ -7,8 +7,9 @@ rendering the surface from camera poses along the trajectory.
 - A cell is occupied if there is a surface in this space. Surfaces below CLEARANCE are ignored.
 - All other cells are unknown.
 
-Runs do not store the field of view of the camera. The field of view of a Kinect is assumed (`queries.changes.EYE`).
-Depth cameras do not observe glass and mirrors, which may therefore be classified as free.
+Runs do not store the field of view of the camera. The field of view of a Kinect is assumed
+(`queries.changes.ASSUMED_CAMERA`). Depth cameras do not observe glass and mirrors, which may therefore be classified as
+free.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from framework.errors import DataError
 from framework.exporting.upright_room import SurfacePoints, UprightRoom, surface_points
 from framework.files.atomic_write import atomic_write
 from framework.geometry import inverse, project, transform
-from framework.queries.changes import EYE, LOOKS
+from framework.queries.changes import ASSUMED_CAMERA, RENDERED_POSES
 from framework.rendering.rasterizer import Rasterizer
 
 CLEARANCE = 0.08  # ignored height above the floor, m, because floors are noisy
@@ -122,15 +123,17 @@ def looked_through(room: UprightRoom, places: Float64) -> Bool:
     """
     through = np.zeros(len(places), np.bool_)
     rasterizer = Rasterizer(room.mesh.vertices, room.mesh.triangles)
-    for k in np.unique(np.linspace(0, len(room.poses) - 1, LOOKS).round().astype(int)) if len(room.poses) else []:
+    if not len(room.poses):
+        return through
+    for k in np.unique(np.linspace(0, len(room.poses) - 1, RENDERED_POSES).round().astype(int)):
         remaining = np.flatnonzero(~through)
         if not len(remaining):
             break
-        depth = rasterizer.draw(EYE, room.poses[k]).depth
+        depth = rasterizer.draw(ASSUMED_CAMERA, room.poses[k]).depth
         in_camera = transform(inverse(room.poses[k]), places[remaining])
         ahead = np.flatnonzero(in_camera[:, 2] > 0)
-        u, v = np.rint(project(EYE, in_camera[ahead])).T
-        inside = (u >= 0) & (u < EYE.width) & (v >= 0) & (v < EYE.height)
+        u, v = np.rint(project(ASSUMED_CAMERA, in_camera[ahead])).T
+        inside = (u >= 0) & (u < ASSUMED_CAMERA.width) & (v >= 0) & (v < ASSUMED_CAMERA.height)
         at = ahead[inside]
         surface = depth[v[inside].astype(np.int64), u[inside].astype(np.int64)]
         through[remaining[at[(surface > in_camera[at, 2] + SLACK) & (surface < FARTHEST)]]] = True
@@ -140,8 +143,8 @@ def looked_through(room: UprightRoom, places: Float64) -> Bool:
 def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
     """Return the mask (C,) of the cells with walls, given the cell (P,) of each point.
 
-    A wall is a part of a wall of the map, or another vertical surface with a height of at least WALL_SPAN that is
-    neither part of an object nor a furniture front.
+    A wall is part of a wall of the map, or another vertical surface at least WALL_SPAN high. Objects and furniture
+    fronts are not walls.
     """
     chosen = found.upright & (found.owner == 0) & (found.structure != Structure.FRONT)
     step = np.floor(found.points[chosen, 2] / LEVEL_STEP).astype(np.int64)

@@ -1,8 +1,8 @@
 """Stored runs in an upright coordinate frame.
 
 The room frame has z up and the floor at z = 0. It is the world frame, rotated upright by the smallest angle about the
-center of the map on the floor, and translated along z. So x and y of the center do not change, and if z is already up
-in the world frame, all x and y do not change.
+center of the map on the floor, and translated along z. The center keeps x and y. If z is already up in the world frame,
+all points keep x and y.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from framework.files.atomic_write import atomic_write
 from framework.vocabulary.label_spaces import label_space_of
 
 MISSING = "usd: expected the package usd-core, got none; run pip install 'instancemap[usd]'"
-NOT_WRITTEN = "the USD library failed"
+NOT_WRITTEN = "the USD library could not write the stage"
 THINNEST = 0.002  # minimum side of a collision box, m; an object observed from one side may be flat
 GRAVITY = 9.81  # m/s^2
 

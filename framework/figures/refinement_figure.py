@@ -182,7 +182,7 @@ def _draw_table(axes: Axes, refinement: Refinement, marks: ClusterMarks, rows: i
 
 
 def _percentage(points: Int32, of: Int32) -> str:
-    return f"{100 * points.sum() / of.sum():.0f} %" if of.any() else "none"
+    return f"{100 * points.sum() / of.sum():.0f}%" if of.any() else "none"
 
 
 def _change(before: int, after: int) -> str:
@@ -191,7 +191,7 @@ def _change(before: int, after: int) -> str:
         return ""
     change = round(100 * (after - before) / before)
     sign = "+" if change > 0 else "−" if change < 0 else "±"
-    return f" ({sign}{abs(change)} %)"
+    return f" ({sign}{abs(change)}%)"
 
 
 def _shortened(text: str, length: int) -> str:

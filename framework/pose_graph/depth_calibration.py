@@ -86,12 +86,13 @@ class DepthCalibration(DepthCalibrator):
     The distortion of each half of the views is tested on the other half. It is used if it reduces the distances there.
     """
 
-    calibration_frames: int = 300  # number of first frames that calibrate depth before the run, in [0, 100000]; 0 = off
-    # minimum decrease of the mean squared distance between surfaces in other views, fraction, in [0, 1]
-    min_gain: float = 0.02
+    # number of frames at the start that calibrate depth before the run, in [0, 100000]; 0 = off
+    calibration_frames: int = 300
+    # minimum relative decrease of the mean squared surface distance in views not used for the fit, in [0, 1]
+    min_distance_decrease: float = 0.02
 
     def __post_init__(self) -> None:
-        check_bounds(self, calibration_frames=(0, 100000), min_gain=(0.0, 1.0))
+        check_bounds(self, calibration_frames=(0, 100000), min_distance_decrease=(0.0, 1.0))
         self._views: list[CalibrationView] = []
         self._shape = (0, 0)  # height and width of the frames
         self._tracked = 0  # number of tracked frames
@@ -126,7 +127,7 @@ class DepthCalibration(DepthCalibrator):
             return None
         with threadpool_limits(1, "blas"):  # the last digits depend on the number of threads
             gain = validated_gain(views)
-            nodes = estimated(views) if gain >= self.min_gain else None
+            nodes = estimated(views) if gain >= self.min_distance_decrease else None
         if nodes is None:
             log.info("depth is not corrected: the mean squared distance in other views decreases by %.1f%%", 100 * gain)
             return None

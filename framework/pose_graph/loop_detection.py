@@ -127,7 +127,7 @@ class Loop:
 class LoopDetection:
     """Detection of loops."""
 
-    # maximum plausible drift, fraction of the path, in [0, 1]; smaller than the distance of identical rooms divided by
+    # maximum plausible drift, fraction of the path, in [0, 1]; below the distance between identical rooms divided by
     # the path between visits
     max_drift: float = 0.03
     loop_keyframes: int = 4  # maximum number of keyframes that are matched with a frame, in [1, 100]

@@ -119,7 +119,7 @@ class Submap:
 class SubmapAnchors:
     """The submaps of a trajectory. Each begins at its anchor, the pose of its first view."""
 
-    begin_distance: float = 2.5  # distance from the anchor of the current submap at which it ends, m, in [0.5, 100]
+    begin_distance: float = 2.5  # distance from its anchor at which the current submap ends, m, in [0.5, 100]
     # distance from all views of a submap at which it is hidden, m, > begin_distance; more than the range of the sensor
     hide_distance: float = 6.0
 

@@ -22,8 +22,8 @@ from framework.data import Bool, Camera, Float32, Float64, Instance, InstanceMes
 from framework.errors import DataError
 from framework.geometry import inverse, project, transform
 
-LOOKS = 60  # number of evenly spaced poses for rendering the map of a visit
-EYE = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)  # assumed camera of a visit: half the resolution of a Kinect
+RENDERED_POSES = 60  # number of evenly spaced poses for rendering the map of a visit
+ASSUMED_CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)  # of a visit: half the resolution of a Kinect
 SAMPLED = 400  # maximum number of sampled vertices of an object
 MIN_GAP, MIN_GAP_PER_DEPTH = 0.06, 0.02  # m, m per m of depth; minimum distance of the surface behind free space
 MIN_SEEN = 0.3  # minimum fraction of an object's vertices observed in the other visit
@@ -170,12 +170,12 @@ def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
         points: World points (P, 3), m.
     """
     there, through = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
-    for k in np.unique(np.linspace(0, len(visit.poses) - 1, LOOKS).round().astype(int)):
-        depth = visit.scene.render(EYE, visit.poses[k]).depth
+    for k in np.unique(np.linspace(0, len(visit.poses) - 1, RENDERED_POSES).round().astype(int)):
+        depth = visit.scene.render(ASSUMED_CAMERA, visit.poses[k]).depth
         points_camera = transform(inverse(visit.poses[k]), points.astype(np.float64))
         in_front = np.flatnonzero(points_camera[:, 2] > 0)
-        u, v = np.rint(project(EYE, points_camera[in_front])).astype(np.int64).T
-        inside = (u >= 0) & (u < EYE.width) & (v >= 0) & (v < EYE.height)
+        u, v = np.rint(project(ASSUMED_CAMERA, points_camera[in_front])).astype(np.int64).T
+        inside = (u >= 0) & (u < ASSUMED_CAMERA.width) & (v >= 0) & (v < ASSUMED_CAMERA.height)
         visible, surface = in_front[inside], depth[v[inside], u[inside]]
         behind = surface - points_camera[visible, 2]
         tolerance = MIN_GAP + MIN_GAP_PER_DEPTH * points_camera[visible, 2]

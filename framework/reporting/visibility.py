@@ -12,7 +12,7 @@ from framework.data import Bool, Camera, Float32, Float64, InstanceMesh, Int32
 from framework.geometry import inverse
 from framework.rendering.rasterizer import Rasterizer
 
-LOOKS = 80  # maximum number of poses at which the map is rendered
+RENDERED_POSES = 80  # maximum number of poses at which the map is rendered
 LOOK_WIDTH = 200  # px, width of the rendered images
 TOLERANCE, TOLERANCE_PER_DEPTH = (
     0.05,
@@ -36,7 +36,7 @@ class Sightings:
         return np.asarray(np.cumsum(counts) / max(1, int(counts.sum())))
 
 
-def spread_out(count: int, most: int = LOOKS) -> list[int]:
+def spread_out(count: int, most: int = RENDERED_POSES) -> list[int]:
     """Return at most `most` evenly spaced indices of `count` poses, including the first and the last."""
     return np.unique(np.rint(np.linspace(0, count - 1, min(count, most))).astype(int)).tolist() if count else []
 
@@ -44,7 +44,7 @@ def spread_out(count: int, most: int = LOOKS) -> list[int]:
 def sightings(
     mesh: InstanceMesh, labels: Int32, poses: Float64, camera: Camera, clarity: Mapping[int, float]
 ) -> Sightings:
-    """Return the visibility of a mesh from at most LOOKS evenly spaced poses.
+    """Return the visibility of a mesh from at most RENDERED_POSES evenly spaced poses.
 
     Args:
         mesh: Mesh of the map.

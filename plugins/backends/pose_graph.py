@@ -63,7 +63,7 @@ class Correction(NamedTuple):
 
 @dataclass
 class PoseGraph(BackEnd):
-    """Submaps with a robust pose graph, as in Voxgraph (Reijgwart et al., 2020) and BundleFusion (Dai et al., 2017).
+    """Submaps with a robust pose graph, after voxgraph (Reijgwart et al., 2020) and Choi et al. (2015).
 
     Distant submaps are hidden, so that the tracker does not blend a drifted view with them. When the camera returns,
     loops with hidden submaps are detected, verified and added to the graph. The graph is optimized in a background
@@ -79,7 +79,7 @@ class PoseGraph(BackEnd):
     min_motion: float = 0.01  # minimum motion of a submap's surface, m, in [0, 1]; smaller motions are omitted
     # number of frames until the results of verification and of optimization in other threads are used, in [0, 1000]
     correction_delay: int = 10
-    object_landmarks: bool = False  # landmarks of the graph are the objects that are mapped before and after the drift
+    object_landmarks: bool = False  # true = use objects mapped before and after the drift as landmarks of the graph
 
     def __post_init__(self) -> None:
         check_bounds(self, min_motion=(0.0, 1.0), correction_delay=(0, 1000))

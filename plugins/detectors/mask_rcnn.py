@@ -32,7 +32,7 @@ from framework.interfaces import Detector
 
 @dataclass
 class MaskRCNNDetector(Detector):
-    """Mask R-CNN (He et al., 2017) with ResNet-50 or ResNet-101 and a feature pyramid, on the CPU or with CUDA.
+    """Mask R-CNN (He et al., 2017) with a ResNet and a feature pyramid, on the CPU or with CUDA.
 
     The network is a published COCO network of torchvision or detectron2, which is downloaded once, or a network trained
     or converted with this project.

@@ -130,7 +130,7 @@ class SimulatedDetector(Detector):
     bleed: float = 2.0  # offset of the mask border from the object border, px; positive = outside, negative = inside
     boundary_noise: float = 2.5  # standard deviation of the displacement of the mask border, px, >= 0
     boundary_scale: float = 12.0  # correlation length of the displacement along the mask border, px, >= 2
-    mask_grid: int = 28  # number of cells per side of a mask, 0 or >= 4; 0 = full resolution
+    mask_grid: int = 28  # number of cells per side of a mask, 0 or in [4, 4096]; 0 = full resolution
     confusion: float = 0.25  # mean total probability of the wrong classes, in [0, 1)
     # concentration of the Dirichlet distribution of classes, > 0; small values give confident but often wrong classes
     confusion_concentration: float = 3.0

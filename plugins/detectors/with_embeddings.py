@@ -30,7 +30,7 @@ class WithEmbeddings(Detector):
     min_pixels: int = 200  # minimum number of mask pixels of a detection with an embedding, >= 1
     context: float = 1.2  # ratio of the side of the square crop to the longer side of the object's box, in [1, 4]
     background_contrast: float = 0.4  # contrast of the background in the crop, in [0, 1]; 0 = gray, 1 = unchanged
-    batch_size: int = 16  # number of crops per batch, >= 1
+    batch_size: int = 16  # number of crops per batch, in [1, 4096]
     half_precision: bool = True  # True = half precision on CUDA; the CPU always uses single precision
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
 

@@ -31,9 +31,9 @@ class BayesianTsdf(MapFuser):
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
     association: Association = field(default_factory=Association)
-    class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
-    # likelihood of each unmatched instance, in [0, 1); 0 = (1 - score) divided equally among the unmatched instances
-    # and "no instance"
+    class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in [1e-6, 0.999]
+    # likelihood of each unmatched instance, in [0, 0.999]; 0 = (1 - score) divided equally among the unmatched
+    # instances and "no instance"
     instance_floor: float = 0.05
     absence_likelihood: float = 0.7  # P(outside the mask | matched instance), in (0, 1]; 1 = no evidence of absence
 

@@ -31,7 +31,7 @@ class ClassOnlyFusion(MapFuser):
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     min_area: float = 0.01  # minimum surface area of an instance in the mesh, m^2, >= 0; smaller instances are omitted
-    class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
+    class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in [1e-6, 0.999]
     # likelihood ratio for a pixel without a mask, P(no mask | any class) / P(no mask | background), in (0, 1]; 1 = no
     # evidence of absence
     absence_likelihood_ratio: float = 0.7

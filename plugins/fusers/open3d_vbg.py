@@ -34,7 +34,7 @@ class Open3DVoxelBlockGrid(MapFuser):
     # maximum number of blocks, > 0; each needs 14 KiB; at the maximum, copying the map needs up to 5.7 GB
     max_blocks: int = 200_000
     min_weight: float = 1.0  # minimum number of observations of a surface voxel, >= 1; Open3D's default is 3
-    class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
+    class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in [1e-6, 0.999]
 
     def __post_init__(self) -> None:
         from framework.baselines.open3d_grid import BlockGridSettings

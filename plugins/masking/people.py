@@ -39,14 +39,14 @@ class Bodies(NamedTuple):
 class People(FrameMasking):
     """Masking of detected people, who are followed by their depth in frames without a detection.
 
-    A body consists of the depth readings of a detected mask near their median, and of readings of similar depth next to
-    them, which coarse masks omit. In the next frame, readings near the body belong to it at its pixels, and where they
-    are in front of all other surfaces that the frame before shows there.
+    A body consists of the depth readings in a detected mask near their median. Readings of similar depth next to them,
+    which coarse masks omit, are added. In the next frame, readings near the body at the pixels of the body belong to
+    the body. At other pixels, readings must also be in front of all surfaces of the previous frame.
 
-    A body is followed until the detector has missed it more often than expected from its earlier detections, so that a
-    single false detection is followed only until the detector runs again. A detection of a masked class that covers a
-    followed body continues it, whatever its score. All detections of the masked classes are removed, and all whose
-    masks cover a followed body.
+    A body is followed until the detector has missed it more often than expected from earlier detections. A single false
+    detection is therefore followed only until the next detector run. A detection of a masked class that covers a
+    followed body continues the body, regardless of the score. All detections of masked classes are removed. Other
+    detections are removed if their masks cover a followed body.
     """
 
     classes: str = "person"  # names of the masked classes, separated by commas; unknown names are ignored

@@ -28,7 +28,7 @@ class Dbscan(ClusterRefiner):
     eps: float = 0.04  # neighborhood radius at depth 0, m, >= 0.001
     eps_per_depth: float = 0.01  # increase of the radius with depth, m per m, >= 0
     min_points: int = 10  # minimum number of neighbors of a core point, including itself, >= 1
-    stride: int = 2  # step between the pixels that are searched for core points, px, >= 1; 1 = all pixels
+    stride: int = 2  # step between the pixels that are searched for core points, px, in [1, 64]; 1 = all pixels
     # maximum number of points of a cluster that are searched for core points, >= 100; limits memory
     max_points: int = 20000
 

@@ -25,12 +25,12 @@ class Geometric(ClusterRefiner):
 
     cell_size: int = 2  # side of the cells in which depth readings are averaged, px, in [1, 16]
     window_radius: int = 3  # radius of the square windows for plane fits, in cells, in [1, 16]
-    noise_factor: float = 3.0  # maximum depth difference that counts as noise, in standard deviations, >= 0.1
+    noise_factor: float = 3.0  # maximum depth difference that counts as noise, in standard deviations, in [0.1, 100]
     # minimum standard deviation of depth, m, in [0, 1]; for coarsely quantized depth, set half of the quantization step
     min_noise: float = 0.0
-    # maximum slope of a surface, m per m, >= 0.1; steeper steps are depth jumps (4 = 76 degrees)
+    # maximum slope of a surface, m per m, in [0.1, 100]; steeper steps are depth jumps (4 = 76 degrees)
     max_slope: float = 4.0
-    max_angle: float = 15.0  # maximum concave angle within a segment, in addition to noise, degrees, in (0, 90)
+    max_angle: float = 15.0  # maximum concave angle within a segment, in addition to noise, degrees, in [0.001, 89]
     closing_radius: int = 1  # radius of the morphological closing of edges, in cells, in [0, 16]
     min_segment: int = 100  # minimum number of pixels of a segment, >= 1; smaller segments are merged with neighbors
     min_overlap: float = 0.8  # minimum fraction of a segment inside a mask to assign it to the mask, in [0, 1)

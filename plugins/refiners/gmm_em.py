@@ -24,24 +24,25 @@ class GmmEm(ClusterRefiner):
     the mask. Background components are initialized by groups of points in a ring around the mask. A uniform component
     can represent outliers.
 
-    The mask is also evidence for the object. This is our choice, because otherwise object and background can swap. The
-    log-odds decrease linearly from `mask_log_odds` inside the mask to -`mask_log_odds` in the ring. Pixels of known
-    structure, found by an earlier refiner, are not part of the ring. Clusters with too few points in the mask or the
-    ring are not changed. Without background components, only outliers are removed.
+    The mask is also evidence for the object (our choice), so that object and background cannot swap. The log-odds
+    decrease linearly from `mask_log_odds` inside the mask to -`mask_log_odds` in the ring. Pixels of known structure,
+    found by an earlier refiner, are not part of the ring. Clusters with too few points in the mask or the ring are not
+    changed. Without background components, only outliers are removed.
     """
 
-    object_components: int = 3  # number of Gaussians of the object, >= 1; about one per visible face
-    background_components: int = 6  # number of Gaussians of the background, >= 0; 0 = no background model
-    # number of k-means iterations for the initialization, >= 1; starts from groups of equal size, ordered by depth
+    object_components: int = 3  # number of Gaussians of the object, in [1, 64]; about one per visible face
+    background_components: int = 6  # number of Gaussians of the background, in [0, 64]; 0 = no background model
+    # number of k-means iterations for the initialization, in [1, 1000]; starts from groups of equal size, ordered by
+    # depth
     start_iterations: int = 5
-    max_iterations: int = 8  # maximum number of EM iterations, >= 1
+    max_iterations: int = 8  # maximum number of EM iterations, in [1, 1000]
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point, >= 0
     std_floor: float = 0.01  # minimum standard deviation of a Gaussian along any axis, m, in [0.0001, 1]
-    outlier_fraction: float = 0.0  # initial fraction of outliers, in [0, 1); 0 = no uniform component for outliers
+    outlier_fraction: float = 0.0  # initial fraction of outliers, in [0, 0.99]; 0 = no uniform component for outliers
     min_posterior: float = 0.5  # minimum posterior probability of the object to keep a point, in (0, 1)
     # prior log-odds of the object far inside the mask, nats, in [0, 20]; 0 = the mask only initializes the mixture
     mask_log_odds: float = 4.0
-    # distance inside the mask border at which the prior log-odds are 0, in ring widths, in [0, 1)
+    # distance inside the mask border at which the prior log-odds are 0, in ring widths, in [0, 0.99]
     expected_bleed: float = 0.4
     ring: Ring = field(default_factory=Ring)
 

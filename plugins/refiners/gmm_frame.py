@@ -43,18 +43,18 @@ class GmmFrame(ClusterRefiner):
     levels: int = 2  # number of levels of hierarchical EM, in [1, 8]; 1 = flat mixture; 2 is our choice
     # number of children of a node: 2, 4 or 8; 8 is our interpretation of section 3.2.2
     children: int = 8
-    # number of level-1 Gaussians per mask, >= 1; section 3.2.2 has one group for each of K classes; 1 per mask is our
-    # choice
+    # number of level-1 Gaussians per mask, in [1, 64]; section 3.2.2 has one group for each of K classes; 1 per mask is
+    # our choice
     gaussians_per_mask: int = 1
     initialization: Initialization = Initialization.MASKS  # initial groups of level 1
     # treatment of points whose most probable Gaussian belongs to another mask: MOVE to that mask (our interpretation of
     # section 3.2.2), DROP or STAY
     foreign_points: ForeignPoints = ForeignPoints.MOVE
-    max_iterations: int = 10  # maximum number of EM iterations in a node, >= 1; our choice
+    max_iterations: int = 10  # maximum number of EM iterations in a node, in [1, 1000]; our choice
     # minimum increase of the mean log-likelihood per EM iteration, nats per point, >= 0; our choice
     tolerance: float = 1e-3
     std_floor: float = 0.005  # minimum standard deviation of a Gaussian along any axis, m, in [0.0001, 1]; our choice
-    # minimum fraction of the frame's points in a Gaussian, in [0, 1); smaller Gaussians are dropped; our choice
+    # minimum fraction of the frame's points in a Gaussian, in [0, 0.99]; smaller Gaussians are dropped; our choice
     min_support: float = 1e-4
     # minimum number of points of a refined cluster, >= 1; smaller clusters are dropped; our choice
     min_points: int = 30

@@ -30,17 +30,18 @@ class GmmTree(ClusterRefiner):
     """
 
     levels: int = 2  # number of levels of the tree, in [1, 8]
-    children: int = 8  # number of children of a node, >= 2; J of Eckart et al. 2016
-    max_iterations: int = 8  # maximum number of EM iterations in a node, >= 1
+    children: int = 8  # number of children of a node, in [2, 64]; J of Eckart et al. 2016
+    max_iterations: int = 8  # maximum number of EM iterations in a node, in [1, 1000]
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point, >= 0
     std_floor: float = 0.01  # minimum standard deviation of a node along any axis, m, in [0.0001, 1]
-    outlier_fraction: float = 0.02  # initial fraction of outliers in a node, in [0, 1)
-    min_support: float = 1e-4  # minimum fraction of the tree's points in a node, in [0, 1); smaller nodes are dropped
+    outlier_fraction: float = 0.02  # initial fraction of outliers in a node, in [0, 0.99]
+    # minimum fraction of the tree's points in a node, in [0, 0.99]; smaller nodes are dropped
+    min_support: float = 1e-4
     min_split_points: int = 32  # minimum number of points of a node to be split, >= 8
     parent_points: float = 4.0  # weight of the parent node's object fraction as a prior, in points, >= 0
     min_posterior: float = 0.5  # minimum posterior probability of the object to keep a point, in (0, 1)
     mask_log_odds: float = 2.0  # prior log-odds of the object far inside the mask, nats, in [0, 20]
-    # distance inside the mask border at which the prior log-odds are 0, in ring widths, in [0, 1)
+    # distance inside the mask border at which the prior log-odds are 0, in ring widths, in [0, 0.99]
     expected_bleed: float = 0.5
     ring: Ring = field(default_factory=Ring)
 

@@ -26,10 +26,10 @@ class KMeans(ClusterRefiner):
     number of points at similar depths. Clusters with too few points in the mask or the ring are not changed.
     """
 
-    object_centers: int = 5  # number of centers of the object, >= 1
-    # number of centers of the background, >= 0; 0 = no background model, all points are kept
+    object_centers: int = 5  # number of centers of the object, in [1, 64]
+    # number of centers of the background, in [0, 64]; 0 = no background model, all points are kept
     background_centers: int = 5
-    max_iterations: int = 20  # maximum number of iterations, >= 1; stops early if no assignment changes
+    max_iterations: int = 20  # maximum number of iterations, in [1, 1000]; stops early if no assignment changes
     ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:

@@ -55,13 +55,13 @@ class Open3dOdometry(PoseTracker):
 
     method: Method = Method.POINT_TO_PLANE  # minimized error
     reference: Reference = Reference.MAP  # reference of the alignment
-    iterations_coarse: int = 10  # number of iterations at 1/4 of the resolution, >= 1
-    iterations_middle: int = 5  # number of iterations at 1/2 of the resolution, >= 1
-    iterations_fine: int = 3  # number of iterations at full resolution, >= 1
-    max_depth: float = 5.0  # maximum depth of used readings, m, > 0
-    max_distance: float = 0.07  # maximum depth difference of corresponding pixels, m, > 0
-    max_translation: float = 0.3  # maximum translation between frames, m, > 0; above it, the pose is lost
-    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; above it, the pose is lost
+    iterations_coarse: int = 10  # number of iterations at 1/4 of the resolution, in [1, 1000]
+    iterations_middle: int = 5  # number of iterations at 1/2 of the resolution, in [1, 1000]
+    iterations_fine: int = 3  # number of iterations at full resolution, in [1, 1000]
+    max_depth: float = 5.0  # maximum depth of used readings, m, in [0.001, 1000]
+    max_distance: float = 0.07  # maximum depth difference of corresponding pixels, m, in [0.0001, 10]
+    max_translation: float = 0.3  # maximum translation between frames, m, in [0.001, 100]; above it, the pose is lost
+    max_rotation: float = 0.35  # maximum rotation between frames, rad, in [0.001, 3.15]; above it, the pose is lost
     # minimum fraction of the frame's readings with a correspondence, in [0, 1]; below it, the pose is lost
     min_matched: float = 0.3
 

@@ -102,9 +102,10 @@ class VoxelHashingIcp(PoseTracker):
     iterations_coarse: int = 8  # number of iterations at 1/4 of the finest resolution, >= 0
     iterations_middle: int = 6  # number of iterations at 1/2 of the finest resolution, >= 0
     iterations_fine: int = 4  # number of iterations at the finest resolution, >= 1
-    # maximum distance of corresponding points, m, > 0; increases with depth beyond 5 m (TUKEY)
+    # maximum distance of corresponding points, m, in [0.0001, 10]; increases with depth beyond 5 m (TUKEY)
     max_distance: float = 0.1
-    # maximum distance of a point from the map's surface to agree with the map, m, > 0; at least 3 sigma of depth noise
+    # maximum distance of a point from the map's surface to agree with the map, m, in [0.0001, 10]; at least 3 sigma of
+    # depth noise
     close_distance: float = 0.05
     min_normal_dot: float = 0.7  # minimum cosine between corresponding normals, in [-1, 1]
     geometric_scale: float = 4.0  # cut-off of point-to-plane distances, in standard deviations, > 0 (TUKEY)
@@ -115,9 +116,10 @@ class VoxelHashingIcp(PoseTracker):
     color_weight: float = 0.1  # weight lambda of the photometric term, >= 0; 0 = ICP only
     color_levels: int = 3  # number of levels with color, from the coarsest, in [1, 3]
     depth_weight: float = 1.0  # weight of the point-to-plane term, in [0, 1]; 0 = color only
-    # maximum translation between frames, m, > 0; above it, the pose is lost; increases with depth beyond 5 m (TUKEY)
+    # maximum translation between frames, m, in [0.001, 100]; above it, the pose is lost; increases with depth beyond 5
+    # m (TUKEY)
     max_translation: float = 0.3
-    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; above it, the pose is lost
+    max_rotation: float = 0.35  # maximum rotation between frames, rad, in [0.001, 3.15]; above it, the pose is lost
     min_visible: float = 0.05  # minimum fraction of a frame's points that are visible in the map, in [0, 1]
     min_matched: float = 0.4  # minimum fraction of the visible points with a nonzero weight, in [0, 1]
     # minimum ratio of smallest to mean eigenvalue of the dimensionless normal matrix, in [0, 1]; doubled while lost
@@ -541,10 +543,10 @@ class VoxelHashingIcp(PoseTracker):
         if points == 0:
             return "the frame has no depth"
         if equations.visible < self.min_visible * points:
-            return f"{equations.visible / points:.0%} of the frame's points are visible in the map"
+            return f"only {equations.visible / points:.0%} of the frame's points are visible in the map"
         few_match = equations.matched < self.min_matched * equations.visible
         if few_match and (self.min_agreement == 0 or equations.close < self.min_agreement * equations.visible):
-            return f"{equations.matched / equations.visible:.0%} of the visible points agree with the map"
+            return f"only {equations.matched / equations.visible:.0%} of the visible points match the map"
         if self._is_jump(T_from_camera):
             step, turn = np.linalg.norm(T_from_camera[:3, 3]), rotation_angle(T_from_camera[:3, :3])
             return f"implausible step of {step:.2f} m and {np.degrees(turn):.0f} deg"

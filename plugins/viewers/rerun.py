@@ -123,7 +123,7 @@ class RerunViewer(Viewer):
             sinks.append(_server(rr, self.port, self.memory_limit))
             with _named_errors(f"viewer.web_port: expected a free port, got {self.web_port}"):
                 self._page = SealedPage(self.web_port, self.port)
-            log.info("viewer: %s until the run ends", self._page.url)
+            log.info("viewer: %s; available until the run ends", self._page.url)
         return sinks
 
 

@@ -182,7 +182,7 @@ def test_rebuilt_plugin_has_parameters_without_state() -> None:
         ),
         ({"_partial_": True}, ["got '_partial_'"]),
         ({"_target_": f"{HERE}.OddField"}, ["bool, int, float, str, Path, Enum or list", "got numpy.ndarray | None"]),
-        ({"_target_": f"{HERE}.Assembled", "nms": 2}, ["Assembled", "nms", "[0, 1]", "got 2"]),
+        ({"_target_": f"{HERE}.Assembled", "nms": 2}, ["detector.nms: expected a value in [0, 1], got 2"]),
         ({"_target_": f"{HERE}.Assembled", "nms": "high"}, ["Assembled: nms: expected a number, got 'high'"]),
         ({"_target_": f"{HERE}.Assembled", "suppression": {"nms": 0.1}}, ["got 'suppression'"]),
         ({"_target_": f"{HERE}.Assembled", "agnostik": True}, ["did you mean 'agnostic'?"]),

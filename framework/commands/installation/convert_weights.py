@@ -10,6 +10,7 @@ import argparse
 from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
+from framework.config.text_values import typed
 from framework.errors import ConfigError
 
 
@@ -60,5 +61,6 @@ def convert(source: Path, target: Path, kind: str | None, classes: str | None, n
     architecture = network.architecture
     print(
         f"{target}: {architecture.backbone.name}, {len(architecture.classes)} classes,"
-        f" {target.stat().st_size / 1e6:.1f} MB; use it with detector=mask_rcnn detector.weights={target}"
+        f" {target.stat().st_size / 1e6:.1f} MB; use the file with detector=mask_rcnn "
+        f"{typed('detector.weights', target)}"
     )

@@ -18,14 +18,14 @@ from framework.doctor import machine, networks, packages
 from framework.doctor.check_result import Check, Status, anonymous, run_checks
 from framework.doctor.isolated import ACCELERATION, KERNELS, REPAIR, Outcomes, run_all
 
-LEGEND = "ok: available   --: missing, optional   !!: missing or broken, required by the default stages"
+LEGEND = "ok: available   --: missing or failed, optional   !!: missing or broken, required by the default stages"
 
 
 def main() -> None:
     """Run the command `instancemap doctor`."""
     parser = argparse.ArgumentParser(
         description="Check the installation and print the fix for each problem. The output contains no user name or "
-        "home folder, so you can paste it into an issue. Exit status 1 means that the default pipeline cannot run."
+        "home folder, so you can paste it into an issue. Exit status 1 means that a required check failed."
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--repair", action="store_true", help="first delete the damaged files of the kernel cache")

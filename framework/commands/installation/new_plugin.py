@@ -42,7 +42,9 @@ LONGEST_NAME = 30  # maximum number of characters of a name; keeps lines of gene
 FOLDERS = ("conf", "tests")  # names of generated folders, not allowed as plugin names
 SMALL = "dataset=synthetic dataset.frames=30 dataset.width=320 dataset.height=240"
 FIRST = "hydra.sweep.dir=outputs/first_sweep"
-TRIES = {  # by stage: command that compares the new plugin with an existing plugin (viewer: a single run)
+# by stage: command that compares the new plugin with an existing one (dataset: two refiners on it; viewer: a single
+# run)
+TRIES = {
     "detector": f"instancemap -m detector=mask_rcnn_rooms,$name {SMALL} {FIRST}",
     "masking": f"instancemap -m masking=none,$name detector=simulated {SMALL} {FIRST}",
     "tracker": f"instancemap -m tracker=voxel_hashing_icp,$name detector=simulated {SMALL} {FIRST}",
@@ -52,9 +54,8 @@ TRIES = {  # by stage: command that compares the new plugin with an existing plu
     "dataset": f"instancemap -m refiner=identity,gmm_em dataset=$name dataset.root=DIR {FIRST}",
     "viewer": f"instancemap viewer=$name detector=simulated {SMALL} hydra.run.dir=outputs/first_run",
 }
-SWEPT = """\
-runs a sweep and prints `outputs/first_sweep/table.md`; `overview.png` of each run shows its map. For a comparison, omit
-`dataset.frames`, `dataset.width` and `dataset.height`."""
+READ = "runs a sweep and prints `outputs/first_sweep/table.md`; `overview.png` of each run shows its map."
+SWEPT = f"{READ} For a comparison, omit\n`dataset.frames`, `dataset.width` and `dataset.height`."
 WATCHED = """\
 maps thirty frames of a synthetic scene with it: `outputs/first_run/frames.jsonl` has a line for each frame.
 `instancemap dataset=desk viewer=$name` maps a real sequence."""
@@ -189,7 +190,7 @@ def names_of(stage: str, name: str) -> dict[str, str]:
         "variant": VARIANTS[stage],
         "data": "\n\n\n".join(map(fields_of, DATA[stage])),
     }
-    texts = {"try": TRIES[stage], "outcome": WATCHED if stage == "viewer" else SWEPT}
+    texts = {"try": TRIES[stage], "outcome": {"viewer": WATCHED, "dataset": READ}.get(stage, SWEPT)}
     return own | {key: Template(text).substitute(own) for key, text in texts.items()}
 
 

@@ -45,26 +45,26 @@ def main() -> None:
     add("--depth", metavar="TOPIC", default="", help="depth images")
     add("--camera-info", metavar="TOPIC", default="", help="intrinsics of the color camera")
     poses = (
-        "camera poses: geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Path (optical axes), "
-        "nav_msgs/Odometry or geometry_msgs/TransformStamped of the camera or of a frame that /tf_static connects with "
-        f"it, or /tf; {NO_POSES}: import without poses (all formats)"
+        "camera poses: /tf, or a topic of type PoseStamped, PoseWithCovarianceStamped, Path (optical axes), Odometry "
+        "or TransformStamped (of the camera, or of a frame that /tf_static connects with the camera); "
+        f"{NO_POSES}: import without poses (all formats)"
     )
     add("--poses", metavar="TOPIC", default="", help=poses)
     odometry = (
-        f"odometry of the same message types, written to {ODOMETRY} for dataset.odometry, as poses of the camera if "
-        "/tf_static contains its transform; default: none"
+        f"odometry, a topic of a type of --poses; written to {ODOMETRY} for dataset.odometry, as camera poses if "
+        "/tf_static contains the transform; default: none"
     )
     add("--odometry", metavar="TOPIC", default="", help=odometry)
     add = parser.add_argument_group("ROS bag contents (default: as recorded)").add_argument
     bag = BagOptions()
     difference = (
-        "maximum time between a color image and its depth image, s; default: half the interval between frames, at "
-        "least 0.02 s"
+        "maximum time between a color image and its depth image, s; default: half the frame interval of the faster "
+        "camera, in [0.02, 0.2] s"
     )
     add("--max-difference", metavar="S", type=float, default=bag.max_difference, help=difference)
-    unit = "unit of the depth images, m; default: 0.001 for integers, 1 for floats"
+    unit = "unit of the depth images, m; default: as recorded (RealSense), otherwise 0.001 for integers, 1 for floats"
     add("--depth-unit", metavar="M", type=float, default=bag.depth_unit, help=unit)
-    registered = "depth is registered to color although the bag does not show it"
+    registered = "assume that depth is registered to color"
     add("--depth-registered", action="store_true", help=registered)
     mounting = 'pose of the camera in the frame of the poses, "TX TY TZ QX QY QZ QW", m; default: from /tf_static'
     add("--camera-pose", metavar="POSE", default=bag.camera_pose, help=mounting)
@@ -83,7 +83,8 @@ def main() -> None:
         best = upright(written.ups)
         if best is not None and best != writing.turned:
             degrees = QUARTER * best.quarters
-            print(f"the images are not upright, which reduces detection accuracy; import again with --rotate {degrees}")
+            fix = f"import into another folder with --rotate {degrees}"
+            print(f"the images are not upright, which reduces detection accuracy; {fix}")
         dataset = f"dataset=rgbd_folder {typed('dataset.root', root)}"
         print(f"check it: instancemap check {dataset}")
         prior = f" {typed('dataset.odometry', root / ODOMETRY)}" if source.odometry else ""

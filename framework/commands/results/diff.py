@@ -59,8 +59,8 @@ def visits_of(*runs: Path) -> list[Visit]:
     poses = [read_tum(run / TRAJECTORY)[1] for run in runs if not is_imported(run)]
     if not poses:
         raise DataError(
-            f"diff: expected a run with {TRAJECTORY}, whose poses show observed space, got two imported maps; compare "
-            "each with a run"
+            f"FIRST, SECOND: expected at least one run with {TRAJECTORY}, got two imported maps; compare each with "
+            "a run"
         )
     return [Visit(scene, of_run) for scene, of_run in zip(scenes, [poses[0], poses[-1]], strict=True)]
 

@@ -23,7 +23,6 @@ from framework.runs.stored_runs import Record, find_records
 from framework.tables.metric_columns import head
 
 SCANNET = {"ap": "AP", "ap50": "AP50", "ap25": "AP25"}  # headings by metric
-REFUSED = "refused: "  # prefix of an error
 
 
 def main() -> None:
@@ -111,7 +110,7 @@ def evaluate_runs(
     """
     records, failures = _find(roots)
     for failure in failures:
-        print_error(failure, REFUSED)
+        print_error(failure)
     failed = len(failures)
     pooled: list[tuple[Reevaluation, BenchmarkScene]] = []
 
@@ -134,7 +133,7 @@ def evaluate_runs(
                     if found.scene is not None:
                         pooled.append((found, found.scene))
                 except KNOWN_ERRORS as error:
-                    print_error(error, f"{REFUSED}{record.directory}: " if truth is None else REFUSED)
+                    print_error(error, f"error: {record.directory}: " if truth is None else "error: ")
                     failed += 1
                 bar.update()
     if len(pooled) > 1:

@@ -33,9 +33,10 @@ TRUE_ASSOCIATION = "GROUND_TRUTH"
 def main() -> None:
     """Run the command `instancemap explain`."""
     parser = argparse.ArgumentParser(
-        description="Explain which stage lost each missed, wrong or split object of a run and caused each false "
-        "instance, and how much each stage contributes to the loss. The sequence is mapped again, up to 16 times, with "
-        "stages replaced by the ground truth; networks run once. The frames need ground-truth instances."
+        description="List the stage that lost each missed, wrong or split object of a run, and the stage that caused "
+        "each false instance. Also list how much each stage contributes to the loss. The sequence is mapped again, up "
+        "to 16 times, with stages replaced by the ground truth. Networks run once. The frames need ground-truth "
+        "instances."
     )
     parser.add_argument("run", metavar="RUN", nargs="+", type=Path, help="run directory, or folder of run directories")
     metric = "metric of which 1 - METRIC is the loss, a key of metrics.json; default: instances.ap50"

@@ -33,7 +33,7 @@ def main() -> None:
     floor = "floor height along the up direction, m; default: floor height of the run, or unknown with --up"
     add("--floor", metavar="M", type=float, help=floor)
     add = parser.add_argument_group("surfaces").add_argument
-    most = "maximum number of triangles of the scene and of each object file, >= 4; default: no limit"
+    most = "approximate number of triangles of the scene, and maximum of each object file, >= 4; default: no limit"
     add("--triangles", metavar="N", type=int, help=most)
     colors = ("appearance", "instance", "class")
     add("--colors", choices=colors, default="appearance", help="vertex colors; default: appearance")

@@ -1,4 +1,4 @@
-"""`instancemap merge RUN_A RUN_B`: merge the maps of two stored runs of overlapping places."""
+"""`instancemap merge RUN_A RUN_B`: merge the overlapping maps of two stored runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from framework.geometry import rotation_angle
 def main() -> None:
     """Run the command `instancemap merge`."""
     parser = argparse.ArgumentParser(
-        description="Merge the maps of two runs of overlapping places, and write a new run directory with the merged "
+        description="Merge the overlapping maps of two runs, and write a new run directory with the merged "
         "map in the world frame of the first run. The transform between the runs is found from their keyframes and "
         "surfaces, unless both are known to have the same world frame."
     )

@@ -42,7 +42,7 @@ def main() -> None:
     kinds = "run directory, folder of runs, its table (table.md, table.tex or table.csv), or bundle (.zip)"
     parser.add_argument("source", metavar="SOURCE", type=Path, help=kinds)
     parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="overrides, e.g. dataset.root=DIR")
-    parser.add_argument("--cell", metavar="ROW", help="reproduce only the runs of this row of the table; default: all")
+    parser.add_argument("--row", metavar="ROW", help="row of the table to reproduce; default: all rows")
     repeated = "output folder of the repeated runs; default: a temporary folder"
     parser.add_argument("--out", metavar="DIR", type=Path, help=repeated)
     check = "list the changes since the runs without running them again"
@@ -136,7 +136,7 @@ def _of_row(folder: Path, row: str) -> list[Record]:
     comparison = ComparisonTable.below(folder)
     rows = {comparison.called(one): list(one.records.values()) for one in comparison.rows}
     if row not in rows:
-        raise ConfigError(f"--cell: expected one of the rows {'; '.join(rows)}, got {row!r}")
+        raise ConfigError(f"--row: expected one of the rows {'; '.join(rows)}, got {row!r}")
     return rows[row]
 
 

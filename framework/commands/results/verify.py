@@ -21,7 +21,7 @@ def main() -> None:
         "missing or additional file is reported, and sets the exit status 1."
     )
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="run directory or folder of runs")
-    accepted = "file of a run that was changed or deleted on purpose; its new hash is written to manifest.json"
+    accepted = "file of a run that you changed or deleted on purpose; its new hash is written to manifest.json"
     parser.add_argument("--accept", metavar="FILE", nargs="+", default=[], help=accepted)
     parsed = arguments(parser)
     with one_line_errors():

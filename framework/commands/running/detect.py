@@ -73,7 +73,7 @@ def job(config: DictConfig) -> None:
         how.append(typed("detector.label_space", write_labels(out, detector.classes)))
         if not keeps_names(detector.classes, ClassNames.AUTO) and any(coco_name(k) != k for k in detector.classes):
             how.append("detector.class_names=OWN")
-    log.info("use it with: %s", " ".join(how))
+    log.info("use the file with: %s", " ".join(how))
 
 
 def file_of_job(out: object, folder: Path) -> Path:

@@ -96,7 +96,7 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
         if best is None or len(found) > len(best[2]):
             best = k, frame, found
     if best is None:
-        fix = "set frame=K to the index of a usable frame"
+        fix = "set frame=K to the position of a usable frame among the selected frames"
         raise DataError(f"{sequence.name}: expected a usable frame, got none among {len(tried)} candidates; {fix}")
     return best
 

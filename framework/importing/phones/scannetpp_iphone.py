@@ -136,7 +136,7 @@ def _blocks(path: Path) -> Sequence[tuple[int, int]] | None:
 def _block_depth(path: Path, blocks: Sequence[tuple[int, int]], number: int) -> Float32:
     where = f"{path}: frame {number}"
     if number >= len(blocks):
-        raise FrameError(f"{where}: expected a frame number of at most {len(blocks) - 1}")
+        raise FrameError(f"{where}: expected a frame number of at most {len(blocks) - 1}, got {number}")
     with path.open("rb") as file:
         file.seek(blocks[number][0])
         packed = file.read(blocks[number][1])

@@ -7,8 +7,8 @@
     camera.json             optional, as in RGB-D folders; only depth_scale is used
 
 pycolmap reads the model. It stores T_camera_world with OpenCV's camera axes, and pixel centers are at half integers.
-The unit of a model from images is arbitrary. The median ratio of measured depth to depth in the model gives its
-length. A model whose unit is a meter within METRIC_WITHIN is not scaled.
+The unit of a model from images is arbitrary. The length of the unit is the median ratio of measured depth to depth in
+the model. A model is not scaled if its unit differs from 1 m by at most METRIC_WITHIN.
 """
 
 from __future__ import annotations

@@ -136,7 +136,8 @@ def _read(path: Path, node: int, stamp: object, odometry: object, optimized: dic
 
 def _blob(where: str, name: str, value: object) -> bytes:
     if not isinstance(value, bytes) or len(value) > LARGEST_FILE:
-        raise FrameError(f"{where}: {name}: expected at most {LARGEST_FILE} bytes, got {type(value).__name__}")
+        found = f"{len(value)} bytes" if isinstance(value, bytes) else type(value).__name__
+        raise FrameError(f"{where}: {name}: expected a blob of at most {LARGEST_FILE} bytes, got {found}")
     return value
 
 

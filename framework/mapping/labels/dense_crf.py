@@ -85,7 +85,8 @@ class Model(NamedTuple):
 class DenseCrf:
     """Dense conditional random field that smooths the instances of the vertices."""
 
-    crf_weight: float = 0.0  # weight of the pairwise potentials, in [0, 1000]; 0 = off
+    # weight of the pairwise potentials of the dense conditional random field (CRF), in [0, 1000]; 0 = off
+    crf_weight: float = 0.0
     crf_position: float = 0.06  # standard deviation of the distance of similar vertices, m, in [0.001, 10]
     crf_color: float = 20.0  # standard deviation of the colors of similar vertices, 8-bit levels, in [0.1, 1000]
     crf_normal: float = 0.3  # standard deviation of the unit normals of similar vertices, in [0.001, 10]

@@ -47,7 +47,7 @@ class SyntheticBuilding(RGBDSequence):
     sensor: SensorChoice = SensorChoice.KINECT_V1  # kind of the depth sensor; AUTO = KINECT_V1
     noise: float = 1.0  # scale of the sensor noise, in [0, 10]; 0 = none, 1 = noise model of the sensor
     distortion: float = 1.0  # scale of the fixed depth error of the device, in [0, 10]; 0 = none
-    blur: bool = True  # motion blur of the color images
+    blur: bool = True  # true = simulate motion blur of the color images
     max_depth: float = 5.0  # maximum depth of the sensor, m, in [0.5, 6.5]
     start: int = 0  # index of the first frame
     stop: int = TO_THE_END  # index of the first frame after the selection, >= 0; -1 = end of the sequence

@@ -116,7 +116,7 @@ def test_recording_check_reports_unregistered_depth(zoom: float, x: float, y: fl
     [fault] = [fault for fault in check(MovedDepth(moved), FARTHEST).errors if fault.subject == "color and depth"]
     assert "not registered" in fault.text
     if zoom == 1:
-        found_x, found_y = (float(number) for number in re.findall(r"([+-][0-9.]+) %", fault.text))
+        found_x, found_y = (float(number) for number in re.findall(r"([+-][0-9.]+)%", fault.text))
         # % of the image width; the reported shift corrects the offset
         assert found_x == pytest.approx(-100 * x / 640, abs=0.4)
         assert found_y == pytest.approx(-100 * y / 640, abs=0.4)

@@ -8,7 +8,7 @@ import numpy as np
 
 from framework.data import Camera, InstanceMesh
 from framework.exporting.decimation import joined
-from framework.reporting.visibility import LOOKS, sightings, spread_out
+from framework.reporting.visibility import RENDERED_POSES, sightings, spread_out
 
 CAMERA = Camera(200, 150, 150.0, 150.0, 99.5, 74.5)
 
@@ -77,5 +77,5 @@ def test_spread_out_poses_cover_trajectory_evenly() -> None:
     assert spread_out(1) == [0]
     assert spread_out(5) == [0, 1, 2, 3, 4]
     chosen = spread_out(1000)
-    assert (len(chosen), chosen[0], chosen[-1]) == (LOOKS, 0, 999)
+    assert (len(chosen), chosen[0], chosen[-1]) == (RENDERED_POSES, 0, 999)
     assert set(np.diff(chosen)) <= {12, 13}

@@ -193,6 +193,6 @@ def test_detect_result_with_known_names_keeps_them(tmp_path: Path) -> None:
     done = completed(tmp_path, "detect", *words, "detector.class_names=OWN", "out=found.json")
     assert done.returncode == 0, done.stderr[-4000:]
     assert "mask AP50 1.00, mask AP 1.00 (mean of 2 classes" in done.stderr
-    arguments = done.stderr.split("use it with: ")[1].split()
+    arguments = done.stderr.split("use the file with: ")[1].split()
     made = instancemap.run(tmp_path / "run", *words[:2], *arguments, *MAPPING)
     assert sorted(one["class"] for one in read_json(made / "instances.json")) == ["chair", "wall"]

@@ -129,7 +129,7 @@ def test_dbscan_does_not_depend_on_thread_count():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"eps": 0.0}, r"Dbscan\.eps: expected a value in \[0\.001, inf\], got 0\.0"),
+        ({"eps": 0.0}, r"Dbscan\.eps: expected at least 0\.001, got 0\.0"),
         ({"eps_per_depth": float("nan")}, "Dbscan.eps_per_depth"),
         ({"min_points": 0}, "Dbscan.min_points"),
         ({"stride": 0}, "Dbscan.stride"),

@@ -216,7 +216,7 @@ def test_plane_removal_keeps_unassigned_points():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"plane_distance": -0.1}, r"PlaneRemoval\.plane_distance: expected a value in"),
+        ({"plane_distance": -0.1}, r"PlaneRemoval\.plane_distance: expected at least 0, got -0\.1"),
         ({"max_cluster_fraction": 1.5}, r"PlaneRemoval\.max_cluster_fraction: expected a value in \[0, 1\], got 1\.5"),
         ({"inverse_depth_noise": float("nan")}, "PlaneRemoval.inverse_depth_noise"),
         ({"max_tilt": 200.0}, "PlaneRemoval.max_tilt"),

@@ -41,7 +41,7 @@ def test_import_prints_written_frames_and_next_commands(
     out, err = capsys.readouterr()
     assert out.splitlines() == [
         f"{tmp_path}/out: from Stray Scanner, 2 frames",
-        "the images are not upright, which reduces detection accuracy; import again with --rotate 180",
+        "the images are not upright, which reduces detection accuracy; import into another folder with --rotate 180",
         f"check it: instancemap check dataset=rgbd_folder dataset.root={tmp_path}/out",
         f"map it: instancemap dataset=rgbd_folder dataset.root={tmp_path}/out",
     ]

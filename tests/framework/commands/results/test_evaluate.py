@@ -220,7 +220,7 @@ def test_evaluate_rejects_only_unusable_run(stored: Path, command, spoil: Callab
     assert status == 1
     assert out == f"{stored}: unchanged\n"
     assert len(err.splitlines()) == 1, err
-    assert err.startswith("refused: ")
+    assert err.startswith("error: ")
     assert str(spoilt) in err
     assert message in err
     assert {path.name: path.read_bytes() for path in spoilt.iterdir()} == before
@@ -229,7 +229,7 @@ def test_evaluate_rejects_only_unusable_run(stored: Path, command, spoil: Callab
 def test_evaluate_folder_without_runs_is_rejected(stored: Path, tmp_path: Path, command) -> None:
     status, out, err = command(tmp_path / "nothing", stored)
     assert (status, out) == (1, f"{stored}: unchanged\n")
-    assert err == f"refused: {tmp_path / 'nothing'}: expected a run directory or a folder of runs, got neither\n"
+    assert err == f"error: {tmp_path / 'nothing'}: expected a run directory or a folder of runs, got neither\n"
 
 
 def test_evaluate_runs_with_same_truth_load_truth_once(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -280,7 +280,7 @@ def test_evaluate_process_reports_results_and_status(mapped: Path, tmp_path: Pat
         timeout=120,
     )
     assert done.stdout == "run: unchanged\n", done.stderr
-    assert done.stderr == "refused: absent: expected a run directory or a folder of runs, got neither\n"
+    assert done.stderr == "error: absent: expected a run directory or a folder of runs, got neither\n"
     assert done.returncode == 1
 
 
@@ -290,7 +290,7 @@ def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
     with locked(stored):
         status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert f"refused: {stored}: expected an unlocked directory, got a directory in use by process {os.getpid()}" in err
+    assert f"error: {stored}: expected an unlocked directory, got a directory in use by process {os.getpid()}" in err
     assert (stored / "metrics.json").read_bytes() == before
     assert command(stored)[0] == 0
 

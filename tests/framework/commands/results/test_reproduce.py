@@ -145,9 +145,9 @@ def test_reproduce_stored_config_cannot_read_environment(
 
 
 def test_reproduce_unknown_row_lists_rows(runs: Path, run: Path) -> None:
-    done = reproduce(runs, run, "--cell", "nothing")
+    done = reproduce(runs, run, "--row", "nothing")
     assert done.returncode == 1
-    assert "error: --cell: expected one of the rows all runs, got 'nothing'" in done.stderr
+    assert "error: --row: expected one of the rows all runs, got 'nothing'" in done.stderr
 
 
 def test_bundle_with_plugin_is_reproduced_without_package(runs: Path, run: Path, tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ def test_detect_output_is_read_by_precomputed(tmp_path: Path) -> None:
     assert (message["found"], message["mask IoU"], message["correct class"], message["false detections per image"]) == (
         *("1.00", "1.00", "1.00", "0.00"),
     )
-    how = done.stderr.split("use it with: ")[1].split()
+    how = done.stderr.split("use the file with: ")[1].split()
     path, labels = (argument.split("=")[1] for argument in how[1:])
     detector = Precomputed(Path(path), label_space=labels)
     assert [len(detector.detect(frame)) for frame in CornerRoom()] == [2, 0, 2, 2, 2, 2]
@@ -91,8 +91,8 @@ def test_detect_sweep_writes_file_per_job_and_table(tmp_path: Path) -> None:
         fake, none = csv.DictReader(file)
     assert fake["overrides"] == "dataset=fake detector=fake out=found.json"
     assert (fake["mask_ap50.couch"], none["correct class"]) == ("1.0", "")
-    [how] = [line for line in done.stderr.splitlines() if "use it with: " in line and "label_space" in line]
-    words = literal(shlex.split(how.partition("use it with: ")[2]), text_kind)
+    [how] = [line for line in done.stderr.splitlines() if "use the file with: " in line and "label_space" in line]
+    words = literal(shlex.split(how.partition("use the file with: ")[2]), text_kind)
     arguments = OverridesParser.create().parse_overrides(words)
     values = {argument.key_or_group: argument.value() for argument in arguments}
     assert values["detector.path"] == str(jobs[0] / "found.json")

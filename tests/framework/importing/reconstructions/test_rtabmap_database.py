@@ -201,7 +201,7 @@ DAMAGED = [
     ("UPDATE Data SET depth = ? WHERE id = 2", b"DEPTHRVL" + bytes(8), "node 2: depth: expected an RVL image"),
     ("UPDATE Data SET depth = ? WHERE id = 2", png(FRAMES[0].color), "node 2: depth: .* got 3 of uint8"),
     ("UPDATE Data SET image = ? WHERE id = 2", b"\xff\xd8", "node 2: image: expected an image with an end marker"),
-    ("UPDATE Data SET calibration = ? WHERE id = 2", None, "node 2: calibration: expected at most .*, got NoneType"),
+    ("UPDATE Data SET calibration = ? WHERE id = 2", None, "node 2: calibration: expected a blob of .*, got NoneType"),
     (
         "UPDATE Data SET calibration = ? WHERE id = 2",
         b"1",
