@@ -93,7 +93,7 @@ def object_data(
 
 def _calibrated(one: StoredInstance) -> list[tuple[str, str]]:
     """Return the names and values of the calibrated numbers of an object that are known, as text."""
-    named = {"Exists": one.exists, "Class is right": one.class_probability, "Expected IoU": one.expected_iou}
+    named = {"Exists": one.exists, "Class correct": one.class_probability, "Expected IoU": one.expected_iou}
     return [(name, f"{value:.2f}") for name, value in named.items() if value is not None]
 
 

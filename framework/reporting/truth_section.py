@@ -123,7 +123,7 @@ class TruthCheck:
 
     def reliability(self) -> str:
         """Return the reliability diagrams as SVG, or "" without evaluated objects."""
-        named = {"Exists": self.forecasts["exists"], "Class is right": self.forecasts["class"]}
+        named = {"Exists": self.forecasts["exists"], "Class correct": self.forecasts["class"]}
         known = {name: one for name, one in named.items() if len(one)}
         return reliability(known) if known else ""
 

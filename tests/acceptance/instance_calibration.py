@@ -264,7 +264,7 @@ def check(directories: Iterable[Path]) -> dict[str, Comparison]:
 def check_and_draw(directories: Iterable[Path]) -> None:
     """Print the calibration on unseen scenes, and draw its reliability diagrams with and without calibration."""
     total = check(directories)
-    named = {"Exists": total["exists"], "Class is right": total["class"]}
+    named = {"Exists": total["exists"], "Class correct": total["class"]}
     for name in ("today", "calibrated"):
         figure = reliability_figure({title: getattr(one, name) for title, one in named.items()}, background="white")
         figure.savefig(FIGURES / f"calibration_{name}.png", dpi=144)
